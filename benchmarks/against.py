@@ -1,10 +1,11 @@
-"""How fast runs in virtual time are beside another revision: `python -m benchmarks.against 60cd154 [--rounds 15]`.
+"""Measure runs in virtual time against those of another revision: `python -m benchmarks.against HEAD~20 [--rounds 15]`.
 
-The revision is checked out beside, and both play the same seeds in turn, each in a process of its own: believe the
-ratios, of the same round, of this revision's processor time to the other's. Below 1 is faster. `--large` also plays 50
-agents, and the thesis's matrix as `ucp-harness matrix` does, with 200 seeds on one core; that takes minutes.
+The other revision is checked out in a temporary directory. Both revisions play the same seeds alternately, each in a
+process of its own. The ratio is the processor time of this revision divided by that of the other one, in the same
+round. A ratio below 1 means that this revision is faster. `--large` also plays 50 agents, and the thesis's matrix with
+200 seeds on one core, which takes minutes.
 
-The scenario is 20 minutes at 15 % loss with a final reconcile. A run is judged as far as that revision does.
+The scenario has 20 minutes at 15 % loss with a final reconcile. Each revision judges its own runs.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ LARGE = {
     "50 agents, traced": ("traced 50", "traced 50"),
     "a run of the matrix": ("matrix", "matrix"),
 }
-"""What a row compares: what the other revision plays, and what this one does."""
+"""Row -> the runs of the other revision, and the runs of this one."""
 
 
 class Player:
-    """A process that plays with the code in `root`."""
+    """A process that plays runs with the code in `root`."""
 
     def __init__(self, root: Path) -> None:
         self._process = subprocess.Popen(
@@ -51,13 +52,13 @@ class Player:
         )
 
     def seconds(self, what: str, seed: int) -> float:
-        """Processor time of each run."""
+        """Return the processor time of each run, in seconds."""
         assert self._process.stdin and self._process.stdout, "they are pipes"
         self._process.stdin.write(f"{what}/{seed}\n")
         self._process.stdin.flush()
         answer = self._process.stdout.readline()
         if not answer:
-            sys.exit(f"the process that plays {what} has ended; it says why above")
+            sys.exit(f"the process that plays {what} ended; its error is above")
         return float(answer)
 
     def close(self) -> None:
@@ -66,7 +67,7 @@ class Player:
 
 @contextmanager
 def checked_out(revision: str) -> Iterator[Path]:
-    """A directory with this revision of the project, for a while."""
+    """Check out this revision into a temporary directory, which exists until the block ends."""
     with tempfile.TemporaryDirectory() as directory:
         tree = Path(directory) / "tree"
         git = ("git", "-C", str(ROOT), "worktree")
@@ -95,17 +96,17 @@ def row(name: str, plays: tuple[str, str], other: Player, this: Player, rounds: 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("revision", help="the other one, as git names it")
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--large", action="store_true", help="also 50 agents and the matrix, for one round each")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("revision", help="other revision, as git names it")
+    parser.add_argument("--rounds", type=int, default=15, help="number of rounds")
+    parser.add_argument("--large", action="store_true", help="also 50 agents and the matrix, one round each")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     arguments = parser.parse_args()
     with checked_out(arguments.revision) as tree, ExitStack() as players:
         other, this = Player(tree), Player(ROOT)
         players.callback(other.close)
         players.callback(this.close)
         for player in (other, this):
-            player.seconds("explore", 0)  # and with it whatever is done once
+            player.seconds("explore", 0)  # includes the imports and caches of the first run
         rows = [row(name, plays, other, this, arguments.rounds) for name, plays in SMALL.items()]
         if arguments.large:
             rows += [row(name, plays, other, this, 1) for name, plays in LARGE.items()]

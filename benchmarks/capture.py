@@ -1,9 +1,9 @@
-"""What captures keep up with, and cost: `python -m benchmarks.capture [--vehicles N] [--bytes B] [--rounds R]`.
+"""Measure the rate and the cost of captures: `python -m benchmarks.capture [--vehicles N] [--bytes B] [--rounds R]`.
 
-In a lab without conditions one vehicle broadcasts as fast as it is told to, at each rate in a lab of its own. Of every
-packet N frames are captured: one where it left, and one at each of the others. `dropped` is the share that the files
-lack, by the kernel's count; `processor_us` is the capture's processor time for one frame, with all that it writes. The
-last row is as fast as the sender can.
+In a lab without conditions one vehicle broadcasts at each rate, in a new lab for each rate. N vehicles capture N frames
+of each packet: one at its sender, and one at each other vehicle. `dropped` is the share of frames missing in the files,
+counted by the kernel. `processor_us` is the processor time of the capture for each frame, including the writing of the
+files. The last row has no limit of the rate.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from typing import Any
 from benchmarks.rounds import Spread, show
 from netem import _probe
 from netem.capture import LiveCapture
-from netem.errors import CaptureError
-from netem.lab import Lab, LabError
+from netem.errors import LabError, LiveCaptureError
+from netem.lab import Lab
 
 _PORT = 14600
 _RATES = (5_000, 10_000, 20_000, 40_000)
@@ -35,7 +35,7 @@ _Row = dict[str, Any]
 
 
 async def once(vehicles: int, rate: int, packets: int, size: int, folder: Path) -> dict[str, float]:
-    """Broadcast that many packets of `size` bytes of data; `rate` a second, or 0: as fast as possible."""
+    """Broadcast this number of packets with `size` bytes of data at `rate` packets per second; 0 means no limit."""
     captures = folder / f"{rate}-{time.monotonic_ns()}"
     captures.mkdir()
     async with await Lab.open(range(1, vehicles + 1), log=folder / "lab.log") as lab:
@@ -55,12 +55,12 @@ async def once(vehicles: int, rate: int, packets: int, size: int, folder: Path) 
 
 
 def _pause_s(rate: int) -> float:
-    """A packet itself takes about 20 us."""
+    """Return the pause between two bursts. A packet takes about 20 us itself."""
     return max(0.0, _BURST / rate - _BURST * 20e-6) if rate else 0.0
 
 
 async def _broadcast(lab: Lab, packets: int, size: int, pause_s: float, folder: Path) -> float:
-    """Seconds that it took."""
+    """Return the duration of the broadcasts, in seconds."""
     numbers = (_PORT, packets, 0, lab.broadcast, size, pause_s)
     argv = [sys.executable, "-I", "-S", _probe.__file__, "broadcast", *map(str, numbers)]
     output = folder / "broadcast.log"
@@ -80,11 +80,11 @@ def row(vehicles: int, rate: int, seconds: float, size: int, rounds: int, folder
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--vehicles", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=5.0, help="at each rate")
-    parser.add_argument("--bytes", type=int, default=300, help="of data in each packet")
-    parser.add_argument("--rounds", type=int, default=3, help="median and spread are shown")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--vehicles", type=int, default=5, help="number of vehicles")
+    parser.add_argument("--seconds", type=float, default=5.0, help="duration at each rate")
+    parser.add_argument("--bytes", type=int, default=300, help="bytes of data in each packet")
+    parser.add_argument("--rounds", type=int, default=3, help="number of rounds")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -92,7 +92,7 @@ def main() -> None:
                 row(options.vehicles, rate, options.seconds, options.bytes, options.rounds, Path(folder))
                 for rate in (*_RATES, _FASTEST)
             ]
-    except (LabError, CaptureError) as error:
+    except (LabError, LiveCaptureError) as error:
         sys.stderr.write(f"{error}\n")
         sys.exit(3)
     show(rows, _FORMS, options.json)

@@ -1,9 +1,10 @@
-"""Thousands of runs of right agents, of every kind, each judged in everything: none may have a finding.
+"""Check thousands of different runs of correct agents. No check may have a finding.
 
     python -m benchmarks.clean_runs [RUNS] [FIRST]
 
-A run's scenario is drawn from its number: 2 to 12 agents, loss, bursts, partitions, deaths and returns, pauses, clocks
-that drift, readings of the thesis. What is bad is printed with its number, and the exit status is 1.
+The number of a run determines its scenario: 2 to 12 agents, loss, bursts, partitions, kills and restarts, pauses,
+clocks that drift, and readings of the thesis. The benchmark prints each finding with the number of its run. With
+findings, the exit status is 1.
 """
 
 import sys
@@ -74,7 +75,7 @@ def _death(draw: Random, agents: int, duration_s: float) -> list[dict[str, Any]]
 
 
 def judge(number: int) -> tuple[list[str], dict[str, str]]:
-    """What is bad, in sentences, and every verdict."""
+    """Return a sentence for each bad judgement, and all verdicts."""
     result = simulate(scenario(number), number, tracing=True).result
     bad = [f"{key}: {judgement.verdict}: {judgement.reason}" for key, judgement in result.judgements.items()]
     verdicts = {key: judgement.verdict for key, judgement in result.judgements.items()}

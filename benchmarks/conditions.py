@@ -1,10 +1,10 @@
-"""What engines do, beside what is asked, more often than `ucp-harness doctor --measure`, and with virtual time too.
+"""Measure the conditions that engines apply, more often than `ucp-harness doctor --measure`, and also in virtual time.
 
     python -m benchmarks.conditions [--packets N] [--rounds R] [--json]
 
-Each round asks all questions of `netem.measure`, of every engine that works here and of the medium; engines take turns.
-A row gives the mean of what was measured with its extremes, and how often the first answer's 99.9 % interval held what
-was asked: in 999 of 1000 rounds, if the engine is right.
+Each round asks all questions of `netem.measure` to each engine of this machine and to the medium, in turn. A row has
+the mean, minimum and maximum of the measured values. `inside` counts the rounds in which the first 99.9 % interval
+contained the requested value: 999 of 1000, if the engine is correct.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from netem.observers import in_lab, in_medium
 
 
 def observers() -> dict[str, Observer]:
-    """Those that work on this machine."""
+    """Return the observers of all engines that work on this machine."""
     working = {finding.name for finding in examine() if finding.ok}
     kernel = {engine: in_lab(engine) for engine in get_args(EngineName) if engine in working}
     return {**kernel, "medium": in_medium(seed=1)}
@@ -49,9 +49,9 @@ def show(rounds: Mapping[str, list[Measured]]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--packets", type=int, default=PACKETS, help="of each stream")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", action="store_true", help="everything, as JSON")
+    parser.add_argument("--packets", type=int, default=PACKETS, help="packets of each stream")
+    parser.add_argument("--rounds", type=int, default=3, help="number of rounds")
+    parser.add_argument("--json", action="store_true", help="print all rows of all rounds as JSON")
     options = parser.parse_args()
     engines = observers()
     rounds: dict[str, list[Measured]] = {engine: [] for engine in engines}

@@ -1,4 +1,4 @@
-"""`consolidate` of what a large swarm brings home: seconds and memory, where chains agree and where they do not.
+"""Measure the time and memory of `consolidate` for a large swarm, whose chains agree or diverge.
 
 python -m benchmarks.consolidate [AGENTS [BLOCKS]]
 """
@@ -22,14 +22,14 @@ from ucp.telemetry import POSITION, Position
 EPOCH_US = 1_795_258_278_000_000
 EVENTS_IN_A_BLOCK = 13
 SHAPES = {
-    "one chain": "all agree",
-    "two halves": "half of each chain is mutual, then the swarm falls in two",
-    "each its own": "nobody ever heard anybody",
+    "one chain": "all chains are equal",
+    "two halves": "half of each chain is mutual, then two groups differ",
+    "each its own": "no agent ever received a message",
 }
 
 
 def block(agent_id: int, number: int, lots: random.Random) -> Block:
-    """Thirteen positions: 975 bytes of 1,024."""
+    """Return a block with 13 positions, which fill 975 of 1,024 bytes."""
     at_us = EPOCH_US + 10_000_000 * number
     data = b""
     for event in range(EVENTS_IN_A_BLOCK):

@@ -1,8 +1,9 @@
-"""How long agents take to come up and go away: `python -m benchmarks.containers [--rounds R] [--json] [N ...]`.
+"""Measure the start and stop of agents: `python -m benchmarks.containers [--rounds R] [--json] [N ...]`.
 
-In containers (root, a Docker engine; this machine's own files, nothing is built) and as processes, in turn, round by
-round: up is from nothing until the last agent answers, network included; down is from the first SIGTERM until the last
-container, or the lab, is gone. Ratios are of the same round.
+Each round starts the agents in containers, and then as processes. Containers need root and a Docker engine. They use
+the files of this machine, so no image is built. Up is the time from the beginning until the last agent answers,
+including the network. Down is the time from the first SIGTERM until the last container or the lab is gone. Ratios are
+of one round.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any
 from benchmarks.rounds import Spread, show
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
+from harness.play._vehicle_keys import Handed
 from harness.play.containers._container_backend import Containers
 from harness.play.containers._container_preflight import require_root
 from harness.play.process._agent_process import AgentProcess, agent_command
@@ -34,7 +36,7 @@ _FORMS = {f"{key}_s": ".2f" for key in ("docker_up", "process_up", "docker_down"
 
 
 async def once(agents: int, open_lab: OpenLab, directory: Path) -> tuple[float, float]:
-    """Seconds that so many agents take to come up, and to go."""
+    """Return the seconds in which `agents` agents start, and the seconds in which they stop."""
     scenario = parse(
         {"name": "up and down", "agents": agents, "vehicles": {"kind": "none"}, "docker": {"image_from_host": True}}
     )
@@ -43,7 +45,10 @@ async def once(agents: int, open_lab: OpenLab, directory: Path) -> tuple[float, 
     started = [AgentProcess(agent, rundir, agent_command(scenario, agent), clock.now) for agent in scenario.roster]
     begin = time.perf_counter()
     async with await open_lab(scenario, rundir, lambda _: None) as lab:
-        await asyncio.gather(*(agent.start(lab, scenario, 1, b"benchmark", False, False) for agent in started))
+        starts = (
+            agent.start(lab, scenario, 1, b"benchmark", False, False, None, Handed(None, Path())) for agent in started
+        )
+        await asyncio.gather(*starts)
         up = time.perf_counter()
         await asyncio.gather(*(agent.stop() for agent in started))
         await lab.close()
@@ -66,9 +71,9 @@ def up_and_down(agents: int, rounds: int, folder: Path) -> _Row:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("agents", nargs="*", type=int, metavar="N", help="agents (5 20)")
-    parser.add_argument("--rounds", type=int, default=3, help="median and spread are shown")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("agents", nargs="*", type=int, metavar="N", help="numbers of agents (default 5 20)")
+    parser.add_argument("--rounds", type=int, default=3, help="number of rounds")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
     try:
         require_root()

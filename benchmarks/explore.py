@@ -1,9 +1,9 @@
-"""New local states for the same processor time, of a hunt beside seeds alone: `python -m benchmarks.explore`.
+"""Compare the local states reached by a hunt and by random seeds: `python -m benchmarks.explore`.
 
-Each round gives both the same processor time on one core, first the one, then the other, then the other way round, with
-seeds of its own. Both are played, followed and judged by the same code.
-`small` is three agents that complete about three blocks, of which `prove` knows all local states that there are where
-messages may be lost; `five` a mission of five agents with about eight.
+Each round gives both methods the same processor time on one core. The order changes from round to round, and each round
+has its own seeds. The same code plays, follows and judges the runs of both. `small` has three agents that complete
+about three blocks. For it, `prove` knows all local states that exist if messages may be lost. `five` is a mission of
+five agents with about eight blocks.
 """
 
 import argparse
@@ -34,7 +34,7 @@ SEEDS_OF_ROUND = 1_000_000
 
 
 def seeds_alone(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, Reached]:
-    """How many runs, and what they reached."""
+    """Return the number of runs, and the local states that they reached."""
     reached, runs, ends_s = Reached(), 0, time.process_time() + budget_s
     while time.process_time() < ends_s:
         reached.add(tried(scenario, first_seed + runs).reached)
@@ -43,7 +43,7 @@ def seeds_alone(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[i
 
 
 def hunted(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, Reached]:
-    """How many runs, and what they reached; what it takes to begin is in the budget."""
+    """Return the number of runs, and the local states that they reached. The budget includes the start of the hunt."""
     ends_s = time.process_time() + budget_s
     limits, begun = beginnings(scenario, range(first_seed, first_seed + 4))
     hunt = Hunt(limits, Random(first_seed))
@@ -56,8 +56,8 @@ def hunted(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, R
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=60.0, help="processor time for each of the two in a round")
+    parser.add_argument("--rounds", type=int, default=5, help="number of rounds")
+    parser.add_argument("--seconds", type=float, default=60.0, help="processor time of each method in a round")
     parser.add_argument("--scenario", nargs="+", choices=SCENARIOS, default=list(SCENARIOS))
     arguments = parser.parse_args()
     for name in arguments.scenario:
@@ -86,7 +86,7 @@ def compare(scenario: Scenario, rounds: int, seconds: float) -> None:
 
 
 def of(reached: Reached, there: Existing | None) -> str:
-    """How many local states, and how many of those that exist within the bounds."""
+    """Format the number of local states, and the number of existing states within the bounds among them."""
     if there is None:
         return str(len(reached.states))
     return f"{len(reached.states)} ({len(reached.states & there.states)} of {len(there.states)})"

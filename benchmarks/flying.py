@@ -1,10 +1,10 @@
-"""What a swarm of real vehicles costs: `python -m benchmarks.flying [--vehicles 20] [--seconds 90]`.
+"""Measure the processor time of a swarm of real vehicles: `python -m benchmarks.flying [--vehicles 20] [--seconds 90]`.
 
-That many ArduCopters fly a plan at speedup 1, with agents that lose 15 %, a ground station that asks all of them for
-four updates a second, and a page that is watched; the last two are clients in this process, which is not counted.
-Counted are the processor seconds of the mission (user and system) of the vehicles, which are ArduPilot's, and of the
-rest, which is ours: agents, the harness, and the page's server. Vehicles that keep up have a real-time factor of 0.99,
-at least; the goal is 60 % of a core for what is ours. ARDUPILOT_SITL names the directory with the binary.
+The ArduCopters fly a plan at speedup 1, with agents at 15 % loss. A ground station requests four updates per second
+from each vehicle, and a client reads the live page. Ground station and client belong to this process, which is not
+counted. The benchmark prints the processor seconds (user and system) of the vehicles, and of the other parts: agents,
+harness, and the server of the page. A vehicle keeps up if its real-time factor is at least 0.99. The other parts should
+use at most 60 % of a core. The environment variable ARDUPILOT_SITL names the directory with the binary.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def scenario(vehicles: int, seconds: float) -> dict[str, Any]:
 
 
 class GroundStation(asyncio.DatagramProtocol):
-    """Asks every vehicle that it sees for all streams, and takes what comes."""
+    """Request all data streams of each vehicle, and count the received bytes."""
 
     def __init__(self) -> None:
         self.taken = 0
@@ -63,7 +63,7 @@ class GroundStation(asyncio.DatagramProtocol):
 
 
 def spent(root: int, run: Path) -> dict[str, float]:
-    """Processor seconds by now of a process and all that descend from it, by what they are."""
+    """Return the processor seconds of a process and its descendants up to now, by their part in the run."""
     processes: dict[int, tuple[int, float]] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal():
@@ -148,11 +148,11 @@ def _tell(marks: list[tuple[float, dict[str, float]]], run: Path, taken: int, wa
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--vehicles", type=int, default=20)
-    parser.add_argument("--seconds", type=float, default=90.0, help="of mission")
+    parser.add_argument("--vehicles", type=int, default=20, help="number of vehicles")
+    parser.add_argument("--seconds", type=float, default=90.0, help="seconds of mission")
     asked = parser.parse_args()
     if "ARDUPILOT_SITL" not in os.environ:
-        sys.exit("ARDUPILOT_SITL has to name the directory that holds arducopter and its default parameters")
+        sys.exit("ARDUPILOT_SITL is not set: set it to the directory with arducopter and its default parameters")
     with TemporaryDirectory() as place:
         file = Path(place, "copters.yaml")
         file.write_text(yaml.safe_dump(scenario(asked.vehicles, asked.seconds)))

@@ -1,10 +1,13 @@
-"""Agents of another make in virtual time: `python -m benchmarks.foreign [-- COMMAND...]`, by default ours driven so.
+"""Measure agents of another implementation in virtual time: `python -m benchmarks.foreign [-- COMMAND...]`.
 
-Missions of 20 minutes with five agents, 15 % loss, with traces and judged in everything, on `--jobs` cores, beside the
-same missions with our agent in the simulation itself. `--same` plays the whole library with some seeds instead, and
-says where a right agent leaves other chains, or is judged otherwise, than ours in the simulation; ours, driven by
-lines, leaves the same traces, too, to the byte. Not so for swarms of which it is proven that they never finish: nobody
-proves that of agents into which nobody sees.
+COMMAND is the agent; without it, the benchmark uses the harness's own agent as a program. The missions have 20 minutes,
+five agents and 15 % loss. They run on `--jobs` cores with traces and all checks. The same missions also run with the
+harness's own agent inside the simulation.
+
+`--same SEEDS` instead plays all scenarios of the library with some seeds. It prints the missions in which a correct
+agent exports other chains, or gets other verdicts, than the own agent inside the simulation. If COMMAND is the own
+agent, the traces must be equal, too. Swarms with a proof that they never finish do not count, because the harness
+cannot prove this for agents whose state it does not know.
 """
 
 import argparse
@@ -28,7 +31,7 @@ def of_library(name: str, command: list[str] | None) -> Scenario:
 
 
 def measure(scenario: Scenario, missions: int, jobs: int) -> tuple[float, int]:
-    """Wall seconds of so many missions, and handler runs in all of them."""
+    """Return the wall time of all missions in seconds, and the number of their handler runs."""
 
     def work(seed: int) -> int:
         result = simulate(scenario, seed, tracing=True, deliver_all=True)
@@ -45,7 +48,7 @@ def measure(scenario: Scenario, missions: int, jobs: int) -> tuple[float, int]:
 
 
 def processor_s(scenario: Scenario, missions: int = 10) -> tuple[float, float]:
-    """Seconds of a processor that a mission takes of this process, and of the agents' without their start."""
+    """Return the processor seconds of this process and of the agents for one mission, without the start of agents."""
 
     def used(who: int) -> float:
         usage = resource.getrusage(who)
@@ -69,7 +72,7 @@ def left_behind(simulated: Simulated, *, with_traces: bool) -> object:
 
 
 def same(command: list[str], seeds: int, jobs: int) -> int:
-    """How many missions are not the same."""
+    """Return the number of missions with a difference."""
 
     def work(task: tuple[str, int]) -> str:
         name, seed = task
@@ -98,9 +101,9 @@ def same(command: list[str], seeds: int, jobs: int) -> int:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--missions", type=int, default=200)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--same", type=int, default=0, metavar="SEEDS")
+    parser.add_argument("--missions", type=int, default=200, help="number of missions")
+    parser.add_argument("--jobs", type=int, default=2, help="number of parallel missions")
+    parser.add_argument("--same", type=int, default=0, metavar="SEEDS", help="play the library with seeds 0..SEEDS-1")
     parser.add_argument("command", nargs="*", default=OURS)
     asked = parser.parse_args()
     if asked.same:

@@ -1,10 +1,11 @@
-"""Forgeries, replays and nonces: `python -m benchmarks.forgeries [--each 1000000] [--only CLASS ...]`.
+"""Send forgeries, replays and repeated nonces to secured agents: `python -m benchmarks.forgeries [--each 1000000]`.
 
-`--each` forged datagrams of each of ten classes reach an agent that has keys, and that has heard others. How many it
-accepts, whether anything of it changed, and how many it rejects in a second of processor time, making them not counted.
+An agent with keys, which has received messages of others, gets `--each` forged datagrams of each of ten classes. A row
+counts the accepted ones, says whether the state of the agent changed, and gives the number of datagrams that it rejects
+in a second of processor time. The time to make them does not count. `--only CLASS ...` selects classes.
 
-`--replays RUNS`: every datagram of so many simulated missions reaches, at later seconds, an agent that heard it.
-`--nonces RUNS`: so many simulated missions with reboots, with and without disk; how often a key and nonce came twice.
+`--replays RUNS` plays simulated missions in which all agents receive each datagram again later. `--nonces RUNS` plays
+simulated missions with reboots, with and without their disk, and counts repeated pairs of key and nonce.
 """
 
 import argparse
@@ -34,7 +35,7 @@ OTHERS = KeySet.derived(b"another mission".ljust(32, b"\0"), ROSTER)
 EPOCH = 5
 NOW = EPOCH * KEYS.public.epoch_s
 POOL = 512
-"""Datagrams from which a class makes its forgeries, of those that are dear to make."""
+"""Number of datagrams from which a class makes its forgeries, if they take long to make."""
 AT_ONCE = 2000
 RUNS_AT_ONCE = 500
 LATER_S = (1.0, 40.0)
@@ -47,7 +48,7 @@ def session(agent_id: int, keys: KeySet = KEYS, now: float = NOW) -> Session:
 
 
 def listener() -> SecuredAgent:
-    """Agent 1, which has heard one datagram of each of the others."""
+    """Return agent 1, which has received one datagram from each other agent."""
     agent = SecuredAgent(session(1), 1, ROSTER, b"test", tracing=False)
     for other in ROSTER[1:]:
         agent.receive_datagram(session(other).seal(0, messages(Random(0))[0], None, None, 0), NOW)
@@ -56,14 +57,14 @@ def listener() -> SecuredAgent:
 
 
 def messages(draw: Random) -> list[Message]:
-    """A message of each shape."""
+    """Return a message of each shape."""
     a, b = draw.randbytes(32), draw.randbytes(32)
     block = Block(2, draw.randrange(2**40), draw.randbytes(draw.randrange(1, 300)))
     return [BlockAddRequest(a, b), CommitBlock(block, a), ChainContainResponse(a, True), BlockResponse(block)]
 
 
 def pool(maker: Session, draw: Random, first: int = 1) -> list[bytes]:
-    """Datagrams that nobody has heard."""
+    """Return datagrams that no agent has received yet."""
     made = []
     while len(made) < POOL:
         for message in messages(draw):
@@ -72,7 +73,7 @@ def pool(maker: Session, draw: Random, first: int = 1) -> list[bytes]:
     return made
 
 
-# The ten classes: each goes on for ever
+# The ten classes: each generator is endless
 
 
 def at_random(draw: Random) -> Iterator[bytes]:
@@ -164,7 +165,7 @@ CLASSES: dict[str, Callable[[Random], Iterator[bytes]]] = {
 
 
 def all_of(agent: SecuredAgent) -> dict[str, Any]:
-    """Everything that a datagram might change."""
+    """Return all state that a datagram might change."""
     state, session = agent.state, agent.session
     return {
         "received": agent.received.copy(),
@@ -185,7 +186,7 @@ def all_of(agent: SecuredAgent) -> dict[str, Any]:
 def forge(
     make: Callable[[Random], Iterator[bytes]], count: int, seed: int = 1
 ) -> tuple[int, bool, float, Counter[str]]:
-    """How many of so many forgeries were accepted, whether anything changed, processor seconds, and why dropped."""
+    """Return the number of accepted forgeries, whether state changed, processor seconds, and reasons for drops."""
     agent, forgeries = listener(), make(Random(1))
     before, seconds, answered = all_of(agent), 0.0, 0
     for _ in range(-(-count // AT_ONCE)):
@@ -209,7 +210,7 @@ def flying(duration_s: float, **more: Any) -> Scenario:
 
 
 class ReplayingAir(VirtualAir):
-    """Everything that is sent reaches everybody else again, `LATER_S` after it was sent."""
+    """Deliver each message to all other agents again, `LATER_S` seconds after it was sent."""
 
     def broadcast(
         self,
@@ -229,10 +230,10 @@ class ReplayingAir(VirtualAir):
 
 
 def replays(runs: int, loss: float) -> tuple[int, int, list[str]]:
-    """Missions with the same chains though all was replayed; datagrams sent again; findings of the checker.
+    """Return the number of missions with unchanged chains, of datagrams dropped as replayed, and the findings.
 
-    With loss, who lost a datagram handles what comes again, once, as of a slow radio: then chains may be others, and
-    all that agents do is judged step by step.
+    With loss, an agent that lost a datagram handles its first repetition, as if the radio was slow. The chains may then
+    differ, so the checker judges each step instead.
     """
     same, dropped, bad = 0, 0, list[str]()
     for seed in range(runs):
@@ -246,7 +247,7 @@ def replays(runs: int, loss: float) -> tuple[int, int, list[str]]:
 
 
 def nonces(seeds: Iterable[int]) -> tuple[int, int]:
-    """How many datagrams were sealed, and how many with a key and nonce that had been used before in their run."""
+    """Return the number of sealed datagrams, and the number of those with a key and nonce used before in their run."""
     used: set[tuple[int, int]] = set()
     sealed = twice = 0
     sealing = SenderKeys.encrypt
@@ -274,11 +275,11 @@ def nonces(seeds: Iterable[int]) -> tuple[int, int]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--each", type=int, default=1_000_000)
-    parser.add_argument("--only", nargs="+", choices=CLASSES, default=list(CLASSES))
-    parser.add_argument("--nonces", type=int, metavar="RUNS")
-    parser.add_argument("--replays", type=int, metavar="RUNS")
-    parser.add_argument("--loss", type=float, default=0.0, help="of the missions whose datagrams are replayed")
+    parser.add_argument("--each", type=int, default=1_000_000, help="forgeries of each class")
+    parser.add_argument("--only", nargs="+", choices=CLASSES, default=list(CLASSES), help="classes of forgeries")
+    parser.add_argument("--nonces", type=int, metavar="RUNS", help="missions in which to count repeated nonces")
+    parser.add_argument("--replays", type=int, metavar="RUNS", help="missions in which to repeat all datagrams")
+    parser.add_argument("--loss", type=float, default=0.0, help="loss in the missions of --replays")
     arguments = parser.parse_args()
     if arguments.nonces is not None:
         for first in range(0, arguments.nonces, RUNS_AT_ONCE):

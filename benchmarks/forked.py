@@ -1,8 +1,9 @@
-"""How many swarms never come to rest after a partition, by cure: `python -m benchmarks.forked`.
+"""Count the swarms that never become idle after a partition, for each cure: `python -m benchmarks.forked`.
 
-3 to 8 agents are parted at random, complete some blocks in their parts, and are then together again: nothing is lost
-any more, one to three more blocks are completed, and they have 20 minutes to become idle. In half of the runs each
-message takes 20 ms, in the others 2 to 50 ms. The same runs with each of the cures of docs/explanation/livelocks.md.
+A random partition divides 3 to 8 agents, which complete some blocks in their groups. Then the partition heals, and no
+messages are lost. The agents complete one to three more blocks, and have 20 minutes to become idle. In half of the runs
+each message takes 20 ms, in the others 2 to 50 ms. The same runs are repeated with each cure of
+docs/explanation/livelocks.md.
 """
 
 import argparse
@@ -67,9 +68,9 @@ def scenario(seed: int, cure: dict[str, Any]) -> Scenario:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=4000)
-    parser.add_argument("--jobs", type=int, default=cores())
-    parser.add_argument("--cure", nargs="+", choices=CURES, default=list(CURES))
+    parser.add_argument("--runs", type=int, default=4000, help="number of runs for each cure")
+    parser.add_argument("--jobs", type=int, default=cores(), help="number of parallel runs")
+    parser.add_argument("--cure", nargs="+", choices=CURES, default=list(CURES), help="cures to play")
     arguments = parser.parse_args()
     for name in arguments.cure:
 

@@ -1,8 +1,9 @@
-"""How many handler runs a second are held against the reference core, on one processor; and what their record weighs.
+"""Measure the handler runs per second that the step judge compares on one core, and the size of records.
 
     python -m benchmarks.judging [ROUNDS]
 
-Records are those of scenarios/loss_15.yaml in virtual time, with so many agents. Bytes are of the traces on disk.
+The records come from scenarios/loss_15.yaml in virtual time, with 5, 20 and 50 agents. Bytes are those of traces on
+disk.
 """
 
 import statistics
@@ -17,7 +18,7 @@ from harness.scenario import Scenario, load_scenario
 SCENARIO = Path(__file__).parent.parent / "scenarios" / "loss_15.yaml"
 AGENTS = (5, 20, 50)
 MEAN_S = 30.0
-"""Between two events of an agent if they are five; so many more make events as rarely as five do together."""
+"""Seconds between two events of an agent in a swarm of five; larger swarms have the same total rate of events."""
 
 
 def scenario(agents: int) -> Scenario:

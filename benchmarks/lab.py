@@ -1,11 +1,12 @@
-"""How long the lab takes to come up and go away: `python -m benchmarks.lab [--rounds R] [--json] [--mininet] [N ...]`.
+"""Measure the start and stop of the lab: `python -m benchmarks.lab [--rounds R] [--json] [--mininet] [N ...]`.
 
-With `--mininet` (root; Debian packages mininet and bridge-utils) Mininet builds as many hosts on one Linux bridge, in
-turn with the lab, round by round: `build` and `start` against `Lab.open`, `stop` against `Lab.close`; ratios are of the
-same round. Of the lab the start of its first process counts too, of Mininet only what it does itself.
+With `--mininet`, each round also starts and stops the same number of Mininet hosts on one Linux bridge. This needs root
+and the Debian packages mininet and bridge-utils. `build` and `start` are compared with `Lab.open`, and `stop` with
+`Lab.close`. Ratios are of one round. The time of the lab includes the start of its first process; the time of Mininet
+does not.
 
-With `--pairs` it is instead `Lab.apply` that is measured, with each engine that works here: every directed pair of
-vehicles gets a loss of its own (`first`), and then another (`change`).
+`--pairs` measures `Lab.apply` instead, with each engine that works on this machine. Each directed pair of vehicles gets
+a loss of its own (`first`), and then another one (`change`).
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from netem.lab import EngineName, Lab, LabError, LabUnavailable
 _PYTHON = "/usr/bin/python3"  # Debian's, which has Debian's Mininet
 _MININET = Path(__file__).with_name("mininet_network.py")
 _MININET_DEADLINE_S = 600.0
-_PAUSE_S = 0.5  # the kernel takes the last namespaces away in the background
+_PAUSE_S = 0.5  # the kernel removes the last namespaces in the background
 
 _SECONDS = ("up", "mininet_up", "down", "mininet_down", "first", "change")
 _FORMS = {**{f"{key}_s": ".3f" for key in _SECONDS}, "up_ratio": ".1f", "down_ratio": ".1f"}
@@ -40,11 +41,11 @@ _Row = dict[str, Any]
 
 
 class _CannotError(Exception):
-    """This machine lacks something; the message is a sentence that says what."""
+    """This machine lacks a requirement. The message names it."""
 
 
 async def lab_once(vehicles: int, log: Path) -> _Row:
-    """Seconds that a lab of so many vehicles takes to come up and to go, and its engine."""
+    """Return the seconds in which a lab of `vehicles` vehicles starts and stops, and its engine."""
     start = time.perf_counter()
     lab = await Lab.open(range(1, vehicles + 1), log=log)
     up = time.perf_counter()
@@ -53,7 +54,7 @@ async def lab_once(vehicles: int, log: Path) -> _Row:
 
 
 def mininet_once(hosts: int) -> _Row:
-    """Seconds that Mininet takes for as many hosts, in namespaces that take with them what it leaves behind."""
+    """Return the seconds of Mininet for this number of hosts, in namespaces that end with all their contents."""
     argv = _namespaces.command([_PYTHON, str(_MININET), str(hosts)], user_namespace=False)
     done = subprocess.run(argv, capture_output=True, text=True, timeout=_MININET_DEADLINE_S, check=False)
     if done.returncode != 0:
@@ -92,7 +93,7 @@ def up_and_down(vehicles: int, rounds: int, mininet: bool, log: Path) -> _Row:
 
 
 def pairs(vehicles: int, rounds: int, log: Path) -> list[_Row]:
-    """A row for each engine that works here."""
+    """Return a row for each engine that works on this machine."""
     rows, refusals = [], []
     for engine in get_args(EngineName):
         try:
@@ -110,7 +111,7 @@ def pairs(vehicles: int, rounds: int, log: Path) -> list[_Row]:
 
 
 async def pairs_once(vehicles: int, engine: EngineName, log: Path) -> tuple[float, float]:
-    """Seconds to give each directed pair a loss of its own, and then another."""
+    """Return the seconds to set a loss for each directed pair, and the seconds to change all of them."""
     directed = list(itertools.permutations(range(1, vehicles + 1), 2))
     losses = [number / (len(directed) + 1) for number in range(1, len(directed) + 1)]
     seconds = []
@@ -127,11 +128,11 @@ async def pairs_once(vehicles: int, engine: EngineName, log: Path) -> tuple[floa
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("vehicles", nargs="*", type=int, metavar="N", help="vehicles (5 20 50 100; with --pairs 100)")
-    parser.add_argument("--rounds", type=int, default=3, help="median and spread are shown")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--rounds", type=int, default=3, help="number of rounds")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--mininet", action="store_true", help="beside Mininet")
-    what.add_argument("--pairs", action="store_true", help="every directed pair with a loss of its own")
+    what.add_argument("--mininet", action="store_true", help="compare with Mininet")
+    what.add_argument("--pairs", action="store_true", help="measure losses for each directed pair")
     options = parser.parse_args()
     try:
         with tempfile.TemporaryDirectory() as folder:

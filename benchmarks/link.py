@@ -1,13 +1,13 @@
-"""What a link of the lab costs without conditions: `python -m benchmarks.link [--rounds R] [--seconds S] [--json]`.
+"""Measure a link of the lab without conditions: `python -m benchmarks.link [--rounds R] [--seconds S] [--json]`.
 
-Links of two vehicles each, side by side in one private network and measured in turn, round by round: a veth pair made
-with ip(8) and nothing else (`veth`), the lab's switch without an engine (`switch`), and the switch with each engine
-that works here while nothing is asked of it. Ratios are to the veth pair in the same round.
+Each link connects two vehicles. The links exist side by side in one private network, and each round measures all of
+them: a veth pair made with ip(8) (`veth`), the switch of the lab without an engine (`switch`), and the switch with each
+engine that works on this machine, without conditions. Ratios are relative to the veth pair of the same round.
 
-UDP: datagrams of 512 bytes received in a second while the sender sends as it can, and the processor time of a datagram
-sent, carried and received. TCP: bytes received in a second on one connection. Round trip: a datagram of 64 bytes
-and its echo. Both ends are Python, each on a processor of its own if there are two; their own time is in every figure,
-of the veth pair too.
+UDP counts datagrams of 512 bytes that arrive in a second, while the sender sends without pause. It also measures the
+processor time to send, transport and receive a datagram. TCP counts bytes received in a second on one connection. A
+round trip is a datagram of 64 bytes and its echo. Both ends are Python programs, on separate processors if there are
+two. All figures include their own time.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ _fork = multiprocessing.get_context("fork")  # a socket stays in the network in 
 
 @dataclass(frozen=True)
 class Link:
-    """Vehicles 1 and 2, and the way into the network of each (`Fabric.inside`)."""
+    """Vehicles 1 and 2, and a function that enters the network of each (`Fabric.inside`)."""
 
     name: str
     inside: Callable[[int], AbstractContextManager[None]]
 
     def datagrams(self) -> tuple[socket.socket, socket.socket]:
-        """A UDP socket in each network, connected to the other."""
+        """Return a UDP socket in each network, connected to the other one."""
         ends = []
         for vehicle, peer in ((1, 2), (2, 1)):
             with self.inside(vehicle):
@@ -65,7 +65,7 @@ class Link:
         return ends[0], ends[1]
 
     def stream(self) -> tuple[socket.socket, socket.socket]:
-        """Both ends of a TCP connection from 1 to 2."""
+        """Return both ends of a TCP connection from 1 to 2."""
         with self.inside(2):
             listener = socket.create_server((addresses.address(2), _PORT))
         with listener, self.inside(1):
@@ -97,7 +97,7 @@ def _ip(*commands: str) -> None:
 
 
 def switch(engine: type[Engine] | None) -> Link:
-    """As `netem.init` makes it; raises EngineError where the engine does not work."""
+    """Make a switch like `netem.init`. Raises EngineError if the engine does not work."""
     _namespaces.unshare_network()
     fabric = Fabric([1, 2], {})
     if engine is not None:
@@ -115,7 +115,7 @@ def links() -> list[Link]:
     return found
 
 
-# What is measured
+# Measurements
 
 
 def udp(link: Link, seconds: float) -> dict[str, float]:
@@ -125,7 +125,7 @@ def udp(link: Link, seconds: float) -> dict[str, float]:
         while time.perf_counter() < end:
             for _ in range(_BURST):
                 sender.send(_DATAGRAM)
-        for _ in range(5):  # an empty one says that it is the last, if there is room for it
+        for _ in range(5):  # an empty datagram ends the stream, if the buffer has room for it
             time.sleep(0.02)
             sender.send(b"")
         return {"UDP 1000 datagrams/s": counted() / 1000}
@@ -142,7 +142,7 @@ def _count_datagrams(receiver: socket.socket) -> float:
 
 
 def udp_cost(link: Link, seconds: float) -> dict[str, float]:
-    """Processor time of a datagram, sent, carried and received in one process: others on the machine matter little."""
+    """Measure the processor time of a datagram that one process sends and receives, which other load hardly affects."""
     sender, receiver = link.datagrams()
     count = 0
     with sender, receiver:
@@ -196,7 +196,7 @@ def _echo(far: socket.socket) -> float:
 
 @contextmanager
 def _beside(function: Callable[[socket.socket], float], end: socket.socket) -> Iterator[Callable[[], float]]:
-    """Run the function in a process of its own meanwhile; gives the way to wait for what it returns."""
+    """Run the function in another process during the block; yield a function that waits for its result."""
     ours, theirs = _fork.Pipe(duplex=False)
 
     def run() -> None:
@@ -205,7 +205,7 @@ def _beside(function: Callable[[socket.socket], float], end: socket.socket) -> I
 
     def result() -> float:
         if not ours.poll(_DEADLINE_S):
-            raise TimeoutError("The other end of the link has not come to its end")
+            raise TimeoutError("The other end of the link did not finish")
         return float(ours.recv())
 
     process = _fork.Process(target=run)
@@ -221,7 +221,7 @@ def _beside(function: Callable[[socket.socket], float], end: socket.socket) -> I
 
 
 def measure(rounds: int, seconds: float) -> dict[str, dict[str, list[float]]]:
-    """Figures of each round by quantity and link."""
+    """Return the figures of all rounds, by quantity and link."""
     found: dict[str, dict[str, list[float]]] = {}
     lines = links()
     for _ in range(rounds):
@@ -247,9 +247,9 @@ def rows(found: dict[str, dict[str, list[float]]]) -> list[dict[str, Any]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=15, help="median and spread are shown")
-    parser.add_argument("--seconds", type=float, default=0.2, help="of each measurement of a rate")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--rounds", type=int, default=15, help="number of rounds")
+    parser.add_argument("--seconds", type=float, default=0.2, help="duration of each measurement of a rate")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)  # in the private network already
     options = parser.parse_args()
     if options.inside:
@@ -258,7 +258,7 @@ def main() -> None:
         return
     possible, word = _namespaces.probe()
     if not possible:
-        sys.stderr.write(f"This machine does not let us make a private network ({word}). {_namespaces.way_out(word)}\n")
+        sys.stderr.write(f"This machine does not allow private networks ({word}). {_namespaces.way_out(word)}\n")
         sys.exit(3)
     argv = [sys.executable, "-m", "benchmarks.link", "--inside", *sys.argv[1:]]
     sys.exit(subprocess.run(_namespaces.command(argv, user_namespace=os.geteuid() != 0), check=False).returncode)

@@ -1,7 +1,8 @@
-"""Mininet's half of `benchmarks.lab`: hosts on one Linux bridge, up and down again, once.
+"""Start and stop Mininet hosts on one Linux bridge, once, for `benchmarks.lab`.
 
-Run by Debian's own Python as first process of private namespaces, so that whatever Mininet leaves behind ends with this
-process. Prints the seconds that `build` and `start` took, and those of `stop`, as JSON; the import is not counted.
+`benchmarks.lab` runs it with Debian's own Python as the first process of private namespaces, so that everything that
+Mininet leaves behind ends with this process. It prints the seconds of `build` and `start`, and of `stop`, as JSON. The
+time of the import is not counted.
 """
 
 import json

@@ -1,7 +1,7 @@
-"""Plays for `benchmarks.against`, with whatever revision of the project comes first on PYTHONPATH.
+"""Play runs for `benchmarks.against`, with the revision of the project that is first on PYTHONPATH.
 
-A line on standard input names what to play and a seed, as in "explore/3"; the answer is the processor time of each run,
-in seconds. It uses what every revision has.
+A line on standard input names the kind of run and a seed, such as "explore/3". The answer is the processor time of each
+run, in seconds. The program uses only functions that all revisions have.
 """
 
 import gc
@@ -16,7 +16,7 @@ from harness.sweep.explore._exploring import simulated as explored
 from harness.sweep.matrix._cell_play import simulated as cell
 
 LOSS = (0.0, 0.10, 0.15, 0.25, 0.30, 0.50, 0.75, 1.00)
-"""Of scenarios/thesis_matrix.yaml."""
+"""The loss rates of scenarios/thesis_matrix.yaml."""
 SEEDS_OF_MATRIX = 200
 SEEDS_OF_EXPLORE = 10
 
@@ -38,14 +38,14 @@ FIVE, FIFTY = scenario(5), scenario(50)
 
 
 def explore(seed: int) -> int:
-    """As `ucp-harness explore` does, on one core; how many runs that were."""
+    """Play seeds like `ucp-harness explore` on one core; return the number of runs."""
     for number in range(SEEDS_OF_EXPLORE):
         explored(FIVE, seed * SEEDS_OF_EXPLORE + number)
     return SEEDS_OF_EXPLORE
 
 
 def matrix(_: int) -> int:
-    """As `ucp-harness matrix` does, on one core; how many runs that were."""
+    """Play all cells like `ucp-harness matrix` on one core; return the number of runs."""
     cells = [scenario(5, loss, final_reconcile=False, settle_s=7200.0) for loss in LOSS]
     runs = list(product(cells, range(SEEDS_OF_MATRIX)))
     for of_loss, number in runs:

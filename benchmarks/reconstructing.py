@@ -1,11 +1,12 @@
-"""How many flights `reconstruct` flies again to the same chains, and why not the others.
+"""Count the flights that `reconstruct` reproduces with the same chains, and the reasons for failures.
 
     python -m benchmarks.reconstructing [--simulated N] [--processes N] [--first NUMBER]
 
-A flight is drawn from its number: loss, bursts, partitions, deaths and returns, pauses, clocks that are off and drift,
-readings of the thesis. Of a flight in virtual time the traces have the times of the agents' own clocks, and say nothing
-of how wrong they are. Only files come home that a vehicle has: traces, exports, captures. Of some flights one agent's
-are missing, of some a trace is cut in half, of some there are only exports and captures.
+The number of a flight determines its scenario: loss, bursts, partitions, kills and restarts, pauses, wrong and drifting
+clocks, and readings of the thesis. In virtual time the traces have the times of the agents' own clocks, without a
+record of the clock errors. `reconstruct` gets only files that vehicles have: traces, exports and captures. In some
+flights the files of one agent are missing. In some, one trace is cut in half. In some, there are only exports and
+captures.
 """
 
 import argparse
@@ -39,12 +40,12 @@ JOBS = 2
 
 Kind = Literal["complete", "one agent missing", "a trace cut in half", "exports and captures only"]
 KINDS: dict[int, Kind] = {7: "one agent missing", 8: "a trace cut in half", 9: "exports and captures only"}
-"""By the last digit of a flight's number; the others are complete."""
+"""The kind of a flight, by the last digit of its number. All other flights are complete."""
 
 
 @dataclass(frozen=True)
 class Tried:
-    """`expected` chains came home that can be reproduced: not that of an agent whose record ends early."""
+    """The result for one flight. `expected` chains can be reproduced, so an agent with a cut record does not count."""
 
     kind: Kind
     backend: str
@@ -80,7 +81,7 @@ def scenario(number: int, backend: BackendName) -> Scenario:
         drawn["timeline"] = _within(clean_runs.scenario(number), 300.0, min(agents, 6))
         drawn["events"] = {"source": "random", "mean_s": 10.0}
     elif drawn["capture"]:
-        drawn.pop("clocks", None)  # in virtual time captures have no clocks of their own
+        drawn.pop("clocks", None)  # in virtual time captures use one clock
     elif draw.random() < 0.6:
         drawn["clocks"] = {
             agent: {
@@ -93,7 +94,7 @@ def scenario(number: int, backend: BackendName) -> Scenario:
 
 
 def _within(drawn: Scenario, duration_s: float, agents: int) -> list[dict[str, Any]]:
-    """The drawn timeline, of a shorter flight, without what names agents that there are not."""
+    """Return the drawn timeline, scaled to a shorter flight, without entries for agents that do not exist."""
     shorter = duration_s / drawn.duration_s
     entries = [entry.model_dump(mode="json", exclude_defaults=True) for entry in drawn.timeline]
     named = {agent for entry in entries for agent in _agents_in(entry)}
@@ -129,7 +130,7 @@ def fly(number: int, backend: BackendName) -> Tried:
 
 
 def _bring_home(run: Path, home: Path, kind: Kind, draw: Random) -> int:
-    """Copy what vehicles have; how many chains can be reproduced."""
+    """Copy the files of the vehicles; return the number of chains that can be reproduced."""
     traces = sorted((run / "agents").glob("*.trace.jsonl"))
     exports = sorted((run / "agents").glob("*.chain.json"))
     struck = draw.choice(traces).name.partition(".")[0]
@@ -153,7 +154,7 @@ def _bring_home(run: Path, home: Path, kind: Kind, draw: Random) -> int:
 
 
 def _by_own_clock(path: Path) -> list[str]:
-    """The lines of a trace with the times that the agent's clock showed, and nothing of its error."""
+    """Return the lines of a trace with the times of the agent's own clock, without its error."""
     lines = path.read_text().splitlines(keepends=True)
     clock = json.loads(lines[0])["clock"]
     offset_s, rate = clock.get("offset_s", 0.0), 1 + clock.get("drift", 0.0)
@@ -171,10 +172,14 @@ def _by_own_clock(path: Path) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.reconstructing")
-    parser.add_argument("--simulated", type=int, default=200)
-    parser.add_argument("--processes", type=int, default=0)
-    parser.add_argument("--first", type=int, default=0)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.reconstructing",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--simulated", type=int, default=200, help="number of flights in virtual time")
+    parser.add_argument("--processes", type=int, default=0, help="number of flights with processes")
+    parser.add_argument("--first", type=int, default=0, help="number of the first flight")
     asked = parser.parse_args()
     tried: list[Tried] = []
     numbers = range(asked.first, asked.first + asked.simulated)
@@ -205,7 +210,7 @@ def _say(tried: list[Tried]) -> None:
     by_kind: dict[tuple[str, str], list[Tried]] = defaultdict(list)
     for one in tried:
         by_kind[one.backend, one.kind].append(one)
-    _tell("| flights | what came home | all chains | chains | blocks | inputs (median) | s (median, most) |")
+    _tell("| flights | records | all chains | chains | blocks | inputs (median) | s (median, maximum) |")
     _tell("|---|---|---|---|---|---|---|")
     for (backend, kind), of_kind in sorted(by_kind.items()):
         whole = f"{sum(one.whole for one in of_kind)}/{len(of_kind)}"
@@ -221,7 +226,7 @@ def _say(tried: list[Tried]) -> None:
 
 
 def _kind_of_reason(why: tuple[str, ...]) -> str:
-    return why[0][:60] if why else "nothing was said"
+    return why[0][:60] if why else "no reason given"
 
 
 if __name__ == "__main__":

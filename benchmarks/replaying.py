@@ -1,9 +1,10 @@
-"""How soon the record of a long mission can be stepped through, how fast it is played, and how far back is.
+"""Measure `replay` of a long record: the start, the speed, and a single step back.
 
     python -m benchmarks.replaying [ROUNDS]
 
-The record is one of 20 agents', which heard everything for two hours at 15 % loss in virtual time, beside those of
-the others and without the run's own; `open` is the whole command, from its start to the first prompt and out again.
+The record is that of one of 20 agents that received all messages for two hours at 15 % loss in virtual time. The
+directory also has the records of the other agents, but no run.json. `open` is the duration of the whole command, from
+its start to the first prompt, including its end.
 """
 
 import statistics
@@ -30,7 +31,7 @@ BACKS = 200
 
 @gc_paused()
 def fly(directory: Path) -> None:
-    """Two hours, everything delivered, so that each trace has all that the agent heard."""
+    """Play two hours and deliver all messages, so that each trace has all inputs of its agent."""
     asked = scenario(AGENTS).model_copy(update={"duration_s": DURATION_S})
     simulation = Simulation(asked, 1, OnDisk(RunDirectory(directory)), deliver_all=True)
     story = mission.play(simulation, asked)
@@ -47,13 +48,13 @@ def timed(what: Callable[[], object]) -> float:
 
 
 def opened(directory: Path) -> None:
-    """As a user opens it."""
+    """Run the command that a user runs."""
     command = [sys.executable, "-m", "harness.cli", "replay", directory, "--agent", str(AGENT), "--step"]
     subprocess.run(command, input=b"next\nquit\n", stdout=subprocess.DEVNULL, check=True)
 
 
 def backs(record: Record) -> list[float]:
-    """Seconds of single steps back, from anywhere."""
+    """Return the seconds of single steps back, from random positions."""
     player, draw = Player(record), Random(1)
     player.to_end()
     took = []

@@ -1,8 +1,8 @@
-"""How long a run's report takes: `python -m benchmarks.report [--agents 5 20 50] [--rounds 5] [--json]`.
+"""Measure the report of a run: `python -m benchmarks.report [--agents 5 20 50] [--rounds 5] [--json]`.
 
-Each run is 20 minutes at 15 % loss in virtual time, of which 50 agents trace over a million lines, and is judged first
-(for 50 agents two minutes). Its traces are then read line by line, and no more, in turn with the report: by the ratio
-both had the same machine. Processor seconds, without the start of Python.
+Each run has 20 minutes at 15 % loss in virtual time, and is judged first. 50 agents write over a million trace lines,
+and judging them takes two minutes. Each round then writes the report, and reads the trace lines without doing anything
+with them. The ratio compares the two on the same machine. Times are processor seconds, without the start of Python.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 
 from benchmarks.rounds import Spread, show
 from benchmarks.simulation import scenario, seconds
+from harness.archive.archive import RunArchive
 from harness.archive.traces import SUFFIX
 from harness.play.progress import Silent
 from harness.report import write_report
@@ -23,7 +24,7 @@ MEGABYTE = 1e6
 
 
 def lines_alone(traces: list[Path]) -> int:
-    """Read them; how many lines there are."""
+    """Read the traces; return the number of their lines."""
     count = 0
     for path in traces:
         with path.open("rb") as file:
@@ -36,7 +37,7 @@ def row(agents: int, rounds: int, directory: Path) -> dict[str, Any]:
     traces = list((directory / "agents").glob(f"*{SUFFIX}"))
     reports, lines = [], []
     for _ in range(rounds):
-        reports.append(seconds(lambda: write_report(directory)))
+        reports.append(seconds(lambda: write_report(RunArchive(directory))))
         lines.append(seconds(lambda: lines_alone(traces)))
     return {
         "agents": agents,
@@ -51,9 +52,9 @@ def row(agents: int, rounds: int, directory: Path) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--agents", type=int, nargs="+", default=[5, 20, 50])
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--agents", type=int, nargs="+", default=[5, 20, 50], help="numbers of agents")
+    parser.add_argument("--rounds", type=int, default=5, help="number of rounds")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     arguments = parser.parse_args()
     rows = []
     for agents in arguments.agents:

@@ -1,4 +1,4 @@
-"""What the rounds of a benchmark say together, as a table or as JSON."""
+"""Combine the figures of all rounds of a benchmark, as a table or as JSON."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Spread:
-    """Median, least and most of a figure over all rounds."""
+    """Median, minimum and maximum of a figure over all rounds."""
 
     median: float
     least: float
@@ -25,16 +25,16 @@ class Spread:
 
     @classmethod
     def of_ratios(cls, figures: Sequence[float], others: Sequence[float]) -> Spread:
-        """Of a figure over another of the same round: a machine that is slow for a while is slow for both."""
+        """Return the ratios of two figures of the same round, so that a slow phase of the machine affects both."""
         return cls.of(figure / other for figure, other in zip(figures, others, strict=True))
 
     def __format__(self, form: str) -> str:
-        """`form` is that of each of the three: "0.42 (0.40..0.47)"."""
+        """Format all three numbers with `form`: "0.42 (0.40..0.47)"."""
         return f"{self.median:{form}} ({self.least:{form}}..{self.most:{form}})"
 
 
 def show(rows: Sequence[Mapping[str, Any]], forms: Mapping[str, str], as_json: bool) -> None:
-    """Print rows of the same keys; `forms` says how a table shows the spreads of a key."""
+    """Print rows with the same keys; `forms` has the format of the spreads of each key."""
     if as_json:
         json.dump([{k: asdict(v) if isinstance(v, Spread) else v for k, v in row.items()} for row in rows], sys.stdout)
         sys.stdout.write("\n")

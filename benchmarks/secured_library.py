@@ -1,9 +1,9 @@
-"""The library, played plain and with keys: `python -m benchmarks.secured_library [--seeds 8] [SCENARIO ...]`.
+"""Play the library with and without keys: `python -m benchmarks.secured_library [--seeds 8] [SCENARIO ...]`.
 
-In virtual time, seed for seed: all agents have to leave the same chains, block hash for block hash, with keys and
-without. A matrix is played at each of its rates of loss. What cannot be compared is left out of both, and told: what a
-rogue node injects is believed by some agents without keys and dropped with them, and without keys nobody is revoked.
-Exit status 1, and the scenario's name, where chains differ.
+In virtual time, with the same seed, all agents must export the same chains with keys and without: the same block hashes
+in the same order. A matrix is played at each of its loss rates. Some parts of a scenario cannot be compared. The
+benchmark removes these parts from both runs, and prints them: injections, which agents with keys drop, and revocations,
+which need keys. If chains differ, it prints the name of the scenario, and the exit status is 1.
 """
 
 import argparse
@@ -19,13 +19,13 @@ from harness.run.simulate import simulate
 from harness.scenario import Scenario, load, load_scenario, read_yaml
 from harness.sweep.matrix._matrix_file import load_matrix
 
-INJECTIONS = "what its rogue node injects, of which agents with keys believe less"
-REVOCATIONS = "its revocations, which nobody without keys hears"
-SEALING = "the sealing of event data, which is in the hashes"
+INJECTIONS = "injections, which agents with keys drop"
+REVOCATIONS = "revocations, which need keys"
+SEALING = "sealed event data, which changes the hashes"
 
 
 class Compared(NamedTuple):
-    """A scenario to play both ways; `without` what cannot be compared."""
+    """A scenario to play with and without keys; `without` lists the parts that cannot be compared."""
 
     name: str
     scenario: Scenario
@@ -33,7 +33,7 @@ class Compared(NamedTuple):
 
 
 def in_both(name: str, scenario: Scenario) -> Compared:
-    """As much of the scenario as means the same with keys and without."""
+    """Return the parts of a scenario that mean the same with and without keys."""
     timeline = [entry for entry in scenario.timeline if not entry.injection]
     heard = [entry for entry in timeline if not (entry.fault and entry.fault.needs_keys)]
     left_out = {
@@ -46,7 +46,7 @@ def in_both(name: str, scenario: Scenario) -> Compared:
 
 
 def all_of(names: Sequence[str]) -> Iterator[Compared]:
-    """Raises ScenarioError for a file that is none."""
+    """Yield all scenarios to compare. Raises ScenarioError for an invalid file."""
     for name in names:
         path = load.find(Path(name))
         if "loss" not in read_yaml(path, "scenario"):
@@ -58,22 +58,23 @@ def all_of(names: Sequence[str]) -> Iterator[Compared]:
 
 
 def difference(task: tuple[Compared, int]) -> str | None:
-    """Where the chains with keys are not those without; None if they are the same, each with all its blocks."""
+    """Return the first difference between the chains with and without keys; None if they are complete and equal."""
     (_, plain, _), seed = task
     without, keyed = (simulate(scenario, seed).result.chains for scenario in (plain, plain.secured()))
     for agent_id in sorted(without.keys() | keyed.keys()):
         ours, theirs = without.get(agent_id), keyed.get(agent_id)
         if ours is None or theirs is None:
-            return f"agent {agent_id} leaves no chain {'without' if ours is None else 'with'} keys"
+            return f"agent {agent_id} exports no chain {'without' if ours is None else 'with'} keys"
         if ours != theirs:
             parted = next((at for at, both in enumerate(zip(ours, theirs, strict=False)) if both[0] != both[1]), None)
             at = min(len(ours), len(theirs)) if parted is None else parted
-            return f"agent {agent_id} has other blocks from {at + 1} on, of {len(ours)} without and {len(theirs)} with"
+            lengths = f"{len(ours)} blocks without and {len(theirs)} with keys"
+            return f"agent {agent_id} has other blocks from block {at + 1} ({lengths})"
     return None
 
 
 def compare(asked: Sequence[Compared], seeds: range, jobs: int) -> dict[str, list[str]]:
-    """Scenario -> how seeds differ."""
+    """Return the differing seeds of each scenario with a difference."""
     different: dict[str, list[str]] = defaultdict(list)
     tasks = [(compared, seed) for compared in asked for seed in seeds]
     with sweep(tasks, difference, jobs, what="missions" if sys.stderr.isatty() else None) as outcomes:
@@ -87,9 +88,9 @@ def compare(asked: Sequence[Compared], seeds: range, jobs: int) -> dict[str, lis
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=8, help="1..N")
-    parser.add_argument("--jobs", type=int, default=cores())
-    parser.add_argument("scenarios", nargs="*", default=load.names())
+    parser.add_argument("--seeds", type=int, default=8, help="number of seeds, from 1")
+    parser.add_argument("--jobs", type=int, default=cores(), help="number of parallel missions")
+    parser.add_argument("scenarios", nargs="*", default=load.names(), help="scenarios; default: the whole library")
     arguments = parser.parse_args()
     seeds = range(1, arguments.seeds + 1)
     try:

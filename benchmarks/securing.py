@@ -1,11 +1,12 @@
-"""What security costs: `python -m benchmarks.securing [--rounds 200] [--missions 20] [--matrix SEEDS] [--speedup 20]`.
+"""Measure the cost of security: `python -m benchmarks.securing [--rounds 200] [--missions 20]`.
 
-Bytes and processor time of each message's datagram, plain and secured, sent and received; then whole missions in
-virtual time: a sweep, and runs with traces, each beside the plain one of the same seed.
+The first table has the bytes and the processor time of each message, plain and secured, to send and to receive. The
+second one has whole missions in virtual time: a sweep, and runs with traces. Each secured run is compared with the
+plain run of the same seed.
 
-`--matrix SEEDS`: the thesis's matrix with so many seeds instead, as `ucp-harness matrix` plays it on one core, and
-beside it the floor: each datagram is signed, or signed and verified once, and nothing else is done. `--speedup 20`:
-five agents as processes instead (root), and whether they keep the clock; exit status 1 if not.
+`--matrix SEEDS` plays the thesis's matrix with this number of seeds instead, like `ucp-harness matrix` on one core. It
+also prints the minimal cost: each datagram is only signed, or only signed and verified once. `--speedup 20` plays five
+agents as processes instead. The exit status is 1 if they do not keep up with the clock.
 """
 
 import argparse
@@ -118,7 +119,7 @@ def per_mission(missions: int) -> None:
 
 
 def matrix(seeds: int) -> None:
-    """Processor time of the same cells and seeds in turn, plain and secured, and what no secured one can do without."""
+    """Measure the same cells and seeds plain and secured, and the cost that each secured run must have at least."""
     plain_s = secured_s = 0.0
     datagrams = 0
     for loss in LOSS_OF_MATRIX:
@@ -147,7 +148,7 @@ def matrix(seeds: int) -> None:
 
 
 def as_processes(speedup: float) -> bool:
-    """Whether five agents keep the clock, plain and secured, by the vote timers in their own traces."""
+    """Return whether five agents keep up with the clock, plain and secured, by the vote timers in their traces."""
     plain = Scenario.model_validate(
         {"name": "clock", "network": {"loss": 0.15}, "vehicles": {"kind": "none"}, "speedup": speedup}
     )
@@ -173,10 +174,10 @@ def say(first: str, *cells: str) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=1000)
-    parser.add_argument("--missions", type=int, default=20)
-    parser.add_argument("--matrix", type=int, metavar="SEEDS")
-    parser.add_argument("--speedup", type=float)
+    parser.add_argument("--rounds", type=int, default=1000, help="datagrams of each message")
+    parser.add_argument("--missions", type=int, default=20, help="missions at each loss rate")
+    parser.add_argument("--matrix", type=int, metavar="SEEDS", help="number of seeds of the matrix")
+    parser.add_argument("--speedup", type=float, help="play five agents as processes at this speedup")
     arguments = parser.parse_args()
     if arguments.matrix is not None:
         matrix(arguments.matrix)

@@ -1,11 +1,12 @@
-"""How fast the simulation is, beside a null model in the same run: `python -m benchmarks.simulation [--rounds 5]`.
+"""Measure the simulation against a null model: `python -m benchmarks.simulation [--rounds 5]`.
 
-`--agents 200 --loss 0.15 --settle 1200 --rounds 1` is the largest swarm; `--matrix` also times 8 x 200 runs of five.
+`--agents 200 --loss 0.15 --settle 1200 --rounds 1` is the largest swarm. `--matrix` also measures 8 x 200 runs of five
+agents.
 
-The null model delivers as many broadcasts to as many agents as the simulated mission had, and does nothing with them:
-a heap, a random number for loss and one for latency, a set insert and a dictionary look-up for each delivery. Rounds
-alternate between the two, so that a machine that is slow for a while is slow for both; processor time is counted. Every
-simulation is judged with the checker, without traces, as in a matrix; `traced` runs have traces and all six verdicts.
+The null model delivers as many broadcasts to as many agents as the simulated mission, and does nothing with them. Each
+delivery is a heap operation, a random number for loss and one for latency, a set insert and a dictionary look-up.
+Rounds alternate between the two, so that a slow phase of the machine affects both. Times are processor times. The
+checker judges each simulation without traces, as in a matrix. Runs with `--traced` have traces and all checks.
 """
 
 import argparse
@@ -34,7 +35,7 @@ def scenario(agents: int, loss: float, settle_s: float) -> Scenario:
 
 
 def null_model(agents: int, loss: float, broadcasts: int) -> int:
-    """Deliver that many broadcasts, spread over the mission; how many deliveries there were."""
+    """Deliver this number of broadcasts, spread over the mission; return the number of deliveries."""
     coming: list[tuple[float, int, int]] = []
     seen: set[tuple[int, int]] = set()
     held = dict.fromkeys(range(agents), 0)
@@ -54,7 +55,7 @@ def null_model(agents: int, loss: float, broadcasts: int) -> int:
 
 
 def seconds(what: Callable[[], object]) -> float:
-    gc.collect()  # what earlier runs left is not this one's
+    gc.collect()  # the garbage of earlier runs does not count
     began = time.process_time()
     what()
     return time.process_time() - began
@@ -62,10 +63,10 @@ def seconds(what: Callable[[], object]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--agents", type=int, nargs="+", default=[5, 20, 50])
-    parser.add_argument("--loss", type=float, nargs="+", default=[0.15, 0.30])
-    parser.add_argument("--settle", type=float, default=7200.0, help="mission seconds after minute 20, at most")
+    parser.add_argument("--rounds", type=int, default=5, help="number of rounds")
+    parser.add_argument("--agents", type=int, nargs="+", default=[5, 20, 50], help="numbers of agents")
+    parser.add_argument("--loss", type=float, nargs="+", default=[0.15, 0.30], help="loss rates")
+    parser.add_argument("--settle", type=float, default=7200.0, help="maximum of mission seconds after minute 20")
     parser.add_argument("--traced", action="store_true", help="also with traces")
     parser.add_argument("--matrix", action="store_true", help=f"also {len(MATRIX_LOSS)} x {MATRIX_SEEDS} runs of 5")
     arguments = parser.parse_args()
@@ -78,7 +79,7 @@ def main() -> None:
 
 
 def matrix() -> None:
-    """What `ucp-harness matrix` does on one core, without its files."""
+    """Play all cells like `ucp-harness matrix` on one core, without files."""
     for loss in MATRIX_LOSS:
         cell = scenario(5, loss, 1800.0)
         for seed in range(MATRIX_SEEDS):

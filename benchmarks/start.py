@@ -1,9 +1,9 @@
-"""How soon an agent is ready, and how large: `python -m benchmarks.start 00ebe8b [--rounds 20]`.
+"""Measure the start of an agent and its memory: `python -m benchmarks.start HEAD~20 [--rounds 20]`.
 
-Another revision of the project is checked out beside, and agents of both start in turn, alone on loopback: believe the
-ratios, of the same round. Ready is when the control socket answers; the processor time is of the whole process by then.
-With `-- COMMAND...` another agent, which gets the mission file as ucp/contract/CONTRACT.md says, instead of the other
-revision.
+Another revision of the project is checked out in a temporary directory. Agents of both revisions start alternately,
+alone on the loopback interface. Ratios are of one round. An agent is ready when its control socket answers. The
+processor time is that of the whole process up to this moment. With `-- COMMAND...` the benchmark starts another agent
+in place of the other revision. The agent gets a mission file as in ucp/contract/CONTRACT.md.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _mission() -> dict[str, Any]:
 
 
 def start(command: Sequence[str], root: Path) -> tuple[float, float, float]:
-    """Milliseconds until it is ready, of processor time and of all time, and its resident size then, in MB."""
+    """Return wall and processor time until the agent is ready, in ms, and its resident size then, in MB."""
     with tempfile.TemporaryDirectory() as directory:
         (Path(directory) / "7.mission.json").write_text(json.dumps(_mission()), encoding="utf-8")
         env = {**os.environ, "PYTHONPATH": str(root)}
@@ -95,16 +95,16 @@ def _resident_mb(pid: int) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("revision", nargs="?", help="the other one, as git names it")
-    parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("revision", nargs="?", help="other revision, as git names it")
+    parser.add_argument("--rounds", type=int, default=20, help="number of rounds")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     before, separator, command = sys.argv[1:], "", []
     if "--" in before:
         place = before.index("--")
         before, separator, command = before[:place], "--", before[place + 1 :]
     arguments = parser.parse_args(before)
     if bool(arguments.revision) == bool(separator):
-        parser.error("name a revision, or after -- the command of another agent")
+        parser.error("give a revision, or the command of another agent after --")
     with checked_out(arguments.revision) if arguments.revision else nullcontext(ROOT) as tree:
         other = command or _OURS
         for warm, root in ((other, tree), (_OURS, ROOT)):

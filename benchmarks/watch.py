@@ -1,9 +1,9 @@
-"""What watching a live run costs: `python -m benchmarks.watch [--agents 50] [--minutes 4] [--speedup 1]`.
+"""Measure the server of the live page: `python -m benchmarks.watch [--agents 50] [--minutes 4] [--speedup 1]`.
 
-A run in virtual time leaves what real agents leave: with every message that reached them, and vehicles that fly. Then
-its files grow again as they did, and the server's process reads them ten times a second for one browser, which here is
-a client on this machine. Counted are its processor seconds (user and system), not the client's. The goal is a fifth of
-a core for 50 vehicles.
+A run in virtual time writes the files of real agents: all received messages are in the traces, and vehicles fly. Then
+these files grow again at the same times. The server process reads them ten times per second for one browser, which is a
+client in another process. The benchmark prints the processor seconds (user and system) of the server alone. 50 vehicles
+should take at most a fifth of a core.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def played(directory: Path, agents: int, minutes: float) -> None:
 
 
 def written(directory: Path) -> Written:
-    """Each line that a run left, and when it was written, in mission seconds."""
+    """Return each line of a run and the mission second at which it was written."""
     lines: Written = []
     for path in directory.rglob("*.jsonl"):
         at_s = 0.0
@@ -48,7 +48,7 @@ def written(directory: Path) -> Written:
 
 
 async def serve(directory: Path, lines: Written, speedup: float, ready: multiprocessing.Queue[object]) -> None:
-    """Let the files grow, and read them; the growing is not counted."""
+    """Let the files grow, and read them. The time to write them is not counted."""
     with closing(Feed(directory)) as feed, closing(Story()) as story:
         async with Server(story, directory, live=True).open(0) as address:
             ready.put(address)
@@ -74,7 +74,7 @@ async def serve(directory: Path, lines: Written, speedup: float, ready: multipro
 
 
 def read(address: str) -> None:
-    """A browser that reads all, and draws nothing."""
+    """Act as a browser that reads all messages and draws nothing."""
 
     async def listen() -> None:
         async with aiohttp.ClientSession() as client, client.ws_connect(f"{address}live", max_msg_size=0) as socket:
@@ -90,9 +90,9 @@ def served(directory: Path, lines: Written, speedup: float, ready: multiprocessi
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--agents", type=int, default=50)
-    parser.add_argument("--minutes", type=float, default=4.0, help="of mission")
-    parser.add_argument("--speedup", type=float, default=1.0)
+    parser.add_argument("--agents", type=int, default=50, help="number of agents")
+    parser.add_argument("--minutes", type=float, default=4.0, help="minutes of mission")
+    parser.add_argument("--speedup", type=float, default=1.0, help="mission seconds per second")
     asked = parser.parse_args()
     with TemporaryDirectory() as place:
         source, growing = Path(place) / "run", Path(place) / "growing"
@@ -113,7 +113,8 @@ def main() -> None:
     live_s = looks * UPDATE_S
     print(  # noqa: T201
         f"{asked.agents} vehicles at {asked.speedup:g}x, {count} lines in {live_s:.0f} s of wall time at 10 updates "
-        f"a second: {cost:.1f} s of processor time, {cost / live_s:.1%} of a core; {told / live_s / 1000:.0f} kB/s told"
+        f"a second: {cost:.1f} s of processor time, {cost / live_s:.1%} of a core; "
+        f"{told / live_s / 1000:.0f} kB/s to the browser"
     )
 
 

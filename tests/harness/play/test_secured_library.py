@@ -44,7 +44,7 @@ def test_where_chains_differ_the_scenario_is_named_and_the_status_is_1(
     monkeypatch.setattr(sys, "argv", ["secured_library", "--seeds", "2", "--jobs", "1", str(mine)])
     assert main() == 1
     said = capsys.readouterr().out
-    assert f"{mine} different\n    seed 1: agent 1 has other blocks from" in said
+    assert f"{mine} different\n    seed 1: agent 1 has other blocks from block" in said
     assert "1 scenarios with 2 seeds, 1 different" in said
 
 
