@@ -69,6 +69,14 @@ def test_the_reference_has_every_key_of_a_scenario(site: Path) -> None:
     assert "Any program that follows ucp/contract/CONTRACT.md" in text  # a docstring in the source
 
 
+def test_every_key_of_a_scenario_has_a_description() -> None:
+    sys.path.insert(0, str(REPOSITORY / "docs" / "hooks"))
+    reference = importlib.import_module("reference")
+    rows = [line for line in reference.reference().splitlines() if line.startswith("| `")]
+    assert len(rows) > 200
+    assert [row for row in rows if row.endswith("|  |")] == []
+
+
 def test_the_picture_of_the_rooms_is_drawn_from_the_imports(site: Path) -> None:
     text = (site / "explanation/architecture.html").read_text()
     assert re.search(r"<title>\d+ of the files in report/ use archive/</title>", text)

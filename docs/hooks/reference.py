@@ -1,4 +1,7 @@
-"""All keys of a scenario, from its JSON Schema and the docstrings of its models: `docs/reference/scenario-keys.md`."""
+"""Generate the tables of `docs/reference/scenario-keys.md`.
+
+The JSON Schema of a scenario has the types and defaults. The docstrings of the models have the descriptions.
+"""
 
 import ast
 import inspect
@@ -12,8 +15,19 @@ from pydantic import BaseModel
 
 from harness.json_schemas import generate
 from harness.scenario import Scenario
+from ucp.quirks import QUIRKS
+from ucp.settings import DECLARED, Number
 
 MARK = "<!-- keys -->"
+ABOUT = {
+    "Offset": "A place relative to the first home: metres east, north and up, and a heading in degrees.",
+    "Settings": "Settings of all agents. Durations are mission seconds, sizes are bytes.",
+}
+"""Model -> introduction, for models whose schema has no description."""
+QUIRKS_SECTION = "Quirks"
+ABOUT_QUIRKS = """A quirk is a mistake that an agent makes on purpose. `crash_on_tie: true` is for all agents, and
+`crash_on_tie: {agents: [2, 3]}` for two agents. `ignore_commit: 0.2` sets the probability of the mistake, and
+`ignore_commit: {agents: [2], value: 0.2}` sets it for one agent. An unknown quirk is an error."""
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -21,35 +35,51 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def reference() -> str:
-    """A table for the scenario, and one for every model in it."""
+    """Return a table of the scenario, and a table of each model that it contains."""
     schema = generate("scenario")
     models = _models(Scenario)
-    parts = [_table(schema, models)]
+    parts = [_table("Scenario", schema, models)]
     for name in sorted(schema["$defs"]):
-        parts.append(f"## {name}\n\n{_table(schema['$defs'][name], models)}")
+        parts.append(f"## {name}\n\n{_table(name, schema['$defs'][name], models)}")
+    parts.append(f"## {QUIRKS_SECTION}\n\n{_quirks()}")
     return "\n\n".join(parts)
 
 
-def _table(schema: dict[str, Any], models: dict[str, type[BaseModel]]) -> str:
-    about = schema.get("description", "")
+def _quirks() -> str:
+    """Return a table of all quirks, in the order of their Algorithms."""
+    rows = ["| quirk | value | mistake |", "|---|---|---|"]
+    for name, quirk in QUIRKS.items():
+        rows.append(f"| `{name}` | {'probability 0 to 1' if quirk.chance else 'true'} | {quirk.sentence} |")
+    return f"{ABOUT_QUIRKS}\n\n" + "\n".join(rows)
+
+
+def _table(name: str, schema: dict[str, Any], models: dict[str, type[BaseModel]]) -> str:
+    about = ABOUT.get(name) or schema.get("description", "")
     if "properties" not in schema:
         return f"{about}\n\n{_type(schema)}"
     documented = _docstrings(models[schema["title"]]) if schema.get("title") in models else {}
     rows = ["| key | value | default | |", "|---|---|---|---|"]
     for key, value in schema["properties"].items():
-        default = "" if "default" not in value else f"`{json.dumps(value['default'])}`"
+        default = "" if value.get("default") is None else f"`{json.dumps(value['default'])}`"
         if key in schema.get("required", []):
-            default = "needed"
+            default = "required"
         elif len(default) > 40:
             default = ""
-        text = value.get("description") or documented.get(key, "")
-        cells = (f"`{key}`", _type(value), default, text.replace("<", "&lt;"))
+        declared = DECLARED.get(key) if schema.get("title") == "Settings" else None
+        text = (
+            value.get("description")
+            or documented.get(key)
+            or documented.get(f"{key}_")
+            or (f"{declared.sentence}" if declared else "")
+        )
+        kind = f"{_type(value)}, {declared.allowed}" if isinstance(declared, Number) else _type(value)
+        cells = (f"`{key}`", kind, default, text.replace("<", "&lt;"))
         rows.append("| " + " | ".join(" ".join(cell.replace("|", "\\|").split()) for cell in cells) + " |")
     return f"{about}\n\n" + "\n".join(rows)
 
 
 def _type(schema: dict[str, Any]) -> str:
-    """What a value may be, in words."""
+    """Return the allowed values in words."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
         return f"[{name}](#{name.lower()})"
@@ -60,13 +90,19 @@ def _type(schema: dict[str, Any]) -> str:
     if "anyOf" in schema or "oneOf" in schema:
         choices = [choice for choice in schema.get("anyOf", schema.get("oneOf")) if choice.get("type") != "null"]
         return " or ".join(dict.fromkeys(map(_type, choices)))
+    if "prefixItems" in schema:
+        return f"list of {len(schema['prefixItems'])}: {', '.join(map(_type, schema['prefixItems']))}"
     if schema.get("type") == "array":
         return f"list of {_type(schema.get('items', {}))}"
     if schema.get("type") == "object":
         values = schema.get("additionalProperties")
+        if "properties" in schema:
+            return f"mapping of [{QUIRKS_SECTION}](#{QUIRKS_SECTION.lower()})"
         if not isinstance(values, dict):
             return "mapping"
-        return f"mapping of IDs to {_type(values)}" if "propertyNames" in schema else f"mapping to {_type(values)}"
+        names = schema.get("propertyNames", {}).get("enum", [])
+        keys = f" from {', '.join(f'`{name}`' for name in names)}" if names else ""
+        return f"mapping{keys} to {_type(values)}"
     bounds = [
         f"{sign} {schema[bound]:.10g}"
         for bound, sign in (("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("exclusiveMaximum", "<"))
@@ -76,7 +112,7 @@ def _type(schema: dict[str, Any]) -> str:
 
 
 def _models(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
-    """The model and all that are in it, by name."""
+    """Return the model and the models that it contains, by name."""
     found: dict[str, type[BaseModel]] = {}
 
     def visit(annotation: Any) -> None:
@@ -92,10 +128,18 @@ def _models(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
 
 
 def _docstrings(model: type[BaseModel]) -> dict[str, str]:
-    """What stands below each attribute in the source."""
+    """Return the docstring of each attribute, from the source of the model and of its base classes."""
+    documented: dict[str, str] = {}
+    for base in reversed(model.__mro__):
+        if base.__module__.startswith("harness."):
+            documented |= _own_docstrings(base)
+    return documented
+
+
+def _own_docstrings(model: type) -> dict[str, str]:
     try:
         (definition,) = ast.parse(inspect.cleandoc("\n" + inspect.getsource(model))).body
-    except (OSError, TypeError, ValueError):  # it was made, not written
+    except (OSError, TypeError, ValueError):  # `create_model` made the class: it has no source
         return {}
     assert isinstance(definition, ast.ClassDef), f"{model} is a class"
     documented, name = {}, None

@@ -1,8 +1,8 @@
 """The network of a scenario: loss, delay, partitions, and the radio's loss over distance.
 
-Three layers: the network, receivers that differ from it, links that differ from their receiver. A layer changes
-the keys that it names. What the values mean, and which go together, `netem.conditions` says; here is how they are
-written, for the whole mission or, laid over that, from some time on: `NetworkLayer`.
+The conditions have three layers: those of all links, those of single receivers, and those of single links. A layer
+replaces the keys that it contains. `netem.conditions` defines the values and their valid combinations. This module
+defines their notation in a scenario. `NetworkModel` is for the whole mission, `NetworkLayer` for a change of it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,9 +19,10 @@ from netem.link import MAX_DELAY_S, MAX_LIMIT
 
 
 class HardRange(Model):
-    """Whoever is within `range_m` hears everything, whoever is not hears nothing."""
+    """A radio that loses no message within `range_m`, and every message beyond it."""
 
     range_m: float = radio.HardRange.range_m
+    """Range in metres, above 0. The default is a typical outdoor range of IEEE 802.11n."""
 
     @model_validator(mode="after")
     def _means_something(self) -> "HardRange":
@@ -30,13 +31,18 @@ class HardRange(Model):
 
 
 class LogDistance(Model):
-    """Log-distance path loss with shadowing; `netem.radio.LogDistance` says what the figures are and where from."""
+    """Log-distance path loss with log-normal shadowing. `netem.radio.LogDistance` has the formula and the sources."""
 
     exponent: float = radio.LogDistance.exponent
+    """Path loss exponent, above 0."""
     shadowing_db: float = radio.LogDistance.shadowing_db
+    """Standard deviation of the shadowing in decibels, at least 0."""
     power_dbm: float = radio.LogDistance.power_dbm
+    """Transmit power in dBm."""
     sensitivity_dbm: float = radio.LogDistance.sensitivity_dbm
+    """Minimum received power in dBm. A message with less power is lost."""
     frequency_hz: float = radio.LogDistance.frequency_hz
+    """Carrier frequency in hertz, above 0."""
 
     @model_validator(mode="after")
     def _means_something(self) -> "LogDistance":
@@ -45,14 +51,14 @@ class LogDistance(Model):
 
 
 class RadioModel(Model):
-    """One of `hard_range` and `log_distance`.
-
-    Every `update_s` mission seconds conditions follow the vehicles; as processes, at most ten times a second.
-    """
+    """Loss that depends on the distance between two vehicles. Needs exactly one of `hard_range` and `log_distance`."""
 
     hard_range: HardRange | None = None
+    """A radio with a fixed range."""
     log_distance: LogDistance | None = None
+    """A radio with a loss that grows with the distance."""
     update_s: Annotated[float, Field(ge=0.1, le=60)] = 1.0
+    """Mission seconds between two updates of the loss. Agents as processes get at most ten updates per second."""
 
     def radio(self) -> radio.Radio:
         if self.hard_range is not None:
@@ -68,27 +74,33 @@ class RadioModel(Model):
 
 
 class Bursts(Model):
-    """Loss in bursts: tc-netem(8) `loss gemodel p r 1-h 1-k`.
+    """Loss in bursts by the Gilbert-Elliott model, as `loss gemodel p r 1-h 1-k` of tc-netem(8).
 
-    `p`: probability per message that a link goes bad; `r`: that it recovers; `loss_bad` and `loss_good`: loss in
-    either state.
+    Each link has its own state, good or bad, and starts in the good state. After each message the state may change.
     """
 
     p: Probability
+    """Probability of a change from the good to the bad state."""
     r: Probability
+    """Probability of a change from the bad to the good state."""
     loss_bad: Probability = 1.0
+    """Probability that a message is lost in the bad state."""
     loss_good: Probability = 0.0
+    """Probability that a message is lost in the good state."""
 
 
 DelaySeconds = Annotated[float, Field(ge=0, le=MAX_DELAY_S, allow_inf_nan=False)]
 
 
 class Jitter(Model):
-    """Delay that varies: `jitter_s` to either side if `uniform`, else the standard deviation, as in tc-netem(8)."""
+    """A random delay, as `delay` and `distribution` of tc-netem(8). Times are mission seconds."""
 
     mean_s: DelaySeconds
+    """Mean of the delay."""
     jitter_s: DelaySeconds = 0.0
+    """Greatest deviation of a uniform delay, or standard deviation of the other distributions. At most `mean_s`."""
     distribution: Distribution = "uniform"
+    """Distribution of the delay. A negative delay becomes 0."""
 
     @model_validator(mode="after")
     def _means_something(self) -> "Jitter":
@@ -97,7 +109,7 @@ class Jitter(Model):
 
 
 def _number_or(mapping: type[Model], number: Any) -> BeforeValidator:
-    """For a union of the two: tries the one that was meant, so that an error speaks of it alone."""
+    """Validate a mapping as the model, any other value as a number. An error then concerns one of the two only."""
     numbers = TypeAdapter(number)
 
     def choose(value: Any) -> Any:
@@ -107,7 +119,7 @@ def _number_or(mapping: type[Model], number: Any) -> BeforeValidator:
 
 
 def _or_none(number: Any) -> BeforeValidator:
-    """For a union with the word none: an error speaks of the number alone."""
+    """Accept the word none, and validate any other value as a number. An error then concerns the number only."""
     numbers = TypeAdapter(number)
     return BeforeValidator(lambda value: value if value == "none" else numbers.validate_python(value))
 
@@ -128,18 +140,26 @@ Vehicles = Annotated[
 
 
 class Difference(Model):
-    """A layer: keys that are not given stay as the layer below has them."""
+    """Conditions that replace those of the layer below. A missing key keeps the value of the layer below."""
 
     loss: Loss | None = None
+    """Probability that a message is lost, or loss in bursts."""
     delay: DelayTime | None = None
+    """Delay in mission seconds, 0 to 60, or a distribution of delays."""
     duplicate: Probability | None = None
+    """Probability that a message arrives twice."""
     reorder: Probability | None = None
+    """Probability that a message is sent without the delay, and so overtakes others. Above 0 it needs a `delay`."""
     corrupt: Probability | None = None
+    """Probability that one bit of a message flips. The receiver drops such a message because of its checksum."""
     rate: Rate | None = None
+    """Bits per mission second from each sender to each receiver, headers included, at least 8. `none`: no limit."""
     limit: Limit | None = None
+    """Number of messages from one sender to one receiver that may wait for delay or rate, 1 to 100,000. Further
+    messages are lost. `none`: no limit. It needs a `delay` or a `rate`."""
 
     def given(self) -> dict[str, Any]:
-        """The keys that are given."""
+        """Return the keys that have a value."""
         return {key: value for key in KEYS if (value := getattr(self, key)) is not None}
 
 
@@ -147,20 +167,23 @@ KEYS = tuple(Difference.model_fields)
 
 
 class Receiver(Difference):
-    """What one vehicle hears, where it differs from the network."""
+    """Conditions of all messages to one vehicle. A missing key keeps the value of the whole network."""
 
 
 class Link(Difference):
-    """From each vehicle of `from` to each of `to`, where it differs from what they else receive.
+    """Conditions of the links from each vehicle of `from` to each vehicle of `to`.
 
-    `both`: and in the other direction.
+    A missing key keeps the value of the receiver. Two entries for the same link are an error.
     """
 
     model_config = ConfigDict(serialize_by_alias=True)
 
     from_: Vehicles = Field(alias="from")
+    """Sender, or a list of senders."""
     to: Vehicles
+    """Receiver, or a list of receivers. A vehicle that is a sender too is an error."""
     both: bool = False
+    """True if the conditions also apply to the opposite direction."""
 
     def pairs(self) -> Iterator[tuple[int, int]]:
         for sender, receiver in product(self.from_, self.to):
@@ -170,16 +193,18 @@ class Link(Difference):
 
 
 Where = None | int | tuple[int, int]
-"""Of whom something is said: of all, of what one vehicle hears, or of a link, from sender to receiver."""
+"""Scope of a condition: None for all links, a receiver, or a link as (sender, receiver)."""
 NetworkValues = dict[Where, dict[str, Any]]
-"""A network, or what changes of it: whose keys have which values."""
+"""The conditions of a network, or a change of them: scope -> key -> value."""
 
 
 class NetworkLayer(Difference):
-    """What is laid over the network as it stands, key by key: for all, for receivers, for links."""
+    """A change of the network: keys for all links, single receivers and single links. Needs at least one key."""
 
     receivers: dict[VehicleKey, Receiver] = {}
+    """Conditions of single receivers, by vehicle ID."""
     links: Annotated[list[Link], Field(max_length=10_000)] = []
+    """Conditions of single links, at most 10,000 entries."""
 
     @model_validator(mode="after")
     def _says_something(self) -> "NetworkLayer":
@@ -188,20 +213,23 @@ class NetworkLayer(Difference):
         return self
 
     def whole(self) -> NetworkValues:
-        """Raises ConditionsError if it says something twice."""
+        """Return the conditions by scope. Raises ConditionsError if two entries concern the same link."""
         return {None: self.given(), **_values_of(self.receivers, self.links)}
 
     def named(self) -> Iterator[tuple[str, int]]:
-        """Every vehicle that is named, with the key that names it."""
+        """Yield each vehicle ID, with the key that contains it."""
         return _named(self.receivers, self.links)
 
 
 class Disturbance(Model):
-    """The language of timeline and schedules: what becomes of the network. `loss` is short for a `network` of it."""
+    """A change of the network, as timeline entries and schedules contain it."""
 
     loss: Loss | None = None
+    """Probability that a message is lost, or loss in bursts. The same as `network: {loss: ...}`."""
     partition: list[list[VehicleId]] | None = None
+    """Groups of vehicles that no message connects. Vehicles in no group form a further group."""
     network: NetworkLayer | None = None
+    """Other conditions of the network. Keys that it does not contain stay as they are."""
 
     @model_validator(mode="after")
     def _says_no_loss_twice(self) -> "Disturbance":
@@ -210,37 +238,40 @@ class Disturbance(Model):
         return self
 
     def changes(self) -> NetworkValues:
-        """What it changes of the network, partitions apart."""
+        """Return the changed conditions, without the partition."""
         values: NetworkValues = self.network.whole() if self.network else {}
         return values if self.loss is None else laid_over(values, {None: {"loss": self.loss}})
 
     @property
     def groups(self) -> tuple[frozenset[int], ...]:
-        """Those of its partition."""
+        """The groups of the partition."""
         return tuple(frozenset(group) for group in self.partition or ())
 
 
 class NetworkModel(Model):
-    """What happens to every message, for each receiver independently; receivers and links that differ."""
+    """Network conditions. Each receiver of a message draws separately. A broadcast may reach some receivers only."""
 
     loss: Loss = 0.0
-    """The probability that a message is lost, or loss in bursts."""
+    """Probability that a message is lost, or loss in bursts."""
     delay: DelayTime = 0.0
-    """Mission seconds."""
+    """Delay in mission seconds, 0 to 60, or a distribution of delays."""
     duplicate: Probability = 0.0
-    """The probability that a message comes twice."""
+    """Probability that a message arrives twice."""
     reorder: Probability = 0.0
-    """The probability that a message overtakes: it is sent at once, without the delay."""
+    """Probability that a message is sent without the delay, and so overtakes others. Above 0 it needs a `delay`."""
     corrupt: Probability = 0.0
-    """The probability that one bit of a message flips, which its receiver notices and throws it away."""
+    """Probability that one bit of a message flips. The receiver drops such a message because of its checksum."""
     rate: Rate = "none"
-    """Bits per mission second from each sender to each receiver, headers included."""
+    """Bits per mission second from each sender to each receiver, headers included, at least 8. `none`: no limit."""
     limit: Limit = "none"
-    """How many messages from one sender to one receiver may wait for delay or rate; what exceeds it is lost."""
+    """Number of messages from one sender to one receiver that may wait for delay or rate, 1 to 100,000. Further
+    messages are lost. `none`: no limit. It needs a `delay` or a `rate`."""
     receivers: dict[VehicleKey, Receiver] = {}
+    """Conditions of single receivers, by vehicle ID."""
     links: Annotated[list[Link], Field(max_length=10_000)] = []
+    """Conditions of single links, at most 10,000 entries."""
     radio: RadioModel | None = None
-    """What is lost over the distance between two vehicles, besides; None: distance does not matter."""
+    """Additional loss that depends on the distance between two vehicles. Without it, distance has no effect."""
 
     @model_validator(mode="after")
     def _means_something(self) -> "NetworkModel":
@@ -248,15 +279,15 @@ class NetworkModel(Model):
         return self
 
     def named(self) -> Iterator[tuple[str, int]]:
-        """Every vehicle that is named, with the key that names it."""
+        """Yield each vehicle ID, with the key that contains it."""
         return _named(self.receivers, self.links)
 
     def whole(self) -> NetworkValues:
-        """Raises ConditionsError if it says something twice."""
+        """Return the conditions by scope. Raises ConditionsError if two entries concern the same link."""
         return {None: {key: getattr(self, key) for key in KEYS}, **_values_of(self.receivers, self.links)}
 
     def conditions(self, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
-        """The conditions that these words mean; raises ConditionsError if they contradict each other."""
+        """Return the conditions of this model. Raises ConditionsError if they contradict each other."""
         return conditions_of(self.whole(), partition)
 
 
@@ -281,19 +312,19 @@ def _values_of(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> Netw
 
 
 def laid_over(network: NetworkValues, layer: NetworkValues) -> NetworkValues:
-    """What the layer says counts, of whomever it says it; what it does not say stays."""
+    """Return the network with the values of the layer. Other values stay."""
     return {where: network.get(where, {}) | layer.get(where, {}) for where in (*network, *layer)}
 
 
 def of_whom(where: Where) -> str:
-    """In words, to put after a key: "loss from 1 to 2"."""
+    """Return the scope in words to put after a key, as in "loss from 1 to 2"."""
     if where is None:
         return ""
     return f" from {where[0]} to {where[1]}" if isinstance(where, tuple) else f" to {where}"
 
 
 def conditions_of(network: NetworkValues, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
-    """The conditions that a whole network comes to; raises ConditionsError if its keys contradict each other."""
+    """Return the conditions of a network. Raises ConditionsError if its keys contradict each other."""
     for_all = network[None]
     conditions: dict[Where, LinkConditions] = {}
     known: dict[tuple[Any, ...], LinkConditions] = {}  # of many links there are few kinds

@@ -25,11 +25,15 @@ from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, EventKind
 MAX_WORDS = 100
 
 Command = Annotated[list[str], Field(min_length=1, max_length=MAX_WORDS)]
-"""A program that follows ucp/contract/CONTRACT.md, and its arguments; the mission file's name is added."""
+"""A program that follows ucp/contract/CONTRACT.md, and its arguments. The harness appends the path of the mission
+file."""
 
 
 def _commands(asked: Any) -> Any:
-    """Raises ValueError for what is neither: of a union pydantic would tell what is wrong by either reading."""
+    """Raise ValueError unless the value is a command or a mapping of commands.
+
+    Without this check, pydantic would report one error for each member of the union.
+    """
     if isinstance(asked, Mapping):
         for agent, words in asked.items():
             if not _is_agent(agent):
@@ -58,10 +62,12 @@ AgentCommand = Annotated[Command | dict[VehicleKey, Command] | None, BeforeValid
 
 
 class OfSome(Model):
-    """A mistake of these agents only; `value` is true, or the probability of a quirk that has one."""
+    """A quirk of some agents only."""
 
     agents: Annotated[list[VehicleId], Field(min_length=1)]
+    """IDs of the agents that make the mistake."""
     value: bool | float = True
+    """true, or the probability 0 to 1 of a quirk that needs one."""
 
 
 def _schema() -> dict[str, Any]:
@@ -84,18 +90,18 @@ Asked = Annotated[
     BeforeValidator(lambda value: OfSome.model_validate(value) if isinstance(value, Mapping) else value),
 ]
 AskedQuirks = Annotated[dict[str, Asked], WithJsonSchema(_schema())]
-"""Quirk -> its value, or which agents have it."""
+"""Quirk -> its value for all agents, or the agents that have it."""
 
 
 def check(asked: Mapping[Any, Any]) -> None:
-    """Raises ValueError, before anybody looks at agents: which quirks there are, and what their values may be."""
+    """Raise ValueError if a quirk does not exist or cannot have its value."""
     for name, said in asked.items():
         value = said.get("value", True) if isinstance(said, Mapping) else said
         check_quirk(str(name), value.value if isinstance(value, OfSome) else value)
 
 
 def of_agent(asked: Mapping[str, bool | float | OfSome], agent_id: int) -> Quirks:
-    """What the agent is asked to do wrong: for its mission file."""
+    """Return the quirks in the mission file of this agent."""
     own: Quirks = {}
     for name, value in asked.items():
         if not isinstance(value, OfSome):
@@ -106,7 +112,7 @@ def of_agent(asked: Mapping[str, bool | float | OfSome], agent_id: int) -> Quirk
 
 
 def in_words(asked: Mapping[str, bool | float | OfSome]) -> Iterator[str]:
-    """For each quirk in force who has it: "crash_on_tie (agents 32 and 122)", "ignore_commit 0.2 (all agents)"."""
+    """Yield each quirk in force with its agents, such as "ignore_commit 0.2 (all agents)"."""
     for name, said in asked.items():
         value = said.value if isinstance(said, OfSome) else said
         if value:
@@ -120,48 +126,53 @@ def _agents(ids: list[int]) -> str:
 
 
 class Security(Model):
-    """The mission is secured: datagrams are authentic, confidential and fresh, blocks signed by their makers."""
+    """A secured mission. Agents seal each datagram, refuse forged and repeated ones, and sign their blocks."""
 
     keys: Annotated[str, Field(min_length=1, max_length=4000)] = "fresh"
-    """`fresh`: each run has keys of its own. Else the directory that `ucp-harness keys new` made, or one of bundles."""
+    """`fresh`: each run generates its keys. Otherwise a directory from `ucp-harness keys new`, or a directory of
+    bundles."""
     captured: VehicleId | None = None
-    """The vehicle whose keys the rogue node has: what it injects is sealed with them."""
+    """ID of a captured vehicle. The rogue node seals its datagrams with the keys of this vehicle. Default: none."""
     seal: bool = False
-    """Event data is sealed to the depot, too: whoever carries it cannot read it. Blocks have 48 bytes less of it."""
+    """True if event data is encrypted for the depot, so that no agent can read the data of others. A block then has
+    room for 48 bytes less."""
 
 
 Staggered = Literal["vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s", "finalize_gap_s"]
 Stagger = dict[Staggered, Annotated[float, Field(ge=0, le=MAX_TIMER_S)]]
-"""By how many mission seconds a timer of each agent runs longer than that of the agent before it on the roster."""
+"""Timer -> mission seconds by which it is longer than the timer of the agent with the next lower ID."""
 
 
 def staggered(settings: Settings, stagger: Mapping[Staggered, float], place: int) -> Settings:
-    """The settings of the agent at `place` of the roster, from 0. Raises ValueError if a timer gets too long."""
+    """Return the settings of the agent with index `place` in the roster. Raises ValueError if a timer gets too long."""
     longer = {name: getattr(settings, name) + step_s * place for name, step_s in stagger.items() if step_s}
     return dataclasses.replace(settings, **longer) if longer else settings
 
 
 Bytes = bytes
-"""A scripted event has a key of that name."""
+"""The type `bytes`. A scripted event has a key of the same name."""
 MAX_DATA_CHARACTERS = 1400
-"""What 1024 bytes are in base64, and some more."""
+"""Maximum length of event data in base64: 1024 bytes, with a margin."""
 
 
 class ScriptedEvent(Model):
-    """At `at_s` mission seconds `agent` logs one event with `bytes` bytes of data, all zero.
-
-    Or the event of a flight, word for word: with this `data`, in base64, this `event_id`, and the `timestamp_us` that
-    the vehicle's clock showed; without it the event has the time of the agent's clock. If it filled a block that was
-    sealed, `sealed` is what that sealed to, in base64: without the vehicle's keys nobody can do it again.
-    """
+    """One event that an agent logs: zero bytes of a given number, or the data of a recorded event."""
 
     at_s: Instant
+    """Mission second at which the agent logs the event."""
     agent: VehicleId
+    """ID of the agent."""
     bytes: Annotated[int, Field(ge=0, le=1024)] = 256
+    """Number of data bytes, all zero. `data` replaces them. More than `settings.max_event_bytes` allows is an error."""
     event_id: Annotated[int, Field(ge=1, le=254, strict=True)] = 1
+    """ID of the kind of event."""
     data: Annotated[Data, Field(max_length=MAX_DATA_CHARACTERS)] | None = None
+    """Data of a recorded event, in base64."""
     timestamp_us: Annotated[int, Field(ge=0, lt=2**64, strict=True)] | None = None
+    """Timestamp of a recorded event in microseconds, in virtual time only. Default: the clock of the agent."""
     sealed: Annotated[Data, Field(max_length=MAX_DATA_CHARACTERS)] | None = None
+    """Sealed data, in base64, of the block that this recorded event completed. A replay has no keys to seal the block
+    again. It needs a `timestamp_us`."""
 
     @property
     def event_data(self) -> Bytes:
@@ -169,7 +180,7 @@ class ScriptedEvent(Model):
 
     @property
     def logged(self) -> LoggableEvent:
-        """Of a flight, word for word. It has a timestamp."""
+        """The recorded event. It has a `timestamp_us`."""
         assert self.timestamp_us is not None, "it is of a flight"
         return LoggableEvent(self.timestamp_us, self.event_id, self.event_data)
 
@@ -181,19 +192,19 @@ class ScriptedEvent(Model):
 
 
 class Events(Model):
-    """Where an agent's loggable events come from.
-
-    `mavlink`: the vehicle's telemetry: the kinds of events in `log`, a position every `position_interval_s` mission
-    seconds on average.
-    `random`: Algorithm 21, one every `mean_s` mission seconds on average. Without vehicles events are random.
-    `scripted`: those of `script`, and no others.
-    """
+    """The source of the events that agents log."""
 
     source: Literal["mavlink", "random", "scripted"] = "mavlink"
+    """`mavlink`: telemetry of the vehicle. `random`: Algorithm 21. `scripted`: the events of `script`. Without
+    vehicles, `mavlink` means `random`."""
     log: Annotated[list[EventKind], Field(min_length=1, max_length=len(EVENT_KINDS))] = list(DEFAULT_LOG)
+    """Kinds of telemetry that become events, for the source `mavlink`."""
     position_interval_s: Seconds = 10.0
+    """Mean number of mission seconds between two positions, for the source `mavlink`."""
     mean_s: Annotated[float, Field(ge=1, le=MAX_MEAN_S, allow_inf_nan=False)] = 30.0
+    """Mean number of mission seconds between two events, for the source `random`."""
     script: Annotated[list[ScriptedEvent], Field(max_length=1_000_000)] = []
+    """Events to log. It needs `source: scripted`."""
 
     @model_validator(mode="after")
     def _script_is_played(self) -> "Events":
@@ -203,19 +214,20 @@ class Events(Model):
 
 
 MIN_MEMORY_MIB = 6
-"""Docker refuses a container that may use less."""
+"""Docker refuses a container with a lower limit."""
 
 
 class Docker(Model):
-    """Limits are of each container by itself; none: the machine's. Other backends pass over all of this."""
+    """Image and limits of containers. Each limit applies to one container. Other backends ignore these keys."""
 
     image: Annotated[str, Field(min_length=1, max_length=255)] | None = None
-    """In which agents run; the project's own, unless given. `agent_command` is a program in it; if that names agents,
-    the others do not run in it."""
+    """Image of the agents. `agent_command` is a program in this image. Agents without a command of their own, and all
+    agents by default, run in the image of the project."""
     image_from_host: bool = False
-    """This machine's own programs and packages, read-only, instead of the project's image."""
+    """True if containers use the programs and packages of this machine, read-only, instead of the project's image."""
     memory_mib: Annotated[int, Field(ge=MIN_MEMORY_MIB, strict=True)] | None = None
+    """Maximum memory in MiB. Default: no limit."""
     cpus: Annotated[float, Field(ge=0.01, allow_inf_nan=False)] | None = None
-    """How many processors' worth of time."""
+    """Maximum processor time per second, in processors. 0.5 is half of one processor. Default: no limit."""
     pids: Annotated[int, Field(ge=1, strict=True)] | None = None
-    """How many processes and threads."""
+    """Maximum number of processes and threads. Default: no limit."""

@@ -1,4 +1,4 @@
-"""What a scenario expects of its runs: which verdicts, figures, chains and mistakes; where, and with which seeds.
+"""Expected results of the runs of a scenario: verdicts, figures, chains and deviations, by backend and seed.
 
 expect:
   characteristics: {1: holds, 5: holds, 6: not applicable}
@@ -50,10 +50,10 @@ FigureName = Literal[
     "mutual_chain_before_final_reconcile",
     "distinct_chains_before_final_reconcile",
 ]
-"""As in `harness.checker._figures`."""
+"""The figures that `harness.checker._figures` computes."""
 
 NUMBERS = {number: int(number) for number in CHARACTERISTICS}
-"""The characteristics; JSON has strings for keys."""
+"""Number of a characteristic as a JSON key -> as an integer."""
 
 ChainHash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
@@ -68,10 +68,12 @@ def _known_number(key: Any) -> int:
 
 
 class Range(Model):
-    """From `min` to `max`, both included; at least one of them."""
+    """A range of numbers. Needs `min`, `max`, or both. A single number is short for a range from it to itself."""
 
     min: Number | None = None
+    """Lowest allowed value."""
     max: Number | None = None
+    """Highest allowed value."""
 
     @model_validator(mode="after")
     def _means_something(self) -> "Range":
@@ -85,7 +87,7 @@ class Range(Model):
         return (self.min is None or figure >= self.min) and (self.max is None or figure <= self.max)
 
     def describe(self) -> str:
-        """In words: "at least 40"."""
+        """Return the range in words, such as "at least 40"."""
         if self.min == self.max:
             return f"{self.min:g}"
         words = [f"at least {self.min:g}"] if self.min is not None else []
@@ -93,7 +95,7 @@ class Range(Model):
 
 
 def _exactly(value: Any) -> Any:
-    """A number is short for the range from it to itself."""
+    """Return the range from a number to itself, or the value unchanged if it is a range."""
     if isinstance(value, Mapping | Range):
         return value
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -105,31 +107,41 @@ Count = Annotated[Range, BeforeValidator(_exactly)]
 
 
 class Common(Model):
-    """How many blocks from the inception block on these agents' chains share; of one agent: how many it has."""
+    """The expected length of the common part of several chains, or of the chain of one agent."""
 
     agents: Annotated[list[VehicleId], Field(min_length=1)]
+    """IDs of the agents."""
     blocks: Count
+    """Number of blocks, from the inception block on, that the chains of all these agents share."""
 
 
 class Expect(Model):
-    """A characteristic that is not named may be anything but violated, and so what is judged beside them.
+    """Expected results. pytest plays every seed on every backend, one test each.
 
-    `deviations`: in which handler each agent that is wrong first did other than the algorithms say, and nobody else.
-
-    Every seed is played on every backend.
+    A check without an expected verdict passes unless its verdict is bad.
     """
 
     characteristics: dict[int, CharacteristicVerdict] = {}
+    """Expected verdicts on the characteristics of the thesis (Section 4.3), by number 1 to 6."""
     steps: StepsVerdict | None = None
+    """Expected verdict of the check that compares every handler run with the reference core."""
     records: RecordsVerdict | None = None
+    """Expected verdict of the check that compares records of the same facts."""
     liveness: LivenessVerdict | None = None
+    """Expected verdict of the check whether the swarm became idle."""
     figures: dict[FigureName, Count] = {}
+    """Expected figures of the run, by name, as a number or a range."""
     chains: dict[VehicleKey, ChainHash] = {}
-    """The top chain hash with which the agent ends: no two chains have the same."""
+    """Expected top chain hash at the end, by agent ID. It identifies the whole chain."""
     common: Annotated[list[Common], Field(max_length=1000)] = []
+    """Expected lengths of chains, and of the common parts of chains."""
     deviations: dict[VehicleKey, str] = {}
+    """Agent ID -> the handler in which the agent first deviates from the algorithms. Other agents must not deviate. Any
+    other value of `steps` than `deviates` is an error."""
     backends: Annotated[list[BackendName], Field(min_length=1)] = ["sim"]
+    """Backends to play, each once."""
     seeds: Annotated[list[Annotated[int, Field(ge=0, strict=True)]], Field(min_length=1, max_length=10_000)] = [1]
+    """Seeds to play, each once."""
 
     @field_validator("characteristics", mode="before")
     @classmethod
@@ -169,7 +181,7 @@ class Expect(Model):
         return values
 
     def verdict(self, key: str) -> str | None:
-        """What is expected of this characteristic, or judgement beside them; None if nothing is said of it."""
+        """Return the expected verdict of a check. None if the scenario does not name one."""
         if key in BESIDE:
             expected: str | None = getattr(self, key)
             if key == "steps" and self.deviations:
@@ -182,7 +194,7 @@ class Expect(Model):
         return kind_of(verdict) != "bad" if expected is None else verdict == expected
 
     def out_of_range(self, figures: Mapping[str, float | None]) -> Iterator[str]:
-        """A sentence for each figure that is not what it should be."""
+        """Yield a sentence for each figure outside of its range."""
         for name, wanted in self.figures.items():
             figure = figures.get(name)
             if figure is None or figure not in wanted:
@@ -190,7 +202,7 @@ class Expect(Model):
                 yield f"{name.replace('_', ' ')} is {shown}, and should be {wanted.describe()}"
 
     def other_chains(self, top_chain_hashes: Mapping[int, str]) -> Iterator[str]:
-        """A sentence for each agent that ends with another chain; `top_chain_hashes` are those of the exports."""
+        """Yield a sentence for each agent with an unexpected chain. `top_chain_hashes` come from the exports."""
         for agent_id, wanted in self.chains.items():
             ended = top_chain_hashes.get(agent_id)
             if ended is None:
@@ -199,14 +211,14 @@ class Expect(Model):
                 yield f"agent {agent_id} ends with the chain hash {ended[:12]} on top, and should with {wanted[:12]}"
 
     def named(self) -> Iterator[tuple[str, int]]:
-        """Every agent that is named, with the key that names it."""
+        """Yield each agent ID, with the key that contains it."""
         yield from (("chains", agent) for agent in self.chains)
         yield from (("deviations", agent) for agent in self.deviations)
         for index, common in enumerate(self.common):
             yield from ((f"common.{index}.agents", agent) for agent in common.agents)
 
     def other_common(self, chains: Mapping[int, Sequence[str]]) -> Iterator[str]:
-        """A sentence for each chain, or common part of several, that is not as long as it should be."""
+        """Yield a sentence for each chain, or common part of chains, with an unexpected length."""
         for common in self.common:
             there = all(agent in chains for agent in common.agents)
             levels = zip(*(chains[agent] for agent in common.agents), strict=False) if there else ()
@@ -217,7 +229,10 @@ class Expect(Model):
                 yield f"{common_to} {_has(shared)}, and should have {common.blocks.describe()}"
 
     def other_deviations(self, found: Iterable[tuple[int, str | None]]) -> Iterator[str]:
-        """A sentence for each agent that deviates otherwise than it should; `found`: agents and handlers, by time."""
+        """Yield a sentence for each agent with an unexpected first deviation.
+
+        `found` has an agent and a handler for each deviation, in time order.
+        """
         if not self.deviations:
             return
         first: dict[int, str | None] = {}

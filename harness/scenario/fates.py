@@ -1,4 +1,4 @@
-"""Scripted fates: what is decided about single messages, before chance has its say.
+"""Scripted fates: the delivery or loss of single messages, decided before the random network conditions.
 
 fates:
   - {message: Commit Block, block: "4.11", receiver: 2, drop: true}
@@ -32,7 +32,7 @@ BlockName = Annotated[str, Field(pattern=_BLOCK_NAME)]
 """`<agent>.<ordinal>`, the ordinal counting from 1 that agent's completed blocks. YAML needs quotes: "4.10"."""
 
 OUTCOMES = ("drop", "delay_s", "hold_until_s", "after", "arrivals")
-"""Keys that say what becomes of a message."""
+"""Keys that decide about the delivery of a message."""
 
 FateName = Annotated[str, Field(min_length=1, max_length=100)]
 
@@ -46,34 +46,43 @@ def _quoted(value: Any) -> Any:
 
 
 class Fate(Model):
-    """Which messages, and what becomes of each on its way to each receiver.
+    """The scripted delivery of the messages that match.
 
-    A message is meant if all that is named fits: its type, sender, the block that it is about, and when it is sent
-    (mission seconds, `until_s` excluded). Of those that are meant `count` picks some: 3 is the third, [1, 2] the first
-    two. Without `receiver` the fate is that of every receiver. The first fate in the list that fits decides.
-
-    One of these happens; a partition still lets nothing pass:
-    `drop: true`: it is lost; `delay_s`: it arrives after so long, whatever chance says; `hold_until_s`: it arrives at
-    that mission second, if it would have arrived before; `after`: it arrives right after the message that the fate
-    with that `name` is about; `name` alone: it arrives as chance says; `arrivals`: of all datagrams from `sender` to
-    `receiver` those with these numbers, from 0 through all lives of the sender, arrive at these mission seconds, one
-    that is named twice also twice, and no others.
+    A message matches if it agrees with all of the keys `message`, `sender`, `receiver`, `block`, `from_s` and `until_s`
+    that the fate has. The first fate that matches decides. A fate needs exactly one of `drop`, `delay_s`,
+    `hold_until_s`, `after` and `arrivals`, or only a `name`. With only a name, the network conditions decide about the
+    message. A partition cuts messages in any case.
     """
 
     message: MessageName | None = None
+    """Type of the message. Default: any."""
     sender: VehicleId | None = None
+    """ID of the sender. Default: any."""
     receiver: VehicleId | None = None
+    """ID of the receiver. Default: each receiver."""
     block: Annotated[BlockName | None, BeforeValidator(_quoted)] = None
+    """Block that the message is about: an agent and the number of its block, as in "4.11", in quotes."""
     count: Annotated[int, Field(ge=1)] | list[Annotated[int, Field(ge=1)]] | None = None
+    """Position among the matching messages, from 1, or a list of positions. Default: all of them."""
     from_s: Instant | None = None
+    """Mission second from which the message is sent."""
     until_s: Instant | None = None
+    """Mission second before which the message is sent, after `from_s`."""
 
     drop: Literal[True] | None = None
+    """The message is lost."""
     delay_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    """The message arrives after this number of mission seconds, regardless of the network conditions."""
     hold_until_s: Instant | None = None
+    """The message arrives at this mission second if it would arrive earlier."""
     after: FateName | None = None
+    """The message arrives directly after the message of the fate with this `name`."""
     arrivals: Arrivals | None = None
+    """Arrivals of all datagrams from `sender` to `receiver`. In "0@12.3 1@12.75" datagram 0 arrives at mission second
+    12.3 and datagram 1 at 12.75. Numbers start at 0 and count across reboots of the sender. A number that is listed
+    twice arrives twice. All other datagrams are lost."""
     name: FateName | None = None
+    """Name of the fate, for `after`. Two fates with the same name are an error."""
 
     @property
     def as_chance_says(self) -> bool:
@@ -99,7 +108,7 @@ class Fate(Model):
         return self
 
     def describe(self) -> str:
-        """In words: "drop Commit Block of 4.11 to 2"."""
+        """Return the fate in words, such as "drop Commit Block of block 4.11 to 2"."""
         what = (
             "drop"
             if self.drop

@@ -1,4 +1,4 @@
-"""Injections and stray datagrams: what a scenario sends that none of its agents sent.
+"""Injections and scripted datagrams: messages of a run that no agent sent.
 
 timeline:
   - {at_s: 100, replay: {message: Commit Block, sender: 2, count: 3}}
@@ -10,9 +10,9 @@ timeline:
   - {at_s: 700, flood: {for_s: 10, per_s: 50, message: Chain Contain Query}}
   - {at_s: 800, lie: {message: Commit Block, sender: 3, receivers: [1, 2], block: made 790.5, chain: ["2.1", "1.1"]}}
 
-`message` and `sender` that are left out mean any. The rogue hears everything that agents send, and everybody hears the
-rogue, whatever keeps agents apart. It adds to what is on the air and can take nothing away: an original that it delays,
-corrupts or forges an answer to arrives as well.
+A rogue node plays the injections. It receives every message that an agent sends, and every agent receives its messages,
+regardless of network conditions and partitions. It cannot remove messages: the original of a delayed or corrupted
+message arrives too, and so does the true answer beside a forged one.
 
 datagrams:
   - {source: 32, datagram: VUMBBQ..., reaches: {10: 812.3, 28: 812.31}}
@@ -34,17 +34,19 @@ MAX_FLOOD = 100_000
 
 
 class _Matching(Model):
-    """Of what is heard, the messages of this type and sender."""
+    """The messages of one type and one sender, among those that the rogue node receives."""
 
     message: MessageName | None = None
+    """Type of the messages. Default: any."""
     sender: VehicleId | None = None
+    """ID of the sender. Default: any."""
 
     def matches(self, message: str, sender: int) -> bool:
         return self.message in (None, message) and self.sender in (None, sender)
 
     @property
     def lasts_s(self) -> float:
-        """Mission seconds from its beginning until nothing more comes of it."""
+        """Mission seconds from the start of the injection until its last datagram."""
         return 0.0
 
     def in_words(self) -> str:
@@ -53,9 +55,10 @@ class _Matching(Model):
 
 
 class Replay(_Matching):
-    """What was heard before and matches: the last `count` of it once more, byte for byte."""
+    """The rogue node sends the last matching messages again, byte for byte."""
 
     count: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Number of messages."""
 
     def in_words(self) -> str:
         return f"the last {self.count} of {super().in_words()}"
@@ -63,6 +66,7 @@ class Replay(_Matching):
 
 class _Lasting(_Matching):
     for_s: Seconds
+    """Duration in mission seconds."""
 
     @property
     def lasts_s(self) -> float:
@@ -73,18 +77,20 @@ class _Lasting(_Matching):
 
 
 class Duplicate(_Lasting):
-    """For `for_s` whatever matches is sent again at once, `copies` times."""
+    """The rogue node repeats each matching message at once."""
 
     copies: Annotated[int, Field(ge=1, le=100)] = 1
+    """Number of copies per message."""
 
     def in_words(self) -> str:
         return f"{super().in_words()}, {self.copies} more of each"
 
 
 class DelayedCopy(_Lasting):
-    """For `for_s` whatever matches is sent again `by_s` later."""
+    """The rogue node repeats each matching message later."""
 
     by_s: Seconds
+    """Mission seconds between the message and its copy."""
 
     @property
     def lasts_s(self) -> float:
@@ -95,28 +101,34 @@ class DelayedCopy(_Lasting):
 
 
 class Corrupt(_Lasting):
-    """For `for_s` whatever matches is sent again at once with `bits` of it flipped, under a good UDP checksum."""
+    """The rogue node repeats each matching message at once, with flipped bits and a valid UDP checksum."""
 
     bits: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Number of flipped bits per message."""
 
     def in_words(self) -> str:
         return f"{super().in_words()}, {self.bits} bit{'s' if self.bits > 1 else ''} flipped"
 
 
 class Forge(Model):
-    """A message that `sender` never sent.
+    """The rogue node sends messages in the name of an agent.
 
-    Commit Block, at once: a block that claims to be the sender's, on top of the chain that the rogue has heard of last.
-    The others, for `for_s`: an answer to each question, ahead of the sender's own; to a query for a successor always
-    "Is Top Of Chain". `approve` is what the answer says.
+    A forged Commit Block is sent once. It contains a new block in the name of `sender`, on top of the last chain that
+    the rogue node knows. The other messages are answers: for `for_s`, the rogue node answers each question of the other
+    agents before `sender` does. Its answer to a Chain Hash Successor Query is always "Is Top Of Chain".
     """
 
     ANSWERS: ClassVar = ("Block Add Response", "Chain Contain Response", "Next in Sequence Response")
 
     message: Literal["Commit Block", "Block Add Response", "Chain Contain Response", "Next in Sequence Response"]
+    """Type of the message."""
     sender: VehicleId
+    """ID of the agent in whose name the rogue node sends."""
     for_s: Seconds | None = None
+    """Duration in mission seconds. Needed for answers, an error for a Commit Block."""
     approve: bool | None = None
+    """True if a forged Block Add Response or Chain Contain Response approves. Default: no. An error for other
+    messages."""
 
     @property
     def lasts_s(self) -> float:
@@ -137,9 +149,13 @@ class Forge(Model):
 
 
 class Flood(_Lasting):
-    """For `for_s`, `per_s` well-formed messages a mission second, of random content and in random names."""
+    """The rogue node sends well-formed messages with random content in the names of random agents.
+
+    More than 100,000 messages are an error.
+    """
 
     per_s: Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
+    """Messages per mission second."""
 
     @model_validator(mode="after")
     def _can_be_counted(self) -> "Flood":
@@ -155,12 +171,10 @@ BlockName = Annotated[str, Field(pattern=r"^(\d{1,5}\.\d{1,6}|made \d{1,9}(\.\d{
 
 
 class Lie(Model):
-    """One message in `sender`'s name, of just this content, which `receivers` hear; everybody if they are left out.
+    """The rogue node sends one message with the given content in the name of an agent.
 
-    `block` is the block that it is about: "2.1" is the first that agent 2 has proposed, "made 12.5" one that the rogue
-    makes in the sender's name, with that timestamp in mission seconds. `chain` are the blocks of the chain that it is
-    about, the oldest first, or `nobody's`; that of a Commit Block is what its block goes on top of. A Next in Sequence
-    Response without `block` says "Is Top Of Chain".
+    The type of the message decides which of `block`, `chain`, `approve` and `timestamp_s` it needs. A missing or
+    additional key is an error.
     """
 
     NEEDS: ClassVar[dict[str, tuple[str, ...]]] = {
@@ -180,12 +194,22 @@ class Lie(Model):
     }
 
     message: MessageName
+    """Type of the message."""
     sender: VehicleId
+    """ID of the agent in whose name the rogue node sends."""
     receivers: Annotated[list[VehicleId], Field(min_length=1)] | None = None
+    """IDs of the agents that receive the message. Default: all."""
     block: BlockName | None = None
+    """Block in the message. "2.1" is the first block that agent 2 proposed. "made 12.5" is a new block in the name of
+    `sender` with a timestamp of 12.5 mission seconds. A Next in Sequence Response without a block means "Is Top Of
+    Chain"."""
     chain: Annotated[list[BlockName], Field(max_length=1000)] | Literal["nobody's"] | None = None
+    """Blocks of the chain in the message, oldest first, without the inception block. `nobody's` stands for a hash that
+    no chain has. The block of a Commit Block goes on top of this chain."""
     approve: bool | None = None
+    """True if the message approves the block, or if the chain of `sender` contains `chain`."""
     timestamp_s: Instant | None = None
+    """Timestamp in a Next in Sequence Response, in mission seconds."""
 
     @property
     def lasts_s(self) -> float:
@@ -222,15 +246,15 @@ MODELS: dict[str, type[Injection]] = {
 
 
 MAX_CHARACTERS = 4 * (65536 // 3 + 1)
-"""What the largest datagram that UDP has is in base64."""
+"""Length in base64 of the largest UDP datagram."""
 
 
 class ScriptedDatagram(Model):
-    """`datagram`, in base64, under the address of vehicle `source`, `reaches` these agents at these mission seconds.
-
-    Nothing else becomes of it: no loss, no partition.
-    """
+    """A datagram that no agent sent. Network conditions and partitions do not apply to it."""
 
     source: VehicleId
+    """Vehicle whose address is the source of the datagram."""
     datagram: Annotated[Data, Field(max_length=MAX_CHARACTERS)]
+    """Content, in base64."""
     reaches: Annotated[dict[VehicleKey, Instant], Field(min_length=1)]
+    """ID of each receiver -> mission second of the arrival."""

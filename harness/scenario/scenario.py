@@ -1,4 +1,4 @@
-"""One experiment, whole: `Scenario.model_json_schema()` documents every key."""
+"""The model of a scenario. `Scenario.model_json_schema()` documents every key."""
 
 import dataclasses
 from collections import Counter
@@ -42,88 +42,97 @@ from ucp.settings import Settings
 from ucp.short_value import shown
 
 MAX_DURATION_S = 31 * 86400
-"""No mission is longer: a run in virtual time would take hours and all memory."""
+"""Maximum duration of a mission. A longer run in virtual time would take hours and fill the memory."""
 MAX_INITIAL_DATA = 64 * 1024
 
 
 class Settle(Model):
-    """After the mission the agents finish their votes and reconciles, for at most `limit_s` mission seconds."""
+    """The time after the mission in which agents finish their votes and reconciles."""
 
     limit_s: Seconds = 1800.0
+    """Maximum number of mission seconds. The run ends earlier when all agents are idle."""
 
 
 class Clock(Model):
-    """An agent's own clock: at mission second t it shows offset_s + (1 + drift) * t seconds."""
+    """The clock of one agent. At mission second t it shows `offset_s` + (1 + `drift`) * t seconds."""
 
     offset_s: Annotated[float, Field(ge=-1e10, le=1e10)] = 0.0
+    """Seconds that the clock shows at the start of the mission."""
     drift: Annotated[float, Field(gt=-0.5, le=1.0)] = 0.0
+    """Relative error of the rate. A clock with a drift of 0.01 gains one second in 100 mission seconds."""
 
     def shows(self, mission_s: float) -> float:
-        """What it shows then."""
+        """Return the time, in seconds, that the clock shows at this mission second."""
         return self.offset_s + (1 + self.drift) * mission_s
 
     def mission_s(self, shown_s: float) -> float:
-        """When it shows that."""
+        """Return the mission second at which the clock shows this time."""
         return (shown_s - self.offset_s) / (1 + self.drift)
 
 
 class Scenario(Model):
-    """One experiment. Times are mission seconds."""
+    """One experiment. All times are mission seconds, counted from the start of the mission."""
 
     name: Annotated[str, Field(min_length=1, max_length=200)]
+    """Name of the scenario, of 1 to 200 characters. Run directories and reports contain it."""
     about: Annotated[str, Field(max_length=2000)] = ""
-    """What the run shows, for its report."""
+    """Purpose of the run, of at most 2000 characters. The report shows it."""
     agents: int | list[int] = 5
-    """How many, or their IDs."""
+    """Number of agents, 1 to 1000, or a list of their IDs. A number `n` stands for the IDs 1 to `n`."""
     duration_s: Annotated[Seconds, Field(le=MAX_DURATION_S)] = 1200.0
-    """For so long events are logged; then the agents finish what they are about."""
+    """Duration of the mission in mission seconds. Agents log events until its end. Then `settle` begins."""
     speedup: Annotated[float, Field(gt=0, le=1000)] = 20.0
-    """Mission seconds per second, of processes and containers."""
+    """Mission seconds per second of wall time, for processes and containers. Virtual time ignores it."""
     network: NetworkModel = NetworkModel()
-    """Conditions from the start on, until the timeline changes them."""
+    """Network conditions at the start. `timeline` and `schedule` can change them."""
     timeline: Annotated[list[TimelineEntry], Field(max_length=10_000)] = []
-    """What happens when, to the network and to agents."""
+    """Changes of the network, faults of agents, and injected messages, each at one instant."""
     schedule: Annotated[list[Schedule], Field(max_length=100)] = []
-    """What happens to the network again and again."""
+    """Ramps and repeated changes of the network."""
     events: Events = Events()
-    """What the agents log."""
+    """Source of the events that agents log."""
     vehicles: Vehicles = Vehicles()
-    """What carries the agents."""
+    """Vehicles that carry the agents: ArduPilot, embedded vehicles, or none."""
     flight: Annotated[list[Flight], Field(max_length=MAX_AGENTS)] = []
-    """Where vehicles fly; those that no plan names take off and stay."""
+    """Flight plans. A vehicle without a plan takes off and stays in place."""
     agent_command: AgentCommand = None
-    """Any program that follows ucp/contract/CONTRACT.md, with its arguments: for all agents, or by agent for some."""
+    """Any program that follows ucp/contract/CONTRACT.md, with its arguments. A list is the command of all agents. A
+    mapping has one command per agent ID, and the other agents are reference agents. Default: reference agents."""
     docker: Docker = Docker()
-    """What containers are made from, and may use."""
+    """Image and resource limits of containers. Only the backend `docker` uses them."""
     settings: Settings = Settings()
-    """The agents' timers, and how they read what the thesis leaves open."""
+    """Timers and sizes of the agents, and their readings of ambiguous passages of the thesis."""
     stagger: Stagger = {}
-    """By how many seconds timers of each agent run longer than those of the agent before it: it is told so."""
+    """Mission seconds by which a timer of each agent is longer than that of the agent with the next lower ID. Each
+    agent receives its own durations in its mission file."""
     security: Security | None = None
-    """Keys for all agents; without, whatever is on the air counts."""
+    """Keys of a secured mission. Without them agents accept every datagram."""
     quirks: AskedQuirks = {}
-    """Mistakes that all agents make, or those that are named (`ucp.quirks`)."""
+    """Mistakes that all agents, or the listed agents, make on purpose. `ucp.quirks` declares them."""
     clocks: dict[VehicleKey, Clock] = {}
-    """What agents' own clocks show, by agent, in virtual time."""
+    """Clocks of agents, by agent ID. Other agents have an exact clock. In virtual time only."""
     fates: Annotated[list[Fate], Field(max_length=100_000)] = []
-    """What becomes of single messages, in virtual time."""
+    """Scripted delivery or loss of single messages. In virtual time only."""
     datagrams: Annotated[list[ScriptedDatagram], Field(max_length=100_000)] = []
-    """What is on the air beside what agents send."""
+    """Datagrams that no agent sent but that agents receive. In virtual time only."""
     lateness: dict[VehicleKey, Lateness] = {}
-    """Timers that end late, by agent: "3+0.25" is the fourth that it has started, from 0 through all its lives, which
-    ends a quarter of a mission second late. Those between are punctual."""
+    """Late timers, by agent ID. In "3+0.25 8+1" the timer with number 3 expires 0.25 mission seconds late, and number 8
+    one second late. Numbers start at 0 and count all timers that the agent starts, across its reboots. Other timers are
+    punctual."""
     initial_data: Annotated[Data, Field(max_length=MAX_INITIAL_DATA)] | None = None
-    """BD_0, in base64. Without it each run has its own: in virtual time made of `name` and seed."""
+    """Data of the inception block (BD_0), in base64, at most 65536 characters. By default each run has its own data. In
+    virtual time it follows from `name` and seed."""
     settle: Settle = Settle()
-    """How long agents may finish after the mission."""
+    """Time after the mission in which agents may finish."""
     final_reconcile: bool = False
-    """At the end clear all conditions, and let one agent after another reconcile."""
+    """True if the run ends with perfect network conditions, under which one agent after another reconciles."""
     capture: bool = False
-    """Keep every frame that a vehicle sent, and every one that reached it, in capture/<ID>.pcapng."""
+    """True if the run writes every frame that a vehicle sent or received to capture/<ID>.pcapng."""
     gcs: Annotated[str, Field(max_length=300)] | None = None
-    """HOST:PORT of a ground station, by UDP, that sees all vehicles and may command them; usually 127.0.0.1:14550."""
+    """HOST:PORT of a ground station, usually 127.0.0.1:14550. It receives the telemetry of all vehicles by UDP, and may
+    command them."""
     expect: Expect | None = None
-    """For pytest, which collects the file as tests if it has this."""
+    """Expected results. pytest collects a scenario file with this key as tests."""
 
     @field_validator("gcs")
     @classmethod
@@ -135,15 +144,15 @@ class Scenario(Model):
 
     @property
     def roster(self) -> tuple[int, ...]:
-        """The agents' IDs, ascending."""
+        """The IDs of the agents, ascending."""
         return tuple(range(1, self.agents + 1)) if isinstance(self.agents, int) else tuple(sorted(self.agents))
 
     def secured(self) -> "Scenario":
-        """The same with keys; fresh ones if it has none."""
+        """Return the scenario with fresh keys, or unchanged if it has keys."""
         return self if self.security else self.model_copy(update={"security": Security()})
 
     def settings_of(self, agent_id: int) -> Settings:
-        """What the mission tells the agent."""
+        """Return the settings in the mission file of this agent."""
         told = staggered(self.settings, self.stagger, self.roster.index(agent_id))
         if self.security is not None and self.security.seal:
             largest = min(told.max_block_bytes, MAX_EVENT_DATA_BYTES - SEAL_BYTES)
@@ -154,7 +163,7 @@ class Scenario(Model):
 
     @property
     def rogue(self) -> int | None:
-        """The rogue node's ID on the air, which no agent has; None if the timeline injects nothing."""
+        """The vehicle ID of the rogue node, different from all agents. None if the timeline injects nothing."""
         if not any(entry.injection for entry in self.timeline):
             return None
         taken = set(self.roster)
@@ -166,33 +175,33 @@ class Scenario(Model):
         return self.roster if self.rogue is None else (*self.roster, self.rogue)
 
     def command_of(self, agent_id: int) -> list[str] | None:
-        """What starts this agent, but for the mission file; None of one that is the harness's own."""
+        """Return the command of this agent, without the mission file. None for a reference agent."""
         asked = self.agent_command
         return asked.get(agent_id) if isinstance(asked, dict) else asked
 
     @property
     def foreign(self) -> tuple[int, ...]:
-        """The agents that are not the harness's own, as the scenario says itself; ascending."""
+        """The IDs of agents with a command in `agent_command`, ascending."""
         return tuple(agent_id for agent_id in self.roster if self.command_of(agent_id) is not None)
 
     def quirks_of(self, agent_id: int) -> Quirks:
-        """Mistakes that this agent is asked to make."""
+        """Return the mistakes that this agent makes on purpose."""
         return of_agent(self.quirks, agent_id)
 
     @property
     def has_wrong_agents(self) -> bool:
-        """Whether any agent is wrong on purpose."""
+        """True if any agent makes mistakes on purpose."""
         return any(in_force(self.quirks_of(agent_id)) for agent_id in self.roster)
 
     def flight_of(self, vehicle: int) -> Flight | None:
-        """The flight that names this vehicle, if one does."""
+        """Return the flight of this vehicle. None if no flight names it."""
         return next((flight for flight in self.flight if vehicle in flight.vehicles), None)
 
     def timeline_in_order(self) -> list[TimelineEntry]:
         return sorted(self.timeline, key=lambda entry: entry.at_s)
 
     def faults_in_order(self) -> list[Fault]:
-        """All that happens to agents; of one instant what was begun first."""
+        """Return all faults by time. Faults at the same instant are in the order of their timeline entries."""
         return [fault for _, fault in self._faults_with_their_keys()]
 
     def _faults_with_their_keys(self) -> list[tuple[str, Fault]]:
@@ -202,7 +211,7 @@ class Scenario(Model):
         return sorted(course, key=lambda keyed: keyed[1].at_s)
 
     def network_steps(self) -> Iterator[Step]:
-        """Every change of the network, by the timeline and by schedules."""
+        """Yield every change of the network by the timeline and the schedules, in time order."""
         return steps(self.network, self.roster, self.timeline, self.schedule, self.duration_s)
 
     @field_validator("agents", mode="before")
@@ -249,7 +258,7 @@ class Scenario(Model):
         return self
 
     def _named(self) -> Iterator[tuple[str, int]]:
-        """Every vehicle that is named anywhere but in a partition, with the key that names it."""
+        """Yield each vehicle ID outside of partitions, with the key that contains it."""
         yield from ((f"network.{key}", vehicle) for key, vehicle in self.network.named())
         yield from ((f"events.script.{index}.agent", event.agent) for index, event in enumerate(self.events.script))
         yield from (("clocks", vehicle) for vehicle in self.clocks)

@@ -21,7 +21,7 @@ VehicleId = Annotated[int, Field(ge=1, le=MAX_AGENT_ID, strict=True)]
 VehicleKey = Annotated[
     VehicleId, BeforeValidator(lambda value: int(value) if isinstance(value, str) and value.isdecimal() else value)
 ]
-"""A vehicle as the key of a mapping: JSON has strings there."""
+"""A vehicle ID as the key of a mapping. In JSON the key is a string."""
 
 
 def _decodable(text: str) -> str:
@@ -50,18 +50,18 @@ def _listed(sign: str) -> str:
 
 
 def numbered(text: str) -> list[tuple[int, float]]:
-    """(number, seconds), in the order of the text."""
+    """Return (number, seconds) for each entry, in the order of the text."""
     pairs = (re.split(r"[@+]", entry) for entry in text.split())
     return [(int(number), float(seconds)) for number, seconds in pairs]
 
 
 def in_text(pairs: Iterable[tuple[int, float]], sign: str) -> str:
-    """As a file says it, to the microsecond."""
+    """Return the pairs in the notation of a scenario, rounded to microseconds."""
     return " ".join(f"{number}{sign}{seconds:.6f}".rstrip("0").rstrip(".") for number, seconds in pairs)
 
 
 def _listing(sign: str, example: str) -> BeforeValidator:
-    """Says what is wrong in better words than the pattern itself."""
+    """Raise an error that shows an example, instead of the regular expression."""
 
     def check(text: Any) -> Any:
         if isinstance(text, str) and len(text) <= MAX_CHARACTERS and not re.match(_listed(sign), text):
@@ -72,6 +72,6 @@ def _listing(sign: str, example: str) -> BeforeValidator:
 
 
 Arrivals = Annotated[str, Field(pattern=_listed("@"), max_length=MAX_CHARACTERS), _listing("@", "17@12.345 18@12.5")]
-"""Number of a datagram, and the mission second at which it arrives."""
+"""Numbers of datagrams, each with the mission second of its arrival."""
 Lateness = Annotated[str, Field(pattern=_listed("+"), max_length=MAX_CHARACTERS), _listing("+", "3+0.25 8+1")]
-"""Number of a timer, and by how many seconds it ends late."""
+"""Numbers of timers, each with the number of seconds by which it expires late."""

@@ -6,10 +6,10 @@
       - {repeat: {network: {links: [{from: 1, to: 2, loss: 0.9}]}}, every_s: 120, for_s: 30}
       - {nemesis: halves, every_s: 60, for_s: 20, seed: 7}
 
-Each is a layer over the network of the scenario and its timeline, and is worked out before the run: every backend plays
-the same. Of the network they say what the timeline says: `loss`, `partition`, or `network` with any of its keys. Where
-layers meet, of each key the later one's value counts, partitions cut all that any of them cuts, and a pair that one of
-them cuts is cut.
+Each schedule is a layer over the network of the scenario and its timeline. The layers are computed before the run, so
+that every backend plays the same. A schedule can change the same keys as a timeline entry: `loss`, `partition`, and
+`network` with any of its keys. If layers overlap, the value of the later layer counts for each key. A message is cut if
+a partition of any layer cuts it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -40,26 +40,33 @@ NETWORK_KEYS = ("loss", "partition", "heal", "network")
 
 
 class _Entry(Disturbance):
-    """At `at_s` mission seconds, one change: of the network; something happens to agents; an injection.
+    """One change at one instant. An entry needs `at_s` and exactly one kind of change.
 
-    `loss`, and all keys of `network`, change what they name and leave the rest of the network as it is; `partition`
-    stands until `heal` or another one. With `for_s` such a change passes: after so many mission seconds what it has
-    changed is as it would be without it.
-
-    What happens to agents, from `crash` to `resume`: `harness.scenario.faults`. Injections, from `replay` to `lie`:
-    `harness.scenario.injection`.
+    A change of the network is `loss`, `partition`, `heal` or `network`. A fault, such as `kill`, has a list of agents.
+    An injection, such as `replay`, makes a rogue node send messages. Two entries at the same instant are an error.
     """
 
     at_s: Instant
+    """Mission second of the change, at most `duration_s`."""
     for_s: Seconds | None = None
+    """Mission seconds until the end of a change by `loss`, `partition` or `network`. Default: it lasts until a later
+    change of the same value."""
     heal: Literal[True] | None = None
+    """End of the partition."""
     replay: Replay | None = None
+    """The rogue node repeats messages that it received before."""
     duplicate: Duplicate | None = None
+    """The rogue node repeats each message at once."""
     delay: DelayedCopy | None = None
+    """The rogue node repeats each message later."""
     corrupt: Corrupt | None = None
+    """The rogue node repeats each message with flipped bits."""
     forge: Forge | None = None
+    """The rogue node sends forged messages in the name of an agent."""
     flood: Flood | None = None
+    """The rogue node sends random messages at a high rate."""
     lie: Lie | None = None
+    """The rogue node sends one message with the given content in the name of an agent. In virtual time only."""
 
     @field_validator("delay", "duplicate", "corrupt", mode="before")
     @classmethod
@@ -71,12 +78,12 @@ class _Entry(Disturbance):
 
     @property
     def injection(self) -> tuple[InjectionName, Injection] | None:
-        """What a rogue node sends, if it does."""
+        """The name and the parameters of the injection. None if the entry has none."""
         return next(((name, injection) for name in INJECTIONS if (injection := getattr(self, name)) is not None), None)
 
     @property
     def fault(self) -> Fault | None:
-        """What happens to agents, if anything does."""
+        """The fault of this entry. None if the entry has none."""
         for kind in ASKED_FOR:
             if (agents := getattr(self, kind.what)) is not None:
                 return kind(self.at_s, tuple(agents), **{key: getattr(self, key) for key in kind.further_keys()})
@@ -84,12 +91,12 @@ class _Entry(Disturbance):
 
     @property
     def disturbs(self) -> str | None:
-        """The key by which it changes the network, if it does."""
+        """The key that changes the network. None if the entry has none."""
         return next((key for key in NETWORK_KEYS if getattr(self, key) is not None), None)
 
     @property
     def ends_at_s(self) -> float:
-        """When the last thing that it says happens."""
+        """Mission second at which the effect of the entry ends."""
         if (fault := self.fault) is not None:
             return fault.course()[-1].at_s
         lasts_s = self.injection[1].lasts_s if self.injection else self.for_s or 0.0
@@ -115,12 +122,17 @@ class _Entry(Disturbance):
 
 
 def _keys_of_faults() -> dict[str, Any]:
-    """The fields of an entry that faults bring along: the agents, by the fault's name, and its further keys."""
+    """Return the fields of an entry for faults: the name of each fault, with a list of agents, and its further keys."""
     annotations: dict[str, Any] = {}
+    descriptions: dict[str, str] = {}
     for kind in ASKED_FOR:
+        descriptions |= {kind.what: " ".join((kind.__doc__ or "").split()), **kind.key_descriptions}
         hints = get_type_hints(kind, include_extras=True)
         annotations |= {kind.what: Agents, **{key: hints[key] for key in kind.further_keys()}}
-    return {key: (annotation | None, None) for key, annotation in annotations.items()}
+    return {
+        key: (annotation | None, Field(None, description=descriptions.get(key)))
+        for key, annotation in annotations.items()
+    }
 
 
 if TYPE_CHECKING:  # a type checker does not run the code that makes the class
@@ -130,7 +142,7 @@ else:
 
 
 MAX_STEPS = 10_000
-"""More changes than this are a mistake, or another scenario."""
+"""Maximum number of changes by one schedule."""
 
 Groups = Annotated[list[list[VehicleId]], Field(min_length=1)]
 Pairs = frozenset[tuple[int, int]]
@@ -138,26 +150,29 @@ Pairs = frozenset[tuple[int, int]]
 
 @dataclass(frozen=True)
 class Layer:
-    """What a schedule makes of the network for a while; nothing: it leaves it alone."""
+    """The change of the network by a schedule, for some time. An empty layer changes nothing."""
 
     values: NetworkValues = field(default_factory=dict)
     partition: tuple[frozenset[int], ...] = ()
     cut: Pairs = frozenset()
-    """Directed pairs, sender and receiver, between which nothing passes."""
+    """Pairs of a sender and a receiver. All messages from this sender to this receiver are lost."""
 
 
 UNTOUCHED = Layer()
 
 Step = tuple[float, str, Layer]
-"""(mission seconds, what in a word or two, the layer from then on)."""
+"""Mission second, name of the change, and the layer from this second on."""
 
 
 class Ramp(Model):
-    """From the first value to the second, in equal steps; `network`: of each number that both name."""
+    """A change from a first value to a second, in equal steps. Needs at least one key."""
 
     loss: tuple[Probability, Probability] | None = None
+    """First and last probability that a message is lost."""
     delay: tuple[DelaySeconds, DelaySeconds] | None = None
+    """First and last delay in mission seconds, 0 to 60."""
     network: tuple[NetworkLayer, NetworkLayer] | None = None
+    """First and last network conditions. Both need the same keys, and each value must be a number."""
 
     @model_validator(mode="after")
     def _of_something(self) -> "Ramp":
@@ -175,11 +190,11 @@ class Ramp(Model):
         return self
 
     def _ends(self) -> tuple[NetworkValues, NetworkValues]:
-        """What `network` is at first, and in the end."""
+        """Return the first and the last network."""
         return (self.network[0].whole(), self.network[1].whole()) if self.network else ({}, {})
 
     def at(self, share: float) -> NetworkValues:
-        """What it has come to after this share of it."""
+        """Return the conditions after this share, 0 to 1, of the ramp."""
         short = {key: ends for key in ("loss", "delay") if (ends := getattr(self, key)) is not None}
         first, last = (
             laid_over({None: {key: ends[number] for key, ends in short.items()}}, end)
@@ -196,10 +211,12 @@ def _values(end: NetworkValues) -> Iterator[tuple[Where, str, Any]]:
 
 
 class Repeated(Disturbance):
-    """What is done for a while, and undone."""
+    """A temporary change of the network. Needs at least one key."""
 
     partition: Groups | None = None
+    """Groups of vehicles that no message connects. Vehicles in no group form a further group."""
     delay: DelaySeconds | None = None
+    """Delay in mission seconds, 0 to 60."""
 
     @model_validator(mode="after")
     def _of_something(self) -> "Repeated":
@@ -218,23 +235,28 @@ Nemesis = Literal["halves", "isolate", "majorities ring", "bridge", "flapping"]
 
 
 class Schedule(Model):
-    """One of `ramp`, `repeat` or `nemesis`, from `from_s` until `until_s` (the mission's end).
-
-    `ramp`: a step every `every_s`, 10 s if not given; in the end it stays at its second value. `repeat`: every
-    `every_s`, for `for_s`, then undone. `nemesis`: the same with something drawn anew from `seed` each time: `halves`
-    parts the swarm into two random halves, `isolate` cuts off one vehicle, `majorities ring` lets every vehicle hear a
-    majority and no two the same one (Jepsen), `bridge` leaves one vehicle that hears both halves, `flapping` cuts one
-    pair of vehicles from each other.
-    """
+    """A gradual or repeated change of the network. Needs exactly one of `ramp`, `repeat` and `nemesis`."""
 
     ramp: Ramp | None = None
+    """A change in equal steps from one value to another. After the end, the last value stays."""
     repeat: Repeated | None = None
+    """A change that starts every `every_s` and ends after `for_s`."""
     nemesis: Nemesis | None = None
+    """A random change that starts every `every_s` and ends after `for_s`. `halves` splits the swarm into two random
+    halves. `isolate` cuts off one vehicle. `majorities ring` lets each vehicle hear a different majority, as the
+    nemesis of Jepsen does. `bridge` splits the swarm into two halves, and one vehicle hears both. `flapping` cuts one
+    pair of vehicles."""
     from_s: Instant = 0.0
+    """Mission second of the start."""
     until_s: Instant | None = None
+    """Mission second of the end, after `from_s`. Default: the end of the mission."""
     every_s: Seconds | None = None
+    """Mission seconds between two changes. Needed for `repeat` and `nemesis`. Default of a ramp: 10 s."""
     for_s: Seconds | None = None
+    """Mission seconds until a change ends, less than `every_s`. Needed for `repeat` and `nemesis`, an error for
+    `ramp`."""
     seed: int = 0
+    """Seed of the random choices of `nemesis`."""
 
     @model_validator(mode="after")
     def _one_kind(self) -> "Schedule":
@@ -254,14 +276,14 @@ class Schedule(Model):
         return self
 
     def named(self) -> Iterator[tuple[str, int]]:
-        """Every vehicle that is named outside of partitions, with the key that names it."""
+        """Yield each vehicle ID outside of partitions, with the key that contains it."""
         if self.repeat is not None and self.repeat.network is not None:
             yield from ((f"repeat.network.{key}", vehicle) for key, vehicle in self.repeat.network.named())
         for number, end in enumerate((self.ramp.network if self.ramp else None) or ()):
             yield from ((f"ramp.network.{number}.{key}", vehicle) for key, vehicle in end.named())
 
     def steps(self, roster: Sequence[int], end_s: float) -> list[Step]:
-        """What happens when, in order. ValueError if it is more than anybody wants."""
+        """Return the steps of the schedule in time order. Raises ValueError above MAX_STEPS."""
         until = end_s if self.until_s is None else self.until_s
         every = self.every_s or 10.0
         if (until - self.from_s) / every > MAX_STEPS:
@@ -302,7 +324,7 @@ def _isolate(shuffled: list[int]) -> Layer:
 
 
 def _majorities_ring(shuffled: list[int]) -> Layer:
-    """Each vehicle hears itself and its nearest on the ring, a majority in all; everybody's majority is another."""
+    """Return a layer in which each vehicle hears itself and its neighbours on a ring, a different majority for each."""
     size = len(shuffled)
     reach = (size // 2 + 1) // 2
     heard = {
@@ -329,7 +351,7 @@ NEMESES: dict[Nemesis, Callable[[list[int]], Layer]] = {
     "bridge": _bridge,
     "flapping": _flapping,
 }
-"""From the vehicles in random order to what becomes of the network."""
+"""Nemesis -> function that turns the vehicles in random order into a layer."""
 
 NEEDED: dict[Nemesis, int] = {"halves": 2, "isolate": 2, "majorities ring": 4, "bridge": 3, "flapping": 2}
-"""Vehicles without which it would be no fault."""
+"""Nemesis -> minimum number of vehicles."""

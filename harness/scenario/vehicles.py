@@ -23,11 +23,14 @@ MAX_ARGUMENTS = 100
 LONG_OPTIONS = ("instance", "home", "model", "speedup", "console", "defaults", "sysid", "base-port", "uartA", "uartB")
 SET_BY_US = frozenset({*(f"--{name}" for name in LONG_OPTIONS), *(f"--serial{port}" for port in range(3))})
 SHORT_AND_SET_BY_US = frozenset({"-I", "-O", "-M", "-s", "-C"})
-"""Options of ArduPilot that the harness gives itself."""
+"""Options that the harness sets on the command line of ArduPilot."""
 
 
 def _read(read: Callable[[str, Path], Any], written_out: Any) -> BeforeValidator:
-    """Of text: what `read` finds under that name, beside the file that the scenario is in; else it is `written_out`."""
+    """Replace a text by the content of the file with this name, in the directory of the scenario file.
+
+    `read` reads the file. `written_out` is the type of a value that is no text.
+    """
 
     def value(asked: Any, info: ValidationInfo) -> Any:
         if not isinstance(asked, str):
@@ -81,15 +84,15 @@ def _on_earth(home: tuple[float, float, float, float]) -> tuple[float, float, fl
 
 Coordinates = tuple[float, float, float, float]
 Place = Annotated[Coordinates, AfterValidator(_on_earth), _read(_named, Coordinates)]
-"""Latitude and longitude in degrees, altitude in metres, heading in degrees; or a name in a `locations.txt`."""
+"""Latitude and longitude in degrees, altitude in metres, heading in degrees. Or a name in a `locations.txt`."""
 
 Pairs = dict[str, float]
 Parameters = Annotated[Pairs, AfterValidator(_sound), _read(lambda name, beside: parameters.read(beside / name), Pairs)]
-"""Pairs, or a file of them."""
+"""Parameter -> value, or the name of a parameter file."""
 
 Offsets = dict[Annotated[int, Field(ge=0, le=start_places.MAX_INSTANCE)], Offset]
 Swarm = Annotated[Offsets, _read(lambda name, beside: start_places.swarm(beside / name), Offsets)]
-"""By instance, from 0; or a file of them."""
+"""Instance, from 0 -> offset, or the name of a file of offsets."""
 
 Frame = Annotated[str, Field(pattern=r"^[A-Za-z0-9+][A-Za-z0-9_.+-]{0,63}$"), AfterValidator(_flown_here)]
 Arguments = Annotated[
@@ -98,66 +101,83 @@ Arguments = Annotated[
 
 
 class Wind(Model):
-    """Of ArduPilot's simulation: metres per second, the direction that it comes from, and how much it changes."""
+    """The wind in ArduPilot's simulation, from the start on."""
 
     speed_ms: Annotated[float, Field(ge=0, le=100)]
+    """Speed in metres per second (`SIM_WIND_SPD`)."""
     from_deg: Annotated[float, Field(ge=0, le=360)] = 180.0
+    """Direction from which the wind blows, in degrees clockwise from north (`SIM_WIND_DIR`)."""
     turbulence: Annotated[float, Field(ge=0, le=100)] = 0.0
+    """Strength of the turbulence (`SIM_WIND_TURB`)."""
 
     def parameters(self) -> dict[str, float]:
         return {"SIM_WIND_SPD": self.speed_ms, "SIM_WIND_DIR": self.from_deg, "SIM_WIND_TURB": self.turbulence}
 
 
 class EachVehicle(Model):
-    """What one vehicle has of its own."""
+    """Settings of one vehicle. They override the settings of all vehicles."""
 
     frame: Frame | None = None
+    """Frame that ArduPilot simulates. Default: the frame of all vehicles."""
     parameters: Parameters = {}
+    """ArduPilot parameters, in addition to those of all vehicles."""
     wind: Wind | None = None
+    """Wind at this vehicle. Default: the wind of all vehicles."""
     home: Place | None = None
+    """Home of this vehicle, as `vehicles.home`. Default: a place in the field, or from `vehicles.swarm`."""
     arguments: Arguments = []
+    """Arguments for ArduPilot, after those of all vehicles."""
     debugger: Debugger | None = None
+    """Debugger of this vehicle. Default: the debugger of all vehicles."""
 
 
 class Vehicles(Model):
-    """The vehicles under the agents. `kind` unset: ArduPilot if there are binaries of all types, else embedded ones.
-
-    `type` is that of all vehicles but those in `types`; `binary` is for a run of one type. What `each` says of a
-    vehicle comes before what is said of all, and is added to it where that is parameters or arguments.
-    """
+    """The vehicles that carry the agents."""
 
     kind: VehicleKind | None = None
+    """`ardupilot`: ArduPilot's SITL. `embedded`: simple vehicles inside the harness. `none`: no vehicles. Default:
+    ArduPilot if a binary for each type is installed, otherwise embedded vehicles."""
     type: VehicleType = "copter"
+    """Type of all vehicles that `types` does not list."""
     types: dict[VehicleKey, VehicleType] = {}
+    """Types of single vehicles, by vehicle ID."""
     binary: Path | None = None
+    """ArduPilot binary. An error if the vehicles have more than one type."""
     frame: Frame | None = None
-    """What ArduPilot simulates: quadplane, motorboat, heli, hexa, or whatever else its binary offers for the type."""
+    """Frame that ArduPilot simulates, such as quadplane, motorboat, heli or hexa. The binary decides which frames
+    exist. A frame of another type of vehicle is an error. Default: the frame of the type."""
     parameters: Parameters = {}
-    """ArduPilot's, from the start on: pairs, or a file of them."""
+    """ArduPilot parameters at the start, as pairs of name and value, or the name of a parameter file."""
     wind: Wind | None = None
+    """Wind in ArduPilot's simulation."""
     arguments: Arguments = []
-    """Further ones for ArduPilot's command line."""
+    """Additional arguments for ArduPilot, at most 100. Options that the harness sets, such as `--home`, are an
+    error."""
     debugger: Debugger | None = None
-    """What ArduPilot runs under: gdb tells where it crashed, valgrind what it did to memory."""
+    """Debugger that runs ArduPilot. gdb reports the place of a crash. valgrind reports memory errors."""
     log_mib: Annotated[int, Field(ge=0, le=1_000_000)] | None = 16
-    """How long ArduPilot's own log of a vehicle may get: 0 for none, null for no bound. It is about 3 MiB a minute."""
+    """Maximum size in MiB of ArduPilot's log of one vehicle. 0: no log. null: no limit. A log grows by about 3 MiB per
+    minute."""
     takeoff_altitude_m: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    """Altitude in metres above home to which vehicles without a flight plan take off."""
     home: Place = (-35.363262, 149.165237, 584.0, 353.0)
-    """Latitude and longitude in degrees, altitude in metres, heading in degrees, of the first vehicle; or a name in a
-    `locations.txt` as ArduPilot has it: beside the scenario, the user's own, or beside the binary."""
+    """Home of the first vehicle: latitude and longitude in degrees, altitude in metres, heading in degrees. Or a name
+    in a `locations.txt` in ArduPilot's format: in the directory of the scenario, in the user's own, or next to the
+    binary."""
     spacing_m: Annotated[float, Field(gt=0, le=10_000)] = SPACING_M
-    """How far apart the homes are, about, spread over the field round that of the first."""
+    """Approximate distance in metres between homes. The homes form a field around the home of the first vehicle."""
     swarm: Swarm = {}
-    """Where vehicles begin, from `home`: [east, north, up in metres, heading in degrees], or a file as ArduPilot's
-    swarminit.txt. The first vehicle is 0, as ArduPilot counts instances; the others are spread."""
+    """Homes of single vehicles, relative to `home`: [east, north, up in metres, heading in degrees]. Or the name of a
+    file like ArduPilot's swarminit.txt. Keys are ArduPilot's instance numbers: 0 is the vehicle with the lowest ID.
+    Other vehicles start in the field."""
     each: dict[VehicleKey, EachVehicle] = {}
-    """Of single vehicles."""
+    """Settings of single vehicles, by vehicle ID."""
 
     def type_of(self, vehicle: int) -> VehicleType:
         return self.types.get(vehicle, self.type)
 
     def setup_of(self, vehicle: int) -> Setup:
-        """What of its program may be like no other's."""
+        """Return the frame, parameters, arguments, debugger and log size of this vehicle."""
         own = self.each.get(vehicle, EachVehicle())
         given: dict[str, float] = {}
         for asked in (self, own):
@@ -172,7 +192,7 @@ class Vehicles(Model):
         )
 
     def home_of(self, vehicle: int, index: int) -> Home:
-        """Where a vehicle begins, the `index`-th of all, from 0. Raises VehicleError where that is not on Earth."""
+        """Return the home of a vehicle with this index in the roster. Raises VehicleError for an impossible place."""
         own, first = self.each.get(vehicle, EachVehicle()).home, self.field
         if own is not None:
             return Home(own[0], own[1], own[2], own[3] % 360)
@@ -182,11 +202,11 @@ class Vehicles(Model):
 
     @property
     def field(self) -> Home:
-        """Its middle."""
+        """The home of the first vehicle, and the middle of the field."""
         return Home(*self.home[:3], self.home[3] % 360)
 
     def check_frames(self, roster: tuple[int, ...]) -> None:
-        """Raises ValueError for a frame of another type of vehicle."""
+        """Raise ValueError for a frame of another type of vehicle."""
         for vehicle in roster:
             frame, own = self.setup_of(vehicle).frame, self.type_of(vehicle)
             if frame and type_of(frame) not in (None, own):
@@ -200,17 +220,20 @@ LEGS = ("take_off", "go_to", "loiter_s", "land")
 
 
 class Leg(Model):
-    """One of four: take off to metres above home, go to metres north and east of it, loiter (mission seconds), land.
-
-    `altitude_m` (above home) and `speed_ms` belong to `go_to`; without, the altitude stays and the speed is the type's.
-    """
+    """One leg of a flight plan. Needs exactly one of `take_off`, `go_to`, `loiter_s` and `land`."""
 
     take_off: float | None = None
+    """Altitude in metres above home to which the vehicle takes off."""
     go_to: tuple[float, float] | None = None
+    """Destination as [north, east] in metres from home."""
     altitude_m: float | None = None
+    """Altitude in metres above home, for `go_to` only. Default: the altitude before this leg."""
     speed_ms: float | None = None
+    """Speed in metres per second, for `go_to` only. Default: the speed of the type."""
     loiter_s: float | None = None
+    """Mission seconds to stay in place. A plane circles."""
     land: Literal[True] | None = None
+    """The vehicle lands."""
 
     @model_validator(mode="after")
     def _one_leg(self) -> "Leg":
@@ -229,14 +252,15 @@ class Leg(Model):
 
 
 class Flight(Model):
-    """A plan and the vehicles that fly it.
-
-    `by: mission`: uploaded by the MAVLink mission protocol and flown in AUTO; `guided`: leg by leg in GUIDED.
-    """
+    """A flight plan and the vehicles that fly it."""
 
     vehicles: Annotated[list[VehicleId], Field(min_length=1)]
+    """IDs of the vehicles. A vehicle in two plans is an error."""
     by: By = "mission"
+    """`mission`: upload the plan by the MAVLink mission protocol, and fly it in AUTO mode. `guided`: command one leg
+    after another in GUIDED mode."""
     plan: Annotated[list[Leg], Field(min_length=1, max_length=MAX_LEGS)]
+    """Legs in order. A leg that the type of vehicle cannot fly is an error."""
 
     def planned(self) -> Plan:
         return Plan(tuple(leg.planned() for leg in self.plan))

@@ -19,7 +19,7 @@ Agents = Annotated[list[VehicleId], Field(min_length=1)]
 Disk = Literal["kept", "lost"]
 
 RUNNING, PAUSED, KILLED, REBOOTING, SWITCHED_OFF = "running", "paused", "killed", "rebooting", "switched off"
-"""States of an agent. A fault may lead to another, with a word of its own."""
+"""States of an agent. A fault may define a further one."""
 
 CROSS = "M-5-5l10 10m0-10l-10 10"
 BARS = "M-3-5v10M3-5v10"
@@ -31,116 +31,118 @@ BAR = "M0-6v12"
 
 
 class Lives(Protocol):
-    """What a backend can do to an agent and its vehicle. None of it waits for mission time to pass."""
+    """The operations of a backend on an agent and its vehicle. None of them waits for mission time to pass."""
 
     async def end_life(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
-        """Destroy the agent, and with it its vehicle if asked; `disk_kept`: what it had stored is there later on."""
+        """End the agent, and its vehicle if `with_vehicle` is true. `disk_kept` keeps the data on its disk."""
 
     async def begin_life(self, agent_id: int, *, new_vehicle: bool = False) -> None:
-        """Start the agent anew, with what is on its disk if that was kept, and on another vehicle if asked."""
+        """Start the agent again, with the kept data of its disk, and on a new vehicle if `new_vehicle` is true."""
 
     async def fall(self, agent_id: int) -> None:
-        """Have the agent's vehicle fall to the ground, from now on."""
+        """Let the vehicle of the agent fall to the ground."""
 
     async def pause(self, agent_id: int) -> None:
-        """Have the agent stand still; what reaches it waits."""
+        """Stop the agent. Its incoming messages wait."""
 
     async def resume(self, agent_id: int) -> None: ...
 
     async def stop_logging(self, agent_id: int) -> None:
-        """Have the agent log no more events in this life."""
+        """Stop the event logging of the agent until it starts again."""
 
     async def switch_off(self, agent_id: int) -> None:
-        """Have the agent export its chain and end, and its vehicle with it."""
+        """Make the agent export its chain, then end it and its vehicle."""
 
     async def reconcile(self, agent_id: int) -> None:
-        """Have the agent begin a reconcile."""
+        """Make the agent start a reconcile."""
 
     async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
-        """Have these vehicles hear, from the ground, that the agent's keys are revoked."""
+        """Send the revocation of the agent's keys from the ground to the vehicles in `heard_by`."""
 
     async def befall(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
-        """Have the agent's vehicle simulate this, `what` in words; whether it does is on record at the end."""
+        """Make the vehicle of the agent simulate a circumstance. The run record says whether it did."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """At `at_s` mission seconds something happens to `agents`.
+    """A fault of `agents` at mission second `at_s`.
 
-    Further fields of a subclass are keys of its timeline entry, each of which it needs; their annotations say what they
-    may be. Fault itself is one of which nothing is known: it does nothing, and ends, takes and loses nothing.
+    Further fields of a subclass are keys of its timeline entry. The entry needs all of them. Their annotations declare
+    the allowed values. `Fault` itself stands for an unknown fault and has no effect.
     """
 
     at_s: float
     agents: tuple[int, ...]
     by_hand: bool = field(default=False, kw_only=True)
-    """Somebody asked for it while the mission was played."""
+    """True if a user requested the fault during the mission."""
 
     what: ClassVar[str] = ""
     """The key of a timeline entry, the word in records, and the verb in pytest."""
     is_asked_for: ClassVar[bool] = True
-    """Whether it is a key of a timeline entry; otherwise it comes of another fault."""
+    """True if the fault is a key of a timeline entry. False if another fault causes it."""
     needs: ClassVar[tuple[str, ...]] = ()
-    """The states that an agent may be in before."""
+    """States of an agent in which the fault is possible."""
     leads_to: ClassVar[str | None] = RUNNING
-    """The state that it is in afterwards; None: the same."""
+    """State of the agent after the fault. None: unchanged."""
     needs_keys: ClassVar[bool] = False
-    """Whether it is about keys, which only secured missions have."""
+    """True if the fault needs the keys of a secured mission."""
     ends_a_life: ClassVar[bool] = False
-    """What the agent held in memory is gone."""
+    """The agent loses the data in its memory."""
     begins_a_life: ClassVar[bool] = False
     takes_the_vehicle: ClassVar[bool] = False
-    """The vehicle is out of the air, with all that the agent held."""
+    """The vehicle leaves the mission, with all data of the agent."""
     leaves_an_export: ClassVar[bool] = False
-    """The life ends in order: what the agent held by then is in its export, and not lost."""
+    """The agent exports its data before it ends. The data is not lost."""
     brings_a_vehicle: ClassVar[bool] = False
-    """Another one, in the place of one that was taken."""
+    """The agent gets a new vehicle."""
     stands_still: ClassVar[bool] = False
-    """The agent lives and does nothing until the next fault."""
+    """The agent stays alive but does nothing until the next fault."""
     stops_events: ClassVar[bool] = False
-    """The agent logs nothing more in this life."""
+    """The agent logs no further events until it starts again."""
     keys_in_words: ClassVar[str] = ""
-    """What its further keys have to be, for whoever has left one out."""
+    """The further keys in words, for an error about a missing key."""
+    key_descriptions: ClassVar[Mapping[str, str]] = {}
+    """Further key -> its description for the scenario reference and the JSON Schema."""
     unless_told: ClassVar[Mapping[str, Any]] = {}
-    """What its further keys are in pytest, where a test leaves them out."""
+    """Default values of the further keys in pytest."""
     mark: ClassVar[str] = ""
-    """How the report's timeline shows it, an SVG path around the origin; without one it does not."""
+    """Mark in the timeline of the report: an SVG path around the origin. Without a mark, the report omits the fault."""
     meaning: ClassVar[str] = ""
-    """What the mark means; faults that mean the same share a mark."""
+    """Meaning of the mark. Faults with the same meaning share a mark."""
 
     async def strike(self, lives: Lives, agent_id: int) -> None:
-        """Do it to one of the agents."""
+        """Apply the fault to one of the agents."""
 
     def course(self) -> "Sequence[Fault]":
-        """All that happens to the agents by this entry of the timeline, in order."""
+        """Return all faults of this timeline entry, in time order."""
         return [self]
 
     def check(self, vehicles: Vehicles) -> None:
-        """Raises ValueError, with what to do instead, if it cannot happen to such vehicles."""
+        """Raise ValueError if these vehicles cannot have the fault. The message names an alternative."""
 
     @property
     def also_named(self) -> Sequence[int]:
-        """Vehicles that its further keys name."""
+        """Vehicle IDs in the further keys."""
         return ()
 
     @property
     def disk_left(self) -> Disk | None:
-        """What it leaves of the agents' disks; None if that is no question."""
+        """State of the disks after the fault. None if the fault does not concern disks."""
         return None
 
     @classmethod
     def loses_data(cls, disk: Disk | None) -> bool:
-        """Whether all that the agents held is gone, by what it left of their disks."""
+        """True if the agents lose all their data, given the state of their disks."""
         return cls.ends_a_life and not cls.leaves_an_export and disk != "kept"
 
     @classmethod
     def further_keys(cls) -> list[str]:
-        """Its keys in a timeline entry, beside `at_s` and the one that names it."""
+        """Return the keys of its timeline entry besides `at_s` and the name of the fault."""
         return [field.name for field in fields(cls) if field.name not in Fault.__dataclass_fields__]
 
     @classmethod
     def told(cls, *agents: int, **further: Any) -> dict[str, Any]:
-        """The verb in pytest: what a test says, as the keys of a timeline entry."""
+        """Return the keys of a timeline entry for the call of a test."""
         return {cls.what: list(agents), **cls.unless_told, **further}
 
     @property

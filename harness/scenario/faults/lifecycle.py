@@ -23,7 +23,7 @@ from harness.scenario.vehicles import Vehicles
 
 
 class Crash(Fault):
-    """Their vehicles fall to the ground; they are gone as by `kill`."""
+    """The vehicles of these agents fall to the ground. The agents end as with `kill`."""
 
     what = "crash"
     needs = (RUNNING, PAUSED)
@@ -43,7 +43,7 @@ class Crash(Fault):
 
 
 class Kill(Fault):
-    """They are gone with their vehicles, and all that they held with them (Section 3.3)."""
+    """These agents end, with their vehicles and all their data (Section 3.3)."""
 
     what = "kill"
     needs = (RUNNING, PAUSED)
@@ -58,7 +58,7 @@ class Kill(Fault):
 
 
 class Pause(Fault):
-    """They stand still, and what reaches them waits until `resume`."""
+    """These agents stop. Their incoming messages wait until `resume`."""
 
     what = "pause"
     needs = (RUNNING,)
@@ -73,11 +73,15 @@ class Pause(Fault):
 
 @dataclass(frozen=True)
 class Reboot(Fault):
-    """Their computers brown out; they are back after `down_s` with what was on their disks, or with nothing."""
+    """The computers of these agents fail, and start again after `down_s`, with or without the data on their disks."""
 
     down_s: Seconds
     disk: Disk
 
+    key_descriptions = {
+        "down_s": "Mission seconds until the agents of `reboot` start again.",
+        "disk": "Whether the agents of `reboot` start with the data on their disks, or with the inception block only.",
+    }
     what = "reboot"
     needs = (RUNNING, PAUSED)
     leads_to = REBOOTING
@@ -120,7 +124,7 @@ class Boot(Fault):
 
 
 class Restart(Fault):
-    """Killed agents begin anew, on vehicles at their homes, with nothing but the inception block."""
+    """These killed agents start again, on new vehicles at their homes, with the inception block only."""
 
     what = "restart"
     needs = (KILLED,)
@@ -134,7 +138,7 @@ class Restart(Fault):
 
 
 class Resume(Fault):
-    """Paused agents go on, with what has waited for them."""
+    """These paused agents continue, and receive the messages that waited for them."""
 
     what = "resume"
     needs = (PAUSED,)
@@ -146,7 +150,7 @@ class Resume(Fault):
 
 
 class SwitchOff(Fault):
-    """They are switched off for good: each exports its chain, as it is then, and ends (Section 4.2)."""
+    """These agents are switched off for the rest of the run. Each exports its chain and ends (Section 4.2)."""
 
     what = "switch_off"
     needs = (RUNNING,)

@@ -10,7 +10,7 @@ from harness.scenario.strict_model import VehicleId
 
 
 class Reconcile(Fault):
-    """They begin a reconcile, as the operator asks (Section 5.1); one that reconciles already goes on with that."""
+    """These agents start a reconcile, as an operator can request (Section 5.1). No effect during a reconcile."""
 
     what = "reconcile"
     needs = (RUNNING,)
@@ -24,10 +24,13 @@ Hearers = Annotated[list[VehicleId], Field(min_length=1)]
 
 @dataclass(frozen=True)
 class Revoke(Fault):
-    """The authority revokes their keys; those in `heard_by` hear it from the ground, the others from them."""
+    """The authority revokes the keys of these agents. Only secured missions have keys."""
 
     heard_by: Hearers
 
+    key_descriptions = {
+        "heard_by": "IDs of the vehicles that receive the message of `revoke` from the ground. They forward it."
+    }
     what = "revoke"
     needs = (RUNNING, PAUSED, KILLED, REBOOTING, SWITCHED_OFF)
     leads_to = None
@@ -45,7 +48,7 @@ class Revoke(Fault):
 
 
 class StopEvents(Fault):
-    """They log no more events, as a vehicle on the ground does (Section 4.2); votes and reconciles go on."""
+    """These agents log no further events, as a vehicle on the ground (Section 4.2). Votes and reconciles continue."""
 
     what = "stop_events"
     needs = (RUNNING,)

@@ -22,21 +22,21 @@ from sitl.circumstances import wind as of_wind
 from sitl.vehicle import VEHICLE_TYPES, VehicleType
 
 FALLING = "M-5-2l5 6 5-6M0-6v4"
-"""Marks beside those of `fault`: what befalls a vehicle, and the end of it."""
+"""Marks of the faults in this module: the start of a problem of a vehicle, and its end."""
 RISING = "M-5 4l5-6 5 6"
 TROUBLED, WELL_AGAIN = "its vehicle is in trouble", "its vehicle is well again"
 
 
 class VehicleFault(Fault):
-    """A kind of fault for the vehicles of `agents`, which fly on or act as their failsafes say; the agents run on."""
+    """A fault of the vehicles of `agents`. A vehicle flies on, or its failsafe acts. The agents continue to run."""
 
     needs = (RUNNING,)
     of_types: ClassVar[tuple[VehicleType, ...]] = VEHICLE_TYPES
-    """Those that it can befall."""
+    """Types of vehicles that can have this fault."""
 
     @property
     def circumstance(self) -> Circumstance:
-        """What the vehicles are to simulate."""
+        """The circumstance that the vehicles simulate."""
         raise NotImplementedError
 
     def check(self, vehicles: Vehicles) -> None:
@@ -51,7 +51,7 @@ class VehicleFault(Fault):
 
     @property
     def whose(self) -> str:
-        """ "vehicles 1 2"."""
+        """The vehicles in words: "vehicles 1 2"."""
         return f"vehicle{'s' if len(self.agents) > 1 else ''} {' '.join(map(str, self.agents))}"
 
     @property
@@ -61,9 +61,11 @@ class VehicleFault(Fault):
 
 @dataclass(frozen=True)
 class Battery(VehicleFault):
-    """Their vehicles' batteries have `volts` from now on, and are used up from there."""
+    """The batteries of these vehicles drop to `volts`, and discharge further."""
 
     volts: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
+
+    key_descriptions = {"volts": "Voltage of the batteries of `battery`."}
 
     what = "battery"
     unless_told = {"volts": 10.4}
@@ -81,7 +83,7 @@ class Battery(VehicleFault):
 
 
 class LoseCompass(VehicleFault):
-    """None of their vehicles' compasses works from now on."""
+    """All compasses of these vehicles fail."""
 
     what = "lose_compass"
     mark = FALLING
@@ -93,7 +95,7 @@ class LoseCompass(VehicleFault):
 
 
 class RegainCompass(VehicleFault):
-    """Their vehicles' compasses work again."""
+    """The compasses of these vehicles work again."""
 
     what = "regain_compass"
     mark = RISING
@@ -105,7 +107,7 @@ class RegainCompass(VehicleFault):
 
 
 class LoseGps(VehicleFault):
-    """Their vehicles have no GPS from now on."""
+    """These vehicles lose GPS."""
 
     what = "lose_gps"
     mark = FALLING
@@ -117,7 +119,7 @@ class LoseGps(VehicleFault):
 
 
 class RegainGps(VehicleFault):
-    """Their vehicles have a GPS again."""
+    """These vehicles have GPS again."""
 
     what = "regain_gps"
     mark = RISING
@@ -129,7 +131,7 @@ class RegainGps(VehicleFault):
 
 
 class StopMotor(VehicleFault):
-    """One motor of each of their copters gives no thrust any more: one with four falls."""
+    """One motor of each of these copters stops. A copter with four motors falls."""
 
     what = "stop_motor"
     of_types = ("copter",)
@@ -143,10 +145,15 @@ class StopMotor(VehicleFault):
 
 @dataclass(frozen=True)
 class Wind(VehicleFault):
-    """Their vehicles are in wind of `wind_ms` metres per second that comes from `from_deg`; of 0 it is over."""
+    """The wind at these vehicles changes to `wind_ms` from `from_deg`. A speed of 0 ends the wind."""
 
     wind_ms: Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)]
     from_deg: Annotated[float, Field(ge=0, lt=360, allow_inf_nan=False)]
+
+    key_descriptions = {
+        "wind_ms": "Speed of `wind` in metres per second.",
+        "from_deg": "Direction from which `wind` blows, in degrees clockwise from north.",
+    }
 
     what = "wind"
     unless_told = {"wind_ms": 10.0, "from_deg": 0.0}
