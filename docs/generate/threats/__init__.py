@@ -1,6 +1,6 @@
-"""Who could harm a secured mission, and what comes of it: each row of the table is played, in virtual time.
+"""The table of attacks on a secured mission. Each row is played in virtual time.
 
-`python -m docs.generate.threats` plays all, and puts the table into docs/explanation/security.md.
+`python -m docs.generate.threats` plays all rows, and writes the table into docs/explanation/security.md.
 """
 
 from docs.generate.threats.rows import ROWS, Row

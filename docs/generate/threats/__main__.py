@@ -1,4 +1,4 @@
-"""`python -m docs.generate.threats`: play all threats, and put the table into docs/explanation/security.md."""
+"""`python -m docs.generate.threats`: play all attacks, and write the table into docs/explanation/security.md."""
 
 from pathlib import Path
 

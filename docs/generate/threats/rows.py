@@ -1,4 +1,4 @@
-"""The rows: who, what they do, and the scenario in which they do it."""
+"""The rows of the table: attacker, attack, and the scenario in which the attack is played."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,10 +12,10 @@ LOST_S, REVOKED_S, ATTACK_S = 100, 200, 300
 
 @dataclass(frozen=True)
 class Row:
-    """`attack` are entries of the timeline without their times; with `captured` whoever attacks has vehicle 3's keys.
+    """One attack. `attack` has entries of the timeline without their times.
 
-    `revoked`: they are revoked before it begins. `quirks` are those of vehicle 3, which then is a traitor. `own` are
-    keys of the scenario that are as nowhere else.
+    With `captured` the attacker has the keys of vehicle 3. With `revoked` these keys are revoked before the attack.
+    `quirks` are wrong handlers of vehicle 3. `own` replaces keys of the scenario.
     """
 
     who: str
@@ -94,31 +94,31 @@ _ALL_IN_STEP: dict[str, Any] = {
     ],
     "final_reconcile": False,
 }
-"""Blocks fill while all have a block to vote on; the livelock that it ends in was found by `prove --captured`."""
+"""The livelock that `prove --captured` found. Blocks become full while all agents have a block to vote on."""
 
 ROWS = (
     Row("outsider", "forges a commit and votes, and floods", (_commit(2), _answers(2, "Block Add Response"), _FLOOD)),
-    Row("replayer", "sends all that it hears again: at once, later, and with a bit flipped", _AGAIN),
-    Row("captor of vehicle 3", "commits a block in vehicle 2's name", (_commit(2),), captured=True),
-    Row("captor of vehicle 3", "commits a block in vehicle 3's name", (_commit(CAPTURED),), captured=True),
-    Row("captor of vehicle 3", "answers all questions with lies", _LIES, captured=True),
-    Row("captor of vehicle 3", "floods, in any name", (_FLOOD,), captured=True),
+    Row("outsider", "replays datagrams at once, later, and with flipped bits", _AGAIN),
+    Row("captured vehicle 3", "commits a block in the name of vehicle 2", (_commit(2),), captured=True),
+    Row("captured vehicle 3", "commits a block in the name of vehicle 3", (_commit(CAPTURED),), captured=True),
+    Row("captured vehicle 3", "answers all requests falsely", _LIES, captured=True),
+    Row("captured vehicle 3", "floods, in any name", (_FLOOD,), captured=True),
     Row(
-        "captor of vehicle 3, revoked afterwards",
-        "commits another block to each, and has all reconcile at once while they vote; no final reconcile",
+        "captured vehicle 3, revoked later",
+        "commits a different block to each agent, and makes all reconcile during their votes; no final reconcile",
         captured=True,
         own=_ALL_IN_STEP,
     ),
     Row(
-        "captor of vehicle 3, revoked",
-        "does all of that",
+        "captured vehicle 3, revoked",
+        "commits in both names, answers falsely, and floods",
         (_commit(2), _commit(CAPTURED), *_LIES, _FLOOD),
         captured=True,
         revoked=True,
     ),
-    Row("traitor, vehicle 3", "disapproves of every block", quirks=("disapprove_everything",)),
-    Row("traitor, vehicle 3", "hides its commits", quirks=("hide_commits",)),
-    Row("traitor, vehicle 3", "commits others' blocks twice", quirks=("commit_others_twice",)),
-    Row("traitor, vehicle 3", "says to contain every chain", quirks=("contain_everything",)),
-    Row("traitor, vehicle 3, revoked", "disapproves of every block", revoked=True, quirks=("disapprove_everything",)),
+    Row("dishonest vehicle 3", "disapproves of every block", quirks=("disapprove_everything",)),
+    Row("dishonest vehicle 3", "hides its commits", quirks=("hide_commits",)),
+    Row("dishonest vehicle 3", "commits blocks of others twice", quirks=("commit_others_twice",)),
+    Row("dishonest vehicle 3", "claims to contain every chain", quirks=("contain_everything",)),
+    Row("dishonest vehicle 3, revoked", "disapproves of every block", revoked=True, quirks=("disapprove_everything",)),
 )

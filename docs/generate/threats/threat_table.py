@@ -1,4 +1,4 @@
-"""What comes of a threat: which characteristics are violated in some run, and why what was sent was not believed."""
+"""Play an attack, and report the violated characteristics and the reasons of dropped datagrams."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -9,26 +9,26 @@ from harness.run.simulate import simulate
 from harness.scenario.verdict_names import CHARACTERISTICS
 
 SEEDS = (1, 2)
-HEADER = "| who | does | 1 | 2 | 3 | 4 | 5 | 6 | dropped as |\n|---|---|:-:|:-:|:-:|:-:|:-:|:-:|---|\n"
+HEADER = "| attacker | attack | 1 | 2 | 3 | 4 | 5 | 6 | dropped because |\n|---|---|:-:|:-:|:-:|:-:|:-:|:-:|---|\n"
 
 
-OTHERS, ITSELF, NOBODY = "\u2718", "(\u2718)", "\u00b7"
-"""Whose record violates a characteristic: that of others or the swarm as a whole, that of vehicle 3 alone, or none."""
+OTHERS, ITSELF, NONE = "\u2718", "(\u2718)", "\u00b7"
+"""The mark of a characteristic: violated by others or the swarm as a whole, by vehicle 3 alone, or not at all."""
 
 SWARM = 0
-"""Who violates what no single record shows."""
+"""Stands for the swarm as a whole if a violation has no agent."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """`marks` says of each characteristic whose record violates it, `dropped` why datagrams were, the most first."""
+    """The mark of each characteristic, and the reasons of dropped datagrams, most frequent first."""
 
     marks: dict[str, str]
     dropped: list[str]
 
 
 def outcome(row: Row) -> Outcome:
-    """That of all seeds together."""
+    """Return the combined outcome of all seeds."""
     guilty: dict[str, set[int]] = {key: set() for key in CHARACTERISTICS}
     dropped = Counter[str]()
     for seed in SEEDS:
@@ -39,15 +39,13 @@ def outcome(row: Row) -> Outcome:
                 guilty[key].update({finding.agent_id for finding in judgement.evidence} or {SWARM})
         for agent in run.played.agents.values():
             dropped.update(agent.get("dropped", {}))
-    marks = {
-        key: NOBODY if not agents else ITSELF if agents == {CAPTURED} else OTHERS for key, agents in guilty.items()
-    }
+    marks = {key: NONE if not agents else ITSELF if agents == {CAPTURED} else OTHERS for key, agents in guilty.items()}
     return Outcome(marks, [reason for reason, _ in dropped.most_common()])
 
 
 def table(rows: Iterable[Row] = ROWS) -> Iterator[str]:
-    """The table, line by line, in Markdown."""
+    """Yield the lines of the table in Markdown."""
     yield HEADER
     for row in rows:
-        came = outcome(row)
-        yield f"| {row.who} | {row.does} | {' | '.join(came.marks.values())} | {', '.join(came.dropped)} |\n"
+        found = outcome(row)
+        yield f"| {row.who} | {row.does} | {' | '.join(found.marks.values())} | {', '.join(found.dropped)} |\n"
