@@ -37,7 +37,7 @@ def row(agents: int, rounds: int, directory: Path) -> dict[str, Any]:
     traces = list((directory / "agents").glob(f"*{SUFFIX}"))
     reports, lines = [], []
     for _ in range(rounds):
-        reports.append(seconds(lambda: write_report(RunArchive(directory))))
+        reports.append(seconds(lambda: write_report(RunArchive(directory, skim=True))))
         lines.append(seconds(lambda: lines_alone(traces)))
     return {
         "agents": agents,
