@@ -1,7 +1,18 @@
 """The command line: the list of commands, in panels.
 
-Exit status 0: ran, and no characteristic is violated. 1: at least one is violated, or an agent failed. 2: the request
-was wrong. 3: this machine cannot do it. 4: `prove` reached a limit. 130: interrupted.
+Exit statuses, of which `docs/reference/commands.md` has a table:
+
+- 0: the command completed, and its result is good.
+- 1: the result is bad. A check of the run has a bad verdict (a characteristic, the steps, the records or the liveness).
+  Or an agent under test crashed, hung, refused a command, or gave an invalid or irreproducible answer. Or a command
+  that compares, searches or proves has a negative result: see the help of `bisect`, `conformance`, `consolidate`,
+  `diff`, `doctor`, `explore`, `keys inspect`, `matrix`, `mission verify`, `prove`, `reconstruct`, `replay` and
+  `validate`.
+- 2: the scenario, an argument or an input file is wrong, or no input is usable.
+- 3: this machine cannot do it, or an agent does not support it.
+- 4: `prove` reached a limit.
+- 125 and 128: `bisect --once` cannot try the code, or its request is wrong. 128 also stands for an old command name.
+- 130: interrupted.
 """
 
 import errno
@@ -20,7 +31,7 @@ from harness.errors import WRONG_REQUEST, HarnessError, MachineError
 from harness.gc_pause import gc_paused
 
 MAX_NAME = 200
-"""More of a file's name is not shown."""
+"""Maximum number of characters of a file name in an error."""
 
 
 class Command(NamedTuple):
@@ -126,17 +137,20 @@ OLD_NAMES = {
     "again": "`ucp-harness bisect --once`",
     "scale": "`ucp-harness matrix growth_matrix`",
 }
-"""Commands that had another name, and what to run instead."""
+"""Old name of a command -> the call that replaces it."""
 
 
 class OldNameError(HarnessError):
-    """The command has another name. `git bisect run` stops at this status, and would take 2 for a bad commit."""
+    """The command has another name now.
+
+    `git bisect run` stops at status 128. It would take status 2 for a bad commit.
+    """
 
     exit_status = 128
 
 
 class Commands(TyperGroup):
-    """All commands, of which only the one that is called is there in full."""
+    """All commands. Only the called command is loaded."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] in COMMANDS:
@@ -147,7 +161,7 @@ class Commands(TyperGroup):
 
 
 def loaded(name: str) -> Any:
-    """The command in full, or the group of commands."""
+    """Return the command, or the group of commands, with its arguments and options."""
     module, _, attribute = COMMANDS[name].where.partition(":")
     with gc_paused():
         command = getattr(import_module(module), attribute)
@@ -181,7 +195,7 @@ def _harness(
 
 
 class _Output(io.FileIO):
-    """Standard output. A reader that has seen enough (`| head`) ends what is printed, and nothing else."""
+    """Standard output. When its reader ends early (`| head`), the command continues without output."""
 
     def write(self, data: Any, /) -> int:
         try:
@@ -192,8 +206,8 @@ class _Output(io.FileIO):
 
 
 def main() -> NoReturn:
-    """The console script: a user's mistake ends in one sentence and the right exit status, never in a traceback."""
-    if sys.stdout is None:  # it was closed before we began: nobody wants to read
+    """Run the console script. A mistake of the user ends in one sentence and an exit status, never in a traceback."""
+    if sys.stdout is None:  # the caller closed it
         sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     elif sys.stdout is (own := sys.__stdout__):
         sys.stdout = io.TextIOWrapper(
@@ -214,7 +228,7 @@ def main() -> NoReturn:
             _end(f"{str(error.filename)[:MAX_NAME]}: cannot be looked at: {error.strerror}", exit_status=WRONG_REQUEST)
         if error.filename is not None:
             raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discard the buffered output
         _end(f"standard output cannot be written: {error.strerror}", exit_status=MachineError.exit_status)
     sys.exit(0)
 

@@ -5,12 +5,14 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from harness.cli import COMMANDS, loaded
 from harness.json_schemas import texts
 from harness.scenario.load import parse
 from tests.pages import play
@@ -67,6 +69,37 @@ def test_the_reference_has_every_key_of_a_scenario(site: Path) -> None:
     for key in ("final_reconcile", "vote_timeout_s", "hold_until_s", "takeoff_altitude_m", "reboot"):
         assert f"<code>{key}</code>" in text
     assert "Any program that follows ucp/contract/CONTRACT.md" in text  # a docstring in the source
+
+
+def test_commands_page_has_each_command_and_option(site: Path) -> None:
+    text = (site / "reference/commands.html").read_text()
+    options = 0
+    for name, command in all_commands():
+        start = text.index(f">{name}<a")
+        section = text[start : text.find("<h", start + 1)]
+        for parameter in command.params:
+            for option in (*parameter.opts, *parameter.secondary_opts) if parameter.param_type_name == "option" else ():
+                assert re.search(rf"<code>(?:[^<]*[ /])?{re.escape(option)}\b", section), (name, option)
+                options += 1
+    assert options > 100
+
+
+def test_commands_page_has_the_exit_statuses_of_each_command(site: Path) -> None:
+    text = (site / "reference/commands.html").read_text()
+    for name, command in all_commands():
+        start = text.index(f">{name}<a")
+        own = "xit status 0" in (command.help or "")
+        assert ("<strong>Exit status</strong>" in text[start : text.find("<h", start + 1)]) == own, name
+
+
+def all_commands() -> Iterator[tuple[str, Any]]:
+    """Yield each command with its name, those inside of groups too."""
+    for name in COMMANDS:
+        command = loaded(name)
+        if hasattr(command, "commands"):
+            yield from ((f"ucp-harness {name} {inner}", part) for inner, part in command.commands.items())
+        else:
+            yield f"ucp-harness {name}", command
 
 
 def test_every_key_of_a_scenario_has_a_description() -> None:

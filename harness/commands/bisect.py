@@ -102,7 +102,7 @@ def bisect_command(
     """Find the commit that changes how a scenario or record plays.
 
     Exit status 0: the commit is found. 1: both ends have the same outcome, or only commits that cannot be tried are
-    left.
+    left. 2: the request is wrong, or the repository cannot be read. 3: this machine cannot play the subject.
 
     With --once, the command tries the code in --repository. Exit status 0: the outcome is as expected (of records: as
     recorded). 1: it changed. 125: this code cannot be tried. 128: the request is wrong.

@@ -57,6 +57,9 @@ def conformance_command(
     """Test one agent alone with thousands of generated cases.
 
     The harness plays the agent's peers over UDP.
+
+    Exit status 0: every case passed. 1: a case failed. 3: no case failed, but a case was not tried. With --matrix, the
+    highest status of all agents counts; 2: an agent could not be tested.
     """
     refuse_existing(path for path in (junit, keep, write) if path is not None)
     if only is not None and only not in HANDLERS and only not in map(str, TITLES):

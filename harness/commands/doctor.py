@@ -23,7 +23,10 @@ def doctor_command(
         Kernel, typer.Option(help="Kernel to examine: this machine's, or User Mode Linux.")
     ] = Kernel.host,
 ) -> None:
-    """Report what this machine can do, and how to enable the rest."""
+    """Report what this machine can do, and how to enable the rest.
+
+    Exit status 0: this machine can play runs. 1: with --measure, an engine deviates. 3: a needed feature is missing.
+    """
     if kernel is Kernel.uml:
         asked = {"--json": as_json, "--measure": measure}
         raise typer.Exit(run_inside(["doctor", *(option for option, wanted in asked.items() if wanted)]))

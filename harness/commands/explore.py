@@ -67,6 +67,8 @@ def explore_command(
     With --for or --runs the command hunts instead. It changes events, fates, timings, partitions, deaths and settings,
     and keeps runs that reach new local states. Each run ends in a liveness phase. Findings are new, ongoing, rare or
     resolved compared with the previous hunt in the same --corpus.
+
+    Exit status 0: no run is bad. 1: a run is bad or failed; of a hunt: a run failed, or a finding is not resolved.
     """
     if for_time is not None or runs is not None:
         if seeds is not None or out is not None:

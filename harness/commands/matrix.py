@@ -47,6 +47,9 @@ def matrix_command(
 
     Mission lengths and backends can vary, too. The report has figures with 95 % intervals, and each violation. With
     three or more swarm sizes or mission lengths, it also has power laws of how figures grow.
+
+    Exit status 0: no run is bad. 1: a run is bad or failed, or a figure is worse than in --against. 3: an agent does
+    not support a run.
     """
     request = matrix.load_matrix(file, backend)
     if secured:

@@ -54,7 +54,11 @@ def check_command(
     paths: Annotated[list[Path], typer.Argument(help="Run directory, or chain exports.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
 ) -> None:
-    """Judge chain exports and traces by the six characteristics."""
+    """Judge chain exports and traces by the six characteristics.
+
+    Exit status 0: no verdict is bad. 1: a verdict is bad. 2: no export exists, or a file could not be read. 3: no
+    verdict is bad, and an agent did not support the run.
+    """
     archive = RunArchive(*paths)
     evidence = checker.gather(archive)
     result, survived = checker.check(evidence), survival(evidence)

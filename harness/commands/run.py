@@ -87,7 +87,11 @@ def run_command(
         Kernel, typer.Option(rich_help_panel=RARE, help="This machine's kernel, or User Mode Linux, which has netem.")
     ] = Kernel.host,
 ) -> None:
-    """Play a scenario, judge it, and write a report."""
+    """Play a scenario, judge it, and write a report.
+
+    Exit status 0: no verdict is bad. 1: a verdict is bad, or an agent failed. 2: the scenario is wrong, or a scripted
+    fate matched no message. 3: this machine cannot play it, or an agent does not support it. 130: interrupted.
+    """
     console = Console()
     asked, own_seed = scenario_of(scenario)
     request = _with_options(asked, speedup, vehicles, gcs, capture, image_from_host)
