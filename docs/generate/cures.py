@@ -1,7 +1,7 @@
-"""`python -m docs.generate.cures`: measure the cost and the gain of each cure over the loss matrix of the thesis.
+"""`python -m docs.generate.cures`: measure the cost and the effect of each cure over the loss matrix of the thesis.
 
-Each is played with the same seeds as the thesis's settings are. The tables of the page come from here; the words around
-them are written by hand.
+Each cure uses the same seeds as the default settings. This program writes the tables of the page. The text around them
+is written by hand.
 """
 
 import sys
@@ -21,19 +21,20 @@ from harness.sweep.matrix.matrix_table import say_interval, say_mean
 from ucp.agent_files import write_atomically
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs/explanation/livelocks.md"
+PAGE = ROOT / "docs/appendix/livelock-measurements.md"
 MATRIX = ROOT / "scenarios/thesis_matrix.yaml"
 BEGIN, END = "<!-- table: begin -->\n", "<!-- table: end -->\n"
 SHOWN = ("uniform", "mutual_share", "reconciles", "messages_per_block")
+ALL_IDLE = "All {runs:,} runs of each row became idle in time."
 UNIFORM_AT = Metric("uniform_at_s", "seconds until one chain, of runs that have one", figure("uniform_at_s"))
 TIMER_S = 0.5
 STAGGER: Stagger = {"vote_timeout_s": 0.3, "phase1_timeout_s": 0.15, "phase2_timeout_s": 0.15, "phase3_timeout_s": 0.15}
-"""All timers of an agent are longer by the same share than those of the agent before it: 3 % of the thesis's."""
+"""Each agent's timers are longer than those of the agent before it, by 3 % of the default durations."""
 SEEDS = 50
-"""The first so many of the matrix."""
+"""Number of seeds, from the start of the matrix's list."""
 
 CURES: dict[str, dict[str, Any]] = {
-    "none (the thesis)": {},
+    "none (thesis)": {},
     f"`stagger: {{vote_timeout_s: {TIMER_S}}}`": {"stagger": {"vote_timeout_s": TIMER_S}},
     f"`stagger: {{phase1_timeout_s: {TIMER_S}}}`": {"stagger": {"phase1_timeout_s": TIMER_S}},
     "all timers staggered by 3 %": {"stagger": STAGGER},
@@ -56,14 +57,14 @@ class Task(NamedTuple):
 
 
 def play(matrix: Matrix, task: Task) -> tuple[Figures, bool]:
-    """Its figures, and whether the swarm became idle."""
+    """Return the figures of a run, and whether the swarm became idle."""
     document = matrix.scenario_at(task.point).model_dump(exclude_unset=True) | CURES[task.cure]
     simulated = simulate(Scenario.model_validate(document), task.seed)
     return simulated.result.figures, simulated.played.settled
 
 
 def tables(jobs: int) -> str:
-    """Markdown: a table for each figure, with a row for each cure and a column for each loss."""
+    """Return Markdown: a table for each figure, with a row for each cure and a column for each loss."""
     matrix = load_matrix(MATRIX)
     tasks = [Task(cure, point, seed) for cure in CURES for point in matrix.points for seed in matrix.seed_list[:SEEDS]]
     figures: dict[tuple[str, float], list[Figures]] = defaultdict(list)
@@ -76,9 +77,10 @@ def tables(jobs: int) -> str:
             settled[task.cure].append(outcome[1])
     shown = [metric for metric in METRICS if metric.name in SHOWN] + [UNIFORM_AT]
     parts = [_table(metric, matrix.loss, figures) for metric in shown]
-    runs = len(settled["none (the thesis)"])
-    idle = ", ".join(f"{cure} {runs - sum(those)}" for cure, those in settled.items())
-    return "\n".join([*parts, f"Of {runs:,} runs of each so many did not become idle in time: {idle}.\n"])
+    runs = len(settled["none (thesis)"])
+    active = ", ".join(f"{cure} {runs - sum(those)}" for cure, those in settled.items() if not all(those))
+    sentence = f"Of {runs:,} runs of each row, some did not become idle in time: {active}." if active else ALL_IDLE
+    return "\n".join([*parts, f"{sentence.format(runs=runs)}\n"])
 
 
 def _table(metric: Metric, losses: list[float], figures: dict[tuple[str, float], list[Figures]]) -> str:

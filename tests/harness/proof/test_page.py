@@ -1,4 +1,5 @@
-"""Compare the quick rows of the tables in appendix/proof-bounds.md and explanation/livelocks.md with the prover."""
+"""Compare the quick rows of the tables in appendix/proof-bounds.md and appendix/livelock-measurements.md with the
+prover."""
 
 import re
 from collections.abc import Iterator
@@ -130,8 +131,9 @@ class Cell(NamedTuple):
 
 
 def ways_round() -> Iterator[Cell]:
-    """The cells of docs/explanation/livelocks.md that have few states."""
-    table = (DOCS / "explanation/livelocks.md").read_text().partition("<!-- ways round -->\n")[2].partition("\n\n")[0]
+    """Yield the cells of docs/appendix/livelock-measurements.md that have few states."""
+    page = (DOCS / "appendix/livelock-measurements.md").read_text()
+    table = page.partition("<!-- ways round -->\n")[2].partition("\n\n")[0]
     head, _, *lines = table.splitlines()
     columns = [[part.split()[0] for part in name.split(", ")] for name in cells(head)[1:]]
     for line in lines:

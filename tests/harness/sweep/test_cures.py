@@ -1,4 +1,4 @@
-"""The table of cures in docs/explanation/livelocks.md: each of its cells is played."""
+"""Play each cell of the table of cures in docs/appendix/livelock-measurements.md."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from tests.harness.scenario.test_scenarios import SCENARIOS
 
-PAGE = Path(__file__).parents[3] / "docs/explanation/livelocks.md"
+PAGE = Path(__file__).parents[3] / "docs/appendix/livelock-measurements.md"
 SEED = 1
 SIZES = range(4, 9)
 """Of swarms in which all refuse one agent."""
