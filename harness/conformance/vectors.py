@@ -74,7 +74,7 @@ def to_lines(generated: Sequence[Vectors]) -> Iterator[str]:
         {
             "schema": SCHEMA,
             "vectors": total,
-            "about": "ucp-harness conformance --write; see docs/how-to/test-one-agent.md",
+            "about": "ucp-harness conformance --write; see docs/reference/conformance.md",
         }
     )
     number = 0

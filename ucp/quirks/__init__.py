@@ -33,11 +33,11 @@ MAX_NAME = 40
 
 
 class UnknownQuirkError(ValueError):
-    """A mistake that this agent cannot make."""
+    """The name of a quirk is unknown."""
 
 
 def check_quirk(name: str, value: object) -> None:
-    """Raises ValueError: what the value may be; UnknownQuirkError: which quirks there are."""
+    """Raises ValueError for a value that is not allowed, and UnknownQuirkError for an unknown name."""
     if name not in QUIRKS:
         name = name[:MAX_NAME]
         near = ", ".join(get_close_matches(name, QUIRKS, cutoff=0.0))
@@ -53,7 +53,7 @@ def in_force(quirks: Mapping[str, bool | float]) -> dict[str, float]:
 def wrong_handlers(quirks: Mapping[str, bool | float], lots: Random) -> list[EventHandler[Any]]:
     """The handlers of an agent with these quirks; none if no quirk is in force.
 
-    What is random about them is drawn from `lots`.
+    They draw random numbers from `lots`.
     """
     wrong = in_force(quirks)
     if not wrong:

@@ -1,4 +1,4 @@
-"""What can be wrong about building and committing blocks: Algorithms 1-6."""
+"""Mistakes in building and committing blocks: Algorithms 1-6."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,7 +26,7 @@ def lose_completed_block(good: Helper, core: Core, block: Block) -> None:
 
 @quirk(1, helper=Core.trigger)
 def complete_and_wait(good: Helper, core: Core, event: LocalEvent) -> None:
-    """A completed block is not proposed until something else looks into the deque."""
+    """A completed block triggers no proposal. It waits until another event processes the deque."""
 
 
 @quirk(2)
@@ -48,7 +48,7 @@ def propose_while_reconciling(good: Handler, core: Core) -> str:
 
 @quirk(2)
 def propose_back_of_deque(good: Handler, core: Core) -> str:
-    """The agent has the back of the deque voted on, and then commits the front."""
+    """The agent proposes the block at the back of the deque, and then commits the block at the front."""
     core.blocks_to_be_committed.rotate(1)
     branch = good(core)
     core.blocks_to_be_committed.rotate(-1)
@@ -57,7 +57,7 @@ def propose_back_of_deque(good: Handler, core: Core) -> str:
 
 @quirk(2, helper=Core.send)
 def propose_earlier_top(good: Helper, core: Core, message: BlockAddRequest) -> None:
-    """A proposal names the chain as it was one block earlier."""
+    """A proposal names the top chain hash of one block earlier."""
     chain_hashes = [core.chain.inception.chain_hash, *(chain_hash for _, chain_hash in core.chain.with_chain_hashes())]
     good(core, replace(message, chain_hash=chain_hashes[-2:][0]))
 
@@ -73,7 +73,7 @@ def forget_own_vote(good: Handler, core: Core) -> str:
 
 @quirk(2)
 def keep_old_votes(good: Handler, core: Core) -> str:
-    """A vote begins with the tally of the one before."""
+    """A vote starts with the tally of the previous vote."""
     before = core.vote_count
     branch = good(core)
     if branch == "proposed":
@@ -83,7 +83,7 @@ def keep_old_votes(good: Handler, core: Core) -> str:
 
 @quirk(2, helper=Core.start)
 def hasty_vote(good: Helper, core: Core, timer: Timer, duration_s: float) -> None:
-    """A vote lasts a thousandth of the time that it should."""
+    """The voting timer runs for a thousandth of its duration."""
     good(core, timer, duration_s / 1000)
 
 
@@ -107,14 +107,14 @@ def vote_while_reconciling(good: Handler, core: Core, sender: int, message: Bloc
 
 @quirk(4)
 def count_votes_twice(good: Handler, core: Core, sender: int, message: BlockAddResponse) -> str:
-    """A vote counts as often as it arrives."""
+    """Each copy of a vote counts."""
     core.voters.discard(sender)
     return good(core, sender, message)
 
 
 @quirk(4)
 def count_votes_for_others(good: Handler, core: Core, sender: int, message: BlockAddResponse) -> str:
-    """Votes for other agents' blocks count for the candidate."""
+    """Votes on blocks of other agents count for the agent's own candidate."""
     if core.candidate_block is not None:
         message = replace(message, block_hash=core.candidate_block.block_hash)
     return good(core, sender, message)
@@ -122,13 +122,13 @@ def count_votes_for_others(good: Handler, core: Core, sender: int, message: Bloc
 
 @quirk(4)
 def count_no_votes(good: Handler, core: Core, sender: int, message: BlockAddResponse) -> str:
-    """The agent counts nobody's vote but its own."""
+    """The agent counts only its own vote."""
     return "no vote running"
 
 
 @quirk(5)
 def tie_is_majority(good: Handler, core: Core) -> str:
-    """As many approvals as disapprovals are a majority: >= for >."""
+    """An equal number of approvals and disapprovals is a majority (>= instead of >)."""
     if core.vote_count["yes"] == core.vote_count["no"]:
         core.vote_count["yes"] += 1
     return good(core)
@@ -136,21 +136,21 @@ def tie_is_majority(good: Handler, core: Core) -> str:
 
 @quirk(5)
 def commit_whatever_the_vote(good: Handler, core: Core) -> str:
-    """The agent commits its candidate whatever the vote said."""
+    """The agent commits its candidate regardless of the vote."""
     core.vote_count["yes"] += core.vote_count["no"] + 1
     return good(core)
 
 
 @quirk(5)
 def commit_onto_changed_chain(good: Handler, core: Core) -> str:
-    """The agent commits its candidate although its chain has changed since it was proposed."""
+    """The agent commits its candidate although its chain has changed since the proposal."""
     core.top_chain_hash_at_initiation = core.chain.top_chain_hash
     return good(core)
 
 
 @quirk(5)
 def change_without_new_vote(good: Handler, core: Core) -> str:
-    """A vote that a changed chain has made void is not held again (the pseudo-code as printed)."""
+    """If the chain changes during a vote, the agent holds no new vote (the pseudo-code as printed)."""
     branch = good(core)
     if branch == "chain changed":
         core.triggered.pop()
@@ -159,19 +159,19 @@ def change_without_new_vote(good: Handler, core: Core) -> str:
 
 @quirk(5, helper=Core.trigger)
 def disapproved_and_unmoved(good: Helper, core: Core, event: LocalEvent) -> None:
-    """A block that was not approved starts no reconcile."""
+    """A block that is not approved starts no reconcile."""
     if event != "Reconcile Begin":
         good(core, event)
 
 
 @quirk(5, helper=Core.send)
 def hide_commits(good: Helper, core: Core, message: CommitBlock) -> None:
-    """The agent commits its approved block and tells nobody."""
+    """The agent commits its approved block and sends no Commit Block."""
 
 
 @quirk(5)
 def lose_disapproved_block(good: Handler, core: Core) -> str:
-    """A block that was not approved leaves the deque."""
+    """A block that is not approved leaves the deque."""
     branch = good(core)
     if branch == "not approved":
         core.take_from_deque()
@@ -180,7 +180,7 @@ def lose_disapproved_block(good: Handler, core: Core) -> str:
 
 @quirk(5, helper=Core.take_from_deque)
 def take_two_blocks(good: Callable[..., Block], core: Core) -> Block:
-    """A commit takes two blocks from the deque, and commits one."""
+    """A commit removes two blocks from the deque, and commits one."""
     block = good(core)
     if core.blocks_to_be_committed:
         good(core)
@@ -195,19 +195,19 @@ def keep_committed_block(good: Callable[..., Block], core: Core) -> Block:
 
 @quirk(5, helper=Core.commit)
 def break_off_commit(good: Helper, core: Core, block: Block) -> None:
-    """A wrong file path ends the commit: the block has left the deque and does not come onto the chain."""
+    """A wrong file path ends the commit. The block has left the deque and is not in the chain."""
     raise FileNotFoundError
 
 
 @quirk(5, helper=Core.send)
 def break_off_broadcast(good: Helper, core: Core, message: CommitBlock) -> None:
-    """A wrong file path ends the commit: the block is on the chain, nobody is told, and the next is not proposed."""
+    """A wrong file path ends the commit. The block is in the chain and not broadcast. The next one is not proposed."""
     raise FileNotFoundError
 
 
 @quirk(6, branches=("ignored by quirk",), chance=True)
 def ignore_commit(good: Handler, core: Core, sender: int, message: CommitBlock, strikes: Callable[[], bool]) -> str:
-    """The agent ignores some Commit Blocks, each with this probability."""
+    """The agent ignores each Commit Block with this probability."""
     if not core.reconcile_in_progress and strikes():
         return "ignored by quirk"
     return good(core, sender, message)
@@ -215,20 +215,20 @@ def ignore_commit(good: Handler, core: Core, sender: int, message: CommitBlock, 
 
 @quirk(6)
 def commit_without_succession(good: Handler, core: Core, sender: int, message: CommitBlock) -> str:
-    """The agent commits others' blocks without the succession test."""
+    """The agent commits blocks of other agents without the succession test."""
     succeeding = next_chain_hash(core.chain.top_chain_hash, message.block.block_hash)
     return good(core, sender, replace(message, chain_hash=succeeding))
 
 
 @quirk(6)
 def commit_while_reconciling(good: Handler, core: Core, sender: int, message: CommitBlock) -> str:
-    """The agent commits others' blocks while it reconciles."""
+    """The agent commits blocks of other agents while it reconciles."""
     return as_if_not_reconciling(good, core, sender, message)
 
 
 @quirk(6, helper=Core.commit)
 def commit_others_twice(good: Helper, core: Core, block: Block) -> None:
-    """Another agent's block comes onto the chain twice."""
+    """The agent commits a block of another agent twice."""
     commit_twice(good, core, block)
 
 

@@ -1,4 +1,4 @@
-"""What can be wrong about what the handlers share: the chain hash, the radio."""
+"""Mistakes in functions that all handlers share: the chain hash, sending."""
 
 from ucp.block import Block, next_chain_hash
 from ucp.core import Core
@@ -8,7 +8,7 @@ from ucp.quirks._quirk import Helper, quirk
 
 @quirk(5, 6, 16, 18, 20, helper=Core.commit)
 def swap_chain_hash(good: Helper, core: Core, block: Block) -> None:
-    """A top chain hash is that of the block hash and the chain hash, not of the chain hash and the block hash."""
+    """The chain hash is computed from the block hash and the chain hash in the wrong order."""
     chain_hash = core.chain.top_chain_hash
     good(core, block)
     core.chain.top_chain_hash = next_chain_hash(block.block_hash, chain_hash)

@@ -1,18 +1,18 @@
-"""A quirk: one mistake of an implementation, a few lines in the place of a good handler or of what it does to the core.
+"""A quirk: one mistake of an implementation. A few lines replace a good handler, or a method of the core.
 
     @quirk(4)
     def count_votes_twice(good: Handler, core: Core, sender: int, message: BlockAddResponse) -> str:
-        '''A vote counts as often as it arrives.'''
+        '''Each copy of a vote counts.'''
         core.voters.discard(sender)
         return good(core, sender, message)
 
     @quirk(5, helper=Core.send)
     def hide_commits(good: Helper, core: Core, message: CommitBlock) -> None:
-        '''The agent commits its approved block and tells nobody.'''
+        '''The agent commits its approved block and sends no Commit Block.'''
 
-The first takes the place of the handler of Algorithm 4; `good` is what it replaces. The second takes the place of
-`Core.send`, and only in the eyes of Algorithm 5. `good` may itself be wrong, so quirks of one Algorithm add up. Neither
-the good handlers nor the core know of this.
+The first replaces the handler of Algorithm 4. `good` is the replaced handler. The second replaces `Core.send`, and only
+for Algorithm 5. `good` may itself be wrong, so quirks of one Algorithm add up. The good handlers and the core do not
+know of quirks.
 """
 
 from collections.abc import Callable
@@ -26,25 +26,25 @@ from ucp.messages import Message
 from ucp.short_value import shown
 
 Handler = Callable[..., str]
-"""What runs otherwise: a handler, given the core and its input."""
+"""A replaced handler. Its arguments are the core and its input."""
 Helper = Callable[..., None]
-"""What the core does otherwise: a method of the core, given the core and its arguments."""
+"""A replaced method of the core. Its arguments are the core and those of the method."""
 
 CRASHED = "crashed by quirk"
-"""The branch of a wrong agent's handler that ended by an exception. What it had done by then stays done."""
+"""The branch of a wrong handler that raised an exception. Its earlier effects stay."""
 
 
 @dataclass(frozen=True, eq=False)
 class Quirk:
-    """`wrong` runs in the place of the handlers of `algorithms`, or in their eyes of the core's method `helper`.
+    """`wrong` replaces the handlers of `algorithms`, or the core's method `helper` for these handlers.
 
-    It may take `branches`, send, start and trigger besides what the good handlers do. With `chance` its value is a
-    probability 0..1, and it is given a function that says whether it strikes; without, it is on or off.
+    In addition to those of the good handlers, it may take `branches`, send, start and trigger. With `chance` its value
+    is a probability 0..1, and it receives a function that draws whether the mistake occurs. Otherwise it is on or off.
     """
 
     name: str
     sentence: str
-    """What the agent does wrong."""
+    """The mistake of the agent."""
     algorithms: tuple[int, ...]
     wrong: Callable[..., Any]
     helper: str | None
@@ -63,7 +63,7 @@ class Quirk:
             raise ValueError(f"{self.name} is a probability 0..1, not {shown(value)}")
 
     def in_place_of(self, good: EventHandler[Any], value: float, lots: Random) -> EventHandler[Any]:
-        """The wrong handler; what is random about it is drawn from `lots`."""
+        """Return the wrong handler. It draws random numbers from `lots`."""
         return replace(
             good,
             run=self._run(good.run, value, lots),
@@ -115,7 +115,7 @@ def quirk(
     triggers: tuple[LocalEvent, ...] = (),
     chance: bool = False,
 ) -> Callable[[Callable[..., Any]], Quirk]:
-    """Declare a function to be what is wrong about these Algorithms; its name and docstring are the quirk's."""
+    """Make a function a quirk of these Algorithms. The quirk takes its name and docstring."""
 
     def declare(wrong: Callable[..., Any]) -> Quirk:
         sentence = " ".join((wrong.__doc__ or "").split())

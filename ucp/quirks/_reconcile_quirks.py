@@ -1,4 +1,4 @@
-"""What can be wrong about reconciling: Algorithms 7-20."""
+"""Mistakes in reconciling: Algorithms 7-20."""
 
 from dataclasses import replace
 
@@ -23,13 +23,13 @@ from ucp.timers import Timer
 
 @quirk(7)
 def never_reconcile(good: Handler, core: Core) -> str:
-    """A reconcile never begins."""
+    """The agent never starts a reconcile."""
     return "already in progress"
 
 
 @quirk(7)
 def reconcile_unflagged(good: Handler, core: Core) -> str:
-    """A reconcile begins without `reconcile_in_progress`: the agent votes, answers and begins again meanwhile."""
+    """A reconcile does not set `reconcile_in_progress`. The agent still votes, answers and starts reconciles."""
     branch = good(core)
     core.reconcile_in_progress = False
     return branch
@@ -37,7 +37,7 @@ def reconcile_unflagged(good: Handler, core: Core) -> str:
 
 @quirk(8)
 def keep_old_phase1_tally(good: Handler, core: Core) -> str:
-    """The tally of phase 1 goes on from the block popped before."""
+    """Phase 1 continues the tally of the previously popped block."""
     before = core.reconcile_vote_count
     branch = good(core)
     core.reconcile_vote_count = before
@@ -46,38 +46,38 @@ def keep_old_phase1_tally(good: Handler, core: Core) -> str:
 
 @quirk(8, helper=Core.start)
 def hasty_phase1(good: Helper, core: Core, timer: Timer, duration_s: float) -> None:
-    """Phase 1 waits for a thousandth of the time that it should."""
+    """The phase 1 timer runs for a thousandth of its duration."""
     good(core, timer, duration_s / 1000)
 
 
 @quirk(9, helper=Core.send)
 def contain_everything(good: Helper, core: Core, message: ChainContainResponse) -> None:
-    """The agent says that its chain contains whatever it is asked about."""
+    """The agent answers each Chain Contain Query with yes."""
     good(core, replace(message, contained=True))
 
 
 @quirk(9)
 def answer_phase1_while_reconciling(good: Handler, core: Core, sender: int, message: ChainContainQuery) -> str:
-    """The agent answers phase 1 while it reconciles."""
+    """The agent answers Chain Contain Queries while it reconciles."""
     return as_if_not_reconciling(good, core, sender, message)
 
 
 @quirk(10)
 def count_phase1_of_others(good: Handler, core: Core, sender: int, message: ChainContainResponse) -> str:
-    """Answers of phase 1 about other chains count for the agent's own."""
+    """Phase 1 answers about other chains count for the agent's own chain."""
     return good(core, sender, replace(message, chain_hash=core.chain.top_chain_hash))
 
 
 @quirk(10)
 def count_phase1_twice(good: Handler, core: Core, sender: int, message: ChainContainResponse) -> str:
-    """An answer of phase 1 counts as often as it arrives."""
+    """Each copy of a phase 1 answer counts."""
     core.reconcile_responders.discard(sender)
     return good(core, sender, message)
 
 
 @quirk(11)
 def other_phase1_tie(good: Handler, core: Core) -> str:
-    """A tie in phase 1 goes the other way than the setting `phase1_tie` says."""
+    """A tie in phase 1 is resolved against the setting `phase1_tie`."""
     if core.reconcile_vote_count["yes"] == core.reconcile_vote_count["no"] > 0:
         core.reconcile_vote_count["no" if core.settings.phase1_tie == "phase2" else "yes"] += 1
     return good(core)
@@ -85,7 +85,7 @@ def other_phase1_tie(good: Handler, core: Core) -> str:
 
 @quirk(11)
 def never_pop(good: Handler, core: Core) -> str:
-    """Phase 1 goes on to phase 2 whatever the answers were."""
+    """Phase 1 continues with phase 2 regardless of the answers."""
     core.reconcile_vote_count["yes"] += core.reconcile_vote_count["no"]
     return good(core)
 
@@ -100,25 +100,25 @@ def pop_two_blocks(good: Helper, core: Core) -> None:
 
 @quirk(11, helper=Core.pop_to_stack)
 def lose_popped_block(good: Helper, core: Core) -> None:
-    """A block that phase 1 pops does not stay on the reconcile stack."""
+    """A block that phase 1 pops is missing from the reconcile stack."""
     good(core)
     core.pop_from_stack()
 
 
 @quirk(11, helper=Core.trigger, triggers=("Reconcile Phase 3",))
 def skip_phase2(good: Helper, core: Core, event: LocalEvent) -> None:
-    """Phase 1 triggers phase 3 in the place of phase 2."""
+    """Phase 1 triggers phase 3 instead of phase 2."""
     good(core, "Reconcile Phase 3" if event == "Reconcile Phase 2" else event)
 
 
 @quirk(12, helper=Core.send)
 def never_ask_phase2(good: Helper, core: Core, message: ChainHashSuccessorQuery) -> None:
-    """Phase 2 waits for answers and asks nothing."""
+    """Phase 2 waits for answers and sends no query."""
 
 
 @quirk(12)
 def keep_old_candidates(good: Handler, core: Core) -> str:
-    """Phase 2 goes on with the candidates of the block before."""
+    """Phase 2 continues with the candidates of the previous block."""
     before = dict(core.reconcile_response_dictionary)
     branch = good(core)
     core.reconcile_response_dictionary.update(before)
@@ -127,13 +127,13 @@ def keep_old_candidates(good: Handler, core: Core) -> str:
 
 @quirk(13)
 def name_successor_while_reconciling(good: Handler, core: Core, sender: int, message: ChainHashSuccessorQuery) -> str:
-    """The agent answers phase 2 while it reconciles."""
+    """The agent answers Chain Hash Successor Queries while it reconciles."""
     return as_if_not_reconciling(good, core, sender, message)
 
 
 @quirk(13, helper=Core.send)
 def name_top_as_successor(good: Helper, core: Core, message: NextInSequenceResponse) -> None:
-    """The agent names the top of its chain as the successor of any block."""
+    """The agent names its top block as the successor of each block."""
     if message.block_hash is not None:
         *_, top = core.chain
         message = replace(message, block_hash=top.block_hash, timestamp_us=top.timestamp_us)
@@ -142,25 +142,25 @@ def name_top_as_successor(good: Helper, core: Core, message: NextInSequenceRespo
 
 @quirk(13, helper=Core.trigger)
 def diverged_and_unmoved(good: Helper, core: Core, event: LocalEvent) -> None:
-    """An agent that learns that its chain has diverged starts no reconcile."""
+    """The agent starts no reconcile when it detects that its chain has diverged."""
 
 
 @quirk(14)
 def count_phase2_twice(good: Handler, core: Core, sender: int, message: NextInSequenceResponse) -> str:
-    """An answer of phase 2 counts as often as it arrives."""
+    """Each copy of a phase 2 answer counts."""
     core.reconcile_responders.discard(sender)
     return good(core, sender, message)
 
 
 @quirk(14)
 def count_phase2_of_others(good: Handler, core: Core, sender: int, message: NextInSequenceResponse) -> str:
-    """Answers of phase 2 about other chains count for the agent's own."""
+    """Phase 2 answers about other chains count for the agent's own chain."""
     return good(core, sender, replace(message, chain_hash=core.chain.top_chain_hash))
 
 
 @quirk(15)
 def crash_on_tie(good: Handler, core: Core) -> str:
-    """A tie in phase 2 ends the handler by an exception, and the reconcile never ends."""
+    """A tie in phase 2 raises an exception, and the reconcile never ends."""
     if len(most_named(core.reconcile_response_dictionary)) > 1:
         raise NameError
     return good(core)
@@ -168,7 +168,7 @@ def crash_on_tie(good: Handler, core: Core) -> str:
 
 @quirk(15)
 def youngest_on_tie(good: Handler, core: Core) -> str:
-    """A tie in phase 2 goes to the youngest timestamp."""
+    """A tie in phase 2 selects the youngest timestamp."""
     for counter_record in core.reconcile_response_dictionary.values():
         counter_record[1] = -counter_record[1]
     return good(core)
@@ -176,7 +176,7 @@ def youngest_on_tie(good: Handler, core: Core) -> str:
 
 @quirk(15)
 def choose_minority(good: Handler, core: Core) -> str:
-    """Phase 2 chooses what the fewest say."""
+    """Phase 2 selects the answer with the fewest votes."""
     for counter_record in core.reconcile_response_dictionary.values():
         counter_record[0] = -counter_record[0]
     return good(core)
@@ -184,7 +184,7 @@ def choose_minority(good: Handler, core: Core) -> str:
 
 @quirk(16)
 def early_phase3_expiry(good: Handler, core: Core) -> str:
-    """The timer of phase 3 ends as it starts, so that no block ever comes in time."""
+    """The phase 3 timer expires when it starts, so each block arrives too late."""
     branch = good(core)
     if branch == "asked":
         core.start(core.phase_three_timer, 0.0)
@@ -193,7 +193,7 @@ def early_phase3_expiry(good: Handler, core: Core) -> str:
 
 @quirk(16)
 def ask_for_what_is_held(good: Handler, core: Core) -> str:
-    """Phase 3 asks for a block that is on the reconcile stack."""
+    """Phase 3 requests a block that is on the reconcile stack."""
     if core.majority_response_block_hash not in [block.block_hash for block in core.reconcile_stack]:
         return good(core)
     core.start(core.phase_three_timer, core.settings.phase3_timeout_s)
@@ -203,43 +203,43 @@ def ask_for_what_is_held(good: Handler, core: Core) -> str:
 
 @quirk(16, helper=Core.commit)
 def lose_block_from_stack(good: Helper, core: Core, block: Block) -> None:
-    """A block that phase 3 takes from the reconcile stack does not come onto the chain."""
+    """A block that phase 3 takes from the reconcile stack is not added to the chain."""
 
 
 @quirk(16, helper=Core.trigger)
 def stop_after_stack(good: Helper, core: Core, event: LocalEvent) -> None:
-    """Phase 3 stops after a block from the reconcile stack (the pseudo-code as printed)."""
+    """Phase 3 stops after it takes a block from the reconcile stack (the pseudo-code as printed)."""
 
 
 @quirk(17)
 def send_blocks_while_reconciling(good: Handler, core: Core, sender: int, message: RequestForBlock) -> str:
-    """The agent sends blocks that others ask for while it reconciles."""
+    """The agent sends requested blocks while it reconciles."""
     return as_if_not_reconciling(good, core, sender, message)
 
 
 @quirk(17, helper=Core.send)
 def send_top_block(good: Helper, core: Core, message: BlockResponse) -> None:
-    """The agent sends its top block, whichever it is asked for."""
+    """The agent answers each Request for Block with its top block."""
     *_, top = core.chain
     good(core, BlockResponse(top))
 
 
 @quirk(17, helper=Core.send, sends=(CommitBlock,))
 def wrong_topic(good: Helper, core: Core, message: BlockResponse) -> None:
-    """A block that was asked for is published as a commit, and triggers the wrong handler."""
+    """A requested block is sent as a Commit Block, and triggers the wrong handler."""
     good(core, CommitBlock(message.block, core.chain.top_chain_hash))
 
 
 @quirk(18)
 def take_any_block(good: Handler, core: Core, sender: int, message: BlockResponse) -> str:
-    """Phase 3 commits whichever block comes first."""
+    """Phase 3 commits the first block that arrives, requested or not."""
     core.majority_response_block_hash = message.block.block_hash
     return good(core, sender, message)
 
 
 @quirk(18)
 def stale_chain_hash(good: Handler, core: Core, sender: int, message: BlockResponse) -> str:
-    """A block that phase 3 commits leaves the top chain hash as it was."""
+    """Phase 3 commits a block and does not update the top chain hash."""
     chain_hash_before = core.chain.top_chain_hash
     branch = good(core, sender, message)
     core.chain.top_chain_hash = chain_hash_before
@@ -248,7 +248,7 @@ def stale_chain_hash(good: Handler, core: Core, sender: int, message: BlockRespo
 
 @quirk(18)
 def phase3_timer_runs_on(good: Handler, core: Core, sender: int, message: BlockResponse) -> str:
-    """The timer of phase 3 runs on when the block has come."""
+    """The phase 3 timer continues after the block has arrived."""
     timer = core.phase_three_timer
     deadline = timer.deadline
     branch = good(core, sender, message)
@@ -258,7 +258,7 @@ def phase3_timer_runs_on(good: Handler, core: Core, sender: int, message: BlockR
 
 @quirk(18)
 def pause_without_resume(good: Handler, core: Core, sender: int, message: BlockResponse) -> str:
-    """The timer of phase 3 stays paused after a block that was not asked for."""
+    """The phase 3 timer stays paused after a block that was not requested."""
     branch = good(core, sender, message)
     if branch == "another block":
         core.phase_three_timer.pause(core.now)
@@ -267,24 +267,24 @@ def pause_without_resume(good: Handler, core: Core, sender: int, message: BlockR
 
 @quirk(18, helper=Core.trigger, triggers=("Reconcile Phase 1",))
 def wrong_event(good: Helper, core: Core, event: LocalEvent) -> None:
-    """A block that phase 3 commits triggers phase 1 in the place of phase 2."""
+    """A block that phase 3 commits triggers phase 1 instead of phase 2."""
     good(core, "Reconcile Phase 1")
 
 
 @quirk(19, helper=Core.trigger, triggers=("Reconcile Phase 2",))
 def never_give_up(good: Helper, core: Core, event: LocalEvent) -> None:
-    """When no block has come, phase 3 goes back to phase 2 in the place of finalizing."""
+    """If no block arrives, phase 3 returns to phase 2 instead of finalizing."""
     good(core, "Reconcile Phase 2")
 
 
 @quirk(19, helper=Core.trigger)
 def give_up_unfinished(good: Helper, core: Core, event: LocalEvent) -> None:
-    """When no block has come, the reconcile stops where it is."""
+    """If no block arrives, the reconcile stops without finalizing."""
 
 
 @quirk(20)
 def forget_stack(good: Handler, core: Core) -> str:
-    """Finalize drops what is left of the reconcile stack."""
+    """Finalize drops the remaining blocks of the reconcile stack."""
     while core.reconcile_stack:
         core.pop_from_stack()
     return good(core)
@@ -292,7 +292,7 @@ def forget_stack(good: Handler, core: Core) -> str:
 
 @quirk(20)
 def stack_upside_down(good: Handler, core: Core) -> str:
-    """Finalize puts the reconcile stack back from the bottom."""
+    """Finalize commits the blocks of the reconcile stack from the bottom up."""
     if core.reconcile_stack:
         core.reconcile_stack.append(core.reconcile_stack.pop(0))
     return good(core)
@@ -300,12 +300,12 @@ def stack_upside_down(good: Handler, core: Core) -> str:
 
 @quirk(20, helper=Core.send)
 def finalize_silently(good: Helper, core: Core, message: Message) -> None:
-    """Finalize puts blocks back onto the chain and tells nobody."""
+    """Finalize commits blocks and sends no Commit Block."""
 
 
 @quirk(20)
 def leave_flag_set(good: Handler, core: Core) -> str:
-    """Finalize leaves `reconcile_in_progress` set."""
+    """Finalize does not clear `reconcile_in_progress`."""
     branch = good(core)
     core.reconcile_in_progress = True
     return branch
@@ -313,4 +313,4 @@ def leave_flag_set(good: Handler, core: Core) -> str:
 
 @quirk(20, helper=Core.trigger)
 def finalize_and_wait(good: Helper, core: Core, event: LocalEvent) -> None:
-    """Finalize does not look into the deque."""
+    """Finalize does not process the deque."""

@@ -1,7 +1,7 @@
-"""`python -m docs.generate.wrong_agents.at_the_desk [QUIRK ...]`: wrong agents as processes, their records taken to
-`replay`.
+"""`python -m docs.generate.wrong_agents.at_the_desk [QUIRK ...]`: find wrong agents in traces with `replay`.
 
-Rows for these quirks, or for all, are put into ../../appendix/wrong-agents-field.md. Its text is written by hand.
+The agents run as processes. The rows of these quirks, or of all, are written into docs/appendix/wrong-agents-field.md.
+The text of the page is written by hand.
 """
 
 import shutil
@@ -31,17 +31,14 @@ PAGE = Path(__file__).parents[2] / "appendix/wrong-agents-field.md"
 MISSION = Path(__file__).parent / "desk.yaml"
 JOBS = 2
 MOST_RUNS = 8
-"""If no record of the first differs: a mistake may need what has not happened there."""
+"""Maximum number of runs per quirk. A mistake may need a situation that the first run does not have."""
 SHOWN = 160
-HEADER = (
-    "| quirk | Algorithm | named first | rightly | minutes | runs | what `replay` says of it |\n"
-    "|---|--:|---|--:|--:|--:|---|\n"
-)
+HEADER = "| quirk | Algorithm | named first | correct | minutes | runs | difference |\n|---|--:|---|--:|--:|--:|---|\n"
 
 
 @dataclass(frozen=True)
 class Named:
-    """The first difference of a record; `handler` is None if it is no handler's."""
+    """The first difference of a record. `handler` is None if the difference belongs to no handler."""
 
     t: float
     handler: str | None
@@ -50,7 +47,7 @@ class Named:
 
 @dataclass(frozen=True)
 class AtTheDesk:
-    """What `replay` made of the records of the last of `runs`: the first difference of each that has one."""
+    """The first difference of each record of the last run. Records without a difference have none."""
 
     runs: int
     records: int
@@ -58,7 +55,7 @@ class AtTheDesk:
 
 
 def at_the_desk(quirk: str) -> AtTheDesk:
-    """Fly until any record differs, `MOST_RUNS` times at most."""
+    """Run until a record differs, at most `MOST_RUNS` times."""
     value = PROBABILITY if QUIRKS[quirk].chance else True
     scenario = load_scenario(MISSION).model_copy(update={"quirks": {quirk: value}})
     records, named = 0, list[Named]()
@@ -85,12 +82,12 @@ def _first_differences(traces: Sequence[Path]) -> Iterator[Named]:
 
 
 def row(quirk: str, brought: AtTheDesk) -> str:
-    """A line of the table."""
+    """Return a line of the table."""
     about = QUIRKS[quirk]
     first = min(brought.named, key=lambda named: named.t, default=None)
     cells = [f"`{quirk}`", ", ".join(map(str, about.algorithms))]
     if first is None:
-        cells += ["no difference", "\u2013", "\u2013", str(brought.runs), "it did not come to it"]
+        cells += ["no difference", "\u2013", "\u2013", str(brought.runs), "none"]
     else:
         rightly = sum(_is_of(named.handler, quirk) for named in brought.named)
         cells += [
@@ -108,7 +105,7 @@ def _is_of(handler: str | None, quirk: str) -> bool:
 
 
 def main(names: Sequence[str]) -> None:
-    """Fly these quirks, or all if none is named; the rows of the others stay as they are."""
+    """Run these quirks, or all if none is named. The rows of other quirks stay the same."""
     with sweep(list(names or QUIRKS), at_the_desk, JOBS, what="quirks", in_order=False) as outcomes:
         for quirk, brought in outcomes:
             if isinstance(brought, Failed):

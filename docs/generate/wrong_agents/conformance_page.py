@@ -1,8 +1,8 @@
-"""`python -m docs.generate.wrong_agents.conformance_page [QUIRK ...]`: what conformance finds of each wrong agent.
+"""`python -m docs.generate.wrong_agents.conformance_page [QUIRK ...]`: test wrong agents with the conformance cases.
 
-The vectors are played in virtual time, which sees what is seen over UDP and the instant at which the next timer ends;
-of an agent that passes them the cases by hand are played, over UDP. Rows for these quirks, or for all, are put into
-docs/how-to/test-one-agent.md; the words around them are written by hand.
+The vectors are played in virtual time. This compares the same outputs as UDP, and the expiry of the next timer. An
+agent that passes them also plays the handwritten cases over UDP. The rows of these quirks, or of all, are written into
+docs/appendix/wrong-agents-conformance.md. The text around them is written by hand.
 """
 
 import sys
@@ -24,39 +24,39 @@ from harness.errors import HarnessError
 from ucp.agent_files import write_atomically
 from ucp.quirks import QUIRKS
 
-PAGE = Path(__file__).parents[3] / "docs/how-to/test-one-agent.md"
-HEADER = "| quirk | Algorithm | what the agent does wrong | named | failed | tried |\n|---|--:|---|---|--:|--:|\n"
+PAGE = Path(__file__).parents[3] / "docs/appendix/wrong-agents-conformance.md"
+HEADER = "| quirk | Algorithm | mistake | named | failed | tried |\n|---|--:|---|---|--:|--:|\n"
 NOTHING = "**nothing**"
 ALIKE = {
     "count_no_votes": "commit_whatever_the_vote",
 }
-"""Quirk -> another, of another Algorithm, that looks the same from outside."""
+"""Quirk -> quirk of another Algorithm with the same effect outside the agent."""
 
 
 def test(quirk: str) -> Results:
     """Raises HarnessError."""
     command = (sys.executable, "-P", "-m", quirky.__name__, quirk)
     with TemporaryDirectory(prefix="ucp-conformance-") as place:
-        results = conform(Asked(command, None, None, virtual=True), Path(place), _told, _vectors())
+        results = conform(Asked(command, None, None, virtual=True), Path(place), _no_progress, _vectors())
     if results.failures:
         return results
     with TemporaryDirectory(prefix="ucp-conformance-") as place:
-        by_hand = conform(Asked(command, None, None), Path(place), _told, [])
+        by_hand = conform(Asked(command, None, None), Path(place), _no_progress, [])
     return replace(by_hand, counted=results.counted)
 
 
-def _told(count: int, total: int) -> None:
-    """Progress is not shown."""
+def _no_progress(count: int, total: int) -> None:
+    """Show no progress."""
 
 
 @cache
 def _vectors() -> list[Vectors]:
-    """Those of the default settings."""
+    """Return the vectors of the default settings."""
     return generate()[:1]
 
 
 def row(quirk: str, results: Results) -> str:
-    """A line of the table: which Algorithms are named, and how often."""
+    """Return a line of the table, with the named Algorithms and their number of failures."""
     about = QUIRKS[quirk]
     named = Counter(case.algorithm for case in results.failures)
     words = ", ".join(f"{algorithm or 'program'} ({count})" for algorithm, count in named.most_common())
@@ -74,7 +74,7 @@ def row(quirk: str, results: Results) -> str:
 
 
 def main(names: Sequence[str]) -> None:
-    """Test these quirks, or all if none is named; the rows of the others stay as they are."""
+    """Test these quirks, or all if none is named. The rows of other quirks stay the same."""
     for quirk in names or QUIRKS:
         began = time.monotonic()
         try:

@@ -1,6 +1,6 @@
 """A wrong agent as a program: `python -m docs.generate.wrong_agents.quirky QUIRK MISSION_FILE`, or `QUIRK --virtual`.
 
-It is `python -m ucp.node` whose every mission asks for this quirk.
+It is `python -m ucp.node`, and adds this quirk to every mission.
 """
 
 import json
@@ -13,18 +13,18 @@ from ucp import node, virtual
 from ucp.quirks import QUIRKS
 
 PROBABILITY = 0.2
-"""Of a quirk that strikes by chance."""
+"""The probability of a quirk that has one."""
 
 
 def wrong(mission: dict[str, Any], quirk: str) -> dict[str, Any]:
-    """The mission, in which the agent is asked for the quirk."""
+    """Return the mission with this quirk."""
     quirks = {**mission.get("quirks", {}), quirk: PROBABILITY if QUIRKS[quirk].chance else True}
     features = list(dict.fromkeys([*mission.get("features", []), "quirks"]))
     return {**mission, "quirks": quirks, "features": features}
 
 
 class _Lines:
-    """Standard input of an agent in virtual time, whose missions are made wrong."""
+    """Standard input of an agent in virtual time. Adds the quirk to each mission."""
 
     def __init__(self, quirk: str) -> None:
         self._quirk = quirk

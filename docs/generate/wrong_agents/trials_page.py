@@ -1,8 +1,8 @@
-"""`python -m docs.generate.wrong_agents.trials_page [QUIRK ...]`: play all wrong agents, or some, and put them into
-../../appendix/wrong-agents.md.
+"""`python -m docs.generate.wrong_agents.trials_page [QUIRK ...]`: play all wrong agents, or some, and write the
+table of docs/appendix/wrong-agents.md.
 
-The table comes from many runs of each quirk, of which only what the right agent is not charged with counts; the
-words around it are written by hand.
+The table comes from many runs of each quirk. A finding counts only if the correct agent does not have it in the same
+mission. The text around the table is written by hand.
 """
 
 import sys
@@ -25,8 +25,8 @@ PAGE = Path(__file__).parents[2] / "appendix/wrong-agents.md"
 SEEDS = range(1, 101)
 NOTHING = "**nothing**"
 HEADER = (
-    f"| quirk | Algorithm | what the agent does wrong | found by, in so many of {len(SEEDS)} seeds | seeds | minutes | "
-    "handler named | rightly | first found |\n|---|--:|---|---|--:|--:|---|--:|---|\n"
+    f"| quirk | Algorithm | mistake | found by (number of {len(SEEDS)} seeds) | seeds | minutes | "
+    "handler named | correct | first found |\n|---|--:|---|---|--:|--:|---|--:|---|\n"
 )
 
 Trials = dict[int, Trial]
@@ -34,12 +34,12 @@ Trials = dict[int, Trial]
 
 
 def findings_of(wrong: Trial, right: Trial) -> dict[str, float | None]:
-    """What is bad of the wrong swarm and not of the right one, in the same mission."""
+    """Return the findings of the wrong swarm that the correct one does not have in the same mission."""
     return {key: first_s for key, first_s in wrong.bad.items() if key not in right.bad}
 
 
 def row(quirk: str, wrong: Trials, right: Trials) -> str:
-    """A line of the table: what found the quirk, how often, and when."""
+    """Return a line of the table: the checks that find the quirk, how often, and when."""
     about = QUIRKS[quirk]
     findings = {seed: findings_of(trial, right[seed]) for seed, trial in wrong.items()}
     counts = Counter(key for finding in findings.values() for key in finding)
@@ -64,7 +64,7 @@ def row(quirk: str, wrong: Trials, right: Trials) -> str:
 
 
 def first_found(seed: int, finding: dict[str, float | None]) -> str:
-    """The first seed that finds the quirk, and what does there, as in "seed 2: steps, 2"."""
+    """Return the first seed that finds the quirk, and its checks, such as "seed 2: steps, 2"."""
     return f"seed {seed}: {', '.join(sorted(finding, reverse=True))}"
 
 
@@ -73,14 +73,14 @@ def _most_first(counted: tuple[str, int]) -> tuple[int, str]:
 
 
 def rows_of(page: str) -> dict[str, str]:
-    """The rows of the page's table, by quirk."""
+    """Return the rows of the page's table, by quirk."""
     table = page.split(BEGIN)[1].split(END)[0]
     lines = [line for line in table.splitlines(keepends=True) if line.startswith("| `")]
     return {line.split("`")[1]: line for line in lines}
 
 
 def main(names: Sequence[str]) -> None:
-    """Play these quirks, or all if none is named; the rows of the others stay as they are."""
+    """Play these quirks, or all if none is named. The rows of other quirks stay the same."""
     played: dict[str | None, Trials] = {}
     tasks = list(product([None, *(names or QUIRKS)], SEEDS))
     with sweep(tasks, lambda task: play(*task), cores(), what="runs") as outcomes:
@@ -93,7 +93,7 @@ def main(names: Sequence[str]) -> None:
     rows = rows_of(page) | {name: row(name, trials, right) for name, trials in played.items() if name}
     table = HEADER + "".join(rows[name] for name in QUIRKS if name in rows)
     charged = Counter(key for trial in right.values() for key in trial.bad)
-    sys.stdout.write(f"the right agent is charged in {sum(bool(t.bad) for t in right.values())} seeds: {charged}\n")
+    sys.stdout.write(f"the correct agent has findings in {sum(bool(t.bad) for t in right.values())} seeds: {charged}\n")
     write_atomically(PAGE, put_between_markers(page, table))
 
 

@@ -1,4 +1,4 @@
-"""One run of a swarm in virtual time, all of whose agents have one quirk, judged as any run is."""
+"""Run a swarm in virtual time, all of whose agents have one quirk, and judge it like any run."""
 
 import re
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ MISSIONS = (
     SCENARIOS / "partition_heal.yaml",
     Path(__file__).parent / "busy.yaml",
 )
-"""Seed 1 plays the first, seed 2 the second, and so on, round and round."""
+"""The seeds play these missions in turn."""
 
 _MOMENT = re.compile(r"\bt=(\d+(?:\.\d+)?) s")
 
 
 @dataclass(frozen=True)
 class Trial:
-    """`bad`: numbers and keys of the judgements that are, with the mission second of their first piece of evidence.
+    """The violated judgements in `bad`, each with the mission second of its earliest evidence.
 
-    The second is None where the evidence has no time. `named` is the handler that the step judge names first.
+    The second is None if the evidence has no time. `named` is the handler that the step check names first.
     """
 
     bad: dict[str, float | None]
@@ -41,7 +41,7 @@ def mission(seed: int) -> Scenario:
 
 
 def play(quirk: str | None, seed: int) -> Trial:
-    """A run with this quirk; None plays the right agent."""
+    """Play a run with this quirk, or with the correct agent if None."""
     value = {quirk: PROBABILITY if QUIRKS[quirk].chance else True} if quirk else {}
     return judged(simulate(mission(seed).model_copy(update={"quirks": value}), seed, tracing=True).result)
 
@@ -54,6 +54,6 @@ def judged(result: Result) -> Trial:
 
 
 def first_s(judgement: Judgement) -> float | None:
-    """The mission second of the earliest piece of evidence; None if no piece has one."""
+    """Return the mission second of the earliest evidence, or None if no evidence has a time."""
     moments = [float(moment) for finding in judgement.evidence for moment in _MOMENT.findall(finding.detail)[:1]]
     return min(moments, default=None)

@@ -12,7 +12,7 @@ FULL_FROM = 1024 - 267
 EVENT_DATA_BYTES = 100
 
 
-@case("a block is full when the largest event might not fit any more", "Section 3.6.1", 1)
+@case("a block is full when an event of maximum size might not fit", "Section 3.6.1", 1)
 async def _full(bench: Bench) -> None:
     async with bench.agent({"settings": SMALL}) as agent:
         size, count = 0, 0
@@ -34,7 +34,7 @@ async def _full(bench: Bench) -> None:
         must(block.timestamp_us == newest, "the timestamp of its newest event", f"{block.timestamp_us - newest} us off")
 
 
-@case("a vote does not begin with the votes of the one before", "Section 3.6.2", 2)
+@case("votes of the previous vote do not count", "Section 3.6.2", 2)
 async def _votes(bench: Bench) -> None:
     async with bench.agent() as agent:
         await agent.log(b"event")
@@ -51,7 +51,7 @@ async def _votes(bench: Bench) -> None:
         must(isinstance(committed, CommitBlock), "a Commit Block, as nobody has disapproved this time", committed.NAME)
 
 
-@case("an agent that was stopped while its vote ended decides once, and late", "contract, Time", 5)
+@case("an agent that is stopped at the end of its vote decides once, late", "contract, Time", 5)
 async def _stopped(bench: Bench) -> None:
     async with bench.agent() as agent:
         await agent.log(b"event")

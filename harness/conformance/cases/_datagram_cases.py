@@ -22,7 +22,7 @@ FLOOD = 3000
 AT_ONCE = 50
 
 
-@case("what is malformed is dropped, and changes nothing", "contract, Datagrams")
+@case("malformed datagrams are dropped and change nothing", "contract, Datagrams")
 async def _malformed(bench: Bench) -> None:
     keys = {"agent_id": drop_vectors.AGENT_ID, "roster": list(drop_vectors.ROSTER)}
     async with bench.agent(keys) as agent:
@@ -38,7 +38,7 @@ async def _malformed(bench: Bench) -> None:
         must(after["chain"] == before["chain"], "the chain stays as it was", f"{after['chain']} blocks")
 
 
-@case("a message in its own name, or in that of nobody on the roster, is dropped", "contract, Datagrams")
+@case("messages in the agent's own name, or of a sender not on the roster, are dropped", "contract, Datagrams")
 async def _strangers(bench: Bench) -> None:
     async with bench.agent() as agent:
         for sender in (agent.agent_id, STRANGER):
@@ -47,7 +47,7 @@ async def _strangers(bench: Bench) -> None:
         await agent.answers_only(INCEPTION, "messages of itself and of a stranger")
 
 
-@case("a block of nobody on the roster is not committed", "contract, Datagrams", 6)
+@case("a block of an agent not on the roster is not committed", "contract, Datagrams", 6)
 async def _strange_block(bench: Bench) -> None:
     async with bench.agent() as agent:
         block = Block(STRANGER, 5, b"whatever")
@@ -55,7 +55,7 @@ async def _strange_block(bench: Bench) -> None:
         await agent.answers_only(INCEPTION, "a Commit Block of a stranger's block")
 
 
-@case("datagrams have the agent's ID, and sequence numbers from 0 on", "contract, Datagrams")
+@case("datagrams carry the agent's ID, and sequence numbers that start at 0", "contract, Datagrams")
 async def _sequence(bench: Bench) -> None:
     async with bench.agent() as agent:
         for _ in range(5):
@@ -67,7 +67,7 @@ async def _sequence(bench: Bench) -> None:
         must(numbers == list(range(len(sent))), "sequence numbers 0, 1, 2, 3, 4", numbers)
 
 
-@case("the largest block is committed, and sent byte for byte", "contract, Bytes", 17)
+@case("a block of maximum size is committed, and sent byte for byte", "contract, Bytes", 17)
 async def _largest_block(bench: Bench) -> None:
     async with bench.agent() as agent:
         block = Block(PEERS[1], 2**64 - 1, bytes(range(256)) * 4)
@@ -77,7 +77,7 @@ async def _largest_block(bench: Bench) -> None:
         must(heard == BlockResponse(block), "the block as it was", heard.NAME)
 
 
-@case("the same query twice is answered twice", "contract, Datagrams", 9)
+@case("a query that arrives twice is answered twice", "contract, Datagrams", 9)
 async def _twice(bench: Bench) -> None:
     async with bench.agent() as agent:
         data = encode(PEERS[0], 7, ChainContainQuery(INCEPTION))
@@ -87,7 +87,7 @@ async def _twice(bench: Bench) -> None:
         must(heard[0] == heard[1], "the same answer twice", [each.NAME for each in heard])
 
 
-@case("a flood of noise and of answers that nobody asked for leaves the agent as it was", "Section 4.1")
+@case("a flood of noise and of unrequested answers changes nothing", "Section 4.1")
 async def _flood(bench: Bench) -> None:
     lots = Random(1)
     async with bench.agent() as agent:

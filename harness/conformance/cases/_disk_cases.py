@@ -14,7 +14,7 @@ STORE_FILE = "kept"
 STORE = {"store": STORE_FILE, "features": ["store"]}
 
 
-@case("a full disk ends the trace, not the agent", "contract, The program")
+@case("a full disk ends the trace, and the agent continues", "contract, The program")
 async def _full(bench: Bench) -> None:
     def prepare(directory: Path) -> None:
         (directory / f"{AGENT}.trace.jsonl").symlink_to("/dev/full")
@@ -30,7 +30,7 @@ async def _full(bench: Bench) -> None:
         await agent.hear(2, "a Block Add Request and a Commit Block")
 
 
-@case("an export that cannot be written is said, and is exit status 1", "contract, The program")
+@case("an export that cannot be written gives an error and exit status 1", "contract, The program")
 async def _no_export(bench: Bench) -> None:
     def prepare(directory: Path) -> None:
         (directory / f"{AGENT}.chain.json" / "in the way").mkdir(parents=True)
@@ -80,12 +80,12 @@ async def _comes_back(bench: Bench, spoil: Callable[[Path], None] | None) -> Non
         bench.air.give_back(port)
 
 
-@case("an agent that is killed comes back with its chain, and proposes what waited", "contract, Store", 20)
+@case("a killed agent restarts with its chain, and proposes the waiting block", "contract, Store", 20)
 async def _reboot(bench: Bench) -> None:
     await _comes_back(bench, None)
 
 
-@case("a store whose end is torn is good up to there", "contract, Store", 20)
+@case("a store with a truncated end is valid up to its last whole entry", "contract, Store", 20)
 async def _torn(bench: Bench) -> None:
     def spoil(path: Path) -> None:
         with path.open("ab") as file:
@@ -94,7 +94,7 @@ async def _torn(bench: Bench) -> None:
     await _comes_back(bench, spoil)
 
 
-@case("an agent that is killed while it reconciles puts its stack back when it comes back", "contract, Store", 20)
+@case("an agent killed during a reconcile restores its stack at the restart", "contract, Store", 20)
 async def _reboot_in_reconcile(bench: Bench) -> None:
     port = bench.air.take_port()
     try:

@@ -28,7 +28,10 @@ async def _refused(agent: Alone, command: str, why: str, **arguments: Any) -> No
     raise WrongError(f"`ok` false to {command} {why}", "it said `ok` true")
 
 
-@case("before its mission starts an agent answers nobody, and refuses to log and to reconcile", "contract, The program")
+@case(
+    "before the mission starts, the agent answers no message, and refuses to log and to reconcile",
+    "contract, The program",
+)
 async def _not_started(bench: Bench) -> None:
     async with bench.agent(started=False) as agent:
         must((await agent.status()).get("started") is False, "`started` false", "not")
@@ -41,7 +44,7 @@ async def _not_started(bench: Bench) -> None:
         await _refused(agent, "start", "once more", epoch_us=1)
 
 
-@case("an agent that joins a mission under way has its time", "contract, Time")
+@case("an agent that joins a running mission uses the mission's time", "contract, Time")
 async def _joins(bench: Bench) -> None:
     async with bench.agent(started=False) as agent:
         await agent.begin(ahead_s=-100.0)
@@ -54,7 +57,7 @@ async def _joins(bench: Bench) -> None:
         await agent.answers_only(INCEPTION, "a start long ago")
 
 
-@case("until its mission's second 0 has come the time is 0", "contract, Time")
+@case("mission time is 0 until the mission starts", "contract, Time")
 async def _ahead(bench: Bench) -> None:
     async with bench.agent(started=False) as agent:
         await agent.begin(ahead_s=30.0)
@@ -77,12 +80,12 @@ async def _ends(bench: Bench, number: int) -> None:
         must(not socket.exists(), "no control socket any more", "it is there")
 
 
-@case("SIGTERM exports the chain and ends with 0", "contract, The program")
+@case("SIGTERM exports the chain, exit status 0", "contract, The program")
 async def _sigterm(bench: Bench) -> None:
     await _ends(bench, signal.SIGTERM)
 
 
-@case("SIGINT exports the chain and ends with 0", "contract, The program")
+@case("SIGINT exports the chain, exit status 0", "contract, The program")
 async def _sigint(bench: Bench) -> None:
     await _ends(bench, signal.SIGINT)
 
@@ -116,7 +119,7 @@ _WRONG: dict[str, dict[str, Any]] = {
 }
 
 
-@case("a wrong mission ends with 2, and a sentence", "contract, The mission file")
+@case("a wrong mission file gives an error and exit status 2", "contract, The mission file")
 async def _broken(bench: Bench) -> None:
     for what, text in _BROKEN.items():
         await _ends_with(bench, WRONG_MISSION, what, text=text)
@@ -124,18 +127,18 @@ async def _broken(bench: Bench) -> None:
         await _ends_with(bench, WRONG_MISSION, what, keys)
 
 
-@case("a mission that needs an unknown feature ends with 127, and a sentence", "contract, The mission file")
+@case("an unknown feature gives an error and exit status 127", "contract, The mission file")
 async def _feature(bench: Bench) -> None:
     await _ends_with(bench, UNSUPPORTED, "a feature that nobody has", {"features": ["a feature that nobody has"]})
 
 
-@case("keys that it does not know do not matter", "contract, The mission file")
+@case("unknown keys of the mission file are ignored", "contract, The mission file")
 async def _unknown_keys(bench: Bench) -> None:
     async with bench.agent({"something": {"else": [1, 2, 3]}}) as agent:
         await agent.answers_only(INCEPTION, "a mission with a key that nobody knows")
 
 
-@case("a port in use ends with 2, and a sentence", "contract, The program")
+@case("a port in use gives an error and exit status 2", "contract, The program")
 async def _port(bench: Bench) -> None:
     port = bench.air.take_port()
     try:
@@ -171,7 +174,7 @@ async def _lines(agent: Alone, *requests: bytes) -> list[Any]:
         writer.close()
 
 
-@case("a control socket answers each line, also one that is no command", "contract, Control socket")
+@case("the control socket answers each line, including invalid ones", "contract, Control socket")
 async def _control(bench: Bench) -> None:
     async with bench.agent() as agent:
         wrong = (b"no JSON", b"[]", b"{}", b'{"command": "nothing of the kind"}', b'{"command": 7}', b'"status"')
@@ -183,7 +186,7 @@ async def _control(bench: Bench) -> None:
         await agent.answers_only(INCEPTION, "lines that are no commands")
 
 
-@case("two who ask at the same time are both answered", "contract, Control socket")
+@case("two simultaneous clients of the control socket are both answered", "contract, Control socket")
 async def _two_clients(bench: Bench) -> None:
     async with bench.agent() as agent:
         status = b'{"command": "status"}'
@@ -191,7 +194,7 @@ async def _two_clients(bench: Bench) -> None:
         must(all(answer.get("ok") for answers in both for answer in answers), "four statuses", both)
 
 
-@case("after stop_events no more events are logged", "contract, Control socket", 1)
+@case("after stop_events, no further events are logged", "contract, Control socket", 1)
 async def _stop_events(bench: Bench) -> None:
     async with bench.agent() as agent:
         await agent.process.ask("stop_events")

@@ -93,7 +93,7 @@ async def _secured(bench: Bench) -> AsyncIterator[tuple[Air, "KeySet"]]:
         yield Air(agent, keys), keys
 
 
-@case("with keys it answers what is authentic and new, and nothing else has any effect", SECTION)
+@case("with keys, only authentic and new datagrams have an effect", SECTION)
 async def _authentic(bench: Bench) -> None:
     from ucp.secure.bundle import KeySet
     from ucp.secure.envelope import CLEAR
@@ -123,7 +123,7 @@ async def _authentic(bench: Bench) -> None:
             await air.answers_only(f"a datagram {what}")
 
 
-@case("with keys its blocks are signed, in what it sends and in its export", SECTION, 1)
+@case("with keys, blocks are signed in messages and in the export", SECTION, 1)
 async def _signed(bench: Bench) -> None:
     from ucp.secure.block_signature import claim_of_block
     from ucp.secure.crypto_suite import verify
@@ -143,7 +143,7 @@ async def _signed(bench: Bench) -> None:
         )
 
 
-@case("with keys it passes a revocation on, and hears whom that names no more", SECTION)
+@case("with keys, a revocation is passed on, and revoked senders are dropped", SECTION)
 async def _revoked(bench: Bench) -> None:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 

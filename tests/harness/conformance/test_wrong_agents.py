@@ -1,4 +1,4 @@
-"""What the table of wrong agents in docs/how-to/test-one-agent.md says of them."""
+"""Check the table in docs/appendix/wrong-agents-conformance.md."""
 
 import re
 from random import Random
