@@ -6,8 +6,8 @@
     print(finished.result.bad, finished.report)
 
 Every other module of `harness` may change with any version. `ucp`, `netem` and `sitl` list their own public names.
-A name is imported from its room at its first use, so `import harness.api` costs nothing, and a program that only reads
-archives never imports the parts that play.
+A name is imported at its first use. Therefore `import harness.api` is fast, and a program that only reads archives does
+not import the backends.
 """
 
 from importlib import import_module
@@ -79,7 +79,7 @@ _NAMES_OF = {
     "harness.sweep.matrix": ("Finished", "Matrix", "load_matrix", "run_matrix"),
     "harness.sweep.matrix.matrix_frame": ("matrix_frame",),
 }
-"""The imports above, as they are done at the first use of a name."""
+"""Module -> its public names, to import at their first use."""
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 
 if not TYPE_CHECKING:  # a type checker would accept any name

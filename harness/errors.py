@@ -1,27 +1,28 @@
-"""Errors that a user meets: one clear sentence with the way out, and the exit status of the command line."""
+"""Errors for users: one sentence that names the cause and a solution, and the exit status of the command line."""
 
 import shlex
 from collections.abc import Sequence
 from typing import Self
 
 VIOLATED, WRONG_REQUEST, CANNOT_HERE, INTERRUPTED = 1, 2, 3, 130
-"""Exit statuses besides 0. 1: a characteristic is violated, or an agent failed; 2: scenario, arguments or exports are
-wrong; 3: this machine cannot do it; 130: interrupted."""
+"""Exit statuses besides 0. 1: a verdict is bad, an agent failed, or the result of a command is negative. 2: the
+scenario, an argument or an input file is wrong. 3: this machine cannot do it. 130: interrupted. `harness.cli` lists
+all."""
 
 
 class HarnessError(Exception):
-    """The base of all errors that the harness raises for its users. The message is one sentence with the way out.
+    """The base of all errors that the harness raises for its users. The message is one sentence with a solution.
 
     `exit_status` is the exit status of the command line.
     """
 
     exit_status = WRONG_REQUEST
     details: Sequence[str] = ()
-    """Further sentences, of one thing each, that are said before it."""
+    """Further sentences that the command line prints before the message, one for each problem."""
 
 
 class ScenarioError(HarnessError):
-    """A scenario or matrix is wrong, or does not suit what is to be done with it."""
+    """A scenario or matrix is wrong, or not suitable for the requested command or backend."""
 
 
 class ExportError(HarnessError):
@@ -37,7 +38,7 @@ class RunDirectoryError(HarnessError):
 
 
 class FieldError(HarnessError):
-    """Nothing of what came home from the field can be used."""
+    """No file from the field can be used."""
 
 
 class MachineError(HarnessError):
@@ -47,11 +48,11 @@ class MachineError(HarnessError):
 
 
 class UnsupportedError(MachineError):
-    """An agent under test says that it lacks what the run needs: it is neither right nor wrong."""
+    """An agent under test does not support a feature that the run needs. The run is not judged."""
 
     @classmethod
     def of(cls, agent_id: int, command: Sequence[str], words: str) -> Self:
-        """`words` are the agent's own, and may be none."""
+        """Return the error of an agent. `words` is the message of the agent, which may be empty."""
         why = words.rstrip(".") or "it does not say why"
         return cls(f"not supported by agent {agent_id} ({shlex.join(command)}): {why}")
 

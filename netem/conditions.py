@@ -1,11 +1,9 @@
-"""What the air is like: links and partitions as plain values, which know nothing of how they are applied.
+"""Network conditions: links and partitions as values, independent of the engine that applies them.
 
-What happens to a packet belongs to the receiver, as in the thesis: a broadcast is drawn for by every
-receiver on its own. Where that is not enough, a link from one sender to one receiver differs, in one
-direction. `netem.link` says what there is to ask of a link.
-A partition is a tuple of groups; a packet crosses from one vehicle to another only inside a group.
-Vehicles named in no group form one more group together, "the rest", so a single group cuts its members
-off from everybody else.
+As in the thesis, conditions belong to the receiver: each receiver of a broadcast draws separately. In addition, the
+link from one sender to one receiver can have conditions of its own, in one direction. `netem.link` defines the
+conditions of a link. A partition is a tuple of groups. A packet reaches only vehicles in the group of its sender.
+Vehicles in no group form a further group, so that a single group is cut off from all other vehicles.
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ class NetworkConditions:
             _check_id("links", receiver)
             if sender == receiver:
                 raise ConditionsError(f"links: {sender}>{receiver} leads to itself; allowed is another receiver")
-        # Copies: a value that its maker can still change is none.
+        # Copies, so that later changes by the caller have no effect.
         object.__setattr__(self, "receivers", dict(sorted(self.receivers.items())))
         object.__setattr__(self, "links", dict(sorted(self.links.items())))
         groups = tuple(frozenset(group) for group in self.partition)
@@ -63,23 +61,23 @@ class NetworkConditions:
         object.__setattr__(self, "partition", groups)
 
     def link(self, sender: int, receiver: int) -> LinkConditions:
-        """What happens to a packet from `sender` to `receiver` that no partition cuts."""
+        """Return the conditions of packets from `sender` to `receiver`, without regard to the partition."""
         return self.links.get((sender, receiver)) or self.receivers.get(receiver, self.default)
 
     def is_cut(self, sender: int, receiver: int) -> bool:
-        """Whether a partition stands between the two."""
+        """Return true if the partition separates the two vehicles."""
         return self._group(sender) != self._group(receiver)
 
     @property
     def fully_connected(self) -> bool:
-        """No loss of any kind anywhere and no partition; what is late or comes twice does come."""
+        """True without partition and without loss on any link. Packets may still be late or duplicated."""
         links = (self.default, *self.receivers.values(), *self.links.values())
         return not self.partition and all(link.lossless for link in links)
 
     def needs(self) -> tuple[str, ...]:
-        """What these conditions ask beyond independent loss and partition, by key.
+        """Return the conditions other than independent loss and partition.
 
-        Each key once, with the first place that asks for it: "delay", "receivers 3 reorder", "links 1>2 delay".
+        Each occurs once, with its first place: "delay", "receivers 3 reorder", "links 1>2 delay".
         """
         asked = {key: key for key in self.default.needs()}
         for vehicle, link in self.receivers.items():
@@ -89,30 +87,30 @@ class NetworkConditions:
         return tuple(asked.values())
 
     def differing_links(self) -> Iterator[tuple[int, int, LinkConditions]]:
-        """(sender, receiver, conditions) of the links that differ from what their receiver hears from others."""
+        """Yield (sender, receiver, conditions) of the links that differ from the conditions of their receiver."""
         for (sender, receiver), link in self.links.items():
             if link != self.receivers.get(receiver, self.default):
                 yield sender, receiver, link
 
     def groups(self, vehicles: Iterable[int]) -> tuple[frozenset[int], ...]:
-        """The groups that `vehicles` fall into, the rest last; one group when nothing is cut."""
+        """Return the groups of these vehicles, vehicles in no group last. Without a partition, return one group."""
         members: dict[int, set[int]] = {}
         for vehicle in vehicles:
             members.setdefault(self._group(vehicle), set()).add(vehicle)
         return tuple(frozenset(members[index]) for index in sorted(members))
 
     def with_partition(self, groups: Iterable[Iterable[int]]) -> NetworkConditions:
-        """The same conditions under another partition."""
+        """Return the conditions with this partition."""
         return replace(self, partition=tuple(frozenset(group) for group in groups))
 
     def healed(self) -> NetworkConditions:
-        """The same conditions without a partition."""
+        """Return the conditions without a partition."""
         return replace(self, partition=())
 
     def with_listener(self, listener: int, vehicles: Iterable[int]) -> NetworkConditions:
-        """The same between `vehicles`, and one more that hears and reaches each of them perfectly.
+        """Return the conditions with a further vehicle, whose links to and from `vehicles` are perfect.
 
-        A vehicle is in one group alone, so that the partition becomes links that lose everything.
+        The listener must reach all groups. Therefore links with a loss of 1 replace the partition.
         """
         roster, open_air = tuple(vehicles), LinkConditions()
         cut = {pair: LinkConditions(loss=1.0) for pair in permutations(roster, 2) if self.is_cut(*pair)}
@@ -120,9 +118,9 @@ class NetworkConditions:
         return replace(self, links={**self.links, **cut, **heard}, partition=())
 
     def at_speed(self, speedup: float) -> NetworkConditions:
-        """These conditions of a mission, in seconds of a clock on which it runs `speedup` times as fast.
+        """Return the conditions on a clock on which the mission runs `speedup` times as fast.
 
-        Shorter delays and higher rates: what a kernel, which knows one clock only, has to be asked for.
+        A kernel measures wall time. It needs delays that are shorter, and rates that are higher, by this factor.
         """
         if speedup == 1:
             return self
@@ -134,7 +132,7 @@ class NetworkConditions:
         )
 
     def validate(self, vehicles: Iterable[int]) -> None:
-        """Raise ConditionsError if a vehicle is named that is not one of `vehicles`."""
+        """Raise ConditionsError if the conditions name a vehicle that is not in `vehicles`."""
         known = set(vehicles)
         named = [("receivers", frozenset(self.receivers)), ("links", frozenset(chain.from_iterable(self.links)))]
         named += [(f"partition[{index}]", group) for index, group in enumerate(self.partition)]
@@ -153,7 +151,7 @@ class NetworkConditions:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> NetworkConditions:
-        """The inverse of `to_json`."""
+        """Return the conditions of this JSON object, as `to_json` returns it. Raises ConditionsError."""
         keywords(cls, value)
         return cls(
             LinkConditions.from_json(value.get("default", {})),

@@ -8,7 +8,7 @@ class NetemError(Exception):
 
 
 class ConditionsError(NetemError, ValueError):
-    """Conditions that mean nothing: says the key, the value, and what is allowed."""
+    """Invalid conditions. The message names the key, the value and the allowed values."""
 
 
 class NetlinkError(NetemError):

@@ -46,7 +46,7 @@ _CLOSE_DEADLINE_S = 5.0
 
 
 class LabProcess:
-    """A program in the lab, leader of a session of its own; ends with the lab at the latest."""
+    """A program in the lab, in a session of its own. It ends with the lab at the latest."""
 
     def __init__(self, channel: Channel, vehicle: int | None, pid: int, ended: asyncio.Future[int]) -> None:
         self._channel = channel
@@ -56,32 +56,32 @@ class LabProcess:
 
     @property
     def returncode(self) -> int | None:
-        """None while it runs; then its exit status, or minus the signal that killed it (subprocess)."""
+        """None while the process runs, then its exit status, or the negative number of the signal that killed it."""
         return self._ended.result() if self._ended.done() else None
 
     @property
     def end(self) -> str:
-        """How it ended, for people: the name of the signal that killed it, or its exit status."""
+        """The end of the process in words: the name of the signal that killed it, or its exit status."""
         return in_words(self._ended.result())
 
     async def wait(self) -> int:
-        """Wait for its end; -SIGKILL if it ended with the lab."""
+        """Wait for the end, and return the return code. It is -SIGKILL if the process ended with the lab."""
         return await asyncio.shield(self._ended)
 
     async def send_signal(self, number: int) -> None:
-        """Signal its process group; nothing happens if it has ended."""
+        """Send a signal to the process group. It has no effect after the end."""
         if not self._ended.done():
             await self._channel.ask("signal", pid=self.pid, signal=int(number))
 
     async def pause(self) -> None:
-        """SIGSTOP: it stands still until `resume`."""
+        """Stop the process by SIGSTOP until `resume`."""
         await self.send_signal(signal.SIGSTOP)
 
     async def resume(self) -> None:
         await self.send_signal(signal.SIGCONT)
 
     async def terminate(self, grace_s: float) -> int:
-        """End it with SIGTERM, or after `grace_s` seconds with SIGKILL; returns its return code."""
+        """End the process by SIGTERM, or by SIGKILL after `grace_s` seconds. Return its return code."""
         await self.send_signal(signal.SIGTERM)
         await self.resume()  # a stopped process could not obey
         try:
@@ -113,12 +113,12 @@ class Lab:
         networks: Mapping[int, int] | None = None,
         log: Path,
     ) -> Lab:
-        """Bring up a lab for these vehicle IDs (1..65535); `log` takes what its first process says.
+        """Open a lab for these vehicle IDs, 1 to 65535. The output of its first process goes to `log`.
 
-        `needs` is what conditions will ask beyond loss and partition (`NetworkConditions.needs`). `networks` are
-        descriptors of network namespaces that vehicles have already (root only); they stay the caller's to close.
-        Raises LabUnavailable if this machine cannot, or cannot with the engine asked for or with one that does all
-        that.
+        `engine` is the engine to use; by default the lab chooses one. `needs` lists the conditions other than loss and
+        partition that the engine must support (`NetworkConditions.needs`). `networks` has descriptors of existing
+        network namespaces of vehicles (root only). The caller closes them. Raises LabUnavailable if this machine cannot
+        run a lab, or has no engine for these needs.
         """
         ids = _checked(vehicles)
         given = dict(networks or {})
@@ -180,7 +180,7 @@ class Lab:
     async def _start(
         self, engine: EngineName | None, needs: Sequence[str], networks: Mapping[int, int], log: Path
     ) -> str | None:
-        """Build the network; returns the word of the tool if it could not even get into namespaces."""
+        """Build the network. Return the message of the tool if it could not enter namespaces, otherwise None."""
         if not await self._channel.inside():
             await self.close()
             word = _last_line(log)
@@ -212,7 +212,7 @@ class Lab:
 
     @property
     def network(self) -> Self:
-        """Itself: where vehicles are made of something else, this lab is beneath theirs."""
+        """The lab itself. A lab of containers returns the lab that it is built on."""
         return self
 
     async def spawn(
@@ -226,10 +226,12 @@ class Lab:
         stderr: Path,
         role: str = "program",
     ) -> LabProcess:
-        """Start a program in a vehicle's network (None: in the lab's own, which nothing reaches).
+        """Start a program in the network of a vehicle.
 
-        `env` is all of its environment, its output is appended to the files, its input is empty; `role` says what it
-        is. Raises SpawnError with the operating system's word.
+        With `vehicle` None, the program runs in the lab's own network, which no vehicle reaches.
+
+        `env` is its whole environment. Its output is appended to the files `stdout` and `stderr`. Its input is empty.
+        `role` names the program in errors. Raises SpawnError with the message of the operating system.
         """
         self._check_vehicle(vehicle)
         where = {"cwd": str(cwd), "stdout": str(stdout), "stderr": str(stderr)}
@@ -240,9 +242,9 @@ class Lab:
         return LabProcess(self._channel, vehicle, result["pid"], result["ended"])
 
     async def connect(self, vehicle: int, port: int, *, host: str = "127.0.0.1", timeout_s: float) -> socket.socket:
-        """A TCP connection made inside a vehicle's network, as a blocking socket; `host` is numeric.
+        """Connect by TCP inside the network of a vehicle, and return a blocking socket. `host` is a numeric address.
 
-        Raises ConnectionError if nobody listens there, TimeoutError after `timeout_s` seconds.
+        Raises ConnectionError if no program listens there, and TimeoutError after `timeout_s` seconds.
         """
         self._check_vehicle(vehicle)
         try:
@@ -256,7 +258,7 @@ class Lab:
         return connection
 
     async def apply(self, conditions: NetworkConditions) -> Applied:
-        """Put conditions into force; returns what the kernel then holds.
+        """Apply the conditions, and return the state of the kernel afterwards.
 
         Raises ConditionsError for a vehicle that does not exist, EngineError if the kernel refuses.
         """
@@ -265,17 +267,17 @@ class Lab:
         return Applied.from_json(result)
 
     async def read(self) -> Applied:
-        """What the kernel holds and has counted by now."""
+        """Return the state and the counters of the kernel."""
         result, _ = await self._channel.ask("read")
         return Applied.from_json(result)
 
     async def watch(self) -> None:
-        """Raises LabError when the lab has failed by itself."""
+        """Wait until the first process of the lab ends by itself, then raise LabError."""
         await self._process.wait()
         raise LabError("The lab's first process ended unexpectedly")
 
     async def close(self) -> None:
-        """End every process in the lab and remove it; may be called again."""
+        """End all processes of the lab, and remove it. Further calls have no effect."""
         self._channel.close()
         try:
             await asyncio.wait_for(self._process.wait(), _CLOSE_DEADLINE_S)
@@ -308,7 +310,7 @@ def _checked(vehicles: Sequence[int]) -> tuple[int, ...]:
 
 
 def in_words(returncode: int) -> str:
-    """How a process ended: "SIGKILL", "status 3"."""
+    """Return the end of a process in words, such as "SIGKILL" or "status 3"."""
     if returncode >= 0:
         return f"status {returncode}"
     number = -returncode

@@ -1,7 +1,7 @@
-"""What happens to packets on the way from one vehicle to another: loss, delay, duplicates, reordering, and more.
+"""Conditions of packets from one vehicle to another: loss, delay, duplicates, reordering, and more.
 
-The words are those of tc-netem(8), and so is what they mean; every packet's lots are drawn on its own.
-JSON leaves out what is as if nobody had asked for it, so a plain loss reads {"loss": 0.1}.
+Names and meanings are those of tc-netem(8). The random draws of each packet are independent. JSON omits default values,
+so that a plain loss reads {"loss": 0.1}.
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ from netem.errors import ConditionsError
 Distribution = Literal["uniform", "normal", "pareto", "paretonormal"]
 
 MAX_DELAY_S = 60.0
-"""Six times the longest timer of UCP as the thesis sets it; a 32-bit count of netem's 64 ns ticks reaches 274 s."""
+"""Maximum delay in seconds: six times the longest timer of UCP in the thesis. netem itself allows 274 s (32 bits of 64
+ns ticks)."""
 
 MAX_LIMIT = 100_000
-"""Packets. Where the conditions do not say, a kernel has room for one more: a flood does not fill its memory."""
+"""Maximum number of waiting packets. Without a limit in the conditions, the kernel has room for one packet more, so
+that a flood does not fill its memory."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +43,13 @@ class GilbertElliott:
 
     @property
     def mean(self) -> float:
-        """The share of packets lost in the long run."""
+        """The mean share of lost packets, 0 to 1, over a long time."""
         change = self.p + self.r
         return self.loss_good + (self.loss_bad - self.loss_good) * (self.p / change) if change else self.loss_good
 
     @property
     def lossless(self) -> bool:
-        """Nothing is ever lost, not even in a state that the link leaves for good."""
+        """True if no packet can be lost, in any state that the link can reach."""
         return self.loss_good == 0.0 and (self.p == 0.0 or self.loss_bad == 0.0)
 
     def to_json(self) -> dict[str, Any]:
@@ -55,7 +57,7 @@ class GilbertElliott:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> GilbertElliott:
-        """The inverse of `to_json`."""
+        """Return the value of this JSON object, as `to_json` returns it. Raises ConditionsError."""
         return cls(**keywords(cls, value, "loss", required=("p", "r")))
 
 
@@ -86,7 +88,7 @@ class Delay:
         object.__setattr__(self, "jitter_s", jitter_s)
 
     def at_speed(self, speedup: float) -> Delay:
-        """The same delay where `speedup` seconds pass in one."""
+        """Return the delay on a clock that runs `speedup` times slower than mission time."""
         return replace(self, mean_s=self.mean_s / speedup, jitter_s=self.jitter_s / speedup)
 
     def to_json(self) -> dict[str, Any]:
@@ -94,7 +96,7 @@ class Delay:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Delay:
-        """The inverse of `to_json`."""
+        """Return the value of this JSON object, as `to_json` returns it. Raises ConditionsError."""
         return cls(**keywords(cls, value, "delay", required=("mean_s",)))
 
 
@@ -153,24 +155,24 @@ class LinkConditions:
 
     @property
     def lossless(self) -> bool:
-        """Nothing is ever lost."""
+        """True if no packet can be lost, neither by loss nor by corruption or a full queue."""
         lossless = self.loss.lossless if isinstance(self.loss, GilbertElliott) else self.loss == 0.0
         return lossless and self.corrupt == 0.0 and self.limit is None
 
     @property
     def remembers(self) -> bool:
-        """What becomes of a packet depends on those before it on the same link, one sender to one receiver."""
+        """True if the fate of a packet depends on earlier packets of the same link, from one sender to one receiver."""
         return isinstance(self.loss, GilbertElliott) or self.rate is not None or self.limit is not None
 
     @property
     def independent_loss(self) -> float:
-        """The loss where it is one probability for all packets; raises ConditionsError where it is in bursts."""
+        """The probability of loss, the same for each packet. Raises ConditionsError for loss in bursts."""
         if isinstance(self.loss, GilbertElliott):
             raise ConditionsError(f"loss: {self.loss} is in bursts; allowed here is a probability 0..1")
         return self.loss
 
     def needs(self) -> tuple[str, ...]:
-        """What is asked beyond independent loss."""
+        """Return the names of the conditions other than independent loss, such as "delay"."""
         asked = {
             "loss in bursts": isinstance(self.loss, GilbertElliott),
             "delay": self.delay is not None,
@@ -183,7 +185,10 @@ class LinkConditions:
         return tuple(key for key, needed in asked.items() if needed)
 
     def at_speed(self, speedup: float) -> Self:
-        """The same conditions where `speedup` seconds pass in one: shorter delays, a higher rate."""
+        """Return the conditions on a clock that runs `speedup` times slower than mission time.
+
+        Delays become shorter, and the rate higher.
+        """
         return replace(
             self,
             delay=self.delay and self.delay.at_speed(speedup),
@@ -204,7 +209,7 @@ class LinkConditions:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> LinkConditions:
-        """The inverse of `to_json`."""
+        """Return the value of this JSON object, as `to_json` returns it. Raises ConditionsError."""
         known = keywords(cls, value)
         for key, kind in (("loss", GilbertElliott), ("delay", Delay)):
             if isinstance(known.get(key), Mapping):
@@ -213,7 +218,7 @@ class LinkConditions:
 
 
 def probability(key: str, value: object) -> float:
-    """The value as a float; raises ConditionsError if it is no probability."""
+    """Return the value as a float. Raises ConditionsError if it is no probability."""
     number = _number(key, value, "a probability 0..1")
     if not 0.0 <= number <= 1.0:
         hint = f" (for {value:g} % write {number / 100:g})" if 1.0 < number <= 100.0 else ""
@@ -222,7 +227,7 @@ def probability(key: str, value: object) -> float:
 
 
 def keywords(cls: type[Any], value: Mapping[str, Any], at: str = "", required: tuple[str, ...] = ()) -> dict[str, Any]:
-    """What JSON says of a dataclass's fields; raises ConditionsError for a key that it does not have."""
+    """Return the fields of a dataclass from JSON. Raises ConditionsError for an unknown or missing key."""
     prefix = f"{at}." if at else ""
     allowed = [field.name for field in fields(cls)]
     for key in value:

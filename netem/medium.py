@@ -1,19 +1,18 @@
-"""The air in virtual time: what becomes of a broadcast on its way to each receiver, drawn from a seed.
+"""The medium: the delivery of broadcasts in virtual time, drawn from a seed.
 
-It is the third engine beside tc netem and nftables, for agents that run in no kernel: the same conditions, and no
-packets. A broadcast is drawn for by every receiver on its own. Without a delay or a rate in the conditions a message
-takes 2 to 50 ms, uniformly, as over a radio; under a rate without a delay, as long as the rate makes it.
+The medium is the third engine beside tc netem and nftables. It applies the same conditions without a kernel and without
+packets. Each receiver of a broadcast draws separately. With neither a delay nor a rate in the conditions, the latency
+is uniform from 2 to 50 ms, as over a radio. With only a rate, the rate determines it.
 
-A packet's way is that of Linux, netem_enqueue of net/sched/sch_netem.c: lots for duplication and loss together, then
-one for corruption, then the limit, then the second copy on a way of its own, then the delay and the rate. A partition
-stands before all of this.
+A packet passes the steps of netem_enqueue in Linux (net/sched/sch_netem.c): draws for duplication and loss together, a
+draw for corruption, the limit, the second copy with its own draws, the delay, and the rate. The partition comes first.
 
-Every sender has a random stream of its own for each concern: loss, latency, duplication, and so on. A fault that is
-added, or another sender that says more, changes none of the others' draws. A draw is a word of 32 bits, and what it is
-compared with are whole numbers or tables of them, so that a seed means the same on every machine.
+Each sender has one random stream per concern: loss, latency, duplication, and so on. A further fault, or more messages
+of one sender, therefore do not change the draws of other senders. A draw is a word of 32 bits and is compared with
+integers only, so that a seed gives the same results on every machine.
 
-With 200 agents on the air most lots are never looked at: an answer matters to one agent of the 200. So words are drawn
-many at a time, a broadcast knows where its own stand, and they are read when somebody asks.
+In a swarm of 200 agents most draws are never used, because an answer concerns one agent. The medium therefore draws
+words in large blocks. A broadcast stores the position of its words and reads them on demand.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from netem.conditions import NetworkConditions
 from netem.link import Delay, GilbertElliott, LinkConditions
 
 LATENCY = Delay(mean_s=0.026, jitter_s=0.024)
-"""How long messages take where the conditions give neither delay nor rate."""
+"""Latency of messages if the conditions have neither a delay nor a rate."""
 
 _AT_ONCE = Delay(0.0)
 _HEADERS = 42  # bytes of a frame beside the datagram's data: Ethernet, IPv4, UDP
@@ -42,20 +41,20 @@ _TABLE_SIZE = 4096
 
 
 class RandomDraws(Protocol):
-    """The lots of one broadcast. Receivers are numbered in the order in which the medium was given its vehicles."""
+    """The random draws of one broadcast. Receivers are numbered from 0 in the order of the medium's vehicles."""
 
     latest: float
-    """No copy arrives later than this many seconds after it was sent."""
+    """Upper bound, in seconds, of the time from sending to the arrival of any copy."""
 
     def copies_to(self, receiver: int) -> tuple[float, ...]:
-        """The delay in seconds of every copy that reaches `receiver`."""
+        """Return the delays, in seconds, of all copies that arrive at `receiver`."""
 
     def to_all(self) -> list[tuple[int, float]]:
-        """(receiver, delay in seconds) of every copy that arrives anywhere, by receiver."""
+        """Return (receiver, delay in seconds) for each copy that arrives, ordered by receiver."""
 
 
 class Medium:
-    """The network between `vehicles` in virtual time. Conditions are perfect until `apply`."""
+    """The network between `vehicles` in virtual time. Conditions are perfect until the first call of `apply`."""
 
     def __init__(self, vehicles: Sequence[int], seed: int) -> None:
         self._vehicles = tuple(vehicles)
@@ -65,14 +64,15 @@ class Medium:
         self._links: list[list[_Link]] = [[] for _ in vehicles]  # of each sender, to all; none where the air is plain
         self.soonest = LATENCY.mean_s
         self.latest = LATENCY.mean_s
-        """No copy has ever arrived sooner or later after it was sent, or will under these conditions, in seconds."""
+        """Bounds, in seconds, of the delays of all copies so far and under the current conditions: `soonest` and
+        `latest`."""
         self.apply(NetworkConditions())
 
     def apply(self, conditions: NetworkConditions) -> None:
-        """From now on broadcasts meet these conditions. Raises ConditionsError for an unknown vehicle.
+        """Apply these conditions to later broadcasts. Raises ConditionsError for an unknown vehicle.
 
-        What is under way arrives as it would have. A link's queue lives on while its conditions remember; its bursts
-        begin in the good state whenever its conditions change, as a kernel has them.
+        Messages under way are not affected. A link keeps its queue if the old and the new conditions both need one. As
+        in a kernel, loss in bursts starts in the good state after each change of the link's conditions.
         """
         conditions.validate(self._vehicles)
         group = {
@@ -84,19 +84,19 @@ class Medium:
         self.latest = max(self.latest, *(air.latest for air in self._air))
 
     def certain_delays(self) -> tuple[float, float] | None:
-        """How soon and how late, in seconds, whatever is sent now arrives; None where chance decides what arrives."""
+        """Return the least and the greatest delay in seconds. None if a random draw decides whether messages arrive."""
         if not all(air.certain for air in self._air):
             return None
         return min(air.soonest_of_all for air in self._air), max(air.latest for air in self._air)
 
     def hears(self, sender: int, receiver: int) -> bool:
-        """Whether no partition stands between the two, by their numbers."""
+        """Return true if no partition separates the two vehicles. Both are numbers from 0, not IDs."""
         return self._group[sender] == self._group[receiver]
 
     def draw(self, sender: int, now: float, data_bytes: int) -> RandomDraws:
-        """The lots of a broadcast of the sender with this number: a UDP datagram that it sends at `now`, in seconds.
+        """Return the random draws of a broadcast: a UDP datagram of `data_bytes` bytes, sent at `now` seconds.
 
-        `data_bytes` is the length of the datagram's data; no sender's `now` is before its last.
+        `sender` is the number of a vehicle from 0, not its ID. The calls for one sender must be in time order.
         """
         return self._air[sender].draw(now, data_bytes)
 

@@ -1,4 +1,4 @@
-"""Range makes links: what a radio loses between two places, and what that makes of network conditions.
+"""Radio models: the loss between two places, and its effect on network conditions.
 
 A radio is a function from distance to loss. It knows nothing of flight: whoever flies tells where everybody is.
 """
@@ -16,10 +16,10 @@ from netem.errors import ConditionsError
 from netem.link import GilbertElliott, LinkConditions
 
 MIN_DISTANCE_M = 1.0
-"""Nearer than this antennas are one: the reference distance of the path loss models."""
+"""Reference distance of the path loss models in metres. A shorter distance counts as this one."""
 
 STEPS = 100
-"""Loss is held in steps of 1 %: two vehicles that hover change nothing."""
+"""Steps of the loss. Two hovering vehicles cause no change of conditions."""
 
 
 @dataclass(frozen=True)
@@ -34,15 +34,15 @@ class Place:
         return math.dist((self.north_m, self.east_m, self.up_m), (other.north_m, other.east_m, other.up_m))
 
     def to_json(self) -> list[float]:
-        """North, east, up, to a decimetre."""
+        """Return [north, east, up] in metres, rounded to decimetres."""
         return [round(self.north_m, 1), round(self.east_m, 1), round(self.up_m, 1)]
 
 
 class Radio(Protocol):
-    """What becomes of messages between two vehicles, by their distance alone, and so in both directions."""
+    """A radio: the loss between two vehicles, which depends only on their distance and is equal in both directions."""
 
     def loss(self, distance_m: float) -> float:
-        """The probability, 0..1, that a message over this distance is lost."""
+        """Return the probability, 0 to 1, that a message over this distance is lost."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class LogDistance:
             raise ConditionsError(f"radio.shadowing_db: {self.shadowing_db!r} is below 0; allowed is 0 dB or more")
 
     def margin_db(self, distance_m: float) -> float:
-        """By how much the mean received power exceeds what the receiver needs."""
+        """Return the mean received power minus the sensitivity, in decibels, at this distance in metres."""
         first_metre_db = 20 * math.log10(4 * math.pi * MIN_DISTANCE_M * self.frequency_hz / 299_792_458.0)
         path_db = first_metre_db + 10 * self.exponent * math.log10(max(distance_m, MIN_DISTANCE_M))
         return self.power_dbm - path_db - self.sensitivity_dbm
@@ -106,7 +106,7 @@ class LogDistance:
 
 
 def links(radio: Radio, places: Mapping[int, Place]) -> dict[frozenset[int], float]:
-    """The loss between each two vehicles, in whole steps; those that lose nothing to the radio are left out."""
+    """Return the loss of each pair of vehicles, rounded to steps. Pairs without loss are omitted."""
     losses: dict[frozenset[int], float] = {}
     for first, second in combinations(places, 2):
         if lost := round(radio.loss(places[first].distance_m(places[second])) * STEPS) / STEPS:
@@ -115,7 +115,7 @@ def links(radio: Radio, places: Mapping[int, Place]) -> dict[frozenset[int], flo
 
 
 def over_the_air(conditions: NetworkConditions, losses: Mapping[frozenset[int], float]) -> NetworkConditions:
-    """The conditions with what the radio loses on top: a message has to get past both, each on its own."""
+    """Return the conditions with the additional loss of the radio. The two losses are independent."""
     if not losses:
         return conditions
     pairs = dict(conditions.links)

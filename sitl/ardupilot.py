@@ -74,14 +74,14 @@ class ArduPilot:
 
     @property
     def sha256(self) -> str | None:
-        """The hash of its binary, None if that cannot be read."""
+        """The SHA-256 hash of the binary in hexadecimal. None if the binary cannot be read."""
         with contextlib.suppress(OSError):
             return sha256(self.binary)
         return None
 
     @property
     def frame(self) -> str:
-        """What its program calls its frame."""
+        """The name of the frame in ArduPilot."""
         return self._airframe.model
 
     @property
@@ -90,7 +90,7 @@ class ArduPilot:
 
     @property
     def lack(self) -> str | None:
-        """Without its default parameters a vehicle may refuse to arm."""
+        """A sentence on missing default parameters, without which a vehicle may refuse to arm. None if complete."""
         if not self.missing:
             return None
         files = " and ".join(self.missing)
@@ -104,9 +104,9 @@ class ArduPilot:
         vehicle_type: VehicleType = "copter",
         setup: Setup = USUAL_SETUP,
     ) -> ArduPilot:
-        """The binary that the scenario names, else that of the frame in ARDUPILOT_SITL, on PATH, or installed.
+        """Return `binary`, or the first binary for the frame in ARDUPILOT_SITL, on PATH, or among the installed ones.
 
-        Raises UnusableBinaryError when one is named and will not do, NoBinaryError when none is named or found.
+        Raises UnusableBinaryError if the binary cannot be used, and NoBinaryError if none is found.
         """
         program = airframe(setup.frame, vehicle_type).program
         if binary is not None:
@@ -161,7 +161,7 @@ class ArduPilot:
         return cls(binary.absolute(), found, vehicle_type, setup, missing)
 
     def check(self) -> None:
-        """Raises VehicleError if the binary, or this machine, lacks what the vehicle's setup asks for."""
+        """Raise VehicleError if the binary or this machine cannot provide the setup of the vehicle."""
         if self.setup.frame is not None:
             if self.missing:
                 files, many = " and ".join(self.missing), len(self.missing) > 1
@@ -184,7 +184,7 @@ class ArduPilot:
             raise UnusableBinaryError(f"{self.binary} has no frame {frame[:MAX_SHOWN]!r}: {meant}")
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
-        """Write the vehicle's parameters into `directory`. Raises VehicleError."""
+        """Write the parameters of the vehicle to `directory`, and return the command. Raises VehicleError."""
         check_launch(sysid, home, speedup)
         # names, not paths: ArduPilot takes a comma in a path for the end of it
         files = [path.name for path in self.defaults]

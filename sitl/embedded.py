@@ -57,7 +57,7 @@ class Embedded:
         return self.setup.parameters
 
     def check(self) -> None:
-        """Raises VehicleError for what only ArduPilot has."""
+        """Raise VehicleError if the setup asks for a feature that only ArduPilot has."""
         frame = self.setup.frame
         asked = {
             f"frame {frame}": frame is not None and frame != USUAL[self.vehicle_type],
@@ -69,7 +69,7 @@ class Embedded:
             raise VehicleError(f"embedded vehicles have no {' and no '.join(lacks)}: fly ArduPilot, or leave it out")
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
-        """The embedded vehicle keeps no files: `directory` stays as it is. Raises VehicleError."""
+        """Return the command. The embedded vehicle writes no files to `directory`. Raises VehicleError."""
         check_launch(sysid, home, speedup)
         return Launch(
             [

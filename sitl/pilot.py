@@ -1,10 +1,9 @@
-"""The pilot: the client that flies a vehicle over MAVLink, real ArduPilot and the embedded vehicle alike.
+"""The pilot: a client that flies ArduPilot or the embedded vehicle over MAVLink.
 
-A pilot keeps a link (_pilot_link.py), and pursues one procedure after another (procedure.py): a take-off, a plan by
-mission or
-in GUIDED, the end of a flight; and of the first two at first only what comes before arming. Whatever a procedure waits
-for has a limit, and so has the vehicle's silence: a vehicle that spins, crawls, falls mute or leaves is given up with a
-FlightError that says what it was waited for and what it last said.
+A pilot has a link (_pilot_link.py) and executes procedures (procedure.py): a take-off, a plan as a mission or in GUIDED
+mode, and the end of a flight. It executes the steps before arming of a take-off or plan separately. Each step has a
+time limit, and so has the silence of the vehicle. If a limit expires, or the vehicle ends the connection, the pilot
+raises a FlightError. The error names the step and the last message of the vehicle.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ ASK_AGAIN_S = 2.0  # of our time without a position, after which telemetry is as
 
 
 class Pilot:
-    """The pilot of one vehicle: commands it over MAVLink. Use it in one event loop only."""
+    """The pilot of one vehicle, which commands it over MAVLink. Use it in one event loop only."""
 
     def __init__(
         self,
@@ -49,11 +48,11 @@ class Pilot:
         vehicle_type: VehicleType = "copter",
         vehicle_id: int | None = None,
     ) -> None:
-        """Take over `sock`, already connected to the vehicle's pilot port. `speedup` is what the vehicle was given,
-        `home` where it was started.
+        """Use `sock`, which is connected to the pilot port of the vehicle. `close` closes it.
 
-        `vehicle_id` is what errors call the vehicle, if not by its system ID. Raises OSError when `tlog` cannot be
-        opened.
+        `sysid` is the MAVLink system ID. `tlog` is the file of the telemetry log. `speedup`, in simulated seconds per
+        second, and `home` are those of the vehicle's launch. Errors contain `vehicle_id`, by default the system ID.
+        Raises OSError if `tlog` cannot be opened.
         """
         self.link = Link(sysid, sock, tlog, speedup, home)
         self.vehicle_type: VehicleType = vehicle_type
@@ -67,11 +66,11 @@ class Pilot:
 
     @property
     def real_time_factor(self) -> float | None:
-        """Simulated seconds per second over the speedup, since first heard: 1.0 is a machine fast enough."""
+        """Simulated seconds per second, divided by the speedup. 1.0 means that the machine is fast enough."""
         return self.link.real_time_factor
 
     async def start(self) -> None:
-        """Begin to read, to log and to send heartbeats."""
+        """Start to read and log messages, and to send heartbeats."""
         await self.link.start()
 
     async def close(self) -> None:
@@ -79,60 +78,60 @@ class Pilot:
         await self.link.close()
 
     def ascent(self, altitude_m: float) -> Procedure:
-        """To `altitude_m` above home; a rover is armed in GUIDED, and that is all."""
+        """Return the procedure of a take-off to `altitude_m` metres above home. A rover only arms, in GUIDED mode."""
         return TakeOff(self.link, self.vehicle_type, altitude_m)
 
     def flight(self, plan: Plan, by: By) -> Procedure:
-        """Of a plan. Raises PlanError if this type of vehicle cannot fly it."""
+        """Return the procedure of a flight plan. Raises PlanError if this type of vehicle cannot fly it."""
         waypoints = route(plan, self.vehicle_type, self.link.home.heading_deg)
         flight = MissionFlight if by == "mission" else GuidedFlight
         return flight(self.link, self.vehicle_type, waypoints)
 
     async def introduce(self, given: Mapping[str, float]) -> None:
-        """Have the vehicle say its version and its parameters, of which `given` are to have these values.
+        """Request the version and the parameters of the vehicle, and set the parameters in `given`.
 
-        Raises FlightError, and ParameterError for some of these that it does not know.
+        Raises FlightError, and ParameterError if the vehicle does not know some of the given parameters.
         """
         await self._pursue(Introduction(self.link, given))
         if phrase := unknown(given, self.link.parameters):
             raise ParameterError(f"vehicle {self.vehicle_id} knows {phrase}")
 
     async def get_ready(self, flight: Procedure) -> None:
-        """Do what comes before arming, and return when nothing else has been left to do for READY_FOR_S.
+        """Execute the steps before arming. Return once all of them stay complete for READY_FOR_S seconds.
 
-        ArduPilot runs its checks now and then, and others in another mode: what it said at first it may take back.
-        Raises FlightError.
+        ArduPilot repeats its checks, and has further ones in other modes. It may therefore report ready and then not
+        ready. Raises FlightError.
         """
         await self._pursue(GettingReady(flight, self.state))
 
     async def fly(self, flight: Procedure) -> None:
-        """Return when the last of it is done. Raises FlightError."""
+        """Execute the procedure, and return after its last step. Raises FlightError."""
         await self._pursue(flight)
 
     async def terminate_flight(self) -> None:
-        """Disarm in flight, by force, and return when the vehicle lies on the ground. Raises FlightError.
+        """Force the vehicle to disarm in flight, and return when it lies on the ground. Raises FlightError.
 
-        What was being flown ends, without an error.
+        The current procedure ends without an error.
         """
         self._terminated = True
         await self._pursue(Termination(self.link))
 
     async def befall(self, circumstance: Circumstance) -> Mapping[str, float]:
-        """Have the vehicle simulate this; which parameters have which values for it. Raises NotSimulatedError.
+        """Make the vehicle simulate a circumstance. Return the parameters set for it, with their values.
 
-        From now on it may do what it was not asked for: when it leaves its mode, disarms, or does not make a step in
-        time, what was being flown ends, without an error.
+        The vehicle may now act on its own. If it then leaves its mode, disarms, or misses a time limit, the current
+        procedure ends without an error. Raises NotSimulatedError if the vehicle cannot simulate the circumstance.
         """
         values = await bring_about(self.link, circumstance)
         self._befallen = True
         return values
 
     def hand_over(self) -> None:
-        """Somebody else flies it from now on: whatever this pilot was about ends, without an error."""
+        """Hand the vehicle over to another pilot. The current procedure ends without an error."""
         self._handed_over = True
 
     async def stay_in_touch(self) -> None:
-        """Raises FlightError when the vehicle falls silent or leaves; ends when its flight is terminated."""
+        """Raise FlightError when the vehicle is silent or disconnects. Return after `terminate_flight`."""
         await self._pursue(_Listening())
 
     async def _pursue(self, procedure: Procedure) -> None:

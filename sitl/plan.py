@@ -1,8 +1,8 @@
-"""A flight plan: what a vehicle does, leg by leg, in metres from its own home.
+"""A flight plan: the legs of a flight, in metres from the home of the vehicle.
 
-A plan is a value and knows no MAVLink; `Plan.check` says whether a type of vehicle can fly it. Vehicles with the same
-plan keep the formation of their homes. What the legs leave open (altitudes, speeds, a plane's approach) is filled in by
-sitl/_route.py, once for everybody who flies or computes the plan.
+A plan is a value without MAVLink. `Plan.check` checks that a type of vehicle can fly it. Vehicles with the same plan
+keep the formation of their homes. sitl/_route.py adds missing values, such as altitudes, speeds and the approach of a
+plane.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Literal
 from sitl.vehicle import VehicleError, VehicleType
 
 By = Literal["mission", "guided"]
-"""How a plan is flown: uploaded whole and flown in AUTO, or leg by leg in GUIDED."""
+"""`mission`: the vehicle flies the uploaded plan in AUTO mode. `guided`: the pilot commands each leg in GUIDED mode."""
 
 MAX_LEGS = 100
 MAX_DISTANCE_M = 100_000.0  # the earth is flat up to here, near enough
@@ -44,7 +44,11 @@ class TakeOff:
 
 @dataclass(frozen=True)
 class GoTo:
-    """Go to a place in metres north and east of home; the altitude stays when None, the speed is the type's own."""
+    """Go to a place in metres north and east of home.
+
+    `altitude_m` is above home; None keeps the altitude. `speed_ms` is in metres per second; None is the speed of the
+    type.
+    """
 
     north_m: float
     east_m: float
@@ -57,7 +61,7 @@ class GoTo:
 
 @dataclass(frozen=True)
 class Loiter:
-    """Stay at the place of the leg before for so many seconds of the vehicle's time; a plane circles it."""
+    """Stay at the place of the previous leg for `seconds` of simulated time. A plane circles."""
 
     seconds: float
 
@@ -67,7 +71,7 @@ class Loiter:
 
 @dataclass(frozen=True)
 class Land:
-    """Land at the place of the leg before: a copter straight down, a plane along the heading of its home."""
+    """Land at the place of the previous leg: a copter straight down, a plane along the heading of its home."""
 
     def __str__(self) -> str:
         return "land"
@@ -95,7 +99,7 @@ class Plan:
 
 
 def _problem(leg: Leg, first: bool, last: bool, vehicle_type: VehicleType) -> str | None:
-    """What is wrong with a leg, or None."""
+    """Return the error in a leg, or None."""
     if vehicle_type == "rover" and isinstance(leg, TakeOff | Land):
         return "a rover neither takes off nor lands"
     match leg:

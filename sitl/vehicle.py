@@ -1,9 +1,9 @@
-"""What a vehicle is: a program that speaks MAVLink on three TCP ports, and how it is started.
+"""A vehicle: a program that speaks MAVLink on three TCP ports, and the command that starts it.
 
-A vehicle lives in a network namespace of its own, so every vehicle listens on the same ports: the ones that ArduPilot
-SITL uses for its first three serial ports. The pilot (the orchestrator) has the first, the agent the second, and a
-ground station the third.
-Which program it is, real ArduPilot or the embedded vehicle, is a `VehicleKind`; nothing else needs to know.
+Each vehicle runs in its own network namespace. Therefore all vehicles listen on the same ports, those of the first
+three serial ports of ArduPilot SITL. The pilot in the orchestrator uses the first, the agent the second, and a ground
+station the third. A `VehicleKind` stands for the program, ArduPilot or the embedded vehicle. Other code does not depend
+on it.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ class VehicleError(Exception):
 
 
 class NoBinaryError(VehicleError):
-    """No ArduPilot was named and none is on PATH; a run may fall back to the embedded vehicle."""
+    """No ArduPilot binary is named or found. A run may use the embedded vehicle instead."""
 
 
 class UnusableBinaryError(VehicleError):
-    """An ArduPilot binary was named, or found, and cannot be run."""
+    """An ArduPilot binary is named or found, but cannot be run."""
 
 
 class NoProgramError(VehicleError):
-    """A program that is to run around a vehicle is not on this machine."""
+    """A program that runs the vehicle, such as a debugger, is not on this machine."""
 
 
 class FlightError(VehicleError):
@@ -69,12 +69,12 @@ class Home:
             raise VehicleError(f"home heading {self.heading_deg} is no heading: give 0 to 359 degrees")
 
     def __str__(self) -> str:
-        """The form of ArduPilot's `--home` option: LAT,LON,ALT,HDG."""
+        """Return the place as in ArduPilot's option `--home`: LAT,LON,ALT,HDG."""
         return f"{self.lat_deg:.7f},{self.lon_deg:.7f},{self.alt_m:.2f},{self.heading_deg:.1f}"
 
     @classmethod
     def parse(cls, text: str) -> Home:
-        """Read LAT,LON,ALT,HDG. Raises VehicleError when it is anything else."""
+        """Return the place of a text LAT,LON,ALT,HDG. Raises VehicleError for any other text."""
         try:
             lat, lon, alt, heading = (float(part) for part in text.split(","))
         except ValueError:
@@ -84,13 +84,16 @@ class Home:
         return cls(lat, lon, alt, heading)
 
     def offset(self, north_m: float, east_m: float) -> Home:
-        """The place this far away, same altitude and heading. Flat earth: good for a flying field, not for a voyage."""
+        """Return the place at this offset in metres, with the same altitude and heading.
+
+        The calculation assumes a flat earth, which is accurate enough for a flying field.
+        """
         lat = self.lat_deg + north_m / METRES_PER_DEGREE
         lon = self.lon_deg + east_m / (METRES_PER_DEGREE * max(math.cos(math.radians(self.lat_deg)), 1e-6))
         return Home(max(-90.0, min(90.0, lat)), (lon + 180.0) % 360.0 - 180.0, self.alt_m, self.heading_deg)
 
     def metres_to(self, lat_deg: float, lon_deg: float, alt_m: float) -> tuple[float, float, float]:
-        """How far north, east and above this place that one is. The inverse of `offset`, and as flat."""
+        """Return the offset of a place from this one, in metres north, east and up. The inverse of `offset`."""
         north_m = (lat_deg - self.lat_deg) * METRES_PER_DEGREE
         degrees_east = (lon_deg - self.lon_deg + 180.0) % 360.0 - 180.0
         east_m = degrees_east * METRES_PER_DEGREE * max(math.cos(math.radians(self.lat_deg)), 1e-6)
@@ -119,27 +122,28 @@ class VehicleKind(Protocol):
 
     @property
     def frame(self) -> str | None:
-        """What its program calls its frame, if it has several."""
+        """The name of the frame in the program. None if the program has only one."""
 
     @property
     def sha256(self) -> str | None:
-        """The hash of its program, if that is a file of its own."""
+        """The SHA-256 hash of the program in hexadecimal. None if the program is no single file."""
 
     @property
     def parameters(self) -> Mapping[str, float]:
-        """What its user gives it, which it has to know."""
+        """Parameters from the user. The vehicle must know each of them."""
 
     @property
     def lack(self) -> str | None:
-        """What it may need to fly and does not have, with the way out; None if nothing is known to be missing."""
+        """A sentence on a missing requirement of flight, with a solution. None if nothing is missing."""
 
     def check(self) -> None:
-        """Raises VehicleError if it cannot be had as it is set up."""
+        """Raise VehicleError if this machine cannot run the vehicle with its setup."""
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
-        """Prepare `directory`, which exists and is the vehicle's working directory, and say how to start it.
+        """Prepare the working directory of a vehicle, and return the command that starts it.
 
-        `speedup` is simulated seconds per second. Raises VehicleError when the vehicle cannot be had like that.
+        `sysid` is the MAVLink system ID, 1 to 255. `speedup` is in simulated seconds per second. `directory` must
+        exist. Raises VehicleError for an impossible argument.
         """
 
 
@@ -154,9 +158,10 @@ def check_launch(sysid: int, home: Home, speedup: float) -> None:
 
 
 def place_in_field(index: int, spacing_m: float = SPACING_M) -> tuple[float, float]:
-    """Metres north and east of the field's centre, for the index-th vehicle (from 0): a sunflower's seeds.
+    """Return metres north and east of the centre of a field, for the vehicle with this index from 0.
 
-    No two are closer than about `spacing_m`, any number of vehicles fits, and adding one moves none of the others.
+    The places form the pattern of the seeds of a sunflower. Two places are at least about `spacing_m` apart. Any number
+    of vehicles fits, and a further vehicle moves no other.
     """
     radius = spacing_m * math.sqrt(index)
     bearing = index * math.pi * (3 - math.sqrt(5))  # the golden angle
@@ -164,5 +169,5 @@ def place_in_field(index: int, spacing_m: float = SPACING_M) -> tuple[float, flo
 
 
 def home_in_field(index: int, centre: Home, spacing_m: float = SPACING_M) -> Home:
-    """The home of the index-th vehicle (from 0) of a field, at `place_in_field`."""
+    """Return the home of the vehicle with this index from 0, at `place_in_field`."""
     return centre.offset(*place_in_field(index, spacing_m))

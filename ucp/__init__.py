@@ -104,7 +104,7 @@ _NAMES_OF = {
         "Trigger",
     ),
 }
-"""The imports above, as they are done at the first use of a name."""
+"""Module -> its public names, to import at their first use."""
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 
 if not TYPE_CHECKING:  # a type checker would accept any name

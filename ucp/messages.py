@@ -47,7 +47,8 @@ class MalformedDatagramError(ValueError):
 
 @dataclass(unsafe_hash=True, slots=True)
 class BlockAddRequest:
-    """May the block with this hash go on top of the chain with this chain hash? (Algorithms 2 and 3)"""
+    """A request for votes: may the block with this hash go on top of the chain with this chain hash? (Algorithms 2 and
+    3)"""
 
     NAME: ClassVar[str] = "Block Add Request"
     WIRE: ClassVar[Fields] = {"block_hash": Kind.HASH, "chain_hash": Kind.HASH}
@@ -89,7 +90,7 @@ class BlockAddResponse:
 
 @dataclass(unsafe_hash=True, slots=True)
 class CommitBlock:
-    """Commit this block; `chain_hash` is its own at its place in the sender's chain (Algorithms 5, 6 and 20)."""
+    """A block to commit (Algorithms 5, 6 and 20). `chain_hash` is the chain hash of the block in the sender's chain."""
 
     NAME: ClassVar[str] = "Commit Block"
     WIRE: ClassVar[Fields] = {"chain_hash": Kind.HASH, "block": Kind.BLOCK}
@@ -107,7 +108,7 @@ class CommitBlock:
 
 @dataclass(unsafe_hash=True, slots=True)
 class ChainContainQuery:
-    """Does your chain contain this chain hash? (Algorithms 8 and 9)"""
+    """A query: does the receiver's chain contain this chain hash? (Algorithms 8 and 9)"""
 
     NAME: ClassVar[str] = "Chain Contain Query"
     WIRE: ClassVar[Fields] = {"chain_hash": Kind.HASH}
@@ -123,7 +124,7 @@ class ChainContainQuery:
 
 @dataclass(unsafe_hash=True, slots=True)
 class ChainContainResponse:
-    """Yes or no to a Chain Contain Query (Algorithms 9 and 10)."""
+    """The answer, yes or no, to a Chain Contain Query (Algorithms 9 and 10)."""
 
     NAME: ClassVar[str] = "Chain Contain Response"
     WIRE: ClassVar[Fields] = {"contained": Kind.FLAG, "chain_hash": Kind.HASH}
@@ -142,7 +143,7 @@ class ChainContainResponse:
 
 @dataclass(unsafe_hash=True, slots=True)
 class ChainHashSuccessorQuery:
-    """Which block follows this chain hash in your chain? (Algorithms 12 and 13)"""
+    """A query: which block follows this chain hash in the receiver's chain? (Algorithms 12 and 13)"""
 
     NAME: ClassVar[str] = "Chain Hash Successor Query"
     WIRE: ClassVar[Fields] = {"chain_hash": Kind.HASH}
@@ -158,7 +159,8 @@ class ChainHashSuccessorQuery:
 
 @dataclass(unsafe_hash=True, slots=True)
 class NextInSequenceResponse:
-    """The successor's block hash and timestamp (Algorithms 13 and 14).
+    """The block hash and the timestamp of the successor, in answer to a Chain Hash Successor Query (Algorithms 13 and
+    14).
 
     `block_hash` None is the reserved "Is Top Of Chain"; the timestamp is then that of the responder's top block.
     """
@@ -183,7 +185,7 @@ class NextInSequenceResponse:
 
 @dataclass(unsafe_hash=True, slots=True)
 class RequestForBlock:
-    """Send me the block with this hash (Algorithms 16 and 17)."""
+    """A request for the block with this hash (Algorithms 16 and 17)."""
 
     NAME: ClassVar[str] = "Request for Block"
     WIRE: ClassVar[Fields] = {"block_hash": Kind.HASH}
@@ -199,7 +201,7 @@ class RequestForBlock:
 
 @dataclass(unsafe_hash=True, slots=True)
 class BlockResponse:
-    """The block that was asked for (Algorithms 17 and 18)."""
+    """The requested block (Algorithms 17 and 18)."""
 
     NAME: ClassVar[str] = "Block Response"
     WIRE: ClassVar[Fields] = {"block": Kind.BLOCK}

@@ -107,14 +107,14 @@ class HandlerRun:
     - `t`: mission seconds.
     - `trigger`: why the handler ran.
     - `changes`: (operation, block hash); operations are `complete`, and `chain`, `deque`, `stack` with + or -.
-    - `state`: what holds after the run.
-    - `input`: what came with the trigger: the datagram as it was received; the event as a block has it; the blocks
-      that were found on disk, in the order in which `changes` names them, a length (u16) before each.
-    - `tally`: what the handler counts in, after the run: {"yes": n, "no": n}, or of Algorithms 12 and 14 {block hash,
-      or "" for Is Top Of Chain: [count, timestamp in microseconds]}; of Algorithm 15 {block hash: count} of the chosen
-      block.
-    - `started`: timers that the run started, and their durations in mission seconds.
-    - `sealed`: event data of a block that it completed, if it is sealed.
+    - `state`: a summary of the state after the run.
+    - `input`: the input of the handler. For a message: the received datagram. For an event: its encoding in a block.
+      For a boot: the blocks from the disk in the order of `changes`, each after its length (u16).
+    - `tally`: the counters of the handler after the run. Algorithms 12 and 14 have {block hash: [count, timestamp in
+      microseconds]}, with "" for "Is Top Of Chain". Algorithm 15 has {block hash: count} of the chosen block. The other
+      handlers have {"yes": n, "no": n}.
+    - `started`: timer -> duration in mission seconds, of the timers that the run started.
+    - `sealed`: sealed event data of a block that the run completed.
     """
 
     t: float

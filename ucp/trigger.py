@@ -104,7 +104,7 @@ class OperatorTrigger(Trigger):
 
 @dataclass(unsafe_hash=True, slots=True)
 class BootTrigger(Trigger):
-    """The agent booted, and found a chain of so many blocks on its disk."""
+    """The agent booted, and found a chain of `blocks` blocks on its disk."""
 
     blocks: int
 

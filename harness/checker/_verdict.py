@@ -1,4 +1,4 @@
-"""The whole verdict: six characteristics, what is judged beside them, and the figures."""
+"""The verdict on a run: the six characteristics, the three further checks, and the figures."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -37,7 +37,7 @@ BESIDE: dict[str, Callable[[Evidence], Judgement]] = {
     "records": records.check,
     "liveness": _liveness.check,
 }
-"""Judgements that are not of the thesis, by their keys: see `harness.scenario.verdict_names`."""
+"""Key of each check that is not in the thesis -> its function. See `harness.scenario.verdict_names`."""
 
 
 @dataclass(frozen=True)
@@ -52,22 +52,22 @@ class Result:
     figures: dict[str, float | int | None]
     beside: dict[str, Judgement] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
-    """A sentence for each file that could not be used, or not wholly."""
+    """A sentence for each file that could not be read, or only in part."""
     chains: dict[int, tuple[str, ...]] = field(default_factory=dict)
-    """The hashes of the blocks in each agent's chain, the oldest first."""
+    """Agent ID -> block hashes of its chain in hexadecimal, oldest first."""
 
     @property
     def judgements(self) -> dict[str, Judgement]:
-        """All of them, by number or key, in the order in which they are shown."""
+        """All judgements, by number or key, in the order of the report."""
         return {**self.characteristics, **self.beside}
 
     @property
     def bad(self) -> tuple[str, ...]:
-        """Numbers and keys of what makes the exit status 1."""
+        """Numbers and keys of the bad judgements. If there is one, the exit status is 1."""
         return tuple(key for key, judgement in self.judgements.items() if judgement.kind == "bad")
 
     def to_json(self) -> dict[str, Any]:
-        """The `characteristics`, `figures`, `errors` and judgements beside of `ucp-run/1`."""
+        """Return the keys of the schema `ucp-run/1` that contain the verdict."""
         return {
             "characteristics": {
                 number: characteristic.to_json() for number, characteristic in self.characteristics.items()
@@ -81,7 +81,8 @@ class Result:
 def check(run: Evidence | RunArchive) -> Result:
     """Decide the six characteristics (Section 4.3), and the judgements `steps`, `records` and `liveness`.
 
-    An archive is read first. A damaged file raises no error: a sentence on it is in `Result.errors`.
+    `run` is an archive, or the evidence from it. A damaged file raises no error, but adds a sentence to
+    `Result.errors`.
     """
     evidence = gather(run) if isinstance(run, RunArchive) else run
     chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()}

@@ -1,6 +1,6 @@
-"""A verdict with its reason and evidence: on a characteristic, or beside them.
+"""The verdict of one check, with its reason and evidence.
 
-A check that could not look is `not applicable`, never `holds`.
+A check without evidence is `not applicable`, never `holds`.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -9,24 +9,24 @@ from typing import Any
 from harness.scenario.verdict_names import Kind, Verdict, kind_of
 
 MAX_EVIDENCE = 50
-"""More pieces of evidence than anyone reads are counted in the reason and not listed."""
+"""Maximum number of listed pieces of evidence. The reason has the number of all."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One piece of evidence: the agent, the block if there is one, and what was seen where."""
+    """One piece of evidence: the agent, the block if there is one, and the observation with its place."""
 
     agent_id: int
     detail: str
     block: str | None = None
     block_hash: str | None = None
     handler: str | None = None
-    """Which of the 20 did it, if one did."""
+    """Name of the handler that the evidence concerns, one of the 20. None if it concerns no handler."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict with its reason, one sentence, and the first pieces of evidence."""
+    """The verdict of one check, its reason in one sentence, and at most 50 pieces of evidence."""
 
     name: str
     verdict: Verdict
@@ -35,11 +35,11 @@ class Judgement:
 
     @property
     def kind(self) -> Kind:
-        """What the verdict amounts to; a bad one makes the exit status 1."""
+        """`good`, `bad` or `unknown`. A bad verdict leads to exit status 1."""
         return kind_of(self.verdict)
 
     def to_json(self) -> dict[str, Any]:
-        """A `JudgementRecord` of `ucp-run/1`."""
+        """Return the judgement as a `JudgementRecord` of the schema `ucp-run/1`."""
         return {
             "name": self.name,
             "verdict": self.verdict,

@@ -69,7 +69,7 @@ PLAYED = {
 
 @dataclass(frozen=True)
 class Limits:
-    """When a proof gives up: bytes of memory of all processes, and seconds. `cores` is the number of processes."""
+    """Limits of a proof: memory of all processes in bytes, and time in seconds. `cores` is the number of processes."""
 
     most_bytes: float = 4e9
     most_s: float = float("inf")
@@ -103,18 +103,18 @@ class Proof:
     whole_ended: Ended = "complete"
     example: Example | None = None
     fork: Example | None = None
-    """The nearest state at rest with several chains: nothing is violated, and it stays so until somebody votes."""
+    """The nearest idle state with several chains. It violates no property, and stays as it is until an agent votes."""
     reluctant: Example | None = None
-    """The nearest state for which one more vote is not enough, if more votes are."""
+    """The nearest state that needs more than one further vote to reach one chain. None if none is known."""
     livelocks: list[Livelock] = field(default_factory=list)
-    """The first of each form, those that were played; also of what was looked at where that is not all."""
+    """One livelock of each form, replayed as a run. They may come from an exploration that is not complete."""
     way: list[str] = field(default_factory=list)
     shown: dict[str, Example | None] = field(default_factory=dict)
-    """By characteristic of `OF_CAPTORS`: the nearest of what a captor does; None in the network `any`."""
+    """Characteristic of `OF_CAPTORS` -> the nearest violation that an attacker can cause. None in the network `any`."""
 
     @property
     def claims(self) -> dict[str, str]:
-        """What is looked at in every state."""
+        """The properties that the proof checks in every state, as key -> sentence."""
         claims = CLAIMS if self.bounds.steps else {kind: claim for kind, claim in CLAIMS.items() if kind != "steps"}
         if self.bounds.captured is None:
             return claims

@@ -123,25 +123,25 @@ class Bounds:
 
     @property
     def nameless(self) -> bool:
-        """Whether it makes no difference which ID an agent has: to itself it is the first then.
+        """True if states are stored without IDs, so that each agent counts as the first from its own view.
 
-        Not where each is looked at by itself, against all that the others say by their IDs.
+        False with a captured agent, and in the network `any`, where messages depend on the sender's ID.
         """
         return self.reduced and self.captured is None and self.network != "any"
 
     @property
     def alike(self) -> bool:
-        """Whether it makes no difference who is who."""
+        """True if two states that differ only by an exchange of agents count as one state."""
         return self.nameless and not self.stagger
 
     @property
     def blocks_alike(self) -> bool:
-        """Whether it makes no difference which block is which."""
+        """True if two states that differ only by an exchange of blocks count as one state."""
         return self.nameless and self.clocks_any
 
     @property
     def settles(self) -> bool:
-        """Whether all answers to a question have come, or are lost, when the instant of the question is over."""
+        """True if all answers to a question arrive, or are lost, at the instant of the question."""
         return self.reduced and self.captured is None
 
     def agent_settings(self, agent_id: int = 1) -> Settings:

@@ -37,50 +37,50 @@ class Point(NamedTuple):
 
 
 class Task(NamedTuple):
-    """One run that is asked for."""
+    """One run of the matrix: the place of its cell, and its seed."""
 
     point: Point
     seed: int
 
 
 class Matrix(Model):
-    """A scenario, played by each `backend` for each `duration_s` with each number of `agents` at each rate of `loss`
-    with each of `seeds`.
+    """A scenario and the values to vary: `backend`, `duration_s`, `agents`, `loss` and `seeds`.
 
-    `loss` replaces the scenario's `network.loss`. `agents` and `duration_s`, if given, replace the scenario's keys of
-    the same name. The scenario must leave a replaced key unset, because two values for one thing could differ.
-    Everything else in the scenario (receivers that differ, its timeline) applies to every cell. Every cell has the same
-    seeds, so the same blocks are built at the same times at every loss (common random numbers). A difference between
-    two such cells is therefore an effect of the loss.
+    Each combination of values is one run. `loss` replaces the scenario's `network.loss`. `agents` and `duration_s`, if
+    given, replace the scenario's keys of the same name. The scenario must leave a replaced key unset, because two
+    values for one thing could differ. Everything else in the scenario (receivers that differ, its timeline) applies to
+    every cell. Every cell has the same seeds, so the same blocks are built at the same times at every loss (common
+    random numbers). A difference between two such cells is therefore an effect of the loss.
     """
 
     name: Annotated[str, Field(min_length=1, max_length=200)]
     about: Annotated[str, Field(max_length=2000)] = ""
     scenario: Scenario
-    """Keys of a scenario (its `name` is the matrix's unless given), or the path of one, relative to the matrix file."""
+    """Keys of a scenario, or the path of a scenario file relative to the matrix file. Default of its `name`: that of
+    the matrix."""
     loss: Annotated[list[Probability], Field(min_length=1, max_length=100)]
     seeds: int | list[int] = 200
-    """How many, counted from 1, or which."""
+    """Number of seeds, counted from 1, or a list of seeds."""
     agents: (
         Annotated[list[Annotated[int, Field(ge=1, le=MAX_AGENTS, strict=True)]], Field(min_length=1, max_length=100)]
         | None
     ) = None
-    """One number or several; the scenario's if not given."""
+    """Numbers of agents. Default: that of the scenario."""
     duration_s: (
         Annotated[list[Annotated[Seconds, Field(le=MAX_DURATION_S)]], Field(min_length=1, max_length=100)] | None
     ) = None
-    """One mission length or several; the scenario's if not given."""
+    """Mission lengths in mission seconds. Default: that of the scenario."""
     backend: Annotated[list[BackendName], Field(min_length=1, default_factory=lambda: ["sim"])]
-    """One or several."""
+    """Backends, by default `sim`."""
     keep: Literal["violated", "all"] = "violated"
-    """Of which runs as processes the directories are kept: those that violated a characteristic or failed, or all."""
+    """Run directories to keep, of runs that do not play in memory: of those with a violation or failure, or of all."""
     traces: bool = True
-    """Whether agents write traces in virtual time. Without traces, large swarms take a fifth of the time and far less
+    """True if agents write traces in virtual time. Without traces, large swarms take a fifth of the time and far less
     memory, but the checker judges neither characteristic 1 nor steps and records. Processes always write traces."""
 
     @property
     def needs_processes(self) -> bool:
-        """Whether any run is for real, in containers or without."""
+        """True if any run needs real processes, in containers or without."""
         return any(not BACKENDS[backend].plays_in_memory for backend in self.backend)
 
     @property
