@@ -49,7 +49,8 @@ EventData = Annotated[Base64, Field(max_length=4 * (MAX_EVENT_DATA_BYTES // 3 + 
 
 
 class ExportedBlock(BaseModel):
-    """A block as exported; `chain_hash` is null outside the chain. `signature` is its maker's in a secured mission."""
+    """An exported block. `chain_hash` is null outside the chain. `signature` is that of the block's agent in a secured
+    mission."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -69,7 +70,7 @@ class ExportedBlock(BaseModel):
 
 
 class ExportedInception(BaseModel):
-    """The inception block, which all agents of a mission share: its data is in base64."""
+    """The inception block, the same for all agents of a mission. Its data is in base64."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -84,7 +85,7 @@ class ExportedInception(BaseModel):
 
 
 class CurrentBlock(BaseModel):
-    """The block that is being built: the events that it has by now, in base64."""
+    """The incomplete block of an agent: its events so far, in base64."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -92,7 +93,7 @@ class CurrentBlock(BaseModel):
 
 
 class Export(BaseModel):
-    """One agent's export; fields that this version does not know are ignored."""
+    """The chain export of one agent. Unknown fields are ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 

@@ -1,7 +1,7 @@
-"""What run.json says: the record of one run, schema `ucp-run/1`. Keys are added, never removed or renamed.
+"""The record of one run: run.json, schema `ucp-run/1`. Later versions may add keys, but remove or rename none.
 
-The harness writes all of it. What is read back may be of a run that was killed, of another version, or edited: there
-is a default for every key of a `RunRecord`, which says that nothing is known of it.
+The harness writes the whole record. A record that it reads may come from a killed run or another version, or may be
+edited. Therefore each key of a `RunRecord` has a default that means unknown.
 """
 
 from typing import Annotated, Any, Literal
@@ -18,7 +18,7 @@ SCHEMA = "ucp-run/1"
 
 
 AgentKey = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,4}$")]
-"""An agent's ID, or that of its vehicle, where JSON has text for keys."""
+"""The ID of an agent, or of its vehicle, as a JSON key."""
 
 
 class _Model(BaseModel):
@@ -26,18 +26,18 @@ class _Model(BaseModel):
 
 
 class FindingRecord(_Model):
-    """One piece of evidence; `block` is its name for people, such as 4.11."""
+    """One piece of evidence. `block` is the name of the block, such as 4.11."""
 
     agent_id: int
     detail: str
     block: str | None
     block_hash: str | None
     handler: str | None = None
-    """The event handler that did it, if one did."""
+    """The event handler that the evidence concerns. null if it concerns none."""
 
 
 class CharacteristicRecord(_Model):
-    """The judgement on one of the six characteristics."""
+    """The judgement on one of the six characteristics (Section 4.3)."""
 
     name: str
     verdict: CharacteristicVerdict
@@ -46,7 +46,7 @@ class CharacteristicRecord(_Model):
 
 
 class JudgementRecord(_Model):
-    """A judgement beside the characteristics."""
+    """The judgement of a further check: `steps`, `records` or `liveness`."""
 
     name: str
     verdict: Verdict
@@ -55,7 +55,8 @@ class JudgementRecord(_Model):
 
 
 class NetworkState(_Model):
-    """From mission second `at_s` on, `detail` holds; `fully_connected` means that nothing is lost or cut."""
+    """The state of the network from mission second `at_s` on. `what` names the change, and `detail` describes the state
+    in words. `fully_connected` is true without any loss or partition."""
 
     at_s: float
     what: str
@@ -64,7 +65,7 @@ class NetworkState(_Model):
 
 
 class FaultRecord(_Model):
-    """What a scenario did to the network or to agents at `at_s`; `detail` says it to people."""
+    """A change of the network, or a fault of agents, at mission second `at_s`. `detail` describes it in words."""
 
     at_s: float
     what: str
@@ -72,23 +73,23 @@ class FaultRecord(_Model):
     fully_connected: bool | None = None
     agents: list[int] | None = None
     disk: Disk | None = None
-    """What a reboot left of it."""
+    """State of the disk after a reboot."""
     by_hand: bool = False
-    """Somebody asked for it while the run went on; the scenario's timeline has it since."""
+    """True if a user requested it during the run. The timeline of the recorded scenario contains it."""
 
     @property
     def kind(self) -> type[faults.Fault]:
-        """What is known of such faults."""
+        """The class of the fault."""
         return faults.named(self.what)
 
     @property
     def loses_data(self) -> bool:
-        """Whether all that the agents held was gone."""
+        """True if the agents lost all their data."""
         return self.kind.loses_data(self.disk)
 
 
 class FinalReconcile(_Model):
-    """`complete` once a round of reconciles changed no chain."""
+    """The final reconcile. `complete` is true if a last round of reconciles changed no chain."""
 
     at_s: float
     rounds: int
@@ -96,7 +97,8 @@ class FinalReconcile(_Model):
 
 
 class CycleStep(_Model):
-    """So long after the cycle begins anew, an agent runs this handler; `branch` is None if that was not traced."""
+    """A handler run in a cycle, `after_s` mission seconds after the start of a period. `branch` is null if no trace has
+    it."""
 
     agent_id: int
     after_s: float
@@ -105,20 +107,21 @@ class CycleStep(_Model):
 
 
 class CycleWait(_Model):
-    """An agent asks in each reconcile of the cycle, and these never answer; those refuse its blocks."""
+    """An agent that cannot finish. The agents in `for_agents` never answer its questions, and those in `refused_by`
+    refuse its blocks."""
 
     agent_id: int
     for_agents: list[int] = []
     refused_by: list[int] = []
-    """Empty, too, where that was not traced."""
+    """Also empty if no trace has the votes."""
 
 
 class Cycle(_Model):
-    """What agents that never finish go round in, at the latest since mission second `since_s`.
+    """A sequence of handler runs that agents repeat without end, at the latest from mission second `since_s` on.
 
-    `period_s` is None of a standstill: nothing is on its way, no timer runs, and `agents` are not done. `proven`: the
-    global state recurs, and nothing is left to chance; otherwise the same handler runs were seen `periods` times in a
-    row.
+    `period_s` is null for a standstill: no message is under way, no timer runs, and `agents` are not idle. `proven` is
+    true if the global state recurs and no random draw can change it. Otherwise the same handler runs occurred `periods`
+    times in a row.
     """
 
     since_s: float
@@ -126,16 +129,16 @@ class Cycle(_Model):
     periods: int | None = None
     proven: bool = False
     agents: Annotated[list[int], Field(min_length=1)]
-    """Those that go round, of whom some may be idle at any moment; of a standstill those that are not idle."""
+    """The agents in the cycle. Some may be idle for a time. For a standstill: the agents that are not idle."""
     steps: list[CycleStep] = []
-    """One period, in order."""
+    """The handler runs of one period, in order."""
     waits: list[CycleWait] = []
 
 
 class HandlerRuns(_Model):
-    """How many handler runs an agent had counted in one life, by a moment between `from_s` and `until_s`.
+    """Number of handler runs that an agent counted in one incarnation, until a moment between `from_s` and `until_s`.
 
-    They are the same if it told its own mission time with it.
+    Both are equal if the agent reported its own mission time with the number.
     """
 
     counted: int
@@ -144,24 +147,24 @@ class HandlerRuns(_Model):
 
 
 class AgentRecord(_Model):
-    """`outcome` is exported, not exported, killed, rebooting, crashed, hung, broken, not supported, paused, running or
-    not started.
+    """The outcome of one agent: exported, not exported, killed, rebooting, crashed, hung, broken, not supported,
+    paused, running or not started.
 
-    Counters are those of all its lives, if it had more than one, and null if unknown.
+    Counters are sums over all incarnations of the agent. null means unknown.
     """
 
     outcome: str
     detail: str | None = None
     command: list[str] | None = None
-    """What started it, but for its mission file; null of one that ran inside the harness."""
+    """Command without the mission file. null for an agent inside the harness."""
     version: str | None = None
-    """What it said of itself in its status."""
+    """Name and version from its status."""
     restarts: int = 0
-    """How often it began anew with nothing."""
+    """Number of starts with the inception block only, after the first."""
     reboots: int = 0
-    """How often it came back with what was on its disk."""
+    """Number of starts with the data on its disk."""
     completed_before: list[str] = []
-    """Hashes of the blocks that it completed in lives that left no export, since it was killed."""
+    """Hashes of the blocks that it completed in incarnations without an export, because it was killed."""
     idle: bool | None = None
     reconciles: int | None = None
     chain_changed_at_s: float | None = None
@@ -171,18 +174,20 @@ class AgentRecord(_Model):
     send_failures: int | None = None
     trace_problem: str | None = None
     handler_runs: list[HandlerRuns | None] = []
-    """What it said last in each of its lives; null of a life in which it said nothing."""
+    """Its last report in each incarnation. null for an incarnation without a report."""
 
 
 class CapturedFrames(_Model):
-    """How many frames crossed a vehicle's interface, and how many of them its capture lacks."""
+    """Number of frames at the interface of a vehicle (`received`), and number of those missing in its capture
+    (`dropped`)."""
 
     received: int
     dropped: int
 
 
 class ReceiverCounters(_Model):
-    """How many packets to a vehicle the kernel let through, lost, and cut off; and what it was told to do to them."""
+    """Packets to one vehicle: numbers that the kernel passed, lost, and cut off by a partition. Further keys are the
+    applied conditions."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -192,7 +197,7 @@ class ReceiverCounters(_Model):
 
 
 class Counters(_Model):
-    """What the kernel counted, by receiver."""
+    """Counters of the kernel, by receiver."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -200,7 +205,8 @@ class Counters(_Model):
 
 
 class BlockHolders(_Model):
-    """Who held a block right after vehicles were lost, and at the end; `agent_id` completed it."""
+    """The vehicles that held a block directly after a loss of vehicles (`holders`), and at the end. `agent_id`
+    completed it."""
 
     block: str
     block_hash: str
@@ -210,10 +216,11 @@ class BlockHolders(_Model):
 
 
 class Loss(_Model):
-    """Vehicles were lost at `at_s`, and all that they held with them. Counts are null where traces are missing.
+    """The loss of vehicles, with all their data, at mission second `at_s`. Counts are null if traces are missing.
 
-    Of the blocks `completed` by then, by anybody, `survived` are those that some other vehicle held, `gone` those that
-    only the lost ones did, and `gone_at_end` those that nobody holds at the end, whatever took them.
+    `completed` counts the blocks of all agents until then. Of these, `survived` counts blocks that another vehicle
+    held, and `gone` those that only the lost vehicles held. `gone_at_end` counts blocks that no vehicle holds at the
+    end, for any reason.
     """
 
     at_s: float
@@ -224,27 +231,28 @@ class Loss(_Model):
     gone: int | None = None
     gone_at_end: int | None = None
     blocks: list[BlockHolders] = []
-    """Those that the lost vehicles had completed, and those that are gone; the oldest first."""
+    """Blocks that the lost vehicles completed, and blocks that are gone, oldest first."""
 
 
 class LeastHeld(_Model):
-    """The smallest set of vehicles whose loss would lose a block: the holders of the block that the fewest hold."""
+    """The smallest set of vehicles whose loss would lose a block: the holders of the block with the fewest holders."""
 
     vehicles: int
-    """How many there are to hold it."""
+    """Number of vehicles that could hold it."""
     holders: list[int]
     block: str
     block_hash: str
     blocks: int
-    """How many blocks are on as few vehicles."""
+    """Number of blocks with this number of holders."""
     of: int
-    """How many blocks there are."""
+    """Number of all blocks."""
 
 
 class Survival(_Model):
-    """What became of the `completed` blocks where vehicles were lost; `gone` are on no vehicle at the end.
+    """The survival of blocks after losses of vehicles. `completed` counts all blocks, and `gone` those on no vehicle at
+    the end.
 
-    None where nothing tells what some agents completed.
+    Both are null if the completed blocks of some agents are unknown.
     """
 
     losses: list[Loss] = []
@@ -255,10 +263,11 @@ class Survival(_Model):
 
 
 class InjectedMessages(_Model):
-    """Of one injection the messages of one type: how many it sent, and what the agents that heard them did.
+    """Messages of one type in an injection: their number, and the handler runs that they caused.
 
-    `handled`: branch of the handler -> how often it was taken. `changed`: how many of these handler runs changed what
-    an agent holds. `unhandled`: how many of the messages no agent handled; None if traces name messages otherwise.
+    `handled` maps each branch of the handler to its number of runs. `changed` counts the runs that changed the data of
+    an agent. `unhandled` counts the messages without a handler run. It is null if the names of messages in traces are
+    unknown.
     """
 
     message: str
@@ -269,9 +278,10 @@ class InjectedMessages(_Model):
 
 
 class RogueInjection(_Model):
-    """What became of one injection. `refused`: datagrams that are no message, by reason; agents only count them.
+    """The effect of one injection. `refused` counts datagrams that are no message, by reason. Agents drop and count
+    them.
 
-    `untraced` are copies that are not told from the others.
+    `untraced` counts copies that traces do not distinguish from the originals.
     """
 
     at_s: float
@@ -288,38 +298,39 @@ WRITTEN_FROM_THE_START = ("scenario", "seed", "backend", "versions", "started_at
 
 
 class JudgedRecord(_Model):
-    """The part of a record that a judgement of the run needs."""
+    """The part of a record that the checker needs."""
 
     schema_: Literal["ucp-run/1"] = Field(default="ucp-run/1", alias="schema")
     roster: list[int]
     outcome: Literal["running", "completed", "interrupted", "failed", "not supported"] = "running"
-    """Not supported: an agent said that it lacks what the run needs, and nothing is judged."""
+    """`not supported`: an agent does not support a feature that the run needs. The run is not judged."""
     outcome_detail: str | None = None
     network: list[NetworkState] = []
     faults: list[FaultRecord] = []
     final_reconcile: FinalReconcile | None = None
     cycle: Cycle | None = None
-    """Where agents were shown never to finish; if `proven`, the run stopped there."""
+    """A cycle that shows that agents never finish. If it is `proven`, the run stopped there."""
     mission_s: float | None = None
     stagger: Annotated[Stagger, Field(exclude=True)] = {}
-    """As the scenario has it: by how much agents were told different timers."""
+    """`stagger` of the scenario: the differences between the timers of agents."""
     agents: dict[AgentKey, AgentRecord] = {}
     engine: str | None = None
     counters: Counters | None = None
 
     @property
     def switched_off(self) -> dict[int, float]:
-        """Agents that ended in order before the run did, and when, in mission seconds: their exports are of then."""
+        """Agent ID -> mission second at which the agent exported its chain and ended, before the end of the run."""
         off = (fault for fault in self.faults if fault.kind.leaves_an_export)
         return {agent_id: fault.at_s for fault in off for agent_id in fault.agents or ()}
 
     def end_of(self, agent_id: int) -> float | None:
-        """When the run ended for this agent, in mission seconds; None if it is not on record."""
+        """Return the mission second of the end of this agent. None if the record does not have it."""
         return self.switched_off.get(agent_id, self.mission_s)
 
 
 class OperatorCommand(_Model):
-    """What an operator sent at `at_s`, `times` times in a row until `until_s`; `values` are the message's fields."""
+    """A command of an operator at mission second `at_s`, repeated `times` times until `until_s`. `values` are the
+    fields of the message."""
 
     at_s: float
     until_s: float
@@ -332,7 +343,8 @@ class OperatorCommand(_Model):
 
 
 class GroundStationRecord(_Model):
-    """What passed between the vehicles and a ground station, in datagrams; `dropped` ones were too many, or damaged."""
+    """Traffic between the vehicles and a ground station, in datagrams. `dropped` datagrams were too many, or
+    damaged."""
 
     address: str
     sent: int = 0
@@ -340,11 +352,12 @@ class GroundStationRecord(_Model):
     dropped: int = 0
     commands: list[OperatorCommand] = []
     commands_left_out: int = 0
-    """Of which there were more than are kept."""
+    """Number of further commands, beyond the maximum that the record keeps."""
 
 
 class RunRecord(JudgedRecord):
-    """All of a record. Times are mission seconds except `wall_s`; what is not known, or not yet, is null or empty."""
+    """The record of a run. Times are mission seconds, except `wall_s` in seconds of wall time. Unknown values are null
+    or empty."""
 
     model_config = ConfigDict(json_schema_extra={"required": ["roster", *WRITTEN_FROM_THE_START]})
 
@@ -358,25 +371,25 @@ class RunRecord(JudgedRecord):
     settled: bool = False
     vehicles: dict[AgentKey, dict[str, Any]] = {}
     unmatched_fates: list[str] = []
-    """A sentence for each scripted fate that decided nothing, each injection that sent nothing, and each vehicle that
-    does not simulate what was to befall it."""
+    """A sentence for each scripted fate without a matching message, each injection that sent nothing, and each vehicle
+    that did not simulate a fault."""
     capture: dict[AgentKey, CapturedFrames] | None = None
-    """Of each vehicle, if captures were asked for and came to their end."""
+    """Frames of each vehicle, if captures were requested and completed."""
     ground_station: GroundStationRecord | None = None
-    """If the run had one."""
+    """Traffic with the ground station. null without one."""
     characteristics: dict[str, CharacteristicRecord] = {}
     steps: JudgementRecord | None = None
-    """Whether every agent did at every step what the algorithms say."""
+    """Judgement on each handler run, compared with the reference core."""
     records: JudgementRecord | None = None
-    """Whether what two records tell about the same thing agrees."""
+    """Judgement on the agreement of records of the same facts."""
     liveness: JudgementRecord | None = None
-    """Whether the swarm became idle once no more events came."""
+    """Judgement on whether the swarm became idle after the last event."""
     figures: dict[str, float | int | None] = {}
     survival: Survival | None = None
     rogue: list[RogueInjection] = []
-    """What the rogue node sent and the agents did with it, for each injection of the timeline, in order."""
+    """The effect of each injection of the timeline, in order."""
     errors: list[str] = []
-    """A sentence for each file that the checker could not use, or not wholly."""
+    """A sentence for each file that the checker could not read, or only in part."""
 
     @model_validator(mode="after")
     def _staggered_as_the_scenario_says(self) -> "RunRecord":
@@ -386,16 +399,16 @@ class RunRecord(JudgedRecord):
 
     @property
     def known_agents(self) -> list[int]:
-        """All agents that it names anywhere, whether or not they left anything; the lowest ID first."""
+        """The IDs of all agents in the record, ascending, also of agents without files."""
         asked = self.scenario.roster if self.scenario else ()
         return sorted({*self.roster, *asked, *map(int, self.agents), *map(int, self.vehicles)})
 
     @property
     def judgements(self) -> dict[str, CharacteristicRecord | JudgementRecord]:
-        """The verdicts on the characteristics by number, and those beside them by key."""
+        """The judgements on the characteristics by number, and those of the further checks by key."""
         beside = {key: judgement for key in BESIDE if (judgement := getattr(self, key)) is not None}
         return {**self.characteristics, **beside}
 
     def to_json(self) -> dict[str, Any]:
-        """The document, every key of it."""
+        """Return the JSON document with all keys."""
         return self.model_dump(mode="json", by_alias=True)

@@ -1,4 +1,5 @@
-"""What `ucp-harness packets --json` prints, schema `ucp-packets/1`. Keys are added, never removed or renamed."""
+"""The output of `ucp-harness packets --json`, schema `ucp-packets/1`. Later versions may add keys, but remove or rename
+none."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -18,7 +19,8 @@ _WhoListened = Annotated[Name, Field(description="A vehicle's ID, or the name of
 
 
 class CaptureRecord(BaseModel):
-    """One file. It listened from `began_s` to `ended_s`, null if it saw nothing, and missed `dropped` frames."""
+    """One capture file. It covers the time from `began_s` to `ended_s`, null if it is empty, and lacks `dropped`
+    frames."""
 
     file: str
     vehicle: int | None
@@ -32,7 +34,8 @@ class CaptureRecord(BaseModel):
 
 
 class PairRecord(BaseModel):
-    """Of `sent` datagrams that the receiver should have heard, `lost` never reached it."""
+    """Datagrams from one sender that one receiver should have received: their number (`sent`), and the number of `lost`
+    ones."""
 
     sender: int
     receiver: _WhoListened
@@ -41,7 +44,7 @@ class PairRecord(BaseModel):
 
 
 class ReceptionRecord(BaseModel):
-    """`copies` reached a listener, the last at `last_s`."""
+    """The reception of a datagram: the number of copies, and the times of the first (`at_s`) and the last copy."""
 
     by: _WhoListened
     at_s: float
@@ -50,7 +53,8 @@ class ReceptionRecord(BaseModel):
 
 
 class AnswerRecord(BaseModel):
-    """What came of a request at vehicle `by`: its answer, if it gave one, and the number of the datagram."""
+    """The outcome of a request at vehicle `by`: its answer, and the number of the datagram with the answer. null
+    without one."""
 
     by: int
     outcome: Outcome
@@ -59,11 +63,11 @@ class AnswerRecord(BaseModel):
 
 
 class DatagramRecord(BaseModel):
-    """A datagram, sent once. `number` counts in the order of sending; `answers` is null for what is no request.
+    """One sent datagram. `number` counts in the order of sending. `answers` is null if the message is no request.
 
-    `origin` is captured (seen leaving its sender), inferred (its sender was not captured then: `at_s` is when it first
-    reached somebody) or forged (not sent by the agent that it names). `lost_by` listened and did not receive it;
-    `not_listening` had no capture running.
+    `origin` is `captured` (the capture of its sender has it), `inferred` (its sender had no capture then, and `at_s` is
+    the time of the first reception) or `forged` (the named agent did not send it). The vehicles in `lost_by` had a
+    capture but did not receive it. Those in `not_listening` had no capture.
     """
 
     number: int
@@ -84,7 +88,8 @@ class DatagramRecord(BaseModel):
 
 
 class PacketsRecord(BaseModel):
-    """Times are mission seconds; second 0 is `epoch_us`, the first packet if `captures` are not of a run."""
+    """The datagrams of several captures. Times are mission seconds from `epoch_us` on. Without a run, `epoch_us` is the
+    time of the first packet."""
 
     model_config = ConfigDict(populate_by_name=True)
 
@@ -101,7 +106,7 @@ class PacketsRecord(BaseModel):
 def document(
     captures: Captures, pairs: Iterable[Pair], shown: Iterable[Transmission], exchanges: Exchanges, names: Names
 ) -> Iterator[str]:
-    """The lines of one JSON document, each datagram a line."""
+    """Yield the lines of one JSON document, with one line per datagram."""
     clock = captures.clock
     record = PacketsRecord(
         epoch_us=clock.epoch_ns // 1000,

@@ -52,9 +52,10 @@ FILE = "import.json"
 
 
 class ImportedAgent(BaseModel):
-    """What there is of one agent: files relative to the flight's directory, and what they were made from.
+    """The imported files of one agent, relative to the directory of the flight.
 
-    `handler_runs`, `lives`, `gaps` and `clock_jumps` are of its trace.
+    `trace_from` has the sources of the trace. `handler_runs`, `lives`, `gaps` and `clock_jumps` are counts in the
+    trace.
     """
 
     trace: str | None = None
@@ -69,7 +70,7 @@ class ImportedAgent(BaseModel):
 
 
 class ImportedFlight(BaseModel):
-    """`directory` is relative to the import's; `initial_data` is in base64."""
+    """One imported flight. `directory` is relative to the directory of the import. `initial_data` is in base64."""
 
     directory: str
     initial_data: str | None
@@ -80,7 +81,8 @@ class ImportedFlight(BaseModel):
 
 
 class ImportRemark(BaseModel):
-    """Of a file of the sources, or of the line, row or message of it that `counts` says: `why` ends a sentence."""
+    """A remark on a source file, or on one of its lines, rows or messages: `counts` names the unit. `why` ends a
+    sentence."""
 
     path: str
     line: int | None
@@ -93,7 +95,7 @@ class ImportRemark(BaseModel):
 
 
 class ImportRecord(BaseModel):
-    """The flights, the one with the most in it first; what was left out; and what must be known of the rest."""
+    """The result of an import: the flights, largest first, the files that were left out, and remarks on the others."""
 
     model_config = ConfigDict(extra="ignore")
 

@@ -35,7 +35,7 @@ EXACT = 2**53
 
 
 class ManifestInception(BaseModel):
-    """BH_0 and CH_0 (eq. 3.3 and 3.4)."""
+    """The block hash BH_0 (eq. 3.3) and the chain hash CH_0 (eq. 3.4) of the inception block."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -49,7 +49,8 @@ class ManifestInception(BaseModel):
 
 
 class Manifest(BaseModel):
-    """`files` are the mission files by agent ID, beside the manifest; `settings_sha256` is `fingerprint`'s."""
+    """The manifest of a mission. `files` maps each agent ID to its mission file in the same directory.
+    `settings_sha256` is the SHA-256 hash of the settings."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 

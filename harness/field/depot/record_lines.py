@@ -39,7 +39,7 @@ class Line(BaseModel):
 
 
 class ExportUsed(Line):
-    """An export, and what its agent held. Of several of one agent only the `latest` says what it holds now."""
+    """An export and the numbers of blocks in it. Of several exports of one agent, `latest` marks the current one."""
 
     agent_id: AgentId
     file: str
@@ -55,10 +55,10 @@ class ExportUsed(Line):
 
 
 class Header(Line):
-    """`roster` are all agents that are known to have flown.
+    """The first line: the mission, its exports, and totals. `roster` has the IDs of all agents known to have flown.
 
-    `problems` are what is wrong with the exports, `left_out` the files that are not used and why, `remarks` what else
-    must be known.
+    `problems` has a sentence for each error in an export, `left_out` for each unused file, and `remarks` for other
+    facts.
     """
 
     line: Literal["header"] = "header"
@@ -78,7 +78,7 @@ class Header(Line):
 
 
 class Way(Line):
-    """Agents whose chains go on alike, with the block `next`; null where they end."""
+    """Agents whose chains continue with the same block, `next`. It is null if their chains end."""
 
     agents: list[AgentId]
     next: str | None
@@ -86,7 +86,8 @@ class Way(Line):
 
 
 class Fork(Line):
-    """Chains part after so many blocks, `after` being the last common one; null for the inception block."""
+    """A fork: chains differ after `height` common blocks. `after` is the last common block, null for the inception
+    block."""
 
     line: Literal["fork"] = "fork"
     height: Count
@@ -96,10 +97,11 @@ class Fork(Line):
 
 
 class Held(Line):
-    """`position` counts from 1: in a chain from the inception block, in a deque from the front, in a stack from below.
+    """A place of a block, and the agents that hold it there. `position` counts from 1: in a chain from the inception
+    block, in a deque from the front, in a stack from the bottom.
 
-    The same `chain_hash` is the same history. In a `current block` the agent had the first of its events, and in an
-    `earlier export` the block itself.
+    Blocks with the same `chain_hash` have the same predecessors. `current block` means that the agent had the first
+    events of the block. `earlier export` means that only an older export of the agent has the block.
     """
 
     place: Place
@@ -109,11 +111,11 @@ class Held(Line):
 
 
 class Block(Line):
-    """`number` counts the record's blocks from 1. `block_hash` is null of a block that was being built.
+    """A block. `number` counts the blocks of the record from 1. `block_hash` is null for an incomplete block.
 
-    `mutual`: it is in the chain that all share. `claimed_hash` is what a file says its hash is, where that is wrong: it
-    was edited, or damaged. `unreadable` is what follows its events and is none. `sealed`: nobody has opened it, and it
-    is `unreadable` all of it.
+    `mutual` is true if all chains share the block. `claimed_hash` is the wrong hash in a file that was edited or
+    damaged. `unreadable` is the data after the last readable event. `sealed` is true if the data is encrypted. It is
+    then all `unreadable`.
     """
 
     line: Literal["block"] = "block"
@@ -131,12 +133,12 @@ class Block(Line):
 
     @property
     def holders(self) -> list[int]:
-        """Who holds it now, wherever."""
+        """The IDs of the agents that hold it in chain, deque or stack, ascending."""
         return sorted({agent for held in self.held if held.place in HELD_NOW for agent in held.agents})
 
 
 class Event(Line):
-    """The event at `index`, from 0, of the block with the number `block`."""
+    """One event: number `index`, from 0, in the block with the number `block`."""
 
     line: Literal["event"] = "event"
     block: Number
@@ -148,7 +150,8 @@ class Event(Line):
 
 
 class Lost(Line):
-    """A block of `agent_id`, or without a block the vehicle itself; `agents` are those with whom it was lost."""
+    """A missing block of `agent_id`, or the missing vehicle itself if `block` is null. `agents` are the missing
+    vehicles that may have the block, or `agent_id` alone."""
 
     line: Literal["lost"] = "lost"
     agent_id: AgentId
@@ -159,7 +162,7 @@ class Lost(Line):
 
 
 class Vehicle(Line):
-    """A vehicle after the reconcile, and the blocks, by name, that it has now and had not when it came home."""
+    """A vehicle after the reconcile. `gained` has the names of the blocks that it did not have before."""
 
     agent_id: AgentId
     chain: Count
@@ -168,9 +171,10 @@ class Vehicle(Line):
 
 
 class Reconciled(Line):
-    """`chain` are the hashes of the uniform chain, oldest first; without one it is empty.
+    """The last line: the result of a final reconcile of the exports. `chain` has the hashes of the uniform chain,
+    oldest first. It is empty if the chains are not uniform.
 
-    `left_out` are blocks that no chain has, with the reason.
+    `left_out` has the blocks in no chain, each with the reason.
     """
 
     line: Literal["reconciled"] = "reconciled"
@@ -184,7 +188,7 @@ class Reconciled(Line):
 class ConsolidatedLine(
     RootModel[Annotated[Header | Fork | Block | Event | Lost | Reconciled, Field(discriminator="line")]]
 ):
-    """Any line of `ucp-consolidated/1`."""
+    """One line of a `ucp-consolidated/1` record."""
 
 
 def mutual_chain(chains: Iterable[Sequence[str]]) -> Sequence[str]:

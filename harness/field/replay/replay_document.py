@@ -19,13 +19,14 @@ from ucp.agent import HANDLERS
 
 SCHEMA: Literal["ucp-replay/1"] = "ucp-replay/1"
 MAX_DIFFERENCES = 1000
-"""More of one record are counted."""
+"""Maximum number of listed differences per record. Further ones are only counted."""
 
 Verdict = Literal["as specified", "deviates", "not judged"]
 
 
 class DifferenceRecord(BaseModel):
-    """A step that is not the reference's; without `algorithm`, `handler` and `source` it is no handler's of the 20."""
+    """A step that differs from the reference core. `algorithm`, `handler` and `source` are null if it is none of the 20
+    handlers."""
 
     line: int
     t: Annotated[float, Field(description="Mission seconds, by the agent's record.")]
@@ -36,7 +37,8 @@ class DifferenceRecord(BaseModel):
 
 
 class ReplayedRecord(BaseModel):
-    """Of one record `steps` handler runs were compared, and `unjudged` could not be, because of what the list says."""
+    """The replay of one record. `steps` counts the compared handler runs, and `unjudged` the others. `unjudged_because`
+    has the reasons."""
 
     record: Annotated[str, Field(description="The file, or the first of the files.")]
     agent_id: int
@@ -51,7 +53,7 @@ class ReplayedRecord(BaseModel):
 
 
 class ReplayDocument(BaseModel):
-    """One element for each record that was played, in the order of the agents."""
+    """The result of a replay. `records` has one element per record, in the order of the agents."""
 
     model_config = ConfigDict(populate_by_name=True)
 

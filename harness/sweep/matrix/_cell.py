@@ -52,10 +52,10 @@ class Run(Placed):
 
 
 class Cell(Placed):
-    """`runs` at one point, of which `failed` and `unsupported` have no figures; an estimate per metric; how often each
-    verdict fell.
+    """The runs at one point of a matrix. `failed` and `unsupported` count the runs without figures.
 
-    `violated` has the seeds of the runs that violated a characteristic, or what is judged beside them.
+    `estimates` has an estimate for each metric. `verdicts` counts the verdicts of each check. `violated` has the seeds
+    of the runs with a bad verdict, by check.
     """
 
     runs: int

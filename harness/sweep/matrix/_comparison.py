@@ -12,7 +12,7 @@ from harness.sweep.matrix._estimate import BY_NAME, Estimate
 
 
 class Change(Placed):
-    """`metric` was `before`, is `now`, and the intervals are apart."""
+    """A changed figure: `metric` was `before` and is `now`. The two 95 % intervals do not overlap."""
 
     metric: str
     before: Estimate
@@ -21,7 +21,7 @@ class Change(Placed):
 
 
 class Comparison(BaseModel):
-    """With the matrix of `started_at`, whose matrix.json is `baseline`."""
+    """The comparison with an earlier matrix, which started at `started_at`. `baseline` is its matrix.json."""
 
     baseline: str
     started_at: str

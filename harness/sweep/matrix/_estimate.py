@@ -17,7 +17,8 @@ CONFIDENCE = 0.95
 
 
 class Estimate(BaseModel):
-    """`mean` of `n` runs; `low` and `high` bound its 95 % interval, null for a single run; all null for none."""
+    """The mean of `n` runs. `low` and `high` are the limits of its 95 % interval, null for a single run. Without runs,
+    all are null."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 

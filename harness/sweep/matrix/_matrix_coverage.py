@@ -16,7 +16,7 @@ MOST_AGENTS, MOST_BLOCKS = 3, 3
 
 
 class CellTried(Placed):
-    """Of the runs of a cell that were played by this command."""
+    """Coverage by the runs of one cell that this command played."""
 
     local_states: int
     pairs: int
@@ -24,7 +24,7 @@ class CellTried(Placed):
 
 
 class Tried(BaseModel):
-    """`runs` that were looked at; `all_cells` is a `ucp-coverage/1`."""
+    """Coverage by all examined runs. `all_cells` is a `ucp-coverage/1` document."""
 
     runs: int
     all_cells: dict[str, Any]

@@ -16,17 +16,18 @@ SCHEMA = "ucp-matrix/1"
 
 
 class RunWithoutResult(Placed):
-    """A run without a result, and why."""
+    """A run without a result, with the reason."""
 
     seed: int
     reason: str
 
 
 class MatrixRecord(BaseModel):
-    """One matrix. `matrix` is the file as resolved; a cell for each point of which a run has ended.
+    """The results of a matrix. `matrix` is the resolved matrix file. `cells` has a cell for each point with at least
+    one ended run.
 
-    `started_at` is when it was begun; `wall_s` is of the last command, if it was interrupted and went on. `against` is
-    what changed since the night that it was compared with.
+    `started_at` is the start of the first command. `wall_s` is the wall time of the last command in seconds, if an
+    interrupted matrix was continued. `against` has the changes since the matrix to compare with.
     """
 
     model_config = ConfigDict(populate_by_name=True)
@@ -41,10 +42,10 @@ class MatrixRecord(BaseModel):
     cells: list[Cell]
     failed: list[RunWithoutResult] = []
     unsupported: list[RunWithoutResult] = []
-    """Those in which an agent said that it lacks what they need."""
+    """Runs in which an agent did not support a needed feature."""
     against: Comparison | None = None
     tried: Tried | None = None
-    """How much of the protocol the runs have tried, if that was asked for."""
+    """Coverage of the protocol by the runs, if requested."""
     growths: list[Growth] = []
     """Power laws, if the matrix has several sizes of swarm or mission."""
 
