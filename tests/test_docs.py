@@ -130,6 +130,10 @@ def test_every_command_of_the_tutorial_prints_what_it_shows(tmp_path: Path) -> N
     assert play(REPOSITORY / "docs" / "tutorial.md", tmp_path) > 10
 
 
+def test_commands_of_the_findings_print_their_results(tmp_path: Path) -> None:
+    assert play(REPOSITORY / "docs" / "explanation" / "findings.md", tmp_path) > 7
+
+
 def test_the_public_names_are_on_their_page(site: Path) -> None:
     page = (site / "reference/api.html").read_text()
     for module in ("harness.api", "ucp", "netem", "sitl"):
