@@ -1,6 +1,6 @@
-"""Scenarios: what is asked of a run, as short YAML files validated by pydantic.
+"""Scenarios: the descriptions of runs, as short YAML files that pydantic validates.
 
-An error names the key, the value and what is allowed. One file for each part of a scenario.
+An error names the key, the value and the allowed values. Each module contains one part of a scenario.
 """
 
 from harness.scenario.load import explain, load_scenario, read_yaml

@@ -1,6 +1,7 @@
-"""The fault timeline: what changes when, as values. A backend plays them; the checker judges without them.
+"""The timeline of a run as values: network changes, faults and injections.
 
-A timeline is computed before the run from the scenario alone, so every backend plays the same.
+The timeline is computed before the run from the scenario alone. Therefore every backend plays the same timeline. The
+checker does not use it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,28 +15,29 @@ from harness.scenario.injection import Injection, InjectionName
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 
 RANGE = "range"
-"""What a change of the network is called that flight has made, not the scenario."""
+"""Name of a network change caused by the flight of vehicles, not by the scenario."""
 NO_MORE_FATES = "no more fates"
-"""What it is called in a record that the last scripted fate has decided: nobody did anything then."""
+"""Name of the record at the end of the scripted fates. No change happens then."""
 
 
 @dataclass(frozen=True)
 class NetworkChange:
-    """From `at_s` mission seconds on, these conditions hold. `what` is one word, `detail` says it to people."""
+    """Network conditions from mission second `at_s` on. `what` is a name, and `detail` describes the conditions in
+    words."""
 
     at_s: float
     what: str
     detail: str
     conditions: NetworkConditions
     clears_all: bool = False
-    """From here on distance does not matter either."""
+    """True if the loss over distance ends too."""
     losses: Mapping[str, float] = field(default_factory=dict)
-    """What the radio now loses between two vehicles ("1-2"), where that has changed."""
+    """Changed losses of the radio: pair of vehicles, as in "1-2" -> probability, 0 to 1."""
     by_hand: bool = False
-    """Somebody asked for it while the mission was played."""
+    """True if a user requested the change during the run."""
 
     def to_json(self, at_s: float) -> dict[str, Any]:
-        """The record of this change, made at `at_s`."""
+        """Return the record of this change at mission second `at_s`."""
         return {
             "at_s": at_s,
             "what": self.what,
@@ -48,7 +50,7 @@ class NetworkChange:
 
 @dataclass(frozen=True)
 class Injected:
-    """At `at_s` mission seconds a rogue node begins to send. Injections are numbered from 1, in order."""
+    """An injection, which starts at mission second `at_s`. Injections are numbered from 1 in time order."""
 
     at_s: float
     what: InjectionName
@@ -61,7 +63,7 @@ class Injected:
         return self.injection.in_words()
 
     def to_json(self, at_s: float) -> dict[str, Any]:
-        """The record of this injection, begun at `at_s`."""
+        """Return the record of this injection with a start at mission second `at_s`."""
         return {"at_s": at_s, "what": self.what, "detail": self.detail, **_hand(self.by_hand)}
 
 
@@ -73,7 +75,7 @@ Change = NetworkChange | Fault | Injected
 
 
 def timeline_of(scenario: Scenario) -> list[Change]:
-    """All that the scenario changes, in order; the first is the network's first state, at 0 s."""
+    """Return all changes of the scenario in time order. The first is the initial state of the network, at 0 s."""
     first, *states = _network_states(scenario)
     return [
         first,
@@ -82,13 +84,14 @@ def timeline_of(scenario: Scenario) -> list[Change]:
 
 
 def injections_of(scenario: Scenario) -> list[Injected]:
-    """What a rogue node is to send, in order."""
+    """Return the injections of the scenario in time order."""
     entries = [(entry.at_s, *entry.injection) for entry in scenario.timeline_in_order() if entry.injection]
     return [Injected(at_s, what, injection, number) for number, (at_s, what, injection) in enumerate(entries, 1)]
 
 
 def injected_nothing(begun: Sequence[Injected], sent: Mapping[int, int]) -> list[str]:
-    """A sentence for each injection that has come to nothing; `sent` has the datagrams of each."""
+    """Return a sentence for each injection that sent nothing. `sent` maps the number of an injection to its
+    datagrams."""
     return [
         f"{injected.what} at {injected.at_s:g} s ({injected.detail}) sent nothing, for nothing like it was heard"
         for injected in begun
@@ -97,13 +100,14 @@ def injected_nothing(begun: Sequence[Injected], sent: Mapping[int, int]) -> list
 
 
 def _network_states(scenario: Scenario) -> list[Change]:
-    """Every state of the network; what begins in the same instant makes one state together."""
+    """Return all states of the network. Changes at the same instant form one state."""
     return [_change(step.at_s, step.what, step.network.conditions()) for step in scenario.network_steps()]
 
 
 def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Records of network changes, where scripted fates stood between agents until `at_s`, whatever the conditions."""
-    since = round(at_s + 0.001, 3)  # what is sent in the same instant is meant too
+    """Return the records of network changes, with `fully_connected` false until `at_s`, the end of the scripted
+    fates."""
+    since = round(at_s + 0.001, 3)  # include messages of the same instant
     before = [{**state, "fully_connected": False} for state in network if state["at_s"] < since]
     after = [state for state in network if state["at_s"] >= since]
     again = {"at_s": since, "what": NO_MORE_FATES, "fully_connected": network[len(before) - 1]["fully_connected"]}
@@ -111,7 +115,7 @@ def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[
 
 
 def final_reconcile(at_s: float) -> NetworkChange:
-    """All conditions are cleared, so that everybody can hear everybody."""
+    """Return the change that clears all conditions, so that all vehicles receive all messages."""
     return replace(_change(at_s, "final reconcile", NetworkConditions()), clears_all=True)
 
 
@@ -123,9 +127,9 @@ MAX_DESCRIBED_LINKS = 8
 
 
 def describe(conditions: NetworkConditions) -> str:
-    """Conditions in words: "loss 15 %, loss 50 % to 3, loss 90 % from 1 to 2, partition 1 2 | 3 4 5".
+    """Return conditions in words: "loss 15 %, loss 50 % to 3, loss 90 % from 1 to 2, partition 1 2 | 3 4 5".
 
-    A receiver is told by what differs from the default, a link by what differs from its receiver.
+    The text has the differences of each receiver from the default, and of each link from its receiver.
     """
     words = _differences(conditions.default, LinkConditions())
     if conditions.default.loss == 0.0:

@@ -16,16 +16,18 @@ from ucp.short_value import shown, shown_key
 _PACKAGE = Path(__file__).parents[1]
 _INSIDE = _PACKAGE / "scenarios"
 FOLDER = _INSIDE if _INSIDE.is_dir() else _PACKAGE.parent / "scenarios"
-"""In an installed package inside of it; in a checkout beside it. Who copied the package alone has none."""
+"""Folder of the scenario library: inside an installed package, or next to the package in a checkout. It may be
+missing."""
 
 
 def names() -> list[str]:
-    """All of them, in alphabetical order."""
+    """Return the names of all scenarios of the library in alphabetical order."""
     return sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 
 def find(path: Path) -> Path:
-    """The file that comes along by this name, if it is such a name and no file; else what was given."""
+    """Return the file of the library with this name. Return `path` itself if it exists, or if the library has no such
+    name."""
     named = f"{path}.yaml"
     if len(path.parts) != 1 or not FOLDER.is_dir() or named not in (scenario.name for scenario in FOLDER.iterdir()):
         return path
@@ -33,7 +35,7 @@ def find(path: Path) -> Path:
 
 
 def opening(name: str) -> str:
-    """The sentence that its file begins with."""
+    """Return the first sentence of the comment at the top of the scenario file."""
     comment = []
     for line in (FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):
@@ -43,16 +45,16 @@ def opening(name: str) -> str:
 
 
 MAX_PROBLEM = 200
-"""More of what is wrong with a file is not shown."""
+"""Maximum number of characters of a parser message in an error."""
 MAX_NESTING = 50
 MAX_SCENARIO_BYTES = 8 * 1024 * 1024
-"""A flight of two hours with twenty vehicles, word for word, is half of that."""
+"""Maximum size of a scenario file. The events of a flight of two hours with twenty vehicles take half of it."""
 
 
 def load_scenario(path: Path | str) -> Scenario:
     """Load a scenario from a YAML file, or from the library by its name, such as "loss_15".
 
-    Raises ScenarioError, whose one sentence names the file, the key, the value and what is allowed.
+    Raises ScenarioError. Its message names the file, the key, the value and the allowed values.
     """
     path = Path(path)
     document = read_yaml(path, "scenario")
@@ -65,9 +67,9 @@ def load_scenario(path: Path | str) -> Scenario:
 
 
 def parse(document: dict[str, Any], beside: Path | None = None) -> Scenario:
-    """A document that lies `beside` the files that it names, if it is in a file itself.
+    """Return the scenario of a YAML document. Files that the document names are in the directory `beside`.
 
-    Raises ScenarioError: one sentence that names the key, the value and what is allowed.
+    Raises ScenarioError. Its message names the key, the value and the allowed values.
     """
     try:
         return Scenario.model_validate(document, context={"beside": beside})
@@ -76,9 +78,10 @@ def parse(document: dict[str, Any], beside: Path | None = None) -> Scenario:
 
 
 class _Loader(yaml.SafeLoader):
-    """One to whom a key that is there twice is a mistake: YAML forbids it, and the safe loader takes the last.
+    """A safe loader that rejects duplicate keys and deep nesting.
 
-    Nor is anything nested without an end, which would take the scanner long.
+    YAML forbids duplicate keys, but the safe loader of PyYAML uses the last one. Deep nesting would take its scanner
+    long.
     """
 
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:  # noqa: N803  (its name in yaml)
@@ -97,7 +100,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> Any:
-    """Whatever the text says. Raises ScenarioError: one sentence that begins with "not YAML"."""
+    """Return the value of a YAML text. Raises ScenarioError with a message that starts with "not YAML"."""
     try:
         return yaml.load(text, _Loader)  # noqa: S506  (a safe loader)
     except RecursionError:
@@ -112,7 +115,10 @@ def parse_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path, what: str) -> dict[str, Any]:
-    """The mapping in a YAML file that should be a `what`, or comes along by that name. Raises ScenarioError."""
+    """Return the mapping in a YAML file, or in the library file of this name. `what` is its kind, for errors.
+
+    Raises ScenarioError.
+    """
     path = find(path)
     try:
         status = path.stat()
@@ -140,7 +146,7 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """The first problem that pydantic found, as one sentence for a person."""
+    """Return the most specific problem that pydantic found, as one sentence."""
     problems: list[Any] = error.errors()
     problem = max(problems, key=lambda candidate: (len(candidate["loc"]), candidate["type"] == "extra_forbidden"))
     key = ".".join(shown_key(part) for part in problem["loc"])
@@ -161,7 +167,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 def _siblings(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
-    """The keys that are allowed beside the one at `location`."""
+    """Return the allowed keys at this location."""
     current = model
     for part in location[:-1]:
         for name, field in current.model_fields.items():
@@ -172,7 +178,7 @@ def _siblings(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
 
 
 def _models(annotation: Any) -> Iterator[type[BaseModel]]:
-    """The models that a value of this type can be."""
+    """Yield the models in a type annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):

@@ -1,9 +1,9 @@
-"""The states of the network along a mission: what the scenario says, its timeline, and its schedules over that.
+"""The states of the network during a mission, from the scenario, its timeline, and its schedules.
 
-A change of the timeline lasts, or passes after `for_s`. Of two that change the same thing (a key of all, of a receiver,
-of a link; the partition) one must be over before the other begins, or pass within it: then the inner one holds, and
-after it the outer one again. Any other overlap has two meanings, and is refused. What lasts never ends, so nothing that
-lasts may begin while what it changes is changed for a while.
+A change of the timeline lasts until a later change of the same value, or ends after `for_s`. Two temporary changes of
+the same value must not overlap, unless one lies within the other. The inner one then applies, and after its end the
+outer one again. Other overlaps are ambiguous and are rejected. A lasting change must not start during a temporary
+change of the same value. A value is a key of all links, of a receiver or of a link, or the partition.
 """
 
 import math
@@ -22,19 +22,19 @@ PARTITION = "partition"
 
 @dataclass
 class Network:
-    """The network as it stands."""
+    """The network at one instant."""
 
     roster: tuple[int, ...]
     lasting: NetworkValues
-    """What lasts: of the scenario, and of its timeline up to now."""
+    """Lasting conditions, of the scenario and of its timeline so far."""
     layers: list[Layer]
-    """What each schedule makes of it."""
+    """The current layer of each schedule."""
     partition: Groups = ()
     passing: list[TimelineEntry] = field(default_factory=list)
-    """The timeline's changes that will be over, in the order in which they began."""
+    """Active temporary changes of the timeline, in the order of their start."""
 
     def uncut(self) -> NetworkConditions:
-        """The conditions that there would be without partitions and cuts. Raises ConditionsError."""
+        """Return the conditions without partitions and cuts. Raises ConditionsError."""
         network = self.lasting
         for entry in self.passing:
             network = laid_over(network, entry.changes())
@@ -44,14 +44,14 @@ class Network:
         return conditions_of(network)
 
     def conditions(self) -> NetworkConditions:
-        """Raises ConditionsError if they contradict each other."""
+        """Return the conditions. Raises ConditionsError if they contradict each other."""
         conditions = self.uncut().with_partition(self._cut_by_any())
         cut = sorted(pair for layer in self.layers for pair in layer.cut)
         severed = {pair: replace(conditions.link(*pair), loss=1.0) for pair in cut}
         return replace(conditions, links={**conditions.links, **severed})
 
     def _cut_by_any(self) -> Groups:
-        """Groups whose members no partition keeps apart."""
+        """Return the groups of vehicles that no partition separates."""
         passing = [entry.groups for entry in self.passing if entry.disturbs == PARTITION]
         standing = passing[-1] if passing else self.partition
         partitions = [partition for partition in (standing, *(layer.partition for layer in self.layers)) if partition]
@@ -62,7 +62,7 @@ class Network:
         return tuple(group for group in together if group)
 
     def play(self, entry: TimelineEntry) -> None:
-        """Make a change of the timeline."""
+        """Apply an entry of the timeline."""
         if entry.for_s is not None:
             self.passing.append(entry)
         elif entry.disturbs in (PARTITION, "heal"):
@@ -73,13 +73,13 @@ class Network:
 
 @dataclass(frozen=True)
 class Step:
-    """At an instant the network has changed. `what` in a word or two, `keys`: where the scenario says so."""
+    """A change of the network at one instant. `what` is its name, and `keys` are its places in the scenario."""
 
     at_s: float
     what: str
     keys: list[str]
     network: Network
-    """As it stands now: the next step changes it."""
+    """The network after the change. The next step changes this object."""
 
 
 def steps(
@@ -89,7 +89,7 @@ def steps(
     schedules: Sequence[Schedule],
     end_s: float,
 ) -> Iterator[Step]:
-    """Every change of the network, the first at 0 s; what happens in the same instant makes one step together."""
+    """Yield every change of the network in time order, the first at 0 s. Changes at the same instant form one step."""
     network = Network(roster, model.whole(), [UNTOUCHED for _ in schedules])
     begins: dict[float, list[int]] = defaultdict(list)
     ends: dict[float, list[int]] = defaultdict(list)
@@ -121,7 +121,7 @@ def steps(
 
 
 def refuse_ambiguity(timeline: Sequence[TimelineEntry]) -> None:
-    """Raises ValueError if of two changes of the same thing nobody can say which holds when."""
+    """Raise ValueError if two changes of the same value overlap ambiguously."""
     under_way: dict[tuple[Where, str], list[tuple[float, int]]] = defaultdict(list)
     for number, entry in sorted(enumerate(timeline), key=lambda numbered: numbered[1].at_s):
         until_s = math.inf if entry.for_s is None else entry.ends_at_s
@@ -140,7 +140,7 @@ def refuse_ambiguity(timeline: Sequence[TimelineEntry]) -> None:
 
 
 def changed(entry: TimelineEntry) -> Iterator[tuple[Where, str]]:
-    """Whose keys the entry changes; the partition counts as a key of all."""
+    """Yield the scope and the key of each value that the entry changes. The partition is a key of all links."""
     if entry.disturbs in (PARTITION, "heal"):
         yield None, "the partition"
     elif entry.disturbs:

@@ -1,4 +1,4 @@
-"""A scenario as a file that people read: a comment at the top, a line for each event, fate or change."""
+"""Write a scenario as a readable file: a comment at the top, and one line for each event, fate or change."""
 
 from collections.abc import Callable, Iterable, Iterator
 from textwrap import wrap
@@ -27,7 +27,7 @@ ORDER = (
     "settle",
     "final_reconcile",
 )
-"""Keys in the order in which people read them; all others come at the end."""
+"""Order of the keys in the file. Other keys follow at the end."""
 WIDTH = 112
 
 Document = dict[str, Any]
@@ -36,7 +36,7 @@ Document = dict[str, Any]
 def to_yaml(
     document: Document, comment: Iterable[str], remark: Callable[[Document], str | None] = lambda entry: None
 ) -> str:
-    """The file. `remark` is what is to be said beside an entry of a list."""
+    """Return the text of the file. `remark` returns a comment for an entry of a list, or None."""
     lines = [f"# {line}".rstrip() for line in comment]
     for key in sorted(document, key=lambda key: ORDER.index(key) if key in ORDER else len(ORDER)):
         lines += _lines(key, _plain(document[key]), remark)
@@ -44,7 +44,7 @@ def to_yaml(
 
 
 def _lines(key: str, value: Any, remark: Callable[[Document], str | None]) -> Iterator[str]:
-    """One line for a key, or one for each of a list of mappings."""
+    """Yield one line for a key, or one line for each entry of a list of mappings."""
     if key == "events" and "script" in value:
         yield "events:"
         yield f"  source: {value['source']}"
@@ -64,7 +64,7 @@ def _lines(key: str, value: Any, remark: Callable[[Document], str | None]) -> It
 
 
 def _entry(entry: Document, beside: str) -> Iterator[str]:
-    """A list's entry in a line; one that has a long text in several."""
+    """Yield an entry of a list as one line, or as several lines if it contains a long text."""
     if not any(map(_is_long, entry.values())):
         yield f"  - {in_a_line(entry)}{beside}"
         return
@@ -75,7 +75,7 @@ def _entry(entry: Document, beside: str) -> Iterator[str]:
 
 
 def _item(key: str, value: Any) -> Iterator[str]:
-    """A key whose text, if it is long, goes over several lines, as YAML's folded style has it."""
+    """Yield a key with its value. A long text takes several lines, in YAML's folded style."""
     if not _is_long(value) or " " not in value:
         yield f"{key}: {in_a_line(value)}"
         return
@@ -89,13 +89,13 @@ def _is_long(value: Any) -> bool:
 
 
 def in_a_line(value: Any) -> str:
-    """It as YAML, in one line."""
+    """Return the value as YAML in one line."""
     written: str = yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=1e9, allow_unicode=True)
     return written.strip()[1:-1]
 
 
 def _plain(value: Any) -> Any:
-    """Whole numbers without a point; agents that are keys as numbers."""
+    """Return the value with whole numbers without a decimal point, and with agent IDs in keys as numbers."""
     if isinstance(value, dict):
         named = ((int(key) if isinstance(key, str) and key.isdecimal() else key, item) for key, item in value.items())
         return {key: _plain(item) for key, item in named}

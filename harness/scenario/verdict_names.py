@@ -1,6 +1,7 @@
-"""The verdicts that there are: on the six characteristics (Section 4.3), and on how a swarm came to what it holds.
+"""The checks and their verdicts.
 
-Beside the characteristics, which judge what came out, stand judgements with keys of their own.
+The six characteristics (Section 4.3) concern the chains of a swarm. Three further checks concern its behaviour and its
+records. They have keys instead of numbers.
 """
 
 from typing import Literal
@@ -23,10 +24,10 @@ LivenessVerdict = Literal["finished", "not finished", "never finishes", "not app
 Verdict = CharacteristicVerdict | StepsVerdict | RecordsVerdict | LivenessVerdict
 
 BESIDE = {"steps": "every step", "records": "every record", "liveness": "liveness"}
-"""Key of a judgement beside the characteristics -> short name."""
+"""Key of a further check -> short name."""
 
 JUDGED = {**CHARACTERISTICS, **BESIDE}
-"""All that a run is judged by, in the order in which it is shown."""
+"""All checks in the order of the report: number or key -> short name."""
 
 BAD_IN_WORDS = {
     **{number: f"characteristic {number} violated" for number in CHARACTERISTICS},
@@ -34,7 +35,7 @@ BAD_IN_WORDS = {
     "records": "records contradict",
     "liveness": "swarm not finished",
 }
-"""What a bad verdict says of a run, in a few words."""
+"""Number or key of a check -> a bad verdict in words."""
 
 Kind = Literal["good", "bad", "unknown"]
 
@@ -43,5 +44,5 @@ _BAD = frozenset(("violated", "deviates", "contradict", "not finished", "never f
 
 
 def kind_of(verdict: str) -> Kind:
-    """What a verdict amounts to; a bad one makes the exit status 1."""
+    """Return whether a verdict is good, bad or unknown. A bad verdict leads to exit status 1."""
     return "good" if verdict in _GOOD else "bad" if verdict in _BAD else "unknown"
