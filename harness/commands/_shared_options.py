@@ -33,7 +33,7 @@ def opener_of(bundle: Path | None) -> "Opener | None":
         from ucp.secure.keyfile import KeyFileError
         from ucp.secure.opening import Opener
     except ModuleNotFoundError:
-        raise MachineError("--bundle takes a further package: `pip install ucp-harness[secure]`") from None
+        raise MachineError("--bundle needs the package cryptography: run `pip install 'ucp-harness[secure]'`") from None
     try:
         return Opener(load_bundle(bundle))
     except KeyFileError as error:
@@ -53,7 +53,9 @@ def depot_of(path: Path | None) -> "Depot | None":
     try:
         from harness.play.keyring.key_directory import load_depot_key
     except ModuleNotFoundError:
-        raise MachineError("--depot-key takes a further package: `pip install ucp-harness[secure]`") from None
+        raise MachineError(
+            "--depot-key needs the package cryptography: run `pip install 'ucp-harness[secure]'`"
+        ) from None
     return load_depot_key(path)
 
 

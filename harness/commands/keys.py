@@ -15,7 +15,7 @@ try:
     from harness.play.keyring.key_directory import Home, KeysError, write_revocation
     from ucp.secure.bundle import DEFAULT_EPOCH_S, MAX_EPOCH_S
 except ModuleNotFoundError:
-    raise MachineError("keys take a further package: `pip install ucp-harness[secure]`") from None
+    raise MachineError("keys need the package cryptography: run `pip install 'ucp-harness[secure]'`") from None
 
 SEVERAL_MISSIONS = 1
 
@@ -75,7 +75,7 @@ def inspect_command(
         print_lines(map(in_words, told))
     missions = {facts["mission"] for facts in told}
     if len(missions) > 1:
-        complain(f"these are keys of {len(missions)} missions, whose vehicles do not hear each other")
+        complain(f"these keys belong to {len(missions)} missions: vehicles of one mission drop the messages of another")
         raise typer.Exit(SEVERAL_MISSIONS)
 
 
@@ -101,5 +101,5 @@ def revoke_command(
         try:
             write_revocation(out, revocation, kept.public())
         except OSError as error:
-            raise KeysError(f"{out} cannot be made: {error.strerror}; choose another file") from None
+            raise KeysError(f"{out} cannot be written: {error.strerror}; choose another file") from None
     print_lines([in_words(facts) for facts in inspect(kept.directory / "revocation.json")])

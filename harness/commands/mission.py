@@ -146,7 +146,7 @@ def _home(directory: Path) -> "Home":
     try:
         from harness.play.keyring.key_directory import Home
     except ModuleNotFoundError:
-        raise MachineError("keys take a further package: `pip install ucp-harness[secure]`") from None
+        raise MachineError("keys need the package cryptography: run `pip install 'ucp-harness[secure]'`") from None
     return Home(directory)
 
 

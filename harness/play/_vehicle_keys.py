@@ -58,8 +58,8 @@ def keys_of(scenario: Scenario, secret: bytes) -> MissionKeys | None:
         from ucp.secure.bundle import KeySet
     except ModuleNotFoundError:
         raise MachineError(
-            "a secured mission needs the package cryptography, which comes with the extra `secure`: install that, or "
-            "leave out `security`"
+            "a secured mission needs the package cryptography: run `pip install 'ucp-harness[secure]'`, or remove "
+            "`security`"
         ) from None
     if security.keys == FRESH:
         fresh = KeySet.derived(secret, scenario.roster, seals=security.seal)
@@ -68,9 +68,7 @@ def keys_of(scenario: Scenario, secret: bytes) -> MissionKeys | None:
     directory = Path(security.keys)
     bundles = _bundles_in(directory, scenario.roster)
     if security.seal and any(bundle.public.depot is None for bundle in bundles.values()):
-        raise ScenarioError(
-            f"`security.seal`: the keys in {directory} have no depot's: `ucp-harness keys new` makes one"
-        )
+        raise ScenarioError(f"`security.seal`: {directory} has no depot key: make keys with `ucp-harness keys new`")
     return MissionKeys(bundles, _authority_in(directory, bundles, scenario), security.seal)
 
 
@@ -94,13 +92,13 @@ def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
     for agent_id, bundle in bundles.items():
         if bundle.agent_id != agent_id or not {*roster} <= bundle.public.vehicles.keys():
             raise ScenarioError(
-                f"`security.keys`: {directory / bundle_name(agent_id)} is not of agent {agent_id} in a mission of "
-                f"{len(roster)} such agents: make keys for this roster with `ucp-harness keys new`"
+                f"`security.keys`: {directory / bundle_name(agent_id)} does not belong to agent {agent_id} in a "
+                f"mission with these {len(roster)} agents: make keys for this roster with `ucp-harness keys new`"
             )
     if len({bundle.public.mission for bundle in bundles.values()}) > 1:
         raise ScenarioError(
-            f"`security.keys`: the bundles in {directory} are of several missions, whose vehicles do not hear each "
-            "other: hand out those of one with `ucp-harness keys bundle`"
+            f"`security.keys`: the bundles in {directory} belong to several missions: write those of one mission with "
+            "`ucp-harness keys bundle`"
         )
     return bundles
 
@@ -117,8 +115,8 @@ def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Sc
         raise ScenarioError(f"`security.keys`: {error}") from None
     if early := authority.revoked.intersection(scenario.roster).difference(*revoking[:1]):
         raise ScenarioError(
-            f"`security.keys`: {directory / REVOCATION_NAME} revokes {listed(early)}, and nobody would hear it: leave "
-            "it out of `agents`, or revoke it by the first `revoke` of the timeline"
+            f"`security.keys`: {directory / REVOCATION_NAME} revokes {listed(early)} before the mission: remove it "
+            "from `agents`, or list it in the first `revoke` of the timeline"
         )
     return authority
 

@@ -62,7 +62,7 @@ class PublicKeys:
         """Raises KeyFileError, without the file's name."""
         depot = None if document.get("depot") is None else key_in(document, "depot", KEY_BYTES)
         if depot is not None and not _can_seal_to(depot):
-            raise KeyFileError("`depot` is no X25519 public key to which anything can be sealed")
+            raise KeyFileError("`depot` is not a usable X25519 public key")
         epoch_s = document.get("epoch_s")
         if not isinstance(epoch_s, int | float) or isinstance(epoch_s, bool) or not 1 <= epoch_s <= MAX_EPOCH_S:
             raise KeyFileError(f"`epoch_s` must be a number of seconds 1..{MAX_EPOCH_S:.0f}")

@@ -40,7 +40,9 @@ def read_any_key_file(path: Path, kinds: Mapping[str, tuple[bool, Callable[[dict
             raise KeyFileError(f"not a file of the schema {' or '.join(kinds)}")
         secret, parse = kinds[schema]
         if secret and mode & OTHERS:
-            raise KeyFileError("others can read it, which no secret survives: make new keys, or chmod 600 it")
+            raise KeyFileError(
+                "other users can read this secret: run chmod 600, or make new keys if they may have read it"
+            )
         return parse(document)
     except KeyFileError as error:
         raise KeyFileError(f"{path}: {error}") from None
@@ -57,15 +59,15 @@ def _read(path: Path) -> tuple[dict[str, Any], int]:
         reason = error.strerror if isinstance(error, OSError) else "that is no path"
         raise KeyFileError(f"cannot be read: {reason}") from None
     if data is None:
-        raise KeyFileError("not a file that holds keys")
+        raise KeyFileError("not a key file")
     if len(data) > MAX_FILE_BYTES:
-        raise KeyFileError(f"larger than {MAX_FILE_BYTES} bytes, which no file of keys is")
+        raise KeyFileError(f"larger than {MAX_FILE_BYTES} bytes, the limit for key files")
     try:
         document = json.loads(data)
     except (ValueError, RecursionError):
         raise KeyFileError("not JSON") from None  # what is there instead may be a key
     if not isinstance(document, dict):
-        raise KeyFileError("not a file that holds keys")
+        raise KeyFileError("not a key file")
     return document, mode
 
 

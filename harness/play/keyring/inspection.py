@@ -38,7 +38,7 @@ def inspect(path: Path) -> list[Facts]:
         candidates = sorted(path.iterdir(), key=lambda file: (len(file.name), file.name))
         files = [file for file in candidates if file.suffix in (".json", ".key")]
         if not files:
-            raise KeysError(f"{path}: no keys are here; `ucp-harness keys new` makes some, in a directory of their own")
+            raise KeysError(f"{path} has no key files: make keys with `ucp-harness keys new`, in a new directory")
     return [_inspect(file) for file in files]
 
 
@@ -87,7 +87,7 @@ def _inspect(path: Path) -> Facts:
         mission = key_in(document, "mission", MISSION_ID_BYTES).hex()
         public = path.with_name(PUBLIC_NAME)
         if not public.exists():
-            return {"kind": "a revocation that nothing here checks", "mission": mission}
+            return {"kind": "a revocation, not checked because public.json is missing", "mission": mission}
         told = load_revocation(path, load_public(public))
         return {"kind": "a revocation", "mission": mission, "number": told.number, "revoked": sorted(told.revoked)}
 

@@ -57,9 +57,7 @@ class Home:
         keys = KeySet.derived(os.urandom(KEY_BYTES), roster, seals=seals, epoch_s=epoch_s)
         home, mission = cls(directory), keys.public.mission.hex()
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-            raise KeysError(
-                f"{directory} is there already: new keys need a new directory, for nothing replaces old ones"
-            )
+            raise KeysError(f"{directory} is not an empty directory: choose a new one, because keys are never replaced")
         secret: dict[str, dict[str, Any]] = {
             AUTHORITY_NAME: {"schema": AUTHORITY_SCHEMA, "mission": mission, "private_key": keys.authority.hex()},
             VEHICLES_NAME: {
@@ -99,9 +97,7 @@ class Home:
             if agent_id not in public.vehicles:
                 raise _stranger(agent_id, public)
             if agent_id in revoked:
-                raise KeysError(
-                    f"agent {agent_id} is revoked, and nobody would hear it: fly another vehicle, or new keys"
-                )
+                raise KeysError(f"agent {agent_id} is revoked: use another vehicle, or make new keys")
 
         def parse(document: dict[str, Any]) -> dict[int, Bundle]:
             _check_mission(document, public)
@@ -113,7 +109,7 @@ class Home:
             for agent_id in wanted:
                 key = key_in(private, str(agent_id), KEY_BYTES, "vehicles.")
                 if public_key_of(key) != public.vehicles[agent_id]:
-                    raise KeyFileError(f"the key of vehicle {agent_id} is not the one that {PUBLIC_NAME} tells")
+                    raise KeyFileError(f"the key of vehicle {agent_id} does not match {PUBLIC_NAME}")
                 bundles[agent_id] = Bundle(public, agent_id, key, group_secret)
             return bundles
 
@@ -127,7 +123,7 @@ class Home:
         paths = {agent_id: directory / bundle_name(agent_id) for agent_id in bundles}
         for path in paths.values():
             if path.exists() and not overwrite:
-                raise KeysError(f"{path} is there already: it may be of a later epoch; --overwrite replaces it")
+                raise KeysError(f"{path} exists, and may be of a later epoch: add --overwrite to replace it")
         try:
             directory.mkdir(mode=HOME_MODE, parents=True, exist_ok=True)
             for agent_id, path in paths.items():
@@ -150,10 +146,10 @@ class Home:
         if strangers:
             raise _stranger(strangers[0], public)
         if revoked == before:
-            raise KeysError(f"{listed(agents)}: revoked already, as {self.directory / REVOCATION_NAME} says")
+            raise KeysError(f"{listed(agents)}: already revoked in {self.directory / REVOCATION_NAME}")
         number = last.number + 1 if last else 1
         if len(revoked) > MAX_REVOKED or number > LAST_NUMBER:
-            raise KeysError(f"more than {MAX_REVOKED} vehicles fit into no revocation: make new keys for the others")
+            raise KeysError(f"a revocation has room for {MAX_REVOKED} vehicles: make new keys for the other vehicles")
         authority = Ed25519PrivateKey.from_private_bytes(self.authority(public))
         revocation = Revocation.signed(authority, public.mission, number, revoked)
         try:
@@ -168,7 +164,7 @@ class Home:
         def parse(document: dict[str, Any]) -> bytes:
             key = key_in(document, "private_key", KEY_BYTES)
             if public_key_of(key) != public.authority:
-                raise KeyFileError(f"not the key of the authority that {PUBLIC_NAME} tells")
+                raise KeyFileError(f"this key of the authority does not match {PUBLIC_NAME}")
             return key
 
         return _sound(lambda: read_key_file(self.directory / AUTHORITY_NAME, AUTHORITY_SCHEMA, parse, secret=True))
@@ -208,7 +204,7 @@ def write_revocation(path: Path, revocation: Revocation, public: PublicKeys) -> 
 
 def _check_mission(document: Mapping[str, Any], public: PublicKeys) -> None:
     if key_in(document, "mission", MISSION_ID_BYTES) != public.mission:
-        raise KeyFileError(f"of another mission than {PUBLIC_NAME}")
+        raise KeyFileError(f"this file belongs to another mission than {PUBLIC_NAME}")
 
 
 def _sound(read: Callable[[], T]) -> T:
@@ -224,7 +220,7 @@ def _refused(directory: Path, error: OSError) -> MachineError:
 
 
 def _stranger(agent_id: int, public: PublicKeys) -> KeysError:
-    return KeysError(f"agent {agent_id} is not of this mission, which has {listed(public.vehicles)}")
+    return KeysError(f"agent {agent_id} is not in this mission, which has {listed(public.vehicles)}")
 
 
 def listed(agents: Iterable[int]) -> str:
@@ -267,10 +263,10 @@ class Authority:
         lacking = {*agents} - self.revoked
         if self._private_key is not None or not lacking:
             return
-        made = f"{REVOCATION_NAME} there revokes {listed(self.revoked)} alone" if self._last else "none is there"
+        found = f"{REVOCATION_NAME} revokes only {listed(self.revoked)}" if self._last else "the directory has neither"
         raise KeysError(
-            f"to revoke {listed(lacking)} takes the authority's key, or a revocation made before, and {made}: name the "
-            f"directory that `ucp-harness keys new` made, or write {directory}/{REVOCATION_NAME} with "
+            f"to revoke {listed(lacking)} needs the authority's key or a revocation, and {found}: use the directory "
+            f"that `ucp-harness keys new` made, or write {directory}/{REVOCATION_NAME} with "
             "`ucp-harness keys revoke --out`"
         )
 

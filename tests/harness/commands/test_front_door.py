@@ -210,4 +210,4 @@ def test_every_command_but_keys_imports_without_any_extra() -> None:
     """A user without extras gets a command, or a sentence that names the extra."""
     listed = subprocess.run([sys.executable, "-c", WITHOUT_EXTRAS], capture_output=True, text=True, check=False)
     assert listed.returncode == 0, listed.stderr
-    assert listed.stdout == "keys keys take a further package: `pip install ucp-harness[secure]`\n"
+    assert listed.stdout == "keys keys need the package cryptography: run `pip install 'ucp-harness[secure]'`\n"

@@ -55,21 +55,21 @@ def test_bundles_revoke_by_the_message_that_was_made_at_home(home: Home, tmp_pat
 
 Break = Callable[[Home, Path], None]
 MISTAKES: list[tuple[Break, dict[str, Any], str]] = [
-    (lambda home, bundles: None, {}, "takes the authority's key, or a revocation made before, and none is there"),
+    (lambda home, bundles: None, {}, "needs the authority's key or a revocation, and the directory has neither"),
     (
         lambda home, bundles: write_revocation(bundles / "revocation.json", home.revoke([2]), home.public()),
         {},
-        "to revoke agent 3 takes the authority's key.* there revokes agent 2 alone",
+        "to revoke agent 3 needs the authority's key.* revokes only agent 2",
     ),
     (
         lambda home, bundles: write_revocation(bundles / "revocation.json", home.revoke([2, 3]), home.public()),
         {},
-        "revocation.json revokes agent 2, and nobody would hear it",
+        "revocation.json revokes agent 2 before the mission",
     ),
     (
         lambda home, bundles: write_revocation(bundles / "revocation.json", home.revoke([3]), home.public()),
         {"timeline": []},
-        "revocation.json revokes agent 3, and nobody would hear it",
+        "revocation.json revokes agent 3 before the mission",
     ),
     (
         lambda home, bundles: (bundles / "revocation.json").write_text("{"),
@@ -79,7 +79,7 @@ MISTAKES: list[tuple[Break, dict[str, Any], str]] = [
     (
         lambda home, bundles: other(home, bundles).write_bundles(bundles, [2], overwrite=True) and None,
         {"timeline": []},
-        "of several missions",
+        "belong to several missions",
     ),
 ]
 
@@ -101,5 +101,5 @@ def test_what_was_revoked_at_home_is_the_first_that_the_timeline_revokes(home: H
     assert home.revoke([3]).number == 1
     assert not simulate(asked(home.directory), 1).result.bad
     later = [{"at_s": 60, "revoke": [2], "heard_by": [1]}, *REVOKED["timeline"][1:]]
-    with pytest.raises(ScenarioError, match="revokes agent 3, and nobody would hear it"):
+    with pytest.raises(ScenarioError, match="revokes agent 3 before the mission"):
         simulate(asked(home.directory, timeline=later), 1)

@@ -71,7 +71,7 @@ WRONG: list[tuple[str, Any, str]] = [
     ("schema", "ucp-bundle/2", "schema ucp-bundle/1"),
     ("mission", "00", "`mission` must be 32 hexadecimal digits"),
     ("authority", 7, "`authority` must be 64 hexadecimal digits"),
-    ("depot", "00" * 32, "nothing|anything can be sealed"),
+    ("depot", "00" * 32, "not a usable X25519 public key"),
     ("depot", "é" * 64, "`depot` must be 64"),
     ("private_key", KEYS.vehicles[1].hex(), "not that of vehicle 7"),
     ("private_key", f" {KEYS.vehicles[7].hex()[:-2]} ", "`private_key` must be 64"),

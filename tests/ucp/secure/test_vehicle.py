@@ -56,7 +56,7 @@ def test_a_bundle_that_is_not_this_agents_is_refused_in_a_sentence(tmp_path: Pat
     with pytest.raises(MissionError, match="no keys of agent 9"):
         secured_agent(stranger, tmp_path, quiet)
     path.chmod(0o644)
-    with pytest.raises(MissionError, match="others can read it") as refused:
+    with pytest.raises(MissionError, match="other users can read this secret") as refused:
         secured_agent(secured(), tmp_path, quiet)
     assert not any(secret.hex() in str(refused.value) for secret in secrets_of(KEYS.bundle(1)))
 

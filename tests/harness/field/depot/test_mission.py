@@ -320,5 +320,5 @@ def test_a_secured_mission_has_each_vehicles_keys_beside_its_file(tmp_path: Path
     assert mission.settings.max_block_bytes == 976
     assert harness("mission", "verify", out).returncode == 0
     done = harness("mission", "new", "--agents", "1,8", "--keys", home, "--out", tmp_path / "other")
-    assert (done.returncode, "agent 8 is not of this mission" in done.stderr) == (2, True)
+    assert (done.returncode, "agent 8 is not in this mission" in done.stderr) == (2, True)
     assert not (tmp_path / "other").exists()
