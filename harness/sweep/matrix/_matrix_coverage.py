@@ -47,7 +47,7 @@ class Tally:
     def tried(self, matrix: Matrix, runs: int) -> Tried:
         """`runs` are all that there are: of those that an earlier command played nothing is known."""
         if runs > self._runs:
-            self._reached.untold = f"{runs - self._runs} of {runs} runs were played before, and not looked at"
+            self._reached.untold = f"an earlier command played {runs - self._runs} of {runs} runs"
         scenario = matrix.scenario_at(matrix.points[0])
         there = existing(Bounds(min(MOST_AGENTS, len(scenario.roster)), MOST_BLOCKS))
         return Tried(

@@ -38,38 +38,38 @@ def to_markdown(record: MatrixRecord) -> str:
 
 
 def tried_in_words(tried: Tried) -> Iterator[str]:
-    """How much of the protocol the runs have tried."""
+    """Yield sentences on how much of the protocol the runs reached."""
     every, branches = tried.all_cells, tried.all_cells["branches"]
     yield (
-        f"Tried by {text.value(tried.runs)} runs: {text.value(every['local_states'])} local states, "
-        f"{text.value(every['pairs'])} pairs of one with an input, "
+        f"Coverage of {text.value(tried.runs)} runs: {text.value(every['local_states'])} local states, "
+        f"{text.value(every['pairs'])} pairs of a local state and an input, "
         f"{branches['taken']} of {branches['exist']} branches of the handlers."
     )
     within = every["within"]
     states, pairs = within["local_states"], within["pairs"]
     yield (
-        f"Of what exists within {within['agents']} agents, {within['blocks']} blocks, network {within['network']}: "
+        f"Within the bounds of {within['agents']} agents, {within['blocks']} blocks and a {within['network']} network: "
         f"{states['reached']} of {states['exist']} local states, {pairs['reached']} of {pairs['exist']} pairs."
     )
     if every["untold"]:
-        yield f"Not everything is known: {every['untold']}."
+        yield f"The coverage is incomplete: {every['untold']}."
 
 
 def verdict(record: MatrixRecord) -> str:
-    """What a reader in a hurry wants to know."""
+    """Return the headline: runs, violations, failures and worse figures."""
     runs = sum(cell.runs for cell in record.cells)
     parts = [f"{text.value(runs)} runs"]
     if record.outcome == "interrupted":
         parts[0] += f" of {text.value(record.runs_asked)}, interrupted"
     bad = sum(map(violated, record.cells))
-    parts.append(f"{bad} violated a characteristic" if bad else "none violated a characteristic")
+    parts.append(f"{bad} with violations" if bad else "no violations")
     if record.failed:
         parts.append(f"{len(record.failed)} failed")
     if record.unsupported:
         parts.append(f"{len(record.unsupported)} not supported")
     if record.against:
         worse = len(record.against.regressions)
-        which = f"{worse or 'no'} figure{'s' if worse > 1 else ''} worse"
+        which = f"{worse} figures are worse" if worse > 1 else f"{worse or 'no'} figure is worse"
         parts.append(f"{which} than on {text.started(record.against.started_at)}")
     return "; ".join(parts)
 

@@ -110,11 +110,11 @@ def say_interval(metric: Metric, estimate: Estimate) -> str:
 
 
 def explanation(record: MatrixRecord) -> str:
-    """What the numbers are, in a sentence."""
+    """Return a sentence that explains the numbers."""
     seeds = len(record.matrix.seed_list)
     if seeds == 1:
-        return "One run a cell, so there are no intervals."
-    return f"Means of {seeds} runs a cell, the same seeds in each, and their 95 % intervals."
+        return "Each cell has one run, so there are no intervals."
+    return f"Means of {seeds} runs per cell, with 95 % intervals. All cells have the same seeds."
 
 
 def unjudged(record: MatrixRecord) -> str:

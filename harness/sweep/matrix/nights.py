@@ -67,11 +67,12 @@ class Nights:
 
     @property
     def said_left_out(self) -> str:
-        """How many; nothing if none is."""
+        """Return a clause with the number of files that are not in the trend, or an empty text."""
         if not self.left_out:
             return ""
-        which = "1 file" if len(self.left_out) == 1 else f"{len(self.left_out)} files"
-        return f"{which} in {self.directory} left out of the trend"
+        number = len(self.left_out)
+        files, are = ("file", "is") if number == 1 else ("files", "are")
+        return f"{number} {files} in {self.directory} {are} not in the trend"
 
 
 def opened(directory: Path) -> Path:

@@ -204,7 +204,7 @@ class _Nightwatch:
             if document is None:
                 self._corpus.left_out.append(f"{finding.file}: nothing shows {identity} again")
             else:
-                self._watcher.on_event(f"known, played again: {identity}")
+                self._watcher.on_event(f"playing a known finding again: {identity}")
                 self._shown[identity] = self._how_often(identity, document, finding.seed)
 
     def _how_often(self, identity: Identity, document: Document, seed: int) -> tuple[int, int]:

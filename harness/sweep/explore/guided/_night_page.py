@@ -27,7 +27,7 @@ def to_html(night: dict[str, Any], nights: Sequence[dict[str, Any]]) -> str:
         began=text.started(night["started_at"]),
         headline=headline(night),
         kind="violated" if any(finding["status"] != "resolved" for finding in night["findings"]) else "holds",
-        growth=_curve("local states over the runs of this night", night["growth"], "runs"),
+        growth=_curve("local states by run of this night", night["growth"], "runs"),
         trend=_curve(
             "local states at the end of each night",
             [[number, each["local_states"]] for number, each in enumerate(last, 1)],
@@ -40,11 +40,11 @@ def to_html(night: dict[str, Any], nights: Sequence[dict[str, Any]]) -> str:
 
 
 def headline(night: dict[str, Any]) -> str:
-    """What a reader in a hurry wants to know."""
+    """Return the headline: findings by status, runs and local states."""
     counts = dict.fromkeys(("new", "ongoing", "rare", "resolved"), 0)
     for finding in night["findings"]:
         counts[finding["status"]] += 1
-    told = ", ".join(f"{count} {status}" for status, count in counts.items() if count) or "nothing found"
+    told = ", ".join(f"{count} {status}" for status, count in counts.items() if count) or "no findings"
     broken_off = "; interrupted" if night["outcome"] == "interrupted" else ""
     return f"{told}; {night['runs']:,} runs, {night['local_states']:,} local states{broken_off}"
 

@@ -47,16 +47,16 @@ def watching(console: Console) -> Iterator[Watcher]:
 
 
 def in_words(night: Night) -> Iterator[str]:
-    """What came of it."""
+    """Yield the lines that the command prints at the end of a night."""
     for told in night.told:
-        of = f", shown with {told.shown} of {told.of} seeds" if told.of else ""
+        of = f", appears with {told.shown} of {told.of} seeds" if told.of else ""
         yield f"{told.status}: {told.finding.identity}{of}"
         if told.replay:
             yield f"  {told.replay}"
     if not night.told:
-        yield "nothing found"
+        yield "no findings"
     for candidate, reason in night.hunt.failed[:3]:
-        yield f"no verdict on a run with seed {candidate.seed}: {reason}"
+        yield f"no verdict on the run with seed {candidate.seed}: {reason}"
     yield f"{night.hunt.runs:,} runs, {len(night.hunt.kept):,} kept in {night.directory}"
     yield from coverage_in_words(night.hunt.reached, night.there)
     yield f"{night.report}"

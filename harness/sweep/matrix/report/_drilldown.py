@@ -71,7 +71,7 @@ def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
 def _count(runs: Sequence[Run]) -> str:
     counts = [f"{text.value(len(runs))} run{'s' if len(runs) > 1 else ''}"]
     if number := sum(map(_bad, runs)):
-        counts.append(f"{number} judged bad")
+        counts.append(f"{number} with violations")
     if number := sum(run.failed is not None for run in runs):
         counts.append(f"{number} failed")
     if number := sum(run.unsupported is not None for run in runs):

@@ -16,17 +16,19 @@ from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import name_of, say, say_interval, say_mean, violated
 
 MEANINGS = {
-    "uniform": "Share of the runs that end with one uniform chain on all agents.",
-    "mutual_share": "Share of a run\u2019s blocks that end in the chain that all agents have in common.",
-    "distinct_chains": "How many different chains there are at the end.",
-    "reconciles": "Reconciles of all agents.",
-    "copies_mean": "In how many chains a block is at the end, mean of the blocks.",
-    "copies_min": "In how many chains the block is at the end that fewest have.",
-    "messages_per_block": "Messages that all agents sent for each block.",
-    "uniform_before_final_reconcile": "Share of the runs that the mission left with one uniform chain.",
-    "mutual_share_before_final_reconcile": "Share of a run\u2019s blocks that the mission left in all chains.",
-    "finished": "Share of the runs whose agents became idle once no more events came.",
-    "violated": "Share of the runs that violated a characteristic.",
+    "uniform": "Share of the runs that end with the same chain on all agents.",
+    "mutual_share": "Share of a run\u2019s blocks that are in the common part of all chains at the end.",
+    "distinct_chains": "Number of different chains at the end.",
+    "reconciles": "Number of reconciles of all agents.",
+    "copies_mean": "Number of chains that contain a block at the end, mean over all blocks.",
+    "copies_min": "Number of chains that contain the rarest block at the end.",
+    "messages_per_block": "Number of messages that all agents sent, for each block.",
+    "uniform_before_final_reconcile": "Share of the runs with the same chain on all agents before the final reconcile.",
+    "mutual_share_before_final_reconcile": (
+        "Share of a run\u2019s blocks that are in the common part of all chains before the final reconcile."
+    ),
+    "finished": "Share of the runs whose agents became idle after the last event.",
+    "violated": "Share of the runs that violated a characteristic or failed a check of steps, records or liveness.",
 }
 _FINISHED = Metric("finished", "finished", figure("finished"), "share of runs")
 _VIOLATED = Metric("violated", "violated", figure("violated"), "share of runs")

@@ -28,7 +28,7 @@ def test_a_matrix_ends_in_a_table_and_files(tmp_path: Path) -> None:
     done = harness("matrix", written(tmp_path), "--backend", "sim", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stdout + done.stderr
     assert not sentences(done.stderr)
-    assert "Means of 3 runs a cell" in done.stdout
+    assert "Means of 3 runs per cell, with 95" in done.stdout
     assert "Not applicable" not in done.stdout, "every step is judged, too"
     assert str(tmp_path / "out" / "report.html") in done.stdout
     files = {path.name for path in (tmp_path / "out").iterdir()}

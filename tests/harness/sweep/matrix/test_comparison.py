@@ -108,7 +108,7 @@ def test_a_figure_that_became_worse_fails_the_night_and_is_told_everywhere(tmp_p
     assert f'message="{sentence}"' in (tmp_path / "junit.xml").read_text()
     summary = (tmp_path / "summary.md").read_text()
     assert f"- 50\u00a0% loss: {sentence}\n" in summary
-    assert "1 figure worse than on " in summary
+    assert "1 figure is worse than on " in summary
 
 
 def test_a_figure_that_became_better_is_told_and_passes(tmp_path: Path) -> None:

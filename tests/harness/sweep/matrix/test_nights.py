@@ -51,7 +51,7 @@ def test_what_is_no_night_of_this_matrix_is_left_out_by_name(tmp_path: Path) -> 
     assert f"{tmp_path / 'b.json'} has schema 'ucp-matrix/2'" in said
     assert f"{tmp_path / 'c.json'}: cannot be read: Is a directory" in said
     assert "`cells.0.estimates.uniform.mean` is not" in said
-    assert found.said_left_out == f"5 files in {tmp_path} left out of the trend"
+    assert found.said_left_out == f"5 files in {tmp_path} are not in the trend"
 
 
 def test_only_the_last_nights_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,12 +73,12 @@ def test_the_command_keeps_each_night_and_says_what_it_left_out(tmp_path: Path) 
     asked.write_text(json.dumps({"name": "small", "scenario": scenario, "loss": [0.0], "seeds": 2}))
     first = harness("matrix", asked, "--nights", kept, "--out", tmp_path / "first")
     assert (first.returncode, sentences(first.stderr)) == (0, [])
-    assert "there is one of this matrix" in (tmp_path / "first" / "report.html").read_text()
+    assert "nights has one night of this matrix" in (tmp_path / "first" / "report.html").read_text()
     (one,) = kept.iterdir()
     assert json.loads(one.read_text()) == json.loads((tmp_path / "first" / "matrix.json").read_text())
     (kept / "0.json").write_text("{}")
     again = harness("matrix", asked, "--nights", kept, "--out", tmp_path / "first")
     assert again.returncode == 0
     (said,) = sentences(again.stderr)
-    assert said.startswith(f"1 file in {kept} left out of the trend; {kept / '0.json'} names no schema")
+    assert said.startswith(f"1 file in {kept} is not in the trend; {kept / '0.json'} names no schema")
     assert len(list(kept.iterdir())) == 2

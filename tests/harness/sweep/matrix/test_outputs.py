@@ -64,13 +64,13 @@ def test_cells_without_all_their_runs_are_skipped() -> None:
     (first,), (second,) = cases(finished).values()
     assert (first.tag, first.get("message")) == ("skipped", "interrupted: 2 of 4 runs had ended")
     assert (second.tag, second.get("message")) == ("skipped", "interrupted: 0 of 4 runs had ended")
-    assert "**2 runs of 8, interrupted; none violated a characteristic**" in to_markdown(finished.record)
+    assert "**2 runs of 8, interrupted; no violations**" in to_markdown(finished.record)
 
 
 def test_the_summary_is_a_markdown_table_with_what_went_wrong_below() -> None:
     lines = to_markdown(played(matrix(name="a | b"), 1, breaks).record).splitlines()
     assert lines[0] == "## a \\| b"
-    assert lines[2] == "**8 runs; 1 violated a characteristic; 1 failed**"
+    assert lines[2] == "**8 runs; 1 with violations; 1 failed**"
     rows = [line for line in lines if line.startswith("|")]
     assert len(rows) == 4
     assert len({row.count("|") for row in rows}) == 1

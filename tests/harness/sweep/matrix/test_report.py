@@ -95,7 +95,7 @@ def test_the_runs_of_a_cell_begin_with_those_that_went_wrong() -> None:
     assert bad.rows[1].verdicts == [*"✓✓✗✓✓✓", *3 * ["\u2013"]]
     assert bad.rows[1].figures[bad.figures.index("mutual chain")] == "20"
     assert bad.command == "ucp-harness run cells/loss-0.5-agents-5.yaml --backend sim --seed 3"
-    assert bad.runs == "4 runs, 1 judged bad, 1 failed"
+    assert bad.runs == "4 runs, 1 with violations, 1 failed"
 
 
 def test_a_run_that_was_kept_leads_to_its_report(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_more_runs_than_there_is_room_for_are_counted(monkeypatch: pytest.Monkey
     monkeypatch.setattr(_drilldown, "MAX_ROWS", 4)
     finished = played(matrix(), 1, breaks)
     assert [(len(cell.rows), cell.left_out) for cell in _drilldown.drilldown(finished, Path())] == [(2, 2), (2, 2)]
-    assert "And 2 more in runs.csv." in to_html(finished, Path())
+    assert "runs.csv has 2 more runs." in to_html(finished, Path())
 
 
 def test_the_trend_has_a_panel_for_each_loss_and_a_dot_for_each_night() -> None:
@@ -144,9 +144,9 @@ def test_nights_differ_in_their_panel() -> None:
 
 def test_a_trend_begins_with_the_second_night_and_the_page_says_so() -> None:
     finished = played(matrix(), 1, judge)
-    assert "With --nights DIR each finished night is kept" in to_html(finished, Path())
-    assert "The trend begins with the second night: there is one" in to_html(finished, Path(), over(finished, 1))
-    assert "The trend begins" not in to_html(finished, Path(), over(finished, 2))
+    assert "With --nights DIR, the command keeps each completed night" in to_html(finished, Path())
+    assert "The trend needs two nights. nights has one night" in to_html(finished, Path(), over(finished, 1))
+    assert "The trend needs" not in to_html(finished, Path(), over(finished, 2))
 
 
 def test_absurd_nights_are_drawn_without_their_absurdity() -> None:

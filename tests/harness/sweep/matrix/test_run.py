@@ -127,14 +127,14 @@ def test_the_table_fits_eighty_columns_and_names_what_was_violated() -> None:
     assert "\u2026" not in lines
     assert "100 %" in lines
     assert "50 % loss: characteristic 3 violated in 1 of 4 runs, seed 2" in lines
-    assert "Means of 4 runs a cell, the same seeds in each, and their 95 % intervals." in lines
+    assert "Means of 4 runs per cell, with 95 % intervals. All cells have the same seeds." in lines
 
 
 def test_a_single_run_has_no_interval_and_it_is_said() -> None:
     record = played(matrix(seeds=1), 1, judge).record
     assert record.cells[0].estimates["reconciles"].low is None
     assert "\u00b1" not in shown(record)
-    assert "One run a cell, so there are no intervals." in shown(record)
+    assert "Each cell has one run, so there are no intervals." in shown(record)
     drawing = draw(record)
     assert 'class="band"' not in drawing
     assert "no intervals" in drawing
@@ -180,8 +180,8 @@ def test_how_much_was_tried_is_told_if_asked_for_and_of_what_was_played_only(tmp
     assert record.tried.all_cells["untold"] is None
     assert [cell.loss for cell in record.tried.cells] == [0.0, 1.0]
     assert MatrixRecord.model_validate(record.to_json()) == record
-    assert "Tried by 4 runs" in to_markdown(record)
+    assert "Coverage of 4 runs" in to_markdown(record)
     assert "reached" not in (tmp_path / "out" / _results_file.FILE).read_text()
     again = run_matrix(asked, tmp_path / "out", on_cores(asked, 1), covers=True).record
     assert again.tried is not None
-    assert again.tried.all_cells["untold"] == "4 of 4 runs were played before, and not looked at"
+    assert again.tried.all_cells["untold"] == "an earlier command played 4 of 4 runs"
