@@ -1,6 +1,6 @@
-"""`python -m docs.generate.complexity RUN_DIR`: put a matrix's growth into docs/appendix/growth.md.
+"""`python -m docs.generate.complexity RUN_DIR`: write a matrix's growth into docs/appendix/growth.md.
 
-The tables and the picture come from RUN_DIR; the words around them are written by hand.
+The tables and the picture come from RUN_DIR. The text around them is written by hand.
 """
 
 import sys
@@ -21,7 +21,7 @@ PICTURE = PAGE.with_name("growth.svg")
 
 
 def tables(record: MatrixRecord) -> str:
-    """Markdown: the means at the middle mission length, and the exponents over agents and blocks together."""
+    """Return Markdown: the means at the middle mission length, and the exponents over agents and blocks together."""
     return f"{_sizes(record)}\n{_exponents(record)}"
 
 

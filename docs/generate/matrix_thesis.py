@@ -1,7 +1,7 @@
-"""`python -m docs.generate.matrix_thesis RUN_DIR`: lay a matrix's figures beside what Section 4.3 observed, in
+"""`python -m docs.generate.matrix_thesis RUN_DIR`: compare a matrix with the observations of Section 4.3, in
 docs/appendix/loss-matrix.md.
 
-The table and the picture come from RUN_DIR; the words around them are written by hand.
+The table and the picture come from RUN_DIR. The text around them is written by hand.
 """
 
 import sys
@@ -20,19 +20,19 @@ PICTURE = PAGE.with_name("loss-matrix.svg")
 BEGIN, END = "<!-- table: begin -->\n", "<!-- table: end -->\n"
 
 OBSERVED = {
-    0.0: "one chain; nobody reconciles",
+    0.0: "one chain; no agent reconciles",
     0.1: "one chain, but for a few last blocks",
     0.15: "one chain, but for a few last blocks (Figure 4.3)",
     0.25: "no uniform chain; the mutual chain shrinks",
     0.3: "divergence becomes noticeable (Figure 4.4)",
     0.5: "hardly any mutual chain; thrashing (Figure 4.5)",
     0.75: "not described",
-    1.0: "nobody reconciles; each chain has its own blocks only (Figure 4.6)",
+    1.0: "no agent reconciles; each chain has its own blocks only (Figure 4.6)",
 }
 
 
 def table(record: MatrixRecord) -> str:
-    """Markdown: a row for each loss, what the thesis saw, and our means with their intervals."""
+    """Return Markdown: for each loss, the observation of the thesis and the means with their intervals."""
     headers = ["loss", "Section 4.3", *(metric.label for metric in METRICS)]
     lines = [headers, ["--:", "---", *("--:" for _ in METRICS)], *map(_row, record.cells)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
