@@ -1,7 +1,7 @@
 """Packets between two vehicles: conditions, the network lab, and the engines that apply conditions.
 
 `__all__` lists the public names. A name is imported at its first use, because the first process of every lab imports
-this package and should load only what it needs.
+this package. A lazy import keeps its start fast.
 """
 
 from typing import TYPE_CHECKING

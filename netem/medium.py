@@ -118,18 +118,19 @@ class Medium:
 
 
 class _Air(Protocol):
-    """Around one sender, under one set of conditions."""
+    """The links of one sender under one set of conditions."""
 
     soonest_of_all: float
     latest: float
     certain: bool
-    """Whether one copy of each broadcast arrives at every receiver, or never any."""
+    """True if each receiver gets one copy of each broadcast, or never any."""
 
     def draw(self, now: float, data_bytes: int) -> RandomDraws: ...
 
 
 _Way = tuple[int, float, float]
-"""From a sender to a receiver: the lot below which all are lost, the least delay, and how much longer for each lot."""
+"""A link: the draw below which a packet is lost, the least delay in seconds, and the additional delay per unit of the
+draw."""
 
 _NO_WAY: _Way = (_WORD, 0.0, 0.0)
 
@@ -140,13 +141,13 @@ def _way(link: LinkConditions) -> _Way:
 
 
 def _is_plain(link: LinkConditions) -> bool:
-    """One lot each for loss and latency is all that it takes."""
+    """Return true if a packet needs only one draw for loss and one for latency."""
     uniform = link.delay is None or link.delay.distribution == "uniform"
     return uniform and not (link.duplicate or link.reorder or link.corrupt or link.remembers)
 
 
 class _PlainAir:
-    """Independent loss and uniform latency: a word of 32 bits each for every receiver."""
+    """Links with independent loss and uniform latency. Each receiver needs two words of 32 bits."""
 
     def __init__(self, links: list[LinkConditions], hears: list[bool], words: _Words) -> None:
         self.receivers = len(links)
@@ -168,7 +169,7 @@ class _PlainAir:
 
 
 class _PlainDraws:
-    """Where the words of one broadcast stand among those of others."""
+    """The draws of one broadcast, as a position in the arrays of words."""
 
     __slots__ = ("_air", "_at", "_latency", "_loss", "latest")
 
@@ -196,7 +197,7 @@ class _PlainDraws:
 
 
 class _Words:
-    """Two streams of words of 32 bits, drawn many at a time and taken in step: those from `next` on are left."""
+    """Two streams of words of 32 bits, drawn in blocks and used in parallel. Words from `next` on are unused."""
 
     def __init__(self, loss: Random, latency: Random) -> None:
         self.loss = array("I")
@@ -205,7 +206,10 @@ class _Words:
         self.next = 0
 
     def take(self, count: int) -> int:
-        """Where the next `count` words stand in `loss` and `latency` as they are then; these arrays do not change."""
+        """Return the position of the next `count` words in the current arrays `loss` and `latency`.
+
+        The arrays never change. `refill` replaces them by new ones.
+        """
         at = self.next
         if at + count > len(self.loss):
             at = self.refill(count)
@@ -213,7 +217,7 @@ class _Words:
         return at
 
     def refill(self, count: int) -> int:
-        """Draw words for many times `count`; where the next stand now."""
+        """Draw a block of words for many times `count`, and return the position of the next one."""
         loss, latency = self._streams
         self.loss = self.loss[self.next :] + _draw(loss, _BROADCASTS_AT_ONCE * count)
         self.latency = self.latency[self.next :] + _draw(latency, _BROADCASTS_AT_ONCE * count)
@@ -228,7 +232,7 @@ def _draw(stream: Random, count: int) -> array[int]:
 
 
 class _AnyAir:
-    """All that conditions can ask. Every lot is drawn for every receiver, so that no one's lots depend on another's."""
+    """Links with any conditions. Each receiver has all its draws, so that the draws of receivers are independent."""
 
     soonest_of_all = 0.0
     latest = inf
@@ -261,14 +265,14 @@ class _AnyAir:
 
 
 _Copy = tuple[float, float, float, float, float]
-"""The lots of one copy of a packet, each uniform in 0..1 (exclusive): loss, turn of its model's state, corruption,
-reordering, latency."""
+"""The draws of one copy of a packet, each uniform in 0..1 (exclusive): loss, change of the loss model's state,
+corruption, reordering, latency."""
 
 
 class _Link:
-    """From one sender to one receiver: what becomes of a packet, and what that means for those after it.
+    """The link from one sender to one receiver, with its state between packets.
 
-    `before` is the link under the conditions before; a queue lives on from one that remembers to another.
+    `before` is the link under the previous conditions. Its queue continues if both conditions need one.
     """
 
     def __init__(self, conditions: LinkConditions, before: _Link | None) -> None:
@@ -282,7 +286,7 @@ class _Link:
             self._last, self._departures = before._last, before._departures
 
     def enqueue(self, now: float, bits: int, lots: _Copy, second: _Copy | None = None) -> tuple[float, ...]:
-        """The delays of a packet that comes at `now`, and of its second copy if it has one, as far as they arrive."""
+        """Return the delays of the copies that arrive, of a packet sent at `now` and of its second copy."""
         conditions = self.conditions
         loss, turn, corruption, reordering, latency = lots
         lost = self._loses(loss, turn)
@@ -305,7 +309,7 @@ class _Link:
         return lot < (loss.loss_bad if bad else loss.loss_good)
 
     def _wait(self, now: float, bits: int, latency: float) -> float:
-        """Put a packet into the queue; how many seconds it stays there."""
+        """Put a packet into the queue, and return its delay in seconds."""
         at = now + sample(self._delay, latency)
         if self.conditions.rate is not None:
             if self._last > now:
@@ -317,7 +321,7 @@ class _Link:
         return max(0.0, at - now)
 
     def _waiting(self, now: float) -> int:
-        """How many packets are in the queue."""
+        """Return the number of packets in the queue."""
         while self._departures and self._departures[0] <= now:
             heappop(self._departures)
         return len(self._departures)
@@ -338,7 +342,7 @@ class _RepeatedDraws:
 
 
 def sample(delay: Delay, lot: float) -> float:
-    """The delay in seconds that falls to `lot`, uniform in 0..1 (exclusive); below 0 is at once, as netem has it."""
+    """Return the delay in seconds for a draw in 0..1 (exclusive). As in netem, a negative delay means at once."""
     if delay.distribution == "uniform":
         return delay.mean_s + delay.jitter_s * (2 * lot - 1)
     deviations = table(delay.distribution, _TABLE_SIZE)[int(lot * _TABLE_SIZE)] / SCALE

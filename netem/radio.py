@@ -1,6 +1,6 @@
 """Radio models: the loss between two places, and its effect on network conditions.
 
-A radio is a function from distance to loss. It knows nothing of flight: whoever flies tells where everybody is.
+A radio is a function from distance to loss. The caller provides the positions of the vehicles.
 """
 
 from __future__ import annotations
@@ -126,9 +126,9 @@ def over_the_air(conditions: NetworkConditions, losses: Mapping[frozenset[int], 
 
 
 def components(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> tuple[frozenset[int], ...]:
-    """Who can reach whom, directly or through others, in both directions; the largest component first.
+    """Return the groups of vehicles that reach each other in both directions, largest first.
 
-    A link that loses everything is none.
+    Vehicles may reach each other through others. A link with a loss of 1 does not connect.
     """
     left = list(vehicles)
     groups: list[frozenset[int]] = []

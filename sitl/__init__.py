@@ -1,7 +1,7 @@
 """Vehicles: ArduPilot SITL, the embedded vehicle, and the pilot that flies either over MAVLink.
 
 `__all__` lists the public names. A name is imported at its first use, because every embedded vehicle imports this
-package and should load only what it needs.
+package. A lazy import keeps its start fast.
 """
 
 from typing import TYPE_CHECKING

@@ -1,9 +1,9 @@
-"""ArduPilot SITL: finding the binary, and starting it so that it flies without anybody holding its hand.
+"""ArduPilot SITL: find the binary, and start it without user interaction.
 
-The command line is that of ArduPilot's own SITL (`arducopter --help`, developer documentation "SITL Simulator").
-A vehicle is instance 0 in a network namespace of its own, hence always the same ports; builds with CAN want a multicast
-route in that namespace, or exit with status 1. The vehicle's directory gets its parameters, copied, beside the
-`eeprom.bin` and `logs/` that ArduPilot writes there: what a vehicle flew with stays with the run.
+The command line is that of ArduPilot's SITL (`arducopter --help`, developer documentation "SITL Simulator"). Each
+vehicle is instance 0 in its own network namespace, and so has the same ports. Builds with CAN need a multicast route in
+this namespace, or exit with status 1. The directory of a vehicle contains copies of its parameters, and `eeprom.bin`
+and `logs/` from ArduPilot. The run directory therefore documents the parameters of each vehicle.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ class ArduPilot:
             raise NoProgramError(f"no {self.setup.debugger} is on PATH: install it, or leave out `debugger`")
 
     def _check_model(self, frame: str) -> None:
-        """A model fits if one that the binary offers is its beginning, in capitals or not: that is how it looks."""
+        """Raise VehicleError if the frame does not start with a name that the binary offers."""
         offered = models(self.binary)
         model = self.frame.lower()
         if offered and not any(model.startswith(name.lower()) for name in offered):
@@ -225,10 +225,10 @@ class ArduPilot:
                 return {"LOG_FILE_TIMEOUT": PATIENT_S}
 
     def _bounded(self) -> list[str]:
-        """What starts a program of which no file gets longer than its log may.
+        """The start of a command line that limits the size of files to that of the log.
 
-        ArduPilot takes that for a disk that is slow, and writes no more; it would begin another log after
-        LOG_FILE_TIMEOUT seconds. `ulimit -f` counts blocks of 512 bytes (POSIX).
+        ArduPilot treats the limit as a slow disk, and stops writing. It would start another log after LOG_FILE_TIMEOUT
+        seconds. `ulimit -f` counts blocks of 512 bytes (POSIX).
         """
         if not self.setup.log_mib:
             return []
@@ -243,11 +243,11 @@ _DEBUGGERS: dict[Debugger | None, tuple[str, ...]] = {
     ),
     "valgrind": ("valgrind", "--log-file=valgrind.log", "--soname-synonyms=somalloc=nouserintercepts"),
 }
-"""gdb tells on the vehicle's output where each thread was if it crashes."""
+"""gdb prints the stack of each thread to the output of the vehicle if it crashes."""
 
 
 def models(binary: Path) -> list[str]:
-    """The frames that a binary offers, in its own words: it lists them when it is given none. Empty if it does not."""
+    """Return the names of the frames that a binary lists when it is started without a frame. Empty if it lists none."""
     try:
         said = subprocess.run(
             [binary], stdin=subprocess.DEVNULL, capture_output=True, timeout=ANSWER_LIMIT_S, check=False, cwd="/"
@@ -259,7 +259,7 @@ def models(binary: Path) -> list[str]:
 
 
 def build_of(binary: Path) -> Version | None:
-    """Version and commit that stand in a binary, as it tells them at its start; None if they do not."""
+    """Return the version and the commit in a binary, as it prints them at its start. None if it has none."""
     try:
         with binary.open("rb") as file:
             found = _BUILD.search(file.read(MAX_BINARY_BYTES))
@@ -273,7 +273,7 @@ MAX_BINARY_BYTES = 200_000_000  # one with its debugging information has 80 MB
 
 
 def default_parameters(binary: Path, name: str) -> Path | None:
-    """A file of default parameters for a binary, where it lies in ArduPilot's source tree or beside the binary."""
+    """Return a file of default parameters in ArduPilot's source tree or next to the binary. None if it is missing."""
     for directory in autotest(binary.resolve().parent):
         for path in (directory / name, directory / "default_params" / name, directory / "models" / name):
             if path.is_file():
@@ -282,12 +282,12 @@ def default_parameters(binary: Path, name: str) -> Path | None:
 
 
 def _own_defaults(sysid: int) -> str:
-    """Both names of the system ID, before and since 4.7; ArduPilot passes over a parameter that it does not know."""
+    """Return the system ID under both names, before and since ArduPilot 4.7. ArduPilot ignores an unknown parameter."""
     return f"SYSID_THISMAV {sysid}\nMAV_SYSID {sysid}\n"
 
 
 def _not_a_program(head: bytes) -> str | None:
-    """What is wrong with a file that begins like this, or None."""
+    """Return the error of a binary whose file starts with these bytes, or None."""
     if not head:
         return "is empty"
     if head.startswith(b"#!"):  # a wrapper of the user's own

@@ -135,7 +135,7 @@ class Pilot:
         await self._pursue(_Listening())
 
     async def _pursue(self, procedure: Procedure) -> None:
-        """Ask for step after step, at every heartbeat, until all are made."""
+        """Request each step at every heartbeat until all steps are complete."""
         clocks = _StepClocks(self.link)
         asked: tuple[Step, int] | None = None
         while (step := self._next_step(procedure)) is not None:
@@ -160,7 +160,7 @@ class Pilot:
                 continue
 
     def _is_over(self, procedure: Procedure) -> bool:
-        """Whether nobody wants it any more: a flight that ended by force, or that somebody else flies."""
+        """Return true if the procedure is obsolete: the flight was terminated, or another pilot has the vehicle."""
         if isinstance(procedure, Termination):
             return False
         left = self.link.has_left_its_mode or self.link.has_disarmed
@@ -191,7 +191,7 @@ class Pilot:
 
 
 class _Listening:
-    """The `Procedure` that asks for nothing."""
+    """A `Procedure` without steps, which only listens."""
 
     purpose = "stay in touch"
     _step = Step("its next word", math.inf)
@@ -204,7 +204,7 @@ class _Listening:
 
 
 class _StepClocks:
-    """How long each step has been waited for, all attempts together, in simulated seconds and in ours."""
+    """The waiting time of each step over all attempts, in simulated seconds and in seconds of wall time."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -216,7 +216,7 @@ class _StepClocks:
         self.patience_s = 0.0  # of our time: then it is worth looking again, even if nothing is heard
 
     def lost(self) -> str | None:
-        """Why nothing more can be expected of the vehicle, if so."""
+        """Return the reason if the vehicle is lost, otherwise None."""
         now = time.monotonic()
         if self._link.closed.is_set():
             return "it ended the connection"
@@ -228,7 +228,7 @@ class _StepClocks:
         return None
 
     def overdue(self, step: Step) -> str | None:
-        """Why the wait for `step` is over, if it is."""
+        """Return the reason if a time limit of the step has expired, otherwise None."""
         link, now = self._link, time.monotonic()
         if self._step is not None:
             if self._time_s is not None and link.state.time_s is not None:
@@ -250,6 +250,6 @@ class _StepClocks:
         return SILENCE_S / min(1.0, self._link.speedup)
 
     def _streams(self) -> dict[str, float]:
-        """When anything was last heard, and each message that a pilot lives on, once it has been."""
+        """Return the times of the last message, and of the last heartbeat and position once there is one."""
         times = {"it has sent no heartbeat": self._link.heartbeat_at, "it has sent no position": self._link.position_at}
         return {"it has been silent": self._link.heard_at, **{what: at for what, at in times.items() if at is not None}}

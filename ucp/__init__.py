@@ -1,7 +1,7 @@
 """The Uniform Chain Protocol: blocks, chain, messages, and the 20 event handlers of Algorithms 1-20.
 
-`__all__` lists the public names. A name is imported at its first use, because every agent process imports this package
-and should load only what it needs.
+`__all__` lists the public names. A name is imported at its first use, because every agent process imports this package.
+A lazy import keeps its start fast.
 """
 
 from typing import TYPE_CHECKING

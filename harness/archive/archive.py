@@ -1,8 +1,8 @@
-"""The archive of a run: what it left in its directory, or what came home from the field, whatever has become of it.
+"""The archive of a run: the files in its directory, or files from the field, complete or damaged.
 
-Everything after a run stands on this one reader. A file is read when it is first asked for, and once. What cannot be
-used is left out and told in a sentence, the same for all who ask: `problems` are of files that are damaged or not what
-they should be, `gaps` of what a run that came to its end leaves, and this one has not.
+Checker, report and all other commands read runs through this module. It reads each file once, at its first use.
+Unusable data is left out. `problems` has a sentence for each damaged or wrong file. `gaps` has a sentence for each
+missing file that a complete run would have.
 """
 
 import os
@@ -38,14 +38,19 @@ if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
 
 LARGE_BYTES = 16 * 1024 * 1024
-"""Traces that are larger together are read without what only took a message in, if that is enough."""
+"""If the traces together are larger, they are read without handler runs that only received a message, if the caller
+allows it."""
 MAX_TRACE_BYTES = 256 * 1024 * 1024
-"""Of 50 agents that hear everything, each fills about a tenth of it in 20 minutes."""
+"""Maximum size of a trace. In a swarm of 50 agents without loss, a trace grows to a tenth of it in 20 minutes."""
 _AGENT_ID = re.compile("[1-9][0-9]{0,4}")
 
 
 class RecordedRun(NamedTuple):
-    """A handler run in a trace: the agent, its life (1 until its first restart), and the line in its trace, from 1."""
+    """A handler run in a trace.
+
+    `agent_id` is the agent. `life` is its incarnation, 1 until the first restart. `line` is the line in the trace, from
+    1.
+    """
 
     agent_id: int
     life: int
@@ -66,12 +71,12 @@ class HeldBlock(NamedTuple):
 
 
 class RunArchive:
-    """The archive of a run: what is left in a run directory, a directory of exports, or single export files.
+    """The archive of a run: the files in a run directory, in a directory of exports, or single export files.
 
-    Files are read at first use, and once. `directory` is the first directory with a record, else the first directory
-    given, else None. `exports` and `traces` hold what can be read, by agent; `problems` has a sentence for each
-    damaged file, and `gaps` one for each missing file. With `skim`, large traces are read without the handler runs
-    that only received a message. Raises RunDirectoryError if a path does not exist, or is a directory of other things.
+    Files are read at first use, and once. `directory` is the first directory with a record, else the first given
+    directory, else None. `exports` and `traces` have the readable files by agent. `problems` has a sentence for each
+    damaged file, and `gaps` one for each missing file. With `skim`, large traces are read without the handler runs that
+    only received a message. Raises RunDirectoryError if a path does not exist, or is a directory with other content.
     """
 
     def __init__(self, *given: Path | str, skim: bool = False) -> None:
@@ -85,11 +90,11 @@ class RunArchive:
         # A directory may have traces and no exports: the run was killed.
         self._agents = list(dict.fromkeys([*beside, *map(agents_directory, directories)]))
 
-    # What the run says of itself
+    # The record of the run
 
     @property
     def recorded(self) -> bool:
-        """Whether run.json exists and can be read at least in part."""
+        """True if run.json exists and can be read at least in part."""
         return self._record_file is not None and self._record_file.error is None
 
     @property
@@ -99,7 +104,7 @@ class RunArchive:
 
     @property
     def judged_record(self) -> JudgedRecord | None:
-        """The part of run.json that a judgement needs; None if any of that is missing or damaged."""
+        """The part of run.json that the checker needs. None if any key of it is missing or damaged."""
         return self._record_file.judged if self._record_file else None
 
     @property
@@ -109,7 +114,7 @@ class RunArchive:
 
     @property
     def record_problems(self) -> list[str]:
-        """A sentence for each error in run.json; errors in what a judgement needs come first."""
+        """A sentence for each error in run.json. Errors in the keys that the checker needs come first."""
         return self._record_file.problems if self._record_file else []
 
     @cached_property
@@ -136,7 +141,7 @@ class RunArchive:
         for name in ("_record_file", "origin", "roster"):
             self.__dict__.pop(name, None)
 
-    # What the agents left
+    # Files of the agents
 
     @cached_property
     def exports(self) -> Exports:
@@ -166,8 +171,8 @@ class RunArchive:
     def handler_runs(self) -> Iterator[RecordedRun]:
         """Yield every handler run, trace by trace, agents in order of their IDs.
 
-        Traces are read line by line and not kept, so memory stays small however long they are. Raises
-        RunDirectoryError at the first damaged line; `traces` has what is before it.
+        The function reads traces line by line and does not keep them. Memory therefore stays small for traces of any
+        length. Raises RunDirectoryError at the first damaged line. `traces` has the lines before it.
         """
         for path in self._trace_files:
             for line in read_lines(path):
@@ -186,7 +191,7 @@ class RunArchive:
 
     @cached_property
     def large(self) -> bool:
-        """Whether the traces together are larger than LARGE_BYTES."""
+        """True if the traces together are larger than LARGE_BYTES."""
         return sum(path.stat().st_size for path in self._trace_files if path.is_file()) > LARGE_BYTES
 
     @cached_property
@@ -196,7 +201,7 @@ class RunArchive:
 
     @property
     def _never_began(self) -> bool:
-        """Whether the mission may have ended before its first second."""
+        """True if the mission may have ended before its first second."""
         return self.record.outcome in ("not supported", "failed")
 
     @cached_property
@@ -205,7 +210,7 @@ class RunArchive:
         traces: dict[int, Trace] = {}
         problems, gaps = [], []
         skim = self._skim and self.large
-        of_the_run = self.record.known_agents  # none where nothing says who flew, as of exports from the field
+        of_the_run = self.record.known_agents  # none without a record, as for exports from the field
         for path in self._trace_files:
             if path.is_file() and path.stat().st_size > MAX_TRACE_BYTES:
                 problems.append(
@@ -214,7 +219,7 @@ class RunArchive:
                 continue
             trace = read_trace(path, skim=skim)
             if trace is None and self._never_began and not path.stat().st_size:
-                continue  # an agent that was ready, and whose mission did not begin
+                continue  # an agent that was ready, but whose mission did not start
             if trace is None:
                 problems.append(f"{path}: {why_none(path)}; it is left out")
                 continue
@@ -241,7 +246,7 @@ class RunArchive:
 
     @cached_property
     def _public_keys(self) -> tuple["PublicKeys | None", list[str]]:
-        """The public keys, and what is wrong with them."""
+        """Return the public keys, and a sentence on each problem with them."""
         beside = [*([self.directory] if self.directory else []), *self._agents]
         path = next((place / PUBLIC_KEYS_FILE for place in beside if (place / PUBLIC_KEYS_FILE).exists()), None)
         if path is None:
@@ -258,7 +263,7 @@ class RunArchive:
         except KeyFileError as error:
             return None, [f"{error}; signatures of blocks are not checked"]
 
-    # What was going on around them
+    # Network, vehicles and the rogue node
 
     def network(self, vehicles: Collection[int]) -> Connectivity:
         """Return which of `vehicles` could reach each other when. Empty for exports without a run."""
@@ -281,7 +286,7 @@ class RunArchive:
         path = self._in_directory(NETWORK_FILE)
         return [*JsonLines(path, model)] if path is not None and path.is_file() else None
 
-    # What is wrong
+    # Damaged and missing files
 
     @property
     def problems(self) -> list[str]:

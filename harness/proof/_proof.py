@@ -1,4 +1,4 @@
-"""From bounds to what holds within them: explore, look at the whole, and write what was found as scenarios."""
+"""Prove properties within bounds: explore the states, examine the graph, and write the findings as scenarios."""
 
 import time
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from harness.proof.questions._livelock import Livelock
 from harness.run.simulate import claim
 
 INCOMPLETE = 4
-"""Exit status: a bound was reached before everything had been looked at."""
+"""Exit status: the proof reached a limit before it had explored all states."""
 CLAIMS = {
     "2": "an idle agent has committed every block that it completed",
     "3": "no agent holds a block twice",
@@ -35,12 +35,12 @@ CLAIMS = {
     "crash": "no handler ends by an error",
     "steps": "every step is that of a right agent",
 }
-"""What is looked at in every state; "steps" where it is asked for."""
+"""Properties that the proof checks in every state. "steps" is optional."""
 OF_CAPTORS = {
     "1": "every message that is believed was sent by the vehicle that it names",
     "4": "every block is genuine",
 }
-"""What a captor may violate though no agent does anything wrong: looked at where somebody is captured."""
+"""Properties that an attacker with captured keys can violate although all agents are correct."""
 SHOWN = {
     "1": "an agent believes what the captured vehicle never sent",
     "4": "an agent holds a block in the captured vehicle's name that it never completed",
@@ -50,9 +50,9 @@ OF_OTHERS = {
     "name": "nothing is heard in another's name, and no block that its maker did not sign",
     "revoked": "nothing is heard of the captured vehicle by who knows that it is revoked",
 }
-"""What it must not, whatever it says."""
+"""Properties that an attacker with captured keys must not be able to violate."""
 RUN_LOOKED_FOR_S = 60.0
-"""For so long, at most, a run is looked for that has the flaw that an agent by itself has."""
+"""Maximum time in seconds of the search for a run that shows the flaw of a single agent."""
 PLAYED = {
     "honest": "4",
     "name": "1",
@@ -64,7 +64,7 @@ PLAYED = {
     "crash": "liveness",
     "steps": "steps",
 }
-"""Kinds of flaws, and by what a simulated run shows them."""
+"""Kind of flaw -> the check that shows it in a simulated run."""
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Pr
 
 
 def _with_instants(bounds: Bounds) -> Bounds:
-    """Where messages are lost and heard twice, each in its instant: what is found there is a run."""
+    """Return bounds with lost and duplicated messages at one instant each. A path within them is a possible run."""
     return replace(bounds, network="lossy", faults=tuple(dict.fromkeys((*bounds.faults, "duplicate"))))
 
 

@@ -1,4 +1,4 @@
-"""Within which bounds everything is looked at."""
+"""The bounds of a proof."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -19,11 +19,11 @@ MAX_LIES = 9
 MAX_COINCIDENCES = 9
 MAX_LOSSES = 9
 EVENT_FILLS_BLOCK = {"max_block_bytes": 267}
-"""An event completes a block."""
+"""Settings with which each event completes a block."""
 
 
 class BoundsError(HarnessError):
-    """These are no bounds within which anything can be looked at."""
+    """The bounds of a proof are impossible."""
 
 
 @dataclass(frozen=True)

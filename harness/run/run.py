@@ -41,7 +41,7 @@ REPLAY_FILE = "replay.yaml"
 
 
 def replay_of(scenario: Scenario, by_hand_s: Collection[float], seed: int | None, backend: BackendName | None) -> str:
-    """The file; `by_hand_s` are the seconds of the timeline's entries that were asked for by hand."""
+    """Return the text of the replay file. `by_hand_s` are the seconds of the timeline entries from a user."""
     document = scenario.model_dump(mode="json", exclude_defaults=True)
     timeline = [{"at_s": entry["at_s"], **entry} for entry in document["timeline"]]
     document["timeline"] = sorted(timeline, key=lambda entry: entry["at_s"])
@@ -130,7 +130,7 @@ def run(
 class Recording:
     """The directory of a run and its record, from its start to the verdict.
 
-    Raises RunDirectoryError if `out` is neither new nor empty, MachineError if the disk refuses the record.
+    Raises RunDirectoryError if `out` is neither new nor empty, and MachineError if the record cannot be written.
     """
 
     def __init__(self, scenario: Scenario, seed: int, out: Path, backend: BackendName) -> None:
@@ -148,16 +148,16 @@ class Recording:
         self.directory.write_record(self._record)
 
     def fail(self, error: HarnessError) -> None:
-        """The run could not begin."""
+        """Record that the run could not start."""
         self._update(outcome="failed", outcome_detail=str(error))
 
     def tell(self, scenario: Scenario) -> None:
-        """This is what the run plays: the scenario that it began with, and what it was told since."""
+        """Record the played scenario: the original one with the requests of the user so far."""
         self._scenario = scenario
         self._update(scenario=scenario)
 
     def take_down_by_hand(self, interventions: Interventions) -> None:
-        """What somebody had happen by now: into the record, and as a scenario that plays it again."""
+        """Write the requests of the user so far to the record, and a scenario that plays them again."""
         self.tell(interventions.scenario)
         by_hand_s = [entry.at_s for entry in interventions.by_hand]
         replay = replay_of(interventions.scenario, by_hand_s, self._record.seed, self._record.backend)
@@ -167,7 +167,7 @@ class Recording:
             raise MachineError(f"{self.directory.path / REPLAY_FILE} cannot be written: {error.strerror}") from None
 
     def take_down(self, played: RunOutcome) -> None:
-        """What has been played by now."""
+        """Write the outcome so far to the record."""
         self._update(
             engine=played.engine,
             mission_s=played.mission_s,
@@ -185,7 +185,7 @@ class Recording:
         )
 
     def end(self, played: RunOutcome) -> Run:
-        """Judge what was played, and write record and report. Raises MachineError if the disk refuses them."""
+        """Check the run, and write record and report. Raises MachineError if they cannot be written."""
         self._record = _updated(self._record, outcome=played.outcome, outcome_detail=played.outcome_detail)
         self.take_down(played)
         archive = RunArchive(self.directory.path)
@@ -221,7 +221,7 @@ def _updated(record: RunRecord, **keys: Any) -> RunRecord:
 
 
 async def _by_hand(hand: Interventions, directory: RunDirectory, swarm: mission.Swarm, scenario: Scenario) -> None:
-    """The story of a mission in which somebody may intervene, also from another process."""
+    """Play a mission in which a user can intervene, also from another process."""
     async with listening(hand, directory.path):
         await hand.story(swarm, scenario)
 
@@ -273,7 +273,7 @@ async def _until_interrupted(
 
 
 def versions() -> dict[str, str]:
-    """What this ran on, for whoever wants to repeat it."""
+    """Return the versions of the software and the system, so that a user can repeat the run."""
     return {
         **{package: version(package) for package in PACKAGES},
         "python": platform.python_version(),

@@ -66,7 +66,7 @@ def simulate(
 def simulate_in_memory(
     memory: "InMemory", scenario: Scenario, seed: int, *, again: bool = False, **options: Any
 ) -> Simulated:
-    """As `simulate`; `memory` keeps the run, and `options` are the simulation's."""
+    """Simulate as `simulate` does. `memory` stores the run, and `options` go to the simulation."""
     VirtualTime().refuse(scenario)
     simulation = Simulation(scenario, seed, memory, **options)
     with closing(simulation):
@@ -84,9 +84,10 @@ def simulate_in_memory(
 
 
 def same_twice(scenario: Scenario, seed: int) -> None:
-    """Play `scenario` to see whether agents that are not ours answer the same when they are given the same again.
+    """Check that agents with a command of their own repeat their answers when they get the same input again.
 
-    Raises HarnessError if one does not, or cannot be played so; not of one that crashes or hangs, which its run tells.
+    Raises HarnessError if an agent does not, or does not support this. A crashed or hung agent raises no error here,
+    because its run reports it.
     """
     with suppress(AgentFailedError):
         simulate(scenario, seed, tracing=True, again=True)
@@ -108,7 +109,7 @@ def _header(life: Incarnation) -> Header:
 
 
 class InMemory:
-    """Keeps everything as the checker wants it."""
+    """A recorder that stores traces and records in memory for the checker."""
 
     def __init__(self, tracing: bool) -> None:
         self.tracing = tracing
@@ -127,25 +128,25 @@ class InMemory:
             trace.starts.append(len(trace.runs))
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
-        """The block that it becomes part of has it."""
+        """Do nothing: the block has the event."""
 
     def write(self, agent_id: int, entries: list[Entry]) -> None:
         self._traces[agent_id].extend(entries)
 
     def changed(self, record: dict[str, Any]) -> None:
-        """The run's record has it."""
+        """Do nothing: the record of the run has it."""
 
     def injected(self, record: dict[str, Any]) -> None:
         self._injected.take_down([InjectedDatagram.model_validate(record)])
 
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
-        """Nobody asks where vehicles were."""
+        """Do nothing: the checker needs no positions."""
 
     def keep_chains(self, at_s: float, lives: Iterable[Incarnation]) -> None:
         self._kept = self._exports(at_s, lives)
 
     def export(self, at_s: float, lives: Iterable[Incarnation]) -> None:
-        """The evidence is made of the agents themselves."""
+        """Do nothing: the evidence comes from the agents."""
 
     def evidence(self, simulation: Simulation) -> Evidence:
         record = JudgedRecord.model_validate(
@@ -188,16 +189,16 @@ class InMemory:
 EVIDENCE_SHOWN = 5
 
 Judge = Callable[[Scenario, int], Result]
-"""Plays a scenario with a seed, and judges it."""
+"""A function that plays a scenario with a seed, and checks the run."""
 
 
 ENDED = "ended"
-"""Key of what an agent is judged by that did not get to the end of its mission."""
+"""Key of the judgement on an agent that crashed or hung during the mission."""
 
 
 @gc_paused()
 def simulated(scenario: Scenario, seed: int) -> Result:
-    """With traces, so that all six characteristics are judged; of a run that an agent ended, only that it did."""
+    """Simulate with traces and return the verdict. If an agent crashes or hangs, return only a judgement on that."""
     try:
         return simulate(scenario, seed, tracing=True).result
     except AgentFailedError as error:
@@ -205,14 +206,14 @@ def simulated(scenario: Scenario, seed: int) -> Result:
 
 
 def ended_by(error: AgentFailedError) -> Result:
-    """An agent crashed or hung: there is no more to judge, and no less to find and to shrink."""
+    """Return the verdict on a run that ended because an agent crashed or hung."""
     finding = Finding(error.agent_id, f"{error.outcome}: it {error.detail}")
     judgement = Judgement("every agent to the end", "violated", f"agent {error.agent_id} {error.outcome}", [finding])
     return Result({}, {}, {ENDED: judgement})
 
 
 def evidence_lines(violated: dict[str, Judgement]) -> list[str]:
-    """What is violated, and how one sees it."""
+    """Return lines on the violated checks and their evidence."""
     lines = []
     for key, judgement in violated.items():
         if key in CHARACTERISTICS:
@@ -226,7 +227,7 @@ def evidence_lines(violated: dict[str, Judgement]) -> list[str]:
 
 
 def claim(out: Path | None, name: str) -> Path:
-    """Where the file will be: `out`, or a new name under `runs`. Raises RunDirectoryError if there is one already."""
+    """Return the path of the new file: `out`, or a new name under `runs/`. Raises RunDirectoryError if it exists."""
     if out is not None and out.exists():
         raise RunDirectoryError(f"{out} exists: choose another --out, nothing is overwritten")
     path = out or default_path(f"{name} shrunk").with_suffix(".yaml")
@@ -238,7 +239,7 @@ def claim(out: Path | None, name: str) -> Path:
 
 
 def write(path: Path, text: str) -> Path:
-    """Where it was written: a number is added if somebody was faster. Raises MachineError."""
+    """Write the file and return its path, with a number if another process took the name. Raises MachineError."""
     free, number = path, 2
     while True:
         try:

@@ -17,7 +17,7 @@ from harness.sweep.explore._smaller import replays, scenario_of, shrink, size
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """The run of `seed` violates these characteristics, by number, and judgements beside them, by key."""
+    """A run with bad verdicts: its seed, and the numbers or keys of the checks."""
 
     seed: int
     keys: tuple[str, ...]
@@ -25,7 +25,7 @@ class Violation:
 
 @dataclass
 class Searched:
-    """What became of seeds from the first on. `failed`: seed -> why there is no verdict on its run."""
+    """The result of the search. `failed` maps a seed to the reason why its run has no verdict."""
 
     played: int = 0
     violation: Violation | None = None
@@ -34,9 +34,10 @@ class Searched:
 
 
 def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> Searched:
-    """Play `seeds` in order; the lowest that violates a characteristic is the one found, however many `jobs`.
+    """Play `seeds` in order until a run has a bad verdict.
 
-    Ctrl-C ends it early. Raises HarnessError if the scenario cannot be played.
+    The result is the first such seed, for any number of `jobs`. Ctrl-C ends the search early. Raises HarnessError if
+    the scenario cannot be played.
     """
     searched = Searched()
     try:
@@ -55,12 +56,12 @@ def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: 
 
 MAX_RUNS = 5000
 SEEDS = 1000
-"""Number of seeds that are played unless the caller or the user gives another."""
+"""Default number of seeds."""
 
 
 @dataclass(frozen=True)
 class Shrunk:
-    """The smallest run that was found: where it is written, and how it came about."""
+    """The smallest scenario found: its file, and the steps that led to it."""
 
     path: Path
     seed: int
@@ -90,7 +91,7 @@ class Explored:
 
 @dataclass(frozen=True)
 class Watcher:
-    """What is told meanwhile. `on_step` gets the number of runs so far, and the size in words."""
+    """Functions that report progress. `on_step` receives the number of runs so far, and the size in words."""
 
     on_violation: Callable[[Violation], None] = field(default=lambda violation: None)
     on_step: Callable[[int, str], None] = field(default=lambda runs, words: None)
@@ -153,7 +154,7 @@ def smallest_of(
     max_runs: int,
     on_step: Callable[[int, str], None],
 ) -> tuple[Document, str, bool]:
-    """The smallest document that `still` is what it is; how it came about, in words; whether Ctrl-C ended that."""
+    """Return the smallest document for which `still` is true, the steps in words, and whether Ctrl-C ended it."""
     interrupted = False
     shrinker = Shrinker(
         original,

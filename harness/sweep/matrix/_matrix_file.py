@@ -117,12 +117,12 @@ class Matrix(Model):
 
     @property
     def grows_with_agents(self) -> bool:
-        """Whether there are enough numbers of agents to fit growth."""
+        """True if the matrix has enough numbers of agents to fit power laws."""
         return len(self.agents or ()) >= SIZES_FOR_GROWTH
 
     @property
     def grows_with_length(self) -> bool:
-        """Whether there are enough mission lengths to fit growth."""
+        """True if the matrix has enough mission lengths to fit power laws."""
         return len(self.duration_s or ()) >= SIZES_FOR_GROWTH
 
     @property
@@ -201,9 +201,9 @@ class Matrix(Model):
 
 
 def load_matrix(path: Path | str, backend: BackendName | None = None) -> Matrix:
-    """Load a matrix from a YAML file; `backend`, if given, replaces the file's.
+    """Load a matrix from a YAML file. `backend`, if given, replaces that of the file.
 
-    Raises ScenarioError, whose one sentence names the file, the key, the value and what is allowed.
+    Raises ScenarioError. Its message names the file, the key, the value and the allowed values.
     """
     path = Path(path)
     document = read_yaml(path, "matrix")

@@ -1,4 +1,5 @@
-"""What matrix.json says, schema `ucp-matrix/1`. Keys are added, never removed or renamed."""
+"""The record of a matrix: matrix.json, schema `ucp-matrix/1`. Later versions may add keys, but remove or rename
+none."""
 
 from typing import Any, Literal
 
@@ -59,9 +60,9 @@ class MatrixRecord(BaseModel):
 
     @property
     def exit_status(self) -> int:
-        """As documented for the command line; a run that failed counts like an agent that did.
+        """The exit status of the command `matrix`. A failed run counts as a bad one.
 
-        What is not supported is neither good nor bad, and this machine's agents cannot do it.
+        Runs that an agent does not support are neither good nor bad. Without a bad run they lead to status 3.
         """
         if self.outcome == "interrupted":
             return INTERRUPTED
