@@ -1,6 +1,6 @@
 """UCP in pytest: the fixtures `swarm` and `scenario`; scenarios with an `expect:` section, and stories, as tests.
 
-pytest loads this module wherever the harness is installed, so it imports hardly anything of it before a test asks.
+pytest loads this module in every session, so it imports the rest of the harness only when a test uses a fixture.
 """
 
 from __future__ import annotations
@@ -19,42 +19,48 @@ if TYPE_CHECKING:
     from harness.pytest_plugin.swarm_in_test import Swarm
 
 MARKERS = (
-    "swarm(agents=5, backend='sim', seed=1, ...): what the fixture `swarm` is; any key of a scenario",
-    "scenario(file, backend='sim', seed=1): the scenario that the fixture `scenario` plays; from the test's directory",
+    "swarm(agents=5, backend='sim', seed=1, ...): configure the fixture `swarm` with any keys of a scenario",
+    "scenario(file, backend='sim', seed=1): the scenario of the fixture `scenario`, relative to the test's directory",
 )
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("ucp", "UCP harness")
     group.addoption(
-        "--ucp-backend", choices=BACKEND_NAMES, help="Play on this backend, whatever tests and scenarios say."
+        "--ucp-backend", choices=BACKEND_NAMES, help="Backend of all runs, instead of that of tests and scenarios."
     )
-    group.addoption("--ucp-seed", type=int, metavar="N", help="Play with this seed, whatever tests and scenarios say.")
-    group.addoption("--ucp-speedup", type=float, metavar="X", help="Mission seconds per second, of processes.")
+    group.addoption(
+        "--ucp-seed", type=int, metavar="N", help="Seed of all runs, instead of that of tests and scenarios."
+    )
+    group.addoption(
+        "--ucp-speedup", type=float, metavar="X", help="Mission seconds per second of wall time, for processes."
+    )
     group.addoption(
         "--ucp-keep",
         type=Path,
         metavar="DIR",
-        help="Keep all run directories, in DIR; else those of failed tests, among pytest's temporary directories.",
+        help="Keep all run directories in DIR. Default: keep those of failed tests in pytest's temporary directories.",
     )
     group.addoption(
         "--ucp-kernel",
         choices=("host", "uml"),
         default="host",
-        help="This machine's kernel, or the session in User Mode Linux: it has netem, and needs no rights.",
+        help="This machine's kernel, or run the session in User Mode Linux, which has netem and needs no root.",
     )
     group.addoption(
         "--ucp-image-from-host",
         action="store_true",
-        help="Containers of this machine's own files: no image is built, or pulled.",
+        help="Run containers from this machine's files, and build or pull no image.",
     )
     group.addoption(
         "--ucp-agent",
         metavar="[ID=]COMMAND",
         action="append",
-        help="Play with this agent, whatever scenarios say; with ID=, for that one: may be given again and again.",
+        help="Agent of all runs, instead of that of scenarios; ID= limits it to one agent. Repeatable.",
     )
-    group.addoption("--ucp-rewrite", action="store_true", help="Write into *.story files what agents do now.")
+    group.addoption(
+        "--ucp-rewrite", action="store_true", help="Write the present behaviour of the agents into *.story files."
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -93,7 +99,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 @pytest.fixture
 def swarm(request: pytest.FixtureRequest) -> Iterator[Swarm]:
-    """Agents to tell what happens, sentence by sentence: five of them, without loss, unless a marker says otherwise."""
+    """A swarm that the test controls: five agents without loss, unless a marker changes that."""
     from harness.pytest_plugin._fixtures import swarm_for
 
     yield from swarm_for(request.node)
@@ -101,7 +107,7 @@ def swarm(request: pytest.FixtureRequest) -> Iterator[Swarm]:
 
 @pytest.fixture
 def scenario(request: pytest.FixtureRequest) -> Iterator[Findings]:
-    """What was found when the scenario of the marker `scenario` was played."""
+    """The verdicts and figures of one run of the scenario that the marker `scenario` names."""
     from harness.pytest_plugin._fixtures import scenario_for
 
     yield from scenario_for(request.node)
@@ -109,7 +115,7 @@ def scenario(request: pytest.FixtureRequest) -> Iterator[Findings]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None]:
-    """A run is judged as the last part of its test, not in the teardown: a violation is a failure of the test."""
+    """Judge the run at the end of its test, not in the teardown. A violation is then a failure of the test."""
     try:
         yield
     except Exception:
