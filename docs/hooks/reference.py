@@ -88,7 +88,7 @@ def _type(schema: dict[str, Any]) -> str:
     if "enum" in schema:
         return " or ".join(f"`{value}`" for value in schema["enum"])
     if "anyOf" in schema or "oneOf" in schema:
-        choices = [choice for choice in schema.get("anyOf", schema.get("oneOf")) if choice.get("type") != "null"]
+        choices = [choice for choice in (schema.get("anyOf") or schema["oneOf"]) if choice.get("type") != "null"]
         return " or ".join(dict.fromkeys(map(_type, choices)))
     if "prefixItems" in schema:
         return f"list of {len(schema['prefixItems'])}: {', '.join(map(_type, schema['prefixItems']))}"
