@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import yaml
 from harness.cli import COMMANDS, loaded
 from harness.json_schemas import texts
 from harness.scenario.load import parse
+from tests.harness.report.browser import open_browser
 from tests.pages import play
 
 REPOSITORY = Path(__file__).parents[1]
@@ -62,6 +64,44 @@ def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
         )
         assert loads
         assert not [source for source in loads if re.match(r"(?:https?:)?//", source)], page
+
+
+QUERIES = {
+    "install": "how-to/install.html",
+    "uninstall": "how-to/install.html",
+    "cite": "how-to/install.html",
+    "seed": "how-to/install.html",
+    "latency": "how-to/set-network-conditions.html",
+    "docker": "how-to/run-in-containers.html",
+}
+"""Search term -> page that the site opened as files shows first."""
+SEARCH_DEADLINE_S = 20.0
+TYPE = """(field => {
+    field.focus();
+    field.value = "%s";
+    field.dispatchEvent(new KeyboardEvent("keyup", {key: "a", bubbles: true}));
+})(document.querySelector(".md-search__input"))"""
+FOUND = "document.querySelector('.md-search-result__link')?.href ?? ''"
+
+
+def test_every_page_has_the_search_index_as_a_script_and_the_worker_for_files(site: Path) -> None:
+    assert (site / "search/search_index.js").read_text().startswith("var __index = {")
+    for page in site.rglob("*.html"):
+        assert "vendor/iframe-worker/shim.js" in page.read_text(), page
+
+
+def test_search_of_the_site_opened_as_files_finds_the_page(site: Path, tmp_path: Path) -> None:
+    first = {}
+    with open_browser(tmp_path) as opened, opened.fresh() as browser:
+        for query in QUERIES:
+            browser.show(site / "tutorial.html", width=1200, scheme="light")
+            browser.evaluate(TYPE % query)
+            deadline = time.monotonic() + SEARCH_DEADLINE_S
+            while not (found := browser.evaluate(FOUND)) and time.monotonic() < deadline:
+                time.sleep(0.1)
+            first[query] = found.partition("?")[0].removeprefix(f"{site.resolve().as_uri()}/")
+        assert browser.complaints == []
+    assert first == QUERIES
 
 
 def test_the_reference_has_every_key_of_a_scenario(site: Path) -> None:

@@ -1,0 +1,23 @@
+"""Order the results of the search: guides first, then explanations, then generated lists and measurements."""
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import Files
+from mkdocs.structure.pages import Page
+
+BOOSTS = {
+    "tutorial.md": 2.0,
+    "how-to/": 4.0,
+    "appendix/": 0.5,
+    "benchmarks/": 0.25,
+    "reference/api.md": 0.25,
+    "reference/scenario-keys.md": 0.25,
+    "CHANGELOG.md": 0.25,
+}
+"""Start of a page's path -> factor of its score. Other pages have 1."""
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    for start, boost in BOOSTS.items():
+        if page.file.src_uri.startswith(start):
+            page.meta.setdefault("search", {})["boost"] = boost
+    return markdown
