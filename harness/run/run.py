@@ -28,6 +28,7 @@ from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, 
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
+from harness.play.core_version import core_version
 from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
 from harness.play.progress import Progress, Silent
@@ -275,6 +276,7 @@ async def _until_interrupted(
 def versions() -> dict[str, str]:
     """Return the versions of the software and the system, so that a user can repeat the run."""
     return {
+        "core": core_version(),
         **{package: version(package) for package in PACKAGES},
         "python": platform.python_version(),
         "kernel": f"{platform.release()} (User Mode Linux)" if uml.inside() else platform.release(),

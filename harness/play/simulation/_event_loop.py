@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, cast
 
 from harness.gc_pause import gc_paused
 from harness.play.backend import agent_seed
+from harness.play.core_version import edited_files
 from harness.play.mission import Sought
+from harness.play.simulation._crash import crash_of
 from harness.play.simulation._recurrence import Recurrence
 from harness.play.simulation._simulated_agent import OwnAgent, Stored, VirtualAgent
 from harness.play.simulation.air import Happening, InFlight, Logged, StrayDatagram, VirtualAir
@@ -47,11 +49,13 @@ REMEMBERED = 10_000
 class Clockwork:
     """The agents of a scenario, on a virtual air. Agents are numbered in the roster's order.
 
-    `deliver_all`: deliver also what cannot matter, which takes longer and changes nothing but the traces. Where anybody
-    has quirks, or is not the harness's own, all hear everything: what cannot matter to the right agent may matter to a
-    wrong one. So they do in a secured mission where anything may be dropped: what comes again is a replay, whether or
-    not it mattered. `told`: somebody may yet inject. `fate_script` makes what plays the scenario's fates, `air` what
-    carries messages, and `programs` are those that play agents of another make.
+    `deliver_all`: deliver also the messages that a released agent would ignore. This takes longer and changes only the
+    traces. Every message is delivered if an agent has quirks, is not the harness's own, or has an edited core
+    (`harness.play.core_version`), because such an agent might not ignore it. The same is true of a secured mission in
+    which messages can be dropped: a second copy is a replay even if the first one had no effect.
+
+    `told`: a user may request injections during the run. `fate_script` makes the player of the scenario's fates, `air`
+    the carrier of messages. `programs` play agents of other makes.
     """
 
     def __init__(
@@ -79,6 +83,7 @@ class Clockwork:
         if self._keys is not None:
             self._initial_data = self._keys.mission.sealed_to_depot(initial_data)
         anything_counts = self._anybody_is_unknown or (self._keys is not None and not self._keys.nothing_is_dropped)
+        anything_counts = anything_counts or bool(edited_files())
         self._deliver_all = deliver_all = deliver_all or anything_counts
         self._now = 0.0
         self._generating = True
@@ -155,21 +160,25 @@ class Clockwork:
 
     def _play(self, until: float) -> None:
         alive = self._alive
-        for happening in self._air.until(until):
-            self._now, _, number, what = happening
-            life = alive[number]
-            if life is None:
-                if self._rogue is not None and number == len(self.roster):
-                    self._rogue.wake(self._now)
-            elif life.waiting is not None:
-                if what is not None:
-                    life.waiting.append(happening)
-            elif isinstance(what, InFlight):
-                self._arrive(number, life, what)
-            else:
-                self._happen(number, life, what)
-            if self._found is not None:
-                return
+        life: Incarnation | None = None
+        try:
+            for happening in self._air.until(until):
+                self._now, _, number, what = happening
+                life = alive[number]
+                if life is None:
+                    if self._rogue is not None and number == len(self.roster):
+                        self._rogue.wake(self._now)
+                elif life.waiting is not None:
+                    if what is not None:
+                        life.waiting.append(happening)
+                elif isinstance(what, InFlight):
+                    self._arrive(number, life, what)
+                else:
+                    self._happen(number, life, what)
+                if self._found is not None:
+                    return
+        except Exception as error:
+            raise crash_of(life, error) from error
 
     def _arrive(self, number: int, life: Incarnation, flight: InFlight) -> None:
         """A message reaches the agent."""

@@ -17,6 +17,7 @@ from harness.play._radio_range import TRACK_S, RadioRange, tracks_of
 from harness.play.agent_control import Status
 from harness.play.mission import RunOutcome, Sought
 from harness.play.rogue.rogue_line import OF_NO_INJECTION, line_of
+from harness.play.simulation._crash import crash_of
 from harness.play.simulation._event_loop import ANY_LIFE, Clockwork
 from harness.play.simulation._recurrence import LOOK_AFTER_S, Recurrence, Waiting
 from harness.play.simulation._simulated_agent import Stored
@@ -291,7 +292,10 @@ class Simulation(Clockwork):
         life = self._alive[number]
         if life is not None and life.waiting is None:
             self._hear(number, life)
-            life.agent.begin_reconcile(life.local_s(self._now))
+            try:
+                life.agent.begin_reconcile(life.local_s(self._now))
+            except Exception as error:
+                raise crash_of(life, error) from error
             self._after(number, life)
 
     async def top_chain_hashes(self) -> dict[int, str]:

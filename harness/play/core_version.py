@@ -1,0 +1,72 @@
+"""The agent core that is in use: is it the released one?
+
+The core is the code of `ucp` that determines how an agent behaves. An engineer who develops the protocol edits it in
+place. Two things depend on an edit. A run records which core its agents had. And virtual time withholds messages that a
+released agent would ignore (`ucp.interest`) only from the released core, because an edited core might not ignore them.
+
+`released_core.sha256` has the digests of the released files, in the format of sha256sum(1). After a reviewed change:
+
+    python -m harness.play.core_version --record
+"""
+
+import hashlib
+import sys
+from functools import cache
+from pathlib import Path
+
+import ucp
+
+FILES = (
+    "_dataclass",
+    "agent",
+    "block",
+    "chain",
+    "commit",
+    "core",
+    "events",
+    "handler",
+    "interest",
+    "messages",
+    "reconcile",
+    "sealed",
+    "settings",
+    "short_value",
+    "state",
+    "store",
+    "timers",
+    "trace",
+    "trigger",
+    "wire",
+)
+"""Modules of `ucp` that `ucp.agent` and `ucp.interest` import."""
+RELEASED = Path(__file__).with_name("released_core.sha256")
+
+
+@cache
+def edited_files() -> tuple[str, ...]:
+    """Return the files of the core that differ from the released ones, such as "ucp/commit.py"."""
+    released: dict[str, str] = {}
+    for line in RELEASED.read_text("ascii").splitlines():
+        digest, name = line.split()
+        released[name] = digest
+    return tuple(name for name, digest in _digests().items() if released.get(name) != digest)
+
+
+def core_version() -> str:
+    """Return "released" or "edited", a digest of the core, and the edited files."""
+    digest = hashlib.sha256("".join(_digests().values()).encode("ascii")).hexdigest()[:12]
+    edited = edited_files()
+    return f"edited {digest} ({', '.join(edited)})" if edited else f"released {digest}"
+
+
+@cache
+def _digests() -> dict[str, str]:
+    """The SHA-256 of each file of the core, in hex."""
+    directory = Path(ucp.__file__).parent
+    return {f"ucp/{name}.py": hashlib.sha256((directory / f"{name}.py").read_bytes()).hexdigest() for name in FILES}
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] != ["--record"]:
+        raise SystemExit("usage: python -m harness.play.core_version --record")
+    RELEASED.write_text("".join(f"{digest}  {name}\n" for name, digest in _digests().items()), "ascii")

@@ -1,0 +1,31 @@
+"""A crash of an agent that plays in the harness's own process.
+
+An engineer edits the core in place, and in virtual time the core runs in the process of the harness. An exception that
+comes out of `ucp` is a failure of the agent, like the end of an agent's process. Any other exception is the harness's.
+"""
+
+from pathlib import Path
+from traceback import extract_tb
+
+import harness
+import ucp
+from harness.errors import AgentFailedError
+from harness.play.simulation.incarnations import Incarnation
+
+CORE, HARNESS = Path(ucp.__file__).parent, Path(harness.__file__).parent
+MAX_WORDS = 200
+
+
+def crash_of(life: Incarnation | None, error: Exception) -> Exception:
+    """Return an AgentFailedError if the exception came out of the agent's core, otherwise the exception itself."""
+    frames = [(Path(frame.filename), frame.lineno) for frame in extract_tb(error.__traceback__)]
+    ours = [(path, line) for path, line in frames if path.is_relative_to(CORE) or path.is_relative_to(HARNESS)]
+    if life is None or life.state is None or not ours or not ours[-1][0].is_relative_to(CORE):
+        return error
+    path, line = ours[-1]
+    handler = vars(life.state)["running"]
+    detail = (
+        f"crashed in Algorithm {handler.algorithm}, {handler.name}, at ucp/{path.relative_to(CORE)}:{line}: "
+        f"{type(error).__name__}: {str(error)[:MAX_WORDS]}"
+    )
+    return AgentFailedError(life.agent.agent_id, "crashed", detail)

@@ -1,0 +1,66 @@
+"""The version of the agent core: the recorded digests, and the effect of an edit."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import harness
+from harness.play import core_version
+from harness.run.run import versions
+from harness.run.simulate import simulate
+from tests.harness.play.test_simulation import digest
+from tests.harness.virtual import scenario
+
+ROOT = Path(harness.__file__).parent.parent
+
+
+def test_recorded_digests_are_those_of_the_core() -> None:
+    edited = core_version.edited_files()
+    assert not edited, (
+        f"{', '.join(edited)}: this core is not the released one. If the change is meant and all tests of steps and "
+        "proofs pass, record it: python -m harness.play.core_version --record"
+    )
+    assert core_version.core_version().startswith("released ")
+
+
+def test_core_is_all_that_an_agent_imports() -> None:
+    shown = subprocess.run(
+        [sys.executable, "-c", "import sys, ucp.agent, ucp.interest; print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+    )
+    imported = {name.removeprefix("ucp.") for name in shown.stdout.split() if name.startswith("ucp.")}
+    assert imported == set(core_version.FILES)
+
+
+@pytest.fixture
+def edited_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Record another digest of `ucp/commit.py`, as if the file had been edited."""
+    released = core_version.RELEASED.read_text("ascii")
+    line = next(line for line in released.splitlines() if line.endswith("ucp/commit.py"))
+    recorded = tmp_path / "released_core.sha256"
+    recorded.write_text(released.replace(line, f"{'0' * 64}  ucp/commit.py"), "ascii")
+    monkeypatch.setattr(core_version, "RELEASED", recorded)
+    core_version.edited_files.cache_clear()
+    yield
+    core_version.edited_files.cache_clear()
+
+
+def test_run_record_names_an_edited_core(edited_core: None) -> None:
+    assert core_version.edited_files() == ("ucp/commit.py",)
+    assert versions()["core"].startswith("edited ")
+    assert versions()["core"].endswith("(ucp/commit.py)")
+
+
+def test_virtual_time_withholds_nothing_from_an_edited_core(edited_core: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    lossy = scenario(network={"loss": 0.2}, duration_s=200.0)
+    edited = digest(simulate(lossy, 1, tracing=True))
+    core_version.edited_files.cache_clear()
+    monkeypatch.undo()
+    assert edited == digest(simulate(lossy, 1, tracing=True, deliver_all=True))
+    assert edited != digest(simulate(lossy, 1, tracing=True))
