@@ -1,0 +1,21 @@
+"""The independent reference by which the steps of an agent are judged.
+
+`algorithms` is a transcription of Algorithms 1-20. Its author worked from the thesis and from the readings of the
+thesis, and did not see `ucp`. It shares only the message codec and the hashes with `ucp`. An edit of `ucp` therefore
+changes the agents and not the judge.
+"""
+
+from collections.abc import Container
+
+from ucp.messages import CARRY_A_BLOCK, Message
+
+
+def why_not_handled(agent_id: int, roster: Container[int], sender: int, message: Message) -> str | None:
+    """Return the reason why an agent drops a well-formed message, or None if the agent handles it."""
+    if sender == agent_id:
+        return "own sender"
+    if sender not in roster:
+        return "sender not on the roster"
+    if type(message) in CARRY_A_BLOCK and message.block.agent_id not in roster:  # type: ignore[union-attr]
+        return "block not of the roster"
+    return None

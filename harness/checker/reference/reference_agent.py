@@ -1,0 +1,137 @@
+"""The reference as an agent without I/O, with the inputs and outputs of `ucp.agent.Agent`.
+
+`prove` puts it into the state of an agent and gives both the same input. `conformance` runs it beside the agent under
+test.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+
+from harness.checker.reference import why_not_handled
+from harness.checker.reference.algorithms import ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of
+from harness.checker.reference.state import Handler, Settings, State, Timer
+from ucp.events import LoggableEvent
+from ucp.messages import MalformedDatagramError, Message, decode, encode
+from ucp.store import StoredState
+from ucp.trace import HandlerRun, Sent, StateSummary
+from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger, Trigger
+
+
+class ReferenceAgent:
+    """An agent that does as the reference. All times are mission seconds; `state` may be looked at and set.
+
+    `after_each` is called after each handler run.
+    """
+
+    def __init__(
+        self,
+        agent_id: int,
+        roster: Iterable[int],
+        initial_data: bytes,
+        settings: Settings,
+        after_each: Callable[[], None] | None = None,
+    ) -> None:
+        self.agent_id = agent_id
+        self.roster = frozenset(roster)
+        self.state = State(agent_id, initial_data, settings)
+        self._after_each = after_each
+        self._outbox: list[tuple[int, Message]] = []
+        self._trace: list[HandlerRun] = []
+
+    # Inputs
+
+    def receive_datagram(self, data: bytes, now: float) -> None:
+        """Handle a datagram from the broadcast port. Datagrams that are not messages are dropped."""
+        try:
+            sender, sequence, message = decode(data)
+        except MalformedDatagramError:
+            return
+        self.receive_message(sender, sequence, message, now)
+
+    def receive_message(self, sender: int, sequence: int, message: Message, now: float) -> None:
+        """Handle a message. Messages that are not for this agent are dropped."""
+        if why_not_handled(self.agent_id, self.roster, sender, message) is None:
+            trigger = MessageTrigger(message.NAME, sender, sequence)
+            self._handle(now, trigger, ON_MESSAGE[type(message)], sender, message)
+
+    def add_event(self, event: LoggableEvent, now: float) -> None:
+        """Log an event of the vehicle."""
+        self._handle(now, EventTrigger(event.event_id), ON_LOCAL_EVENT["Build Data Block"], event)
+
+    def next_timer(self) -> float | None:
+        """Return the mission second at which the next timer expires, or None if no timer runs."""
+        timer = self._soonest()
+        return None if timer is None else timer.deadline
+
+    def handle_timer(self, now: float) -> None:
+        """Run the handlers of all timers that have expired by `now`, earliest first."""
+        while (timer := self._soonest()) is not None and timer.deadline is not None and timer.deadline <= now:
+            self.end_timer(timer, now)
+
+    def end_timer(self, timer: Timer, now: float) -> None:
+        """End a running timer at `now`, and run its handler."""
+        timer.stop()
+        self._handle(now, TimerTrigger(timer.name), ON_TIMER[timer.name])
+
+    def boot(self, stored: StoredState, now: float) -> None:
+        """Continue with the state that an earlier incarnation stored on disk."""
+        self.state.now = now
+        self.state.restore(stored.completed, stored.chain, stored.deque, stored.stack)
+        self._handle(now, BootTrigger(len(self.state.chain)), ON_LOCAL_EVENT["Reconcile Finalize"])
+
+    def begin_reconcile(self, now: float) -> None:
+        """Begin a reconcile by the operator's command."""
+        self._handle(now, OperatorTrigger("reconcile"), ON_LOCAL_EVENT["Reconcile Begin"])
+
+    # Outputs
+
+    def messages_to_send(self) -> list[tuple[int, Message]]:
+        """Return the messages to broadcast as (sequence, message), and empty the outbox."""
+        sent, self._outbox = self._outbox, []
+        return sent
+
+    def datagrams_to_send(self) -> list[bytes]:
+        """Return the datagrams to broadcast, and empty the outbox."""
+        return [encode(self.agent_id, sequence, message) for sequence, message in self.messages_to_send()]
+
+    def trace(self) -> list[HandlerRun]:
+        """Return the handler runs since the last call."""
+        trace, self._trace = self._trace, []
+        return trace
+
+    def _soonest(self) -> Timer | None:
+        soonest, ends = None, math.inf
+        for timer in self.state.timers:
+            if timer.deadline is not None and timer.deadline < ends:
+                soonest, ends = timer, timer.deadline
+        return soonest
+
+    def _handle(self, now: float, trigger: Trigger, handler: Handler, *inputs: object) -> None:
+        """Run a handler, then the handlers of the local events that were triggered, in order."""
+        state = self.state
+        state.now = now
+        self._run(trigger, handler, *inputs)
+        while state.triggered:
+            event, by = state.triggered.popleft()
+            self._run(LocalTrigger(by), ON_LOCAL_EVENT[event])
+
+    def _run(self, trigger: Trigger, handler: Handler, *inputs: object) -> None:
+        state = self.state
+        state.running = handler
+        branch = handler.run(state, *inputs)
+        summary = StateSummary(
+            len(state.chain),
+            len(state.blocks_to_be_committed),
+            len(state.reconcile_stack),
+            state.reconcile_in_progress,
+            state.idle,
+            state.chain.top_chain_hash.hex(),
+        )
+        sent = [Sent.of(self.agent_id, sequence, message) for sequence, message in state.outbox]
+        run = HandlerRun(state.now, handler.name, handler.algorithm, trigger, branch, state.changes, sent, summary)
+        run.tally, run.started = tally_of(state, handler), state.started or None
+        self._trace.append(run)
+        self._outbox += state.outbox
+        state.changes, state.outbox, state.started = [], [], {}
+        if self._after_each is not None:
+            self._after_each()
