@@ -85,7 +85,7 @@ COMMANDS = {
         "field", "harness.commands.consolidate:consolidate_command", "Merge the chains of all vehicles into one record."
     ),
     "replay": Command(
-        "field", "harness.commands.replay:replay_command", "Feed an agent's trace to the reference core, and compare."
+        "field", "harness.commands.replay:replay_command", "Feed an agent's trace to the reference, and compare."
     ),
     "reconstruct": Command(
         "field",

@@ -17,10 +17,10 @@ from harness.archive.run_record import AgentRecord, Counters, JudgedRecord
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import Kind, Unknown, first_of, unknown_words
 from harness.checker._trace_replay import Life, replay
+from harness.checker.reference.state import State
 from harness.errors import RunDirectoryError
 from harness.play.rogue.rogue_line import OF_NO_INJECTION
 from ucp.block import HASH_BYTES
-from ucp.state import AgentState
 from ucp.trace import HandlerRun, Sent
 from ucp.trigger import MessageTrigger
 
@@ -35,7 +35,7 @@ Sending = tuple[tuple[float, Sent], ...]
 Sendings = dict[Any, dict[Any, Sending]]
 """Of an agent, by type and sequence number."""
 
-Watch = Callable[[AgentState, HandlerRun | None], None]
+Watch = Callable[[State, HandlerRun | None], None]
 """Is given the state of an agent after a handler has run, and that run; None where a life of it begins."""
 
 _HASH = re.compile(f"[0-9a-f]{{{2 * HASH_BYTES}}}")

@@ -79,7 +79,9 @@ def prove_command(
     steps: Annotated[
         bool,
         typer.Option(
-            "--steps", rich_help_panel=WRONG, help="Also compare each step of --quirk agents with a right agent."
+            "--steps",
+            rich_help_panel=WRONG,
+            help="Also compare each step of the agents with the independent reference.",
         ),
     ] = False,
     second_opinion: Annotated[

@@ -9,13 +9,15 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from harness.checker.steps.core_in_use import IN_USE
 from harness.commands.terminal import complain, print_json
 from harness.errors import VIOLATED, WRONG_REQUEST, InterruptedRunError
-from harness.field.replay import Player, Record, open_record, open_records
+from harness.field.replay import Found, Player, Record, open_record, open_records
 from harness.field.replay.breakpoints import place
 from harness.field.replay.prompt import Prompt
 from harness.field.replay.replay_document import ReplayedRecord, document, head, replayed, summary
 from harness.field.replay.replay_names import Names
+from harness.play.core_version import edited_files
 
 
 def replay_command(
@@ -36,7 +38,7 @@ def replay_command(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the differences as JSON.")] = False,
 ) -> None:
-    """Feed an agent's trace to the reference core, and compare.
+    """Feed an agent's trace to the reference, and compare.
 
     Exit status 0: the agent did the same as the core. 1: it did not. 2: no step could be replayed.
     """
@@ -61,14 +63,15 @@ def _play(console: Console, records: Sequence[Record], until: float | None, as_j
     told, differ, judged = list[ReplayedRecord](), False, False
     for record in records:
         _complain_of(record)
-        player, names = Player(record, until), Names(record)
-        found = player.to_end()
+        names = Names(record)
+        found = Player(record, until).to_end()
+        in_use = Player(record, until, IN_USE).to_end()  # so that a debugger stops in the handlers of `ucp`
         differ |= bool(found.deviations)
         judged |= bool(found.steps)
         if as_json:
             told.append(replayed(record, found, names))
         else:
-            _show(console, [head(record), *summary(record, found, names)])
+            _show(console, [head(record), *summary(record, found, names), *_in_use(in_use, found)])
     if as_json:
         print_json(document(told))
     raise typer.Exit(VIOLATED if differ else 0 if judged else WRONG_REQUEST)
@@ -79,7 +82,7 @@ def _ask(
 ) -> NoReturn:
     """Step through a record as the user says; when no more is said, play the rest."""
     _complain_of(record)
-    player, names = Player(record, until), Names(record)
+    player, names = Player(record, until, IN_USE), Names(record)
     if debug:
         places = [place(words, names) for words in breaks]
         while not player.at_end:
@@ -92,9 +95,21 @@ def _ask(
         prompt.cmdloop()
         if prompt.quit:
             raise typer.Exit(VIOLATED if player.found.deviations else 0)
-    found = player.to_end()
-    _show(console, summary(record, found, names))
+    found = Player(record, until).to_end()
+    _show(console, [*summary(record, found, names), *_in_use(player.to_end(), found)])
     raise typer.Exit(VIOLATED if found.deviations else 0 if found.steps else WRONG_REQUEST)
+
+
+def _in_use(in_use: Found, found: Found) -> list[Text]:
+    """Return a sentence if the core of this installation does not play the record as the reference does."""
+    if [each.line for each in in_use.deviations] == [each.line for each in found.deviations]:
+        return []
+    edited = f", with the edited {', '.join(edited_files())}," if edited_files() else ""
+    if in_use.first is None:
+        return [Text(f"The core of this installation{edited} plays the record without a difference.")]
+    first = in_use.first
+    where = f"line {first.line}, in {first.handler}" if first.handler else f"line {first.line}"
+    return [Text(f"The core of this installation{edited} first differs from the record in {where}.")]
 
 
 def _complain_of(record: Record) -> None:

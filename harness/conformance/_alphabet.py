@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from harness.checker.reference.algorithms import IS_TOP_OF_CHAIN
 from harness.conformance._reference_model import AGENT, OLD_US, PEERS, YOUNG_US, Action, Command, Expire, Model
 from ucp.block import Block, next_chain_hash
 from ucp.messages import (
@@ -22,7 +23,6 @@ from ucp.messages import (
     NextInSequenceResponse,
     RequestForBlock,
 )
-from ucp.reconcile import IS_TOP_OF_CHAIN
 
 UNKNOWN = bytes.fromhex("de" * 32)
 """A hash of nothing."""
@@ -109,8 +109,10 @@ def _top(model: Model) -> bytes:
 
 
 def _chain_hashes(model: Model) -> list[bytes]:
-    chain = model.state.chain
-    return [chain.inception.chain_hash, *(chain_hash for _, chain_hash in chain.with_chain_hashes())]
+    hashes = [model.state.chain.inception.chain_hash]
+    for block in model.state.chain:
+        hashes.append(next_chain_hash(hashes[-1], block.block_hash))
+    return hashes
 
 
 def _below(model: Model) -> bytes | None:

@@ -1,19 +1,20 @@
 """The reference beside the agent under test, and saved moments of it.
 
-It is `ucp.agent.Agent`, given what the agent under test is given, at the same time. Inputs are chosen by its state, so
-that they fit the blocks that the agent really made, whatever its clock says.
+It is the independent reference (`harness.checker.reference`), and gets the inputs of the agent under test at the same
+time. Inputs are chosen by its state, so that they fit the blocks that the agent really made, whatever its clock shows.
 """
 
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-from ucp.agent import Agent
+from harness.checker.reference.reference_agent import ReferenceAgent
+from harness.checker.reference.state import Settings as ReferenceSettings
+from harness.checker.reference.state import State
 from ucp.block import Block
 from ucp.events import LoggableEvent
 from ucp.messages import Message, encode
 from ucp.settings import Settings
-from ucp.state import AgentState
 from ucp.trace import HandlerRun
 
 AGENT = 1
@@ -89,18 +90,18 @@ class Model:
     """The reference agent, the blocks that there are by now, and how many handlers have run."""
 
     def __init__(self, settings: Settings) -> None:
-        self.agent = Agent(AGENT, ROSTER, INITIAL_DATA, settings)
+        self.agent = ReferenceAgent(AGENT, ROSTER, INITIAL_DATA, ReferenceSettings.of(settings))
         self.blocks: dict[bytes, Block] = {}
         """Of peers, by hash; what is in the chain, the deque or the stack is there, too."""
         self.datagrams: list[bytes] = []
         """What it sent last."""
-        self.handled = 0
+        self.handled = self.reconciles = 0
         self.logged = 0
         self._fresh = 0
         self._sequence = 0
 
     @property
-    def state(self) -> AgentState:
+    def state(self) -> State:
         return self.agent.state
 
     def new_block(self, owner: int, *, young: bool) -> Block:
@@ -133,8 +134,9 @@ class Model:
             case Command("reconcile"):
                 self.agent.begin_reconcile(now)
         self.datagrams = self.agent.datagrams_to_send()
-        runs = tuple(_run(entry) for entry in self.agent.trace() if isinstance(entry, HandlerRun))
+        runs = tuple(_run(entry) for entry in self.agent.trace())
         self.handled += len(runs)
+        self.reconciles += sum(run.branch == "begun" for run in runs)
         return Outcome(runs)
 
     def status(self) -> dict[str, Any]:
@@ -147,7 +149,7 @@ class Model:
             "deque": len(state.blocks_to_be_committed),
             "stack": len(state.reconcile_stack),
             "completed": len(state.completed),
-            "reconciles": state.reconciles,
+            "reconciles": self.reconciles,
             "top_chain_hash": state.chain.top_chain_hash.hex(),
             "handled": self.handled,
         }

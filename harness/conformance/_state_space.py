@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from harness.checker.reference.algorithms import IS_TOP_OF_CHAIN
 from harness.conformance._alphabet import INPUTS, LOG, TIMER, Input
 from harness.conformance._reference_model import AGENT, OLD_US, YOUNG_US, Model, Moment, Outcome
 from ucp.block import MAX_EVENT_DATA_BYTES
-from ucp.reconcile import IS_TOP_OF_CHAIN
 from ucp.settings import ALTERNATIVES, Settings
 
 STEP_S = 0.125

@@ -1,9 +1,9 @@
-"""The step judge: did every agent do at every step what the 20 algorithms say?
+"""The step judge: did each handler run of each agent do what the 20 algorithms say?
 
-The record of each agent is fed, step by step, into the reference core (`ucp.core`, with the handlers of `ucp.commit`
-and `ucp.reconcile`), and what the agent did is held against what that does: branch, changes, messages, timers, tallies
-and state. So an agent in any language is judged, by its record alone. An agent that goes on after a difference is
-compared again from its own state, so that one mistake is one finding.
+The judge feeds the record of each agent, step by step, into the independent reference (`harness.checker.reference`). It
+compares branch, changes, messages, timers, tallies and state. It needs only the record, so it judges agents in any
+language, and an edit of `ucp` does not change it. After a difference the judge continues from the agent's own state, so
+one mistake gives one finding.
 """
 
 from collections import Counter
@@ -14,11 +14,12 @@ from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, unknown_words
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.records import cross_examine
+from harness.checker.reference import why_not_handled
+from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
 from harness.checker.steps.recorded_inputs import Blocks, decoded
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
-from ucp.agent import HANDLERS, ON_MESSAGE, why_not_handled
 from ucp.messages import MalformedDatagramError
 from ucp.trace import Commanded, Dropped
 

@@ -7,8 +7,12 @@ from typing import Any, NamedTuple
 
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import branch_is_known, tally_is_known, timer_that_ended, timers_are_known
-from harness.checker.steps._reference import Before, ReferenceCore
+from harness.checker.reference import why_not_handled
+from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_TIMER
+from harness.checker.reference.state import Handler, State
+from harness.checker.steps._adopting_core import Before
 from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.implementation import REFERENCE, Implementation
 from harness.checker.steps.recorded_inputs import (
     Blocks,
     NotOnRecordError,
@@ -18,12 +22,9 @@ from harness.checker.steps.recorded_inputs import (
     stored_blocks,
 )
 from harness.checker.steps.trace_header import CheckedHeader
-from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of, why_not_handled
 from ucp.block import Block
 from ucp.events import MalformedEventsError
-from ucp.handler import EventHandler
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
-from ucp.state import AgentState
 from ucp.trace import HandlerRun, Recorded, StateSummary
 from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger
 
@@ -63,7 +64,7 @@ class Tells(NamedTuple):
 class AnotherHandlerError(NotHandledError):
     """The run is another handler's than `handler`, for which the input is."""
 
-    def __init__(self, run: HandlerRun, handler: EventHandler[Any]) -> None:
+    def __init__(self, run: HandlerRun, handler: Handler) -> None:
         ran = HANDLERS[run.handler].algorithm if run.handler in HANDLERS else run.algorithm
         super().__init__(f"ran as Algorithm {ran}; what came is for Algorithm {handler.algorithm}, {handler.name}")
 
@@ -71,7 +72,14 @@ class AnotherHandlerError(NotHandledError):
 class Follower:
     """Holds the handler runs of one life of an agent against what the reference does."""
 
-    def __init__(self, header: CheckedHeader, tells: Tells, blocks: Blocks, was_paused: Paused) -> None:
+    def __init__(
+        self,
+        header: CheckedHeader,
+        tells: Tells,
+        blocks: Blocks,
+        was_paused: Paused,
+        implementation: Implementation = REFERENCE,
+    ) -> None:
         self.deviations: list[Deviation] = []
         """Where it differs, in order."""
         self.lost: str | None = None
@@ -82,7 +90,9 @@ class Follower:
         self._tells = tells
         self._blocks = blocks
         self._was_paused = was_paused
-        self._core = ReferenceCore(header.agent_id, header.initial_data, header.settings)
+        self._implementation = implementation
+        self._on_message = implementation.on_message
+        self._core = implementation.core(header)
         self._timers = {timer.name: timer for timer in self._core.timers}
         self._ran: dict[str, tuple[int, float]] = {}
         """Handlers that have run since the last input: trace line, mission second."""
@@ -156,13 +166,15 @@ class Follower:
         self._began = True
 
     @property
-    def state(self) -> AgentState:
+    def state(self) -> State:
         """What the agent holds, asks and counts by now; to look at."""
         return self._core
 
     def copy(self) -> "Follower":
         """Another, which goes on from here by itself; what it has found by now is left out."""
-        keep = (self._header, self._tells, self._blocks, self._was_paused, self._state, *self._core.unchanging())
+        keep = [self._header, self._tells, self._blocks, self._was_paused, self._state, self._implementation]
+        keep.append(self._on_message)
+        keep += (*self._implementation.handlers.values(), *self._core.unchanging())
         memo: dict[int, Any] = {id(kept): kept for kept in keep}
         memo[id(self.deviations)] = []
         return deepcopy(self, memo)
@@ -256,35 +268,37 @@ class Follower:
 
     # What came
 
-    def _input(self, run: HandlerRun, now: float) -> tuple[EventHandler[Any], tuple[Any, ...]]:
+    def _input(self, run: HandlerRun, now: float) -> tuple[Handler, tuple[Any, ...]]:
         """The handler that this runs, and what it is given, where no message came. Raises NotHandledError."""
-        trigger = run.trigger
+        trigger, on_local_event = run.trigger, self._implementation.on_local_event
+        handler: Handler
         inputs: tuple[Any, ...]
         if isinstance(trigger, LocalTrigger):
             handler, inputs = self._local(run), ()
         elif isinstance(trigger, TimerTrigger):
             handler, inputs = self._timer(timer_that_ended(run, trigger), now), ()
         elif isinstance(trigger, EventTrigger):
-            handler, inputs = ON_LOCAL_EVENT["Build Data Block"], self._event(run.input, trigger.event_id)
+            handler, inputs = on_local_event["Build Data Block"], self._event(run.input, trigger.event_id)
         elif trigger == OperatorTrigger("reconcile"):
-            handler, inputs = ON_LOCAL_EVENT["Reconcile Begin"], ()
+            handler, inputs = on_local_event["Reconcile Begin"], ()
         elif isinstance(trigger, BootTrigger):
             self._boot(run)
-            handler, inputs = ON_LOCAL_EVENT["Reconcile Finalize"], ()
+            handler, inputs = on_local_event["Reconcile Finalize"], ()
         else:
             raise NotHandledError("ran without a trigger that there is")
         if handler.name != run.handler:
             raise AnotherHandlerError(run, handler)
         return handler, inputs
 
-    def _local(self, run: HandlerRun) -> EventHandler[Any]:
+    def _local(self, run: HandlerRun) -> Handler:
         if run.handler not in EVENT_OF or run.handler == LOGS:
             raise NotHandledError("ran for a local event, which is no such event's handler")
         if self._adopted:
             self._core.go_along(run)
-        return HANDLERS[run.handler]
+        handler: Handler = self._implementation.handlers[run.handler]
+        return handler
 
-    def _message(self, run: HandlerRun, trigger: MessageTrigger) -> tuple[EventHandler[Any], int, Message]:
+    def _message(self, run: HandlerRun, trigger: MessageTrigger) -> tuple[Handler, int, Message]:
         """The handler that this runs, and what it is given: a message, and who sent it. Raises NotHandledError."""
         try:
             sender, sequence, message = decoded(run.input)
@@ -300,12 +314,12 @@ class Follower:
                 f"said to have got {name[:60]} {number} from agent {by}, "
                 f"and the datagram is {message.NAME} {sequence} from agent {sender}"
             )
-        handler = ON_MESSAGE[type(message)]
+        handler: Handler = self._on_message[type(message)]
         if handler.name != run.handler:
             raise AnotherHandlerError(run, handler)
         return handler, sender, message
 
-    def _timer(self, name: str, now: float) -> EventHandler[Any]:
+    def _timer(self, name: str, now: float) -> Handler:
         timer = self._timers.get(name)
         if timer is None or timer.deadline is None:
             raise NotHandledError(f"ran as the {name[:60]} timer ended, which was not running")
@@ -313,7 +327,8 @@ class Follower:
         timer.stop()
         if early > self._header.early_s:
             raise NotHandledError(f"ran {early:.3g} s before the {name} timer ended")
-        return ON_TIMER[name]
+        handler: Handler = self._implementation.on_timer[name]
+        return handler
 
     def _event(self, record: Recorded | None, event_id: int) -> tuple[Any, ...]:
         try:
@@ -354,7 +369,7 @@ class Follower:
 
     # Whether it is as it should be
 
-    def _differs(self, run: HandlerRun, handler: EventHandler[Any], branch: str, may_touch_timers: bool) -> bool:
+    def _differs(self, run: HandlerRun, handler: Handler, branch: str, may_touch_timers: bool) -> bool:
         core = self._core
         if (run.branch != branch and branch_is_known(run)) or run.changes != core.changes:
             return True
@@ -363,7 +378,7 @@ class Follower:
         if self._tells.timers and (run.started or {}) != core.started and timers_are_known(run):
             return True
         tells_tally = branch in COUNTING and run.handler in self._tells.tallying
-        if tells_tally and run.tally != tally_of(core, handler) and tally_is_known(run):
+        if tells_tally and run.tally != self._implementation.tally_of(core, handler) and tally_is_known(run):
             return True
         state = run.state
         if state is self._state and not (may_touch_timers or run.changes or core.triggered):
@@ -384,7 +399,7 @@ class Follower:
             self._top, self._top_hex = top, top.hex()
         return self._top_hex
 
-    def _expected(self, run: HandlerRun, handler: EventHandler[Any], branch: str) -> HandlerRun:
+    def _expected(self, run: HandlerRun, handler: Handler, branch: str) -> HandlerRun:
         core = self._core
         state = StateSummary(
             len(core.chain),
@@ -399,7 +414,7 @@ class Follower:
         expected = HandlerRun(run.t, handler.name, handler.algorithm, run.trigger, taken, changes, sent, state)
         tells_tally = branch in COUNTING and run.handler in self._tells.tallying and tally_is_known(run)
         expected.started = dict(core.started) if self._tells.timers and timers_are_known(run) else run.started
-        expected.tally = tally_of(core, handler) if tells_tally else run.tally
+        expected.tally = self._implementation.tally_of(core, handler) if tells_tally else run.tally
         return expected
 
     def _adopt(self, line: int, run: HandlerRun, before: Before | None) -> None:

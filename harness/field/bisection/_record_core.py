@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import ucp
+from harness.checker.steps.core_in_use import IN_USE
 from harness.errors import HarnessError
 from harness.field.ingest import sort_out
 from harness.field.replay import Player, open_record
@@ -22,7 +23,7 @@ MAX_DIFFERENCES = 10_000
 def differences(path: Path, agent: int | None) -> list[dict[str, Any]]:
     """Raises HarnessError if there is nothing to play."""
     record = open_record(path, agent)
-    found, names = Player(record).to_end(), Names(record)
+    found, names = Player(record, implementation=IN_USE).to_end(), Names(record)
     deviations = sorted(found.deviations, key=lambda deviation: deviation.line)
     return [
         {

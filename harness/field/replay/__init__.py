@@ -7,7 +7,7 @@ the other agents did at the same moment. `prompt` is the interactive command lin
 """
 
 from harness.field.replay._agent_record import Record
-from harness.field.replay._player import Player
+from harness.field.replay._player import Found, Player
 from harness.field.replay._record_search import open_record, open_records
 
-__all__ = ["Player", "Record", "open_record", "open_records"]
+__all__ = ["Found", "Player", "Record", "open_record", "open_records"]

@@ -8,14 +8,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, unknown_words
+from harness.checker.reference.algorithms import ON_TIMER
+from harness.checker.reference.state import State
 from harness.checker.steps import wrongly_dropped
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
+from harness.checker.steps.implementation import REFERENCE, Implementation
 from harness.field.replay._agent_record import Entry, Record
 from harness.field.replay._resumption import ClockSet, Resumption
 from harness.field.replay.replay_names import RecordedBlocks
-from ucp.agent import ON_TIMER
-from ucp.state import AgentState
 from ucp.trace import HandlerRun
 
 CHECKPOINT_STEPS = 1000
@@ -61,11 +62,15 @@ class _Checkpoint:
 class Player:
     """At `position` so many entries of the record have been played; `found` is what has come of these.
 
-    `until_s`: nothing later than this mission second is played.
+    `until_s` is the last mission second that is played. `implementation` plays the record: the reference, by which
+    agents are judged, or the core in use (`harness.checker.steps.core_in_use`).
     """
 
-    def __init__(self, record: Record, until_s: float | None = None) -> None:
+    def __init__(
+        self, record: Record, until_s: float | None = None, implementation: Implementation = REFERENCE
+    ) -> None:
         self.record = record
+        self._implementation = implementation
         entries = record.entries
         self.entries = entries if until_s is None else entries[: _later_than(entries, until_s)]
         self.position = 0
@@ -79,7 +84,7 @@ class Player:
         self._checkpoints = {0: _Checkpoint(self._follower.copy(), 1, self.found.copy())}
 
     @property
-    def state(self) -> AgentState:
+    def state(self) -> State:
         """What the agent holds, asks and counts by now."""
         return self._follower.state
 
@@ -192,7 +197,7 @@ class Player:
         return None
 
     def _born(self) -> Follower:
-        return Follower(self.record.header, self._tells, self._blocks, self.record.was_paused)
+        return Follower(self.record.header, self._tells, self._blocks, self.record.was_paused, self._implementation)
 
 
 def _later_than(entries: Iterable[Entry], until_s: float) -> int:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from harness.checker.evidence import Evidence, Watch
+from harness.checker.reference.state import State
 from harness.checker.steps import check
 from harness.checker.steps.recorded_inputs import decoded
 from harness.play.simulation.simulation import Simulation
@@ -16,7 +17,6 @@ from harness.proof.model._shape import Held, Shape, shape_of
 from harness.run.simulate import InMemory, Simulated, simulate_in_memory
 from harness.scenario import Scenario
 from ucp.agent import HANDLERS
-from ucp.state import AgentState
 from ucp.trace import HandlerRun
 from ucp.trigger import EventTrigger, LocalTrigger, MessageTrigger, TimerTrigger
 
@@ -70,7 +70,7 @@ class Watcher:
         self._input: HandlerRun | None = None
         self._answers = False
 
-    def step(self, state: AgentState, run: HandlerRun | None) -> None:
+    def step(self, state: State, run: HandlerRun | None) -> None:
         """An agent is in this state after this handler has run; None where a life begins."""
         reached = self.reached
         if run is None:
@@ -93,7 +93,7 @@ class Watcher:
                 reached.pairs.add(self._held_before.number((self._shape_before, given)))
         self._number_before, self._shape_before, self._held_before = number, shape, held
 
-    def _what_it_holds(self, state: AgentState) -> Held:
+    def _what_it_holds(self, state: State) -> Held:
         key: tuple[object, ...] = (state.chain.top_chain_hash,)
         if state.blocks_to_be_committed or state.reconcile_stack:
             aside = (*state.blocks_to_be_committed, *state.reconcile_stack)

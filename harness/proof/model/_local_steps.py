@@ -44,7 +44,7 @@ class LocalStates(KnownStates):
         super().__init__(bounds, Blocks(first.chain.inception, self.agents.made))
         self.steps = 0
         """How many the real agent has computed."""
-        self._reference = Reference(self.agents.new) if bounds.steps else None
+        self._reference = Reference(bounds, self.agents.new) if bounds.steps else None
         self.timers = [timer.name for timer in first.timers]
         self.settings = settings = bounds.agent_settings()
         durations = (
@@ -173,8 +173,13 @@ class LocalStates(KnownStates):
         step = self._steps.get(key)
         if step is None:
             flaw = self._got_in(local, message)
+            captured, said = self.bounds.captured, self.messages[message]
             step = self._steps[key] = self._computed(
-                local, lambda agent: agent.receive_datagram(self._sealed(message), NOW_S), hears=True, flaw=flaw
+                local,
+                lambda agent: agent.receive_datagram(self._sealed(message), NOW_S),
+                hears=True,
+                flaw=flaw,
+                to_reference=lambda reference: reference.receive_message(captured, 0, said, NOW_S),
             )
         return step
 
@@ -226,7 +231,9 @@ class LocalStates(KnownStates):
         boots: bool = False,
         completes: int | None = None,
         flaw: Flaw | None = None,
+        to_reference: Give | None = None,
     ) -> Step:
+        """Compute a step. `to_reference` gives the reference an input that the gate opens for the agent."""
         self.steps += 1
         before = self.known[local]
         agent = self.agents.new(before.agent_id) if boots else self._restored(local)
@@ -241,7 +248,9 @@ class LocalStates(KnownStates):
             self.blocks.note_completed((digest, agent.agent_id, completes) for digest in made)
         if self._reference is not None:
             snapshot = None if boots else before.snapshot
-            wrong = self._reference.deviation(before.agent_id, agent, crashed, snapshot, give, self.blocks.in_words)
+            wrong = self._reference.deviation(
+                before.agent_id, agent, crashed, snapshot, give, to_reference or give, self.blocks.in_words
+            )
         if crashed is None:
             crashed = end_at_once(agent)
         if crashed is not None:

@@ -47,13 +47,12 @@ class Agents:
         assert self._gate is not None, "a vehicle is captured"
         return self._gate
 
-    def new(
-        self, agent_id: int, right: bool = False, after_each: Callable[[], None] | None = None, *, revoked: bool = False
-    ) -> Agent:
-        """A new one; it traces its handler runs if `after_each` is to be called after each."""
-        handlers = [] if right else wrong_handlers(self._bounds.quirks, Random(0))
+    def new(self, agent_id: int, after_each: Callable[[], None] | None = None, *, revoked: bool = False) -> Agent:
+        """Return a new agent. It traces its handler runs if `after_each` is to be called after each."""
+        handlers = wrong_handlers(self._bounds.quirks, Random(0))
         if after_each is not None:
-            handlers = [_calling(handler, after_each) for handler in handlers or HANDLERS.values()]
+            all_handlers = HANDLERS | {handler.name: handler for handler in handlers}
+            handlers = [_calling(handler, after_each) for handler in all_handlers.values()]
         settings, tracing = self._bounds.agent_settings(agent_id), after_each is not None
         make = Agent if self._gate is None else partial(self._gate.agent, revoked=revoked)
         own_id = FIRST if self._bounds.nameless else agent_id

@@ -1,36 +1,43 @@
-"""What the right agent makes of the same input in the same state: whoever does anything else takes a wrong step.
+"""Comparison of one step of an agent with the step of the independent reference.
 
-The right agent is put into whatever state the wrong one has come to, so each step is judged by itself: also one that is
-wrong and of which nothing comes.
+The reference is put into the state of the agent and given the same input. Each step is therefore judged by itself, even
+a wrong step without consequences. With the core in use this compares core and reference in every state within the
+bounds.
 """
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from harness.checker.reference.reference_agent import ReferenceAgent
+from harness.checker.reference.state import Settings, State
 from harness.checker.steps.deviation import differences
-from harness.proof.model._snapshot import Snapshot, dead, key_of, put_back, take
+from harness.proof.bounds import Bounds
+from harness.proof.model._known_states import FIRST
+from harness.proof.model._real_agents import INITIAL_DATA
+from harness.proof.model._snapshot import NOW_S, Snapshot, put_back
 from ucp.agent import HANDLERS, Agent
+from ucp.state import AgentState
 from ucp.trace import HandlerRun
 
-Give = Callable[[Agent], None]
-"""Gives an input to an agent."""
-Make = Callable[[int, bool, Callable[[], None] | None], Agent]
-"""A new agent: its ID, whether it is right, and what to call after each handler run, if it is to trace them."""
+Give = Callable[[Any], None]
+"""Gives an input to an agent: a `ucp.agent.Agent` or a `ReferenceAgent`."""
+Make = Callable[[int, Callable[[], None]], Agent]
+"""Makes a new agent with this ID, which traces its handler runs and calls a function after each."""
 
 
 class _Run(NamedTuple):
-    """One handler's, and what it left behind."""
+    """A handler run, and the state after it."""
 
     run: HandlerRun
     left: tuple[Any, ...]
 
 
 class Reference:
-    """Right agents by agent ID."""
+    """The reference in the place of each agent within the bounds."""
 
-    def __init__(self, make: Make) -> None:
+    def __init__(self, bounds: Bounds, make: Make) -> None:
+        self._bounds = bounds
         self._make = make
-        self._right: dict[int, Agent] = {}
 
     def deviation(
         self,
@@ -39,38 +46,48 @@ class Reference:
         crashed: str | None,
         before: Snapshot | None,
         give: Give,
+        to_reference: Give,
         name_of: Callable[[str], str],
     ) -> tuple[str, str] | None:
-        """Handler and sentence if the right agent does not do what `agent` did; None if it does.
+        """Return the handler and a sentence if the agent's step is not that of the reference, otherwise None.
 
-        `before` is the state in which the agent was given the input, None if it had just been switched on. `name_of`
-        names a block for people, by its hash.
+        `before` is the state in which the agent was given the input, None if it had just been switched on. `give` gives
+        the input to an agent, `to_reference` to the reference. `name_of` returns the name of a block, given its hash.
         """
-        if before is None or agent_id not in self._right:
-            self._right[agent_id] = self._make(agent_id, True, None)
-        right = self._right[agent_id]
-        error = _give(right, before, give)
-        outcome = _outcome(right)
-        right.messages_to_send()
-        if error is not None:
-            del self._right[agent_id]  # in what state it is nobody knows
-        if (error is None) == (crashed is None) and outcome == _outcome(agent):
+        reference = self._reference(agent_id, before)
+        error = _error_of(reference, to_reference)
+        alike = (error is None) == (crashed is None)
+        outbox = [said[1] for said in vars(agent.state)["outbox"]]
+        if alike and _state(reference.state) == _state(agent.state) and _said(reference) == outbox:
             return None
-        did, should = (self._traced(agent_id, is_right, before, give) for is_right in (False, True))
+        left: list[tuple[Any, ...]] = []
+        traced = self._make(agent_id, lambda: left.append(_state(traced.state)))
+        if before is not None:
+            put_back(traced, before)
+        _error_of(traced, give)
+        runs = [entry for entry in traced.trace() if isinstance(entry, HandlerRun)]
+        did = [_Run(run, after) for run, after in zip(runs, left, strict=False)]  # a crash leaves no state
+        should_leave: list[tuple[Any, ...]] = []
+        reference = self._reference(agent_id, before, lambda: should_leave.append(_state(reference.state)))
+        _error_of(reference, to_reference)
+        should = [_Run(run, after) for run, after in zip(reference.trace(), should_leave, strict=False)]
         return _first_difference(did, should, name_of)
 
-    def _traced(self, agent_id: int, is_right: bool, before: Snapshot | None, give: Give) -> list[_Run]:
-        """The handlers that run, and what each leaves behind."""
-        left: list[tuple[Any, ...]] = []
-        agent = self._make(agent_id, is_right, lambda: left.append(_outcome(agent)))
-        _give(agent, before, give)
-        runs = [entry for entry in agent.trace() if isinstance(entry, HandlerRun)]
-        return [_Run(run, after) for run, after in zip(runs, left, strict=False)]  # a crash leaves nothing behind
+    def _reference(
+        self, agent_id: int, before: Snapshot | None, after_each: Callable[[], None] | None = None
+    ) -> ReferenceAgent:
+        """Return the reference in the agent's state."""
+        roster = range(1, self._bounds.agents + 1)
+        own_id = FIRST if self._bounds.nameless else agent_id
+        settings = Settings.of(self._bounds.agent_settings(agent_id))
+        reference = ReferenceAgent(own_id, roster, INITIAL_DATA, settings, after_each)
+        if before is not None:
+            _put_into(reference.state, before)
+        reference.state.now = NOW_S
+        return reference
 
 
-def _give(agent: Agent, before: Snapshot | None, give: Give) -> Exception | None:
-    if before is not None:
-        put_back(agent, before)
+def _error_of(agent: Agent | ReferenceAgent, give: Give) -> Exception | None:
     try:
         give(agent)
     except Exception as error:  # a wrong agent's state may be one that no handler was written for
@@ -78,12 +95,72 @@ def _give(agent: Agent, before: Snapshot | None, give: Give) -> Exception | None
     return None
 
 
-def _outcome(agent: Agent) -> tuple[Any, ...]:
-    """What the agent is, as far as a right one will ever ask, what it says, and when its timers end."""
+def _said(reference: ReferenceAgent) -> list[Any]:
+    return [message for _, message in reference.messages_to_send()]
+
+
+COPIED = (
+    "current_block",
+    "blocks_to_be_committed",
+    "completed",
+    "newest_block_timestamp_us",
+    "candidate_block",
+    "top_chain_hash_at_initiation",
+    "vote_count",
+    "voters",
+    "reconcile_in_progress",
+    "reconcile_stack",
+    "reconcile_vote_count",
+    "reconcile_responders",
+    "majority_response_block_hash",
+)
+"""Attributes that the reference's state and an agent's state share, apart from chain, timers and the dictionary."""
+
+
+def _put_into(state: State, before: Snapshot) -> None:
+    """Give the reference the state of an agent, as a snapshot has it."""
+    for name in COPIED:
+        value = before[name]
+        setattr(state, name, value.copy() if hasattr(value, "copy") else value)
+    state.reconcile_response_dictionary = {
+        candidate: list(counted) for candidate, counted in before["reconcile_response_dictionary"].items()
+    }
+    state.note_held()
+    chain = before["chain"].parts
+    for block in chain["_blocks"]:
+        state.chain.append(block)
+    state.chain.top_chain_hash = chain["top_chain_hash"]
+    for timer, name in zip(state.timers, TIMERS, strict=True):
+        before[name].put_back(timer)
+
+
+TIMERS = ("voting_timer", "phase_one_timer", "phase_two_timer", "phase_three_timer", "finalize_timer")
+
+
+def _state(state: State | AgentState) -> tuple[Any, ...]:
+    """Return what determines all later steps. A tally counts only while its timer runs, because it is reset before."""
+    votes, phase_1, phase_2, phase_3, _ = (timer.active for timer in state.timers)
     return (
-        key_of(take(agent) | dead(agent.state), int.from_bytes),
-        [said[1] for said in vars(agent.state)["outbox"]],
-        [timer.deadline for timer in agent.state.timers],
+        [block.block_hash for block in state.chain],
+        state.chain.top_chain_hash,
+        bytes(state.current_block),
+        [block.block_hash for block in state.blocks_to_be_committed],
+        [block.block_hash for block in state.reconcile_stack],
+        list(state.completed),
+        state.newest_block_timestamp_us,
+        state.reconcile_in_progress,
+        [(timer.deadline, timer.active) for timer in state.timers],
+        votes
+        and (
+            state.vote_count.copy(),
+            state.voters.copy(),
+            state.candidate_block and state.candidate_block.block_hash,
+            state.top_chain_hash_at_initiation,
+        ),
+        phase_1 and state.reconcile_vote_count.copy(),
+        (phase_1 or phase_2) and state.reconcile_responders.copy(),
+        phase_2 and {candidate: list(count) for candidate, count in state.reconcile_response_dictionary.items()},
+        phase_3 and state.majority_response_block_hash,
     )
 
 

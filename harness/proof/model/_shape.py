@@ -13,6 +13,7 @@ from hashlib import blake2b
 from itertools import chain
 from typing import Any
 
+from harness.checker.reference.state import State
 from ucp.block import Block, next_chain_hash
 from ucp.messages import Message
 from ucp.state import AgentState
@@ -33,17 +34,18 @@ class Held:
 
     __slots__ = ("_blocks", "_heights", "_numbers", "_ordinals", "_shape", "_top")
 
-    def __init__(self, state: AgentState) -> None:
+    def __init__(self, state: AgentState | State) -> None:
         held = {
             block.block_hash: block.timestamp_us
             for block in chain(state.chain, state.blocks_to_be_committed, state.reconcile_stack)
         }
         self._blocks = sorted((timestamp_us, block_hash) for block_hash, timestamp_us in held.items())
         self._ordinals = ordinals = {block_hash: ordinal for ordinal, (_, block_hash) in enumerate(self._blocks)}
-        self._heights = {
-            chain_hash: height for height, (_, chain_hash) in enumerate(state.chain.with_chain_hashes(), 1)
-        }
-        self._heights[state.chain.inception.chain_hash] = 0
+        chain_hash = state.chain.inception.chain_hash
+        self._heights = {chain_hash: 0}
+        for height, block in enumerate(state.chain, 1):
+            chain_hash = next_chain_hash(chain_hash, block.block_hash)
+            self._heights[chain_hash] = height
         self._top = state.chain.top_chain_hash
         self._numbers: dict[Shape, int] = {}
         self._shape = tuple(
@@ -98,7 +100,7 @@ class Held:
         return self.between(value)
 
 
-def shape_of(state: AgentState, held: Held) -> Shape:
+def shape_of(state: AgentState | State, held: Held) -> Shape:
     """The shape of `state` but for what it holds, which is `held`; their numbers tell states apart."""
     shape: list[Any] = [state.reconcile_in_progress]
     for timer in state.timers:

@@ -8,8 +8,9 @@ import pytest
 from docs.generate.wrong_agents.conformance_page import ALIKE, PAGE
 from docs.generate.wrong_agents.trials_page import rows_of
 from harness.conformance._alphabet import INPUTS, LOG, TIMER
-from harness.conformance._reference_model import Model
+from harness.conformance._reference_model import AGENT, INITIAL_DATA, ROSTER, Model
 from harness.conformance._state_space import STEP_S, VARIANTS
+from ucp.agent import Agent
 from ucp.quirks import QUIRKS, wrong_handlers
 
 WAY = (LOG, "vote no", "vote no", TIMER, LOG, "vote yes", "vote no", LOG, TIMER, LOG, "vote no", TIMER, TIMER)
@@ -33,7 +34,7 @@ def test_two_that_are_alike_do_the_same_to_the_outside(quirk: str, other: str) -
     settings = VARIANTS["default"].settings
     right, wrong = Model(settings), [Model(settings), Model(settings)]
     for model, name in zip(wrong, (quirk, other), strict=True):
-        model.agent.replace_handlers(wrong_handlers({name: True}, Random(0)))
+        model.agent = Agent(AGENT, ROSTER, INITIAL_DATA, settings, handlers=wrong_handlers({name: True}, Random(0)))
     now, said = 0.0, 0
     for name in WAY:
         action = INPUTS[name].make(right)

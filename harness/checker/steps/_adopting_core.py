@@ -1,12 +1,16 @@
-"""The reference core of the step judge: it can also be put into the state that an agent says it is in."""
+"""The core of the step judge: it can also be put into the state that an agent records.
+
+After a deviation the judge compares the agent from the agent's own state. `Adopting` adds this to any core that has the
+attributes of the reference's `State`: to the reference, by which agents are judged, and to the core in use, for a
+debugger and for `bisect` (`harness.checker.steps.core_in_use`).
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from harness.checker.reference.state import State, Timer
 from harness.checker.steps.recorded_inputs import Blocks, NotOnRecordError, decoded
-from ucp.agent import HANDLERS
 from ucp.block import HASH_BYTES, Block
-from ucp.core import Core
 from ucp.messages import (
     BlockAddRequest,
     ChainContainQuery,
@@ -17,66 +21,71 @@ from ucp.messages import (
     block_named,
 )
 from ucp.sealed import SEAL_BYTES, sealed_to
-from ucp.settings import Settings
-from ucp.timers import Timer
 from ucp.trace import HandlerRun, Sent
 
 
 class Before(NamedTuple):
-    """Of the state before a step what its changes do not tell."""
+    """The part of the state before a step that the changes of the step do not show."""
 
     stack: list[Block]
     current_block: bytes | None
-    """Only of a step that logs an event."""
+    """None unless the step logs an event."""
     phase_three_ends: float | None
 
 
-class ReferenceCore(Core):
-    """A step begins with `before`; `undo` takes it back, and `adopt` makes the agent's own instead."""
+if TYPE_CHECKING:
+    _Core = State
+else:
+    _Core = object
 
-    def __init__(self, agent_id: int, initial_data: bytes, settings: Settings) -> None:
+
+class Adopting(_Core):
+    """A step begins with `before`. `undo` takes the step back, and `adopt` takes over the agent's own step instead."""
+
+    def __init__(self, agent_id: int, initial_data: bytes, settings: Any) -> None:
         super().__init__(agent_id, initial_data, settings)
         self.told_sealed: bytes | None = None
-        """What the agent says that it sealed in this step: without its keys nobody can do it again."""
+        """The sealed event data of this step, as the agent recorded it. Without the agent's keys nothing can seal it
+        again."""
         self._seals = sealed_to(initial_data) is not None
         self._moved: dict[str, Block] = {}
-        """Every block that has ever been anywhere here, by hash."""
+        """Every block that the core has held, by hash."""
 
     def event_data(self, timestamp_us: int) -> bytes:
-        """Sealed where the mission seals, if what the agent tells is as long as that is."""
+        """Return the sealed data that the agent recorded, if the mission seals event data and the length is right."""
         events = bytes(self.current_block)
         sealed = self.told_sealed
         return sealed if self._seals and sealed and len(sealed) == len(events) + SEAL_BYTES else events
 
-    def _changed(self, operation: str, block: Block) -> None:
+    def changed(self, operation: str, block: Block) -> None:
         block_hash = block.block_hash.hex()
         self._moved[block_hash] = block
         self.changes.append((operation, block_hash))
 
     def unchanging(self) -> Iterator[object]:
-        """What it refers to and never changes: a copy of it may refer to the same."""
-        yield from (self.settings, self.chain.inception, self._moved, *self._moved.values(), *HANDLERS.values())
-        yield from (message for _, message, _ in self.outbox)
+        """Yield the objects that never change. A copy of the core can share them."""
+        yield from (self.settings, self.chain.inception, self._moved, *self._moved.values())
+        yield from (message for _, message in self.outbox)
 
     def be_idle_with(self, chain: Iterable[Block], current_block: bytes, sequence: int) -> None:
-        """Be, from the beginning, what an agent is that holds no more than these, and waits for nothing."""
+        """Begin as an idle agent with this chain and no other blocks."""
         for block in chain:
             self.commit(block)
             if block.agent_id == self.agent_id:
                 self.newest_block_timestamp_us = max(self.newest_block_timestamp_us, block.timestamp_us)
         self.current_block += current_block
-        self._sequence = sequence
+        self.sequence = sequence
         self.step_is_over()
 
     def before(self, run: HandlerRun) -> Before | None:
-        """What `undo` needs to take back the step that the run is compared with; None if its changes are all."""
+        """Return the data that `undo` needs beside the changes of the step, or None if it needs no more."""
         logs, phase_three_ends = run.handler == "build_data_block", self.phase_three_timer.deadline
         if not (logs or self.reconcile_stack or phase_three_ends is not None):
             return None
         return Before(list(self.reconcile_stack), bytes(self.current_block) if logs else None, phase_three_ends)
 
     def step_is_over(self) -> None:
-        """What has come of it is not wanted any more."""
+        """Forget the changes, messages and timers of the step."""
         if self.changes:
             self.changes = []
         if self.outbox:
@@ -84,17 +93,12 @@ class ReferenceCore(Core):
         if self.started:
             self.started = {}
 
-    def send(self, message: Message) -> None:
-        """As any core does, but for the record, which is made when it is wanted."""
-        self.outbox.append((self._sequence, message, None))
-        self._sequence += 1
-
     def has_sent(self, sent: Sequence[Sent]) -> bool:
-        """Whether these are the messages that the step has sent."""
+        """Return whether the step has sent these messages."""
         if len(sent) != len(self.outbox):
             return False
         for number, told in enumerate(sent):
-            sequence, message, _ = self.outbox[number]
+            sequence, message = self.outbox[number]
             try:
                 datagram = decoded(told.datagram)
             except MalformedDatagramError:
@@ -107,11 +111,11 @@ class ReferenceCore(Core):
         return True
 
     def sent_in_full(self) -> list[Sent]:
-        """What the step has sent, as a trace says it."""
-        return [Sent.of(self.agent_id, sequence, message) for sequence, message, _ in self.outbox]
+        """Return the messages of the step in the form of a trace."""
+        return [Sent.of(self.agent_id, sequence, message) for sequence, message in self.outbox]
 
     def go_along(self, run: HandlerRun) -> None:
-        """It has differed, and runs this by itself: which block it is after says what it does."""
+        """Take the block of phase 3 from a run that the agent, after a deviation, triggered by itself."""
         if run.handler == "reconcile_phase_3":
             hashes = [block_hash for operation, block_hash in run.changes if operation == "chain+"]
             hashes += [sent.block for sent in run.sent if sent.block is not None]
@@ -119,9 +123,9 @@ class ReferenceCore(Core):
                 self.majority_response_block_hash = bytes.fromhex(hashes[0])
 
     def undo(self, before: Before | None) -> None:
-        """Take back what the step did to blocks and timers; what it tallied, `adopt` overrides.
+        """Undo the step's changes of blocks and timers. `adopt` then replaces the tallies.
 
-        `before` is None of a step whose changes tell all of it.
+        `before` is None if the changes of the step are sufficient.
         """
         for operation, block_hash in reversed(self.changes):
             match operation:
@@ -147,16 +151,16 @@ class ReferenceCore(Core):
             if before.current_block is not None:
                 self.current_block[:] = before.current_block
             self.phase_three_timer.deadline = before.phase_three_ends
-        self._sequence -= len(self.outbox)
+        self.sequence -= len(self.outbox)
         self.step_is_over()
 
     def adopt(self, run: HandlerRun, blocks: Blocks) -> None:
-        """Be in the state that the agent says it is in after `run`. Raises NotOnRecordError if that cannot be."""
+        """Take the state that the agent recorded after `run`. Raises NotOnRecordError if that is impossible."""
         for operation, block_hash in run.changes:
             self._adopt_change(operation, self._moved.get(block_hash) or blocks.get(block_hash))
         if run.handler == "build_data_block" and run.changes:
             self.current_block.clear()
-        self._held_aside = {block.block_hash for block in (*self.blocks_to_be_committed, *self.reconcile_stack)}
+        self.note_held()
         state = run.state
         held = len(self.chain), len(self.blocks_to_be_committed), len(self.reconcile_stack)
         if held != (state.chain, state.deque, state.stack):
@@ -206,9 +210,9 @@ class ReferenceCore(Core):
             self.chain.top_chain_hash = chain_hash
 
     def _adopt_sent(self, sent: Iterable[Sent]) -> None:
-        """What it asked for says what it waits for."""
+        """Start the timers of the questions that the agent sent."""
         for announced in sent:
-            self._sequence = announced.seq + 1
+            self.sequence = announced.seq + 1
             try:
                 message = decoded(announced.datagram).message
             except MalformedDatagramError:
@@ -217,7 +221,7 @@ class ReferenceCore(Core):
                 timer.start(self.now, self._duration(timer))
 
     def _asked(self, message: Message) -> Timer | None:
-        """Wait for the answers to `message`; the timer that then runs, if it is a question."""
+        """Wait for the answers to `message`. Return the timer that runs meanwhile, or None if it is no question."""
         match message:
             case BlockAddRequest():
                 waiting = (*self.blocks_to_be_committed, *self.reconcile_stack, *self.chain)

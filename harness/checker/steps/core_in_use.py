@@ -1,0 +1,41 @@
+"""The core of this installation as an implementation that can follow a record.
+
+Agents are judged by the reference. The core in use also follows a record where its own behaviour matters: in a
+debugger, which stops in the handlers of `ucp`, and in `bisect`, which compares the cores of commits.
+"""
+
+from harness.checker.steps._adopting_core import Adopting
+from harness.checker.steps.implementation import Implementation
+from harness.checker.steps.trace_header import CheckedHeader
+from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of
+from ucp.block import Block
+from ucp.core import Core
+from ucp.messages import Message
+
+
+class _CoreInUse(Adopting, Core):  # type: ignore[misc]  # a core has the attributes of the reference's state
+    @property
+    def sequence(self) -> int:
+        return self._sequence
+
+    @sequence.setter
+    def sequence(self, sequence: int) -> None:
+        self._sequence = sequence
+
+    def note_held(self) -> None:
+        self._held_aside = {block.block_hash for block in (*self.blocks_to_be_committed, *self.reconcile_stack)}
+
+    def send(self, message: Message) -> None:
+        self.outbox.append((self.sequence, message))
+        self.sequence += 1
+
+    def _changed(self, operation: str, block: Block) -> None:
+        self.changed(operation, block)
+
+
+def _core(header: CheckedHeader) -> Adopting:
+    return _CoreInUse(header.agent_id, header.initial_data, header.settings)
+
+
+IN_USE = Implementation(_core, ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT, HANDLERS, tally_of)
+"""The core of this installation."""

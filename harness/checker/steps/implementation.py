@@ -1,0 +1,32 @@
+"""An implementation of the 20 handlers that can follow a record: a core, and its tables of handlers."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of
+from harness.checker.reference.state import Settings, State
+from harness.checker.steps._adopting_core import Adopting
+from harness.checker.steps.trace_header import CheckedHeader
+
+
+class ReferenceCore(Adopting, State):
+    """The independent reference, which can adopt the state of an agent."""
+
+
+class Implementation(NamedTuple):
+    """A core and its handlers: by message type, timer name, local event, and name."""
+
+    core: Callable[[CheckedHeader], Adopting]
+    on_message: Mapping[Any, Any]
+    on_timer: Mapping[str, Any]
+    on_local_event: Mapping[Any, Any]
+    handlers: Mapping[str, Any]
+    tally_of: Callable[[Any, Any], Any]
+
+
+def _reference_core(header: CheckedHeader) -> Adopting:
+    return ReferenceCore(header.agent_id, header.initial_data, Settings.of(header.settings))
+
+
+REFERENCE = Implementation(_reference_core, ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT, HANDLERS, tally_of)
+"""The independent reference, by which agents are judged."""
