@@ -12,6 +12,7 @@ from harness import proof as prove
 from harness.commands._shared_options import RARE
 from harness.commands.terminal import Watcher, complain, print_json
 from harness.errors import INTERRUPTED
+from harness.play.core_version import edited_files
 from harness.proof import Bounds, BoundsError, Limits, Progress, specification
 from harness.run.parallel import cores, terminated_is_interrupted
 
@@ -116,6 +117,8 @@ def prove_command(
     quirks = _pairs("--quirk", quirk)
     if lies is not None and (captured is None or network == "any"):
         raise BoundsError("--lies is for --captured, and not for --network any, where any number is heard")
+    if edited := edited_files():
+        complain(f"state reduction is disabled: it assumes the released core, and {', '.join(edited)} was edited")
     bounds = Bounds(
         agents,
         blocks,
@@ -125,7 +128,7 @@ def prove_command(
         coincidences,
         _pairs("--settings", settings),
         quirks,
-        reduced=not whole and not quirks,
+        reduced=not (whole or quirks or edited),
         steps=steps,
         stagger=_pairs("--stagger", stagger),  # type: ignore[arg-type]  # it is checked
         captured=captured,

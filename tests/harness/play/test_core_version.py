@@ -1,13 +1,16 @@
 """The version of the agent core: the recorded digests, and the effect of an edit."""
 
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 import harness
+from harness.cli import app
 from harness.play import core_version
 from harness.run.run import versions
 from harness.run.simulate import simulate
@@ -64,3 +67,9 @@ def test_virtual_time_withholds_nothing_from_an_edited_core(edited_core: None, m
     monkeypatch.undo()
     assert edited == digest(simulate(lossy, 1, tracing=True, deliver_all=True))
     assert edited != digest(simulate(lossy, 1, tracing=True))
+
+
+def test_proof_of_an_edited_core_does_not_reduce_states(edited_core: None) -> None:
+    proved = CliRunner().invoke(app, ["prove", "--agents", "2", "--blocks", "1", "--json"])
+    assert "state reduction is disabled" in proved.stderr and "ucp/commit.py was edited" in proved.stderr
+    assert json.loads(proved.stdout)["reduced"] is False
