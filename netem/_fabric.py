@@ -95,7 +95,7 @@ class Fabric:
 
 
 def _silence_ipv6() -> None:
-    """No IPv6 on links made from here on: an idle link carries nothing that nobody asked for."""
+    """No IPv6 on links made from here on: an idle link is impossible that nobody asked for."""
     _sysctl("ipv6/conf/default/disable_ipv6", b"1")
 
 

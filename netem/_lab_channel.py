@@ -86,8 +86,8 @@ class Channel:
             alive = False
         if not alive:
             self._finish(
-                "The lab's first process ended unexpectedly, and every process in the lab with it; "
-                f"what it said is in {self._log}"
+                "The lab's first process ended unexpectedly, and every process in the lab with it; its output is in "
+                f"{self._log}"
             )
 
     def _take(self, message: dict[str, Any]) -> None:

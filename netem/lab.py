@@ -139,7 +139,7 @@ class Lab:
         if (failure := _namespaces.not_executed(word)) is not None:
             program, why = failure
             reason = f"{_namespaces.user()} cannot execute {program} ({why})"
-            raise LabUnavailable(f"The lab's first process could not be started: {reason}", _namespaces.way_out(word))
+            raise LabUnavailable(f"The lab's first process cannot be started: {reason}", _namespaces.way_out(word))
         raise LabUnavailable(
             f"This machine does not let us make a private network ({word})",
             f"{_namespaces.way_out(word)} Or run it inside User Mode Linux: --kernel uml.",
@@ -238,7 +238,7 @@ class Lab:
         try:
             result, _ = await self._channel.ask("spawn", vehicle=vehicle, argv=[*argv], env={**env}, **where)
         except SpawnError as error:
-            raise SpawnError(f"The {role} could not be started: {error}") from None
+            raise SpawnError(f"The {role} cannot be started: {error}") from None
         return LabProcess(self._channel, vehicle, result["pid"], result["ended"])
 
     async def connect(self, vehicle: int, port: int, *, host: str = "127.0.0.1", timeout_s: float) -> socket.socket:
@@ -296,7 +296,7 @@ class Lab:
     def _check_vehicle(self, vehicle: int | None) -> None:
         if vehicle is not None and vehicle not in self.addresses:
             allowed = ", ".join(map(str, self.vehicles))
-            raise LabError(f"vehicle: there is no {vehicle!r} in the lab; allowed is any of {allowed}")
+            raise LabError(f"vehicle: the lab has no vehicle {vehicle!r}; use one of {allowed}")
 
 
 def _checked(vehicles: Sequence[int]) -> tuple[int, ...]:

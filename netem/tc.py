@@ -213,7 +213,7 @@ class NetemEngine(Engine):
             classes = self._found()
             marks, heard = self._filters()
         except NetlinkError as error:
-            raise EngineError(f"The kernel did not say what it holds: {error}") from error
+            raise EngineError(f"The kernel did not report its state: {error}") from error
         return Applied(self.name, {v: self._figures(v, classes[v], marks, *heard[v]) for v in self._vehicles})
 
     def _figures(

@@ -119,7 +119,7 @@ def find() -> Path:
     }
     missing = [package for package, here in packages.items() if not here]
     if kernel is None or missing:
-        what = "User Mode Linux is not installed" if kernel is None else "User Mode Linux lacks what it needs here"
+        what = "User Mode Linux is not installed" if kernel is None else "User Mode Linux lacks a requirement here"
         raise UmlError(f"{what} (Debian, Ubuntu: apt install {' '.join(missing)})")
     return Path(kernel).absolute()
 

@@ -62,7 +62,9 @@ def enter(folder: Path, argv: Sequence[str], *, cwd: Path, env: Mapping[str, str
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             return _at_console(folder, argv, cwd, env)
     except BlockingIOError:
-        raise UmlError("somebody else is in that User Mode Linux, where one shell at a time can be") from None
+        raise UmlError(
+            "another shell is open in that User Mode Linux, which allows one at a time: close it first"
+        ) from None
     except OSError as error:
         if folder.exists():
             raise UmlError(f"User Mode Linux cannot be entered: {error.strerror}") from None

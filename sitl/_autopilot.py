@@ -170,7 +170,7 @@ class Autopilot:
         if mode is None:
             return self._refuse("Mode change refused: no such mode")
         if mode == BOOT_MODES[self.vehicle_type] and self.airborne:
-            return self._refuse("Mode change refused: nobody has the sticks")
+            return self._refuse("Mode change refused: no remote control")
         if mode == "AUTO" and len(self.mission) < 2:
             return self._refuse("Mode change to AUTO failed: no mission")
         if mode == self.mode:

@@ -59,8 +59,8 @@ def _no_way_to(address: Address, error: OSError | UnicodeError) -> VehicleError:
     """The error, for people, that nothing can be sent there."""
     reason = "it is no name" if isinstance(error, UnicodeError) else error.strerror or str(error)
     return VehicleError(
-        f"the ground station at {address} cannot be sent anything ({reason}): name an address that this machine "
-        "knows, for example 127.0.0.1:14550"
+        f"datagrams to the ground station at {address} cannot be sent ({reason}): name an address that this machine "
+        "can reach, for example 127.0.0.1:14550"
     )
 
 

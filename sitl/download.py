@@ -93,7 +93,7 @@ def fetch_text(url: str, limit: int, stall_s: float = STALL_S) -> str:
         for chunk in _chunks(url, answer, stall_s):
             content += chunk
             if len(content) > limit:
-                raise DownloadError(f"{url} is larger than {megabytes(limit)}, so it is not what it should be")
+                raise DownloadError(f"{url} is larger than {megabytes(limit)}, so it is not the expected file")
     return content.decode(errors="replace")
 
 

@@ -130,7 +130,8 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
 
 def _complain(sysid: int, port: int, reason: str) -> int:
     message = (
-        f"vehicle {sysid}: cannot listen on 127.0.0.1:{port}: {reason}; end what listens there or choose another\n"
+        f"vehicle {sysid}: cannot listen on 127.0.0.1:{port}: {reason}; end the process that listens there, or choose "
+        "another port\n"
     )
     sys.stderr.write(message)
     return 2

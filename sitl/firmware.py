@@ -242,7 +242,7 @@ class _Server:
         numbers.sort(key=lambda number: tuple(map(int, number.split("."))), reverse=True)
         known = [name for name in ("stable", "beta", "latest") if name in names] + numbers[:_NEWEST_NAMED]
         way_out = f"there are {', '.join(known)}" if known else f"look at {self._releases} for those that there are"
-        return RequestError(f"there is no {self._vehicle} {self._version} at {self._release}: {way_out}")
+        return RequestError(f"{self._release} has no {self._vehicle} {self._version}: {way_out}")
 
 
 def _refuse_what_does_not_run(program: Path) -> None:

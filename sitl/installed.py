@@ -109,7 +109,7 @@ def cache(environ: Mapping[str, str]) -> Path:
     for base in (Path(environ.get("XDG_CACHE_HOME", "")), Path(environ.get("HOME", "")) / ".cache"):
         if base.is_absolute():
             return base / "ucp-harness" / "sitl"
-    raise VehicleError("there is no place for a cache: set XDG_CACHE_HOME to the absolute path of a directory")
+    raise VehicleError("no directory for a cache: set XDG_CACHE_HOME to the absolute path of a directory")
 
 
 def all_installed(vehicle: VehicleType, environ: Mapping[str, str]) -> list[Installed]:

@@ -56,10 +56,10 @@ def named(name: str, beside: Path | None, environ: Mapping[str, str]) -> Home:
             known.add(key)
     if not files:
         tried = ", ".join(map(str, _files(beside, environ)))
-        raise PlaceError(f"there is no file of named locations: looked for {tried}")
+        raise PlaceError(f"no file of named locations found: searched {tried}")
     nearest = get_close_matches(name, known, n=1)
     meant = f": did you mean {nearest[0]}?" if nearest else ""
-    raise PlaceError(f"there is no such location in {', '.join(map(str, files))}{meant}")
+    raise PlaceError(f"no such location in {', '.join(map(str, files))}{meant}")
 
 
 def swarm(path: Path) -> dict[int, Offset]:

@@ -115,7 +115,7 @@ _MISSING = object()
 
 
 def _refuse(self: object, name: str, *value: object) -> None:
-    raise AttributeError(f"nobody changes {name} of a {type(self).__name__}")
+    raise AttributeError(f"{name} of a {type(self).__name__} cannot be changed")
 
 
 def _set_state(self: object, state: Any) -> None:

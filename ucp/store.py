@@ -157,7 +157,7 @@ class Store:
 
     def _read(self) -> StoredState | None:
         if not self._path.parent.is_dir():
-            raise StoreError(f"{self._path} cannot be kept: there is no directory {self._path.parent}")
+            raise StoreError(f"{self._path} cannot be written: the directory {self._path.parent} does not exist")
         if self._path.exists() and not self._path.is_file():
             raise StoreError(f"{self._path} is no file: name another as `store`")
         try:

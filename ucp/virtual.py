@@ -73,7 +73,9 @@ class VirtualAgent:
         except MissionError as error:
             raise InputError(str(error), unsupported=isinstance(error, UnsupportedMissionError)) from None
         if mission.epoch_us is None:
-            raise InputError("`epoch_us` of the mission must be a whole number: in virtual time nobody says `start`")
+            raise InputError(
+                "`epoch_us` of the mission must be a whole number, because virtual time has no command `start`"
+            )
         self._epoch_us = mission.epoch_us
         self._tracing = given.get("trace", True) is True
         self._lots = Random(mission.seed)
@@ -312,7 +314,7 @@ def _stored(value: Any, *, secured: bool) -> StoredState:
         stored.check()
         return stored
     except (KeyError, TypeError, ValueError, AttributeError):
-        raise InputError("`store` is not what this agent answered to the command `store`") from None
+        raise InputError("`store` is not an answer of this agent to the command `store`") from None
 
 
 def main() -> int:

@@ -214,7 +214,7 @@ class RunArchive:
         for path in self._trace_files:
             if path.is_file() and path.stat().st_size > MAX_TRACE_BYTES:
                 problems.append(
-                    f"{path}: larger than {MAX_TRACE_BYTES} bytes, which no mission's trace is; it is left out"
+                    f"{path}: larger than {MAX_TRACE_BYTES} bytes, which is too large for a trace; it is left out"
                 )
                 continue
             trace = read_trace(path, skim=skim)
@@ -225,15 +225,15 @@ class RunArchive:
                 continue
             agent_id = trace.header.agent_id
             if agent_id in traces or (of_the_run and agent_id not in of_the_run):
-                problems.append(f"{path}: of an agent that is not of this run, or has a trace already; it is left out")
+                problems.append(f"{path}: its agent is not in this run, or has another trace; it is left out")
                 continue
             recorded = self.record.agents.get(str(agent_id))
             if recorded is not None and recorded.trace_problem:
                 trace.problem = f"it ends early: {recorded.trace_problem}"
             if trace.problem:
-                problems.append(f"{path}: {trace.problem}; what is before that is read")
+                problems.append(f"{path}: {trace.problem}; the part before is read")
             elif trace.cut_off:
-                gaps.append(f"{path}: cut off in mid-line; what is before that is read")
+                gaps.append(f"{path}: truncated in the middle of a line; the part before is read")
             if not all(map(in_time, trace.runs)):
                 gaps.append(f"{path}: handler runs without a possible time are left out of the timeline")
             traces[agent_id] = trace
@@ -251,7 +251,9 @@ class RunArchive:
         path = next((place / PUBLIC_KEYS_FILE for place in beside if (place / PUBLIC_KEYS_FILE).exists()), None)
         if path is None:
             secured = self.record.scenario is not None and self.record.scenario.security is not None
-            missing = f"{PUBLIC_KEYS_FILE} is missing, which a secured run leaves: signatures of blocks are not checked"
+            missing = (
+                f"{PUBLIC_KEYS_FILE} is missing, although the run was secured: signatures of blocks are not checked"
+            )
             return None, [missing] if secured and not self._never_began else []
         try:
             from ucp.secure.bundle import load_public
@@ -303,17 +305,17 @@ class RunArchive:
         if self.directory is None:
             return
         if not (self.directory / RUN_FILE).exists():
-            yield f"{RUN_FILE} is missing: scenario, verdict and figures are not known"
+            yield f"{RUN_FILE} is missing: scenario, verdict and figures are unknown"
         without = [agent_id for agent_id in self.roster if agent_id not in self.traces]
         if without and not self.traces:
-            yield "no agent has left a trace: there is no timeline"
+            yield "no agent has a trace: there is no timeline"
         else:
             yield from (f"agent {agent_id}: no trace, and so no lane in the timeline" for agent_id in without)
         if not (self.directory / NETWORK_FILE).is_file():
-            yield f"{NETWORK_FILE} is missing: who could reach whom is not known"
+            yield f"{NETWORK_FILE} is missing: the network conditions are unknown"
         flew = self.record.vehicles or (self.record.scenario and self.record.scenario.flight)
         if flew and not (self.directory / TRACKS_FILE).is_file():
-            yield f"{TRACKS_FILE} is missing: where the vehicles were is not known"
+            yield f"{TRACKS_FILE} is missing: the positions of the vehicles are unknown"
 
     def within(self, sentence: str) -> str:
         """Return a sentence with file names relative to the run directory."""

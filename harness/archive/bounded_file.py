@@ -52,7 +52,7 @@ class _Content(io.RawIOBase):
         most = min(len(buffer), self._left)
         if not most:
             if self._next(1):
-                self.trouble = f"what is beyond {self._most // 1024 // 1024} MiB is not read"
+                self.trouble = f"only the first {self._most // 1024 // 1024} MiB are read"
                 self.packed, self._input = False, b""
                 self._file.seek(0, os.SEEK_END)
             return 0
@@ -79,12 +79,12 @@ class _Content(io.RawIOBase):
                 self._unpacker = _unpacker()
             self._input = self._input or self._file.read(_CHUNK_BYTES)
             if not self._input:
-                self.trouble = "what gzip packed breaks off"
+                self.trouble = "the gzip data ends early"
                 break
             try:
                 data: bytes = self._unpacker.decompress(self._input, most)
             except zlib.error:
-                self.trouble = "what gzip packed is damaged"
+                self.trouble = "the gzip data is damaged"
                 break
             self._input = self._unpacker.unconsumed_tail
             if data:
@@ -132,12 +132,12 @@ class JsonLines(Generic[Record]):
                         return
                     if number > MAX_LINES or file.tell() > MAX_LINES_BYTES:
                         self._trouble = (
-                            f"what is beyond {MAX_LINES} lines or {MAX_LINES_BYTES // 1024 // 1024} MiB is left out"
+                            f"only the first {MAX_LINES} lines or {MAX_LINES_BYTES // 1024 // 1024} MiB are read"
                         )
                         return
                     if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
                         self._trouble = (
-                            f"what follows {MAX_LINE_BYTES // 1024 // 1024} MiB without a line's end is left out"
+                            f"the part after {MAX_LINE_BYTES // 1024 // 1024} MiB without a line end is left out"
                         )
                         return
                     try:
@@ -157,8 +157,8 @@ class JsonLines(Generic[Record]):
         """A sentence, for people, on each thing that was wrong with what was read."""
         troubles = []
         if self._left_out:
-            lines = "1 line is" if self._left_out == 1 else f"{self._left_out} lines are"
-            troubles.append(f"{lines} left out, damaged or of no meaning")
+            lines = "1 damaged or unknown line is" if self._left_out == 1 else ""
+            troubles.append(f"{lines or f'{self._left_out} damaged or unknown lines are'} left out")
         if self._trouble:
             troubles.append(self._trouble)
         return [f"{self._path.name if self._path else ''}: {trouble}" for trouble in troubles]

@@ -7,7 +7,7 @@ vehicles/7/         the vehicle's own files, its output, telemetry.tlog; of its 
 capture/7.pcapng    every frame that vehicle 7 sent and every one that reached it, if asked for (netem.capture)
 network.jsonl       every change of conditions as the kernel applied it, and its counters at the end
 tracks.jsonl        where the vehicles were, in metres north, east and up from the middle of the field
-replay.yaml         the scenario with what was asked for by hand, if anything was (harness.play.interventions)
+replay.yaml         the scenario with what was caused by hand, if anything was (harness.play.interventions)
 rogue.jsonl         what the rogue node has sent, if the timeline injects; rogue.log has what it had to say
 lab.log             what the lab itself had to say
 report.html  report.md  junit.xml  chains.svg
@@ -137,8 +137,8 @@ class RunDirectory:
             write_json_atomically(self.path / RUN_FILE, record.to_json())
         except OSError as error:
             raise MachineError(
-                f"{self.path / RUN_FILE} cannot be written: {error.strerror}; what the run left is there, and "
-                f"`ucp-harness check {self.path}` judges it"
+                f"{self.path / RUN_FILE} cannot be written: {error.strerror}; the other files of the run are "
+                f"complete: judge them with `ucp-harness check {self.path}`"
             ) from None
 
 
@@ -150,13 +150,15 @@ def claim(directory: Path, *inner: Path) -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         if any(directory.iterdir()):
-            raise RunDirectoryError(f"{directory} is not empty: choose another --out, nothing is overwritten")
+            raise RunDirectoryError(
+                f"{directory} is not empty: choose another --out; existing files are not overwritten"
+            )
         for path in inner:
             path.mkdir()
     except (FileExistsError, NotADirectoryError):
         raise RunDirectoryError(f"{directory} is not a directory: choose another --out") from None
     except OSError as error:
-        raise RunDirectoryError(f"{directory} cannot be made: {error.strerror}; choose another --out") from None
+        raise RunDirectoryError(f"{directory} cannot be created: {error.strerror}; choose another --out") from None
 
 
 def default_path(name: str) -> Path:

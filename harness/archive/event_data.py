@@ -38,10 +38,10 @@ class EventData:
             why = (
                 "no event data is sealed in this mission"
                 if key is None
-                else "this mission's is sealed to another depot"
+                else "the event data of this mission is sealed to another depot"
             )
             raise ExportError(
-                f"the depot's key opens nothing here: {why}; leave out --depot-key, or give the right one"
+                f"the depot key opens no event data here: {why}; leave out --depot-key, or give another key"
             )
         return cls(key is not None, depot)
 

@@ -188,7 +188,7 @@ def read_export(path: Path) -> Export:
     """Raises ExportError: one sentence that names the file, what is wrong with it and where."""
     try:
         if path.stat().st_size > MAX_EXPORT_BYTES:
-            raise ExportError(f"{path}: larger than {MAX_EXPORT_BYTES} bytes, which no mission's export is")
+            raise ExportError(f"{path}: larger than {MAX_EXPORT_BYTES} bytes, which is too large for an export")
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise ExportError(f"{path}: cannot be read: {error.strerror}") from None
@@ -243,8 +243,8 @@ def read_exports(paths: Iterable[Path]) -> Exports:
     for path, export in read:
         if export.inception.block_hash != mission:
             exports.errors.append(
-                f"{path}: agent {export.agent_id} flew another mission (inception block "
-                f"{export.inception.block_hash[:12]}, not {mission[:12]}); check each mission by itself"
+                f"{path}: agent {export.agent_id} belongs to another mission (inception block "
+                f"{export.inception.block_hash[:12]}, not {mission[:12]}); check each mission separately"
             )
             continue
         other = exports.by_agent.get(export.agent_id)
@@ -255,9 +255,7 @@ def read_exports(paths: Iterable[Path]) -> Exports:
             later, earlier = (path, source[export.agent_id])
             if other.exported_at_us > export.exported_at_us:
                 later, earlier = earlier, later
-            exports.errors.append(
-                f"{earlier}: another export of agent {export.agent_id} than {later}, which is later and is used"
-            )
+            exports.errors.append(f"{earlier}: not used, because agent {export.agent_id} has a later export: {later}")
             if later != path:
                 continue
         exports.by_agent[export.agent_id] = export

@@ -19,5 +19,5 @@ def scenario_of(path: Path) -> tuple[Scenario, int | None]:
     if archive.record_error is not None:
         raise archive.record_error
     if archive.record.scenario is None:
-        raise ScenarioError(f"{path / RUN_FILE}: it does not say what was played; name a scenario")
+        raise ScenarioError(f"{path / RUN_FILE}: it does not name the scenario; give a scenario")
     return archive.record.scenario, archive.record.seed

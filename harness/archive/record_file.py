@@ -58,7 +58,7 @@ def fit(model: type[Model], document: dict[str, Any]) -> tuple[Model, list[Misfi
             return model.model_validate(document), list(misfits.values())
         except ValidationError as error:
             if error.error_count() > MAX_MISFITS:
-                raise ValueError(f"{error.error_count()} things are wrong with it") from None
+                raise ValueError(f"{error.error_count()} errors in it") from None
             errors = error.errors(include_url=False, include_context=False, include_input=False)
         for misfit in _by_key(document, errors):
             misfits.setdefault(misfit.key, misfit)
@@ -168,10 +168,14 @@ def _read(path: Path) -> RecordFile:
 def _document(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise DamagedRecordError(f"{path}: larger than {MAX_BYTES} bytes, which no run's record is")
+            raise DamagedRecordError(
+                f"{path}: larger than {MAX_BYTES} bytes, which is too large for the record of a run"
+            )
         text = path.read_text(encoding="utf-8")
         if text.count(",") > MAX_VALUES:
-            raise DamagedRecordError(f"{path}: more than {MAX_VALUES} values, which no run's record has")
+            raise DamagedRecordError(
+                f"{path}: more than {MAX_VALUES} values, which is too many for the record of a run"
+            )
         document = json.loads(text)
     except OSError as error:
         raise DamagedRecordError(f"{path}: cannot be read: {error.strerror}; is this a run directory?") from None

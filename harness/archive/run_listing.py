@@ -34,7 +34,9 @@ def past_runs(folder: Path, most: int) -> Iterator[PastRun]:
     except OSError as error:
         raise RunDirectoryError(f"{folder} cannot be read: {error.strerror}") from None
     if not folder.is_dir():
-        raise RunDirectoryError(f"{folder} is not there: `ucp-harness run` makes it, or name the folder of your runs")
+        raise RunDirectoryError(
+            f"{folder} does not exist: `ucp-harness run` creates it; otherwise name the folder of your runs"
+        )
     for _, path in nlargest(most, written):
         file = read_record(path)
         yield PastRun(path.parent, file.record, str(file.error) if file.error else None)

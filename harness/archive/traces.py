@@ -240,7 +240,7 @@ class Held:
                 if place == "chain":
                     self.not_in_chain.discard(block)
             elif self.places[place][block] < 1:
-                self.impossible = f"{block[:12]} leaves the {place} without having been there"
+                self.impossible = f"{block[:12]} leaves the {place}, but was not in it"
             else:
                 self.places[place][block] -= 1
                 self.size[place] -= 1
@@ -366,10 +366,10 @@ def read_lines(path: Path) -> Iterator[Line]:
                     life += 1
     except OSError as error:
         raise RunDirectoryError(
-            f"{path}: cannot be read ({error.strerror}), and runs are compared by their traces: play the run again"
+            f"{path}: cannot be read ({error.strerror}), and a comparison needs it: play the run again"
         ) from None
     if not life:
-        raise RunDirectoryError(f"{path}: it is empty, and runs are compared by their traces: play the run again")
+        raise RunDirectoryError(f"{path}: it is empty, and a comparison needs it: play the run again")
 
 
 def _validated(kind: TypeAdapter[Record], path: Path, number: int, text: bytes) -> Record:

@@ -25,7 +25,7 @@ def never(name: str, evidence: Evidence) -> Judgement | None:
     cycle = evidence.once(cycle_of)
     if cycle is None or evidence.connected_since_s is None or evidence.missing or evidence.paused_at_end:
         return None
-    return Judgement(name, "violated", f"fully connected, and yet {recurring_cycles.in_short(cycle)}")
+    return Judgement(name, "violated", f"the system is fully connected, but {recurring_cycles.in_short(cycle)}")
 
 
 REASONS_TOLD = 3
@@ -35,9 +35,9 @@ REASONS_TOLD = 3
 def why_unknown(evidence: Evidence) -> str | None:
     """Why equal or unequal exports say nothing about the whole system; None if all of it is there and idle."""
     if not evidence.exports:
-        return "there is no export to look at"
+        return "the run has no chain exports"
     if evidence.missing:
-        return f"there is no export of {agents(evidence.missing)}"
+        return f"the export of {agents(evidence.missing)} is missing"
     busy = [agent_id for agent_id, export in evidence.present.items() if not export.idle]
     if set(busy) & set(evidence.switched_off):
         return f"{agents(busy)} {'was' if len(busy) == 1 else 'were'} switched off before {_idle(busy)}"
@@ -53,24 +53,27 @@ def _idle(ids: list[int]) -> str:
 def why_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
     """Why none of the differing agents has had the chance to agree; None if at least one has."""
     if evidence.record is None:
-        return "exports alone do not tell whether the system was fully connected"
+        return "exports do not show whether the system was fully connected"
     since = evidence.connected_since_s
     if since is None:
-        return f"the system was not fully connected: {evidence.network_at_end or 'its conditions are not on record'}"
+        network = evidence.network_at_end or "its network conditions are not recorded"
+        return f"the system was not fully connected: {network}"
     untraced = (differing | set(evidence.exports)) - set(evidence.traces)
     if untraced:
         return (
-            f"there is no trace of {agents(untraced)} to tell whether {agents(differing)} had the chance to reconcile"
+            f"the trace of {agents(untraced)} is missing, so it is unknown whether {agents(differing)} had a chance "
+            "to reconcile"
         )
     if short := sorted(evidence.once(cross_examine).short):
-        return f"the trace of {agents(short)} is not whole, and does not tell whether there was a chance to reconcile"
+        return f"the trace of {agents(short)} is incomplete, so it is unknown whether there was a chance to reconcile"
     if unknown := evidence.unknown_word("handler", "branch", "operation"):
-        return f"nothing tells whether there was a chance to reconcile: {unknown}"
+        return f"it is unknown whether there was a chance to reconcile: {unknown}"
     if not had_a_chance(evidence, differing):
         without = sorted(differing)
         more = len(without) - REASONS_TOLD
         told = [_why_none(evidence, since, agent_id) for agent_id in without[:REASONS_TOLD]]
-        return "; ".join([*told, *([f"{more} more had no chance either"] if more > 0 else [])])
+        without_chance = f"{more} more {'agents' if more > 1 else 'agent'} had no chance"
+        return "; ".join([*told, *([without_chance] if more > 0 else [])])
     return None
 
 
@@ -86,13 +89,11 @@ def _why_none(evidence: Evidence, since: float, agent_id: int) -> str:
         since, when = there_s[0], "others were switched off"
     within = f"that began after {since:g} s, when {when}"
     if there_s[1] < math.inf:
-        within += f", and ended by {there_s[1]:g} s, when the first was switched off"
+        within += f", and ended before {there_s[1]:g} s, when the first agent was switched off"
     if _somebody_stood_still(evidence, since, math.inf):
-        within += ", and during which nobody stood still"
+        within += ", and during which all agents were running"
     sentence = f"agent {agent_id} completed no reconcile {within}, "
-    return sentence + (
-        f"and none came of the vote at {proposed[-1]:g} s" if proposed else "and proposed no block since"
-    )
+    return sentence + (f"and its vote at {proposed[-1]:g} s led to none" if proposed else "and proposed no block since")
 
 
 def without(evidence: Evidence) -> str:

@@ -26,9 +26,9 @@ def check(evidence: Evidence) -> Judgement:
             lacking[agent_id] = missing
     if not lacking and (untold := evidence.not_told_completed()):
         why = evidence.unknown_word("operation", agent_id=min(untold))
-        return Judgement(NAME, "not applicable", f"nothing tells all that {agents(untold)} completed: {why}")
+        return Judgement(NAME, "not applicable", f"the completed blocks of {agents(untold)} are unknown: {why}")
     if not lacking:
-        but = f"; {gone} more were gone with the agents that {_left(evidence)}" if gone else ""
+        but = f"; {gone} more were lost with agents that {_left(evidence)}" if gone else ""
         whole = f"all {len(completed)} completed blocks are in every chain"
         return Judgement(NAME, "holds", whole + without(evidence) + but)
     no_chance = why_no_chance(evidence, set(lacking))
@@ -38,19 +38,19 @@ def check(evidence: Evidence) -> Judgement:
             NAME,
             "not applicable",
             f"{agents(set(lacking))} lack{'s' if len(lacking) == 1 else ''} {lack} cop{'y' if lack == 1 else 'ies'} "
-            f"of completed blocks, {evidence.name(first)} the first; {no_chance}",
+            f"of completed blocks, the first of block {evidence.name(first)}; {no_chance}",
         )
     findings = [
         Finding(
             agent_id,
-            f"reconciled while fully connected, and still lacks block {evidence.name(block_hash)}",
+            f"reconciled while the system was fully connected, but lacks block {evidence.name(block_hash)}",
             evidence.name(block_hash),
             block_hash,
         )
         for agent_id in sorted(had_a_chance(evidence, set(lacking)))
         for block_hash in lacking[agent_id]
     ]
-    return violated(NAME, "a completed block is not in the chain of an agent that could have it", findings)
+    return violated(NAME, "an agent that had the chance to reconcile lacks a completed block", findings)
 
 
 def _gone_and_left(evidence: Evidence) -> tuple[int, list[str]]:

@@ -33,7 +33,9 @@ _LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
 def check(evidence: Evidence) -> Judgement:
     """By the traces, every line of them; `not applicable` where one is missing, damaged or incomplete."""
     if not evidence.traces:
-        return Judgement(NAME, "not applicable", "no traces: exports do not show what triggered the handlers")
+        return Judgement(
+            NAME, "not applicable", "the run has no traces, and exports do not show the triggers of handlers"
+        )
     sent = evidence.sendings
     findings: list[Finding] = []
     untraced: set[int] = set()
@@ -61,7 +63,7 @@ def check(evidence: Evidence) -> Judgement:
                     findings.append(Finding(agent_id, f"trace line {line}, t={run.t:g} s: {run.handler} {wrong}"))
     findings += waited_too_long(evidence)
     if findings:
-        return violated(NAME, "a handler ran without a trigger of its own, or waited for another agent", findings)
+        return violated(NAME, "a handler ran without a valid trigger, or waited for another agent", findings)
     if unknown := evidence.unknown_word("trigger", "handler", "timer", "message", "branch"):
         return Judgement(NAME, "not applicable", unknown)
     silent = sorted(set(evidence.roster or evidence.exports) - set(evidence.traces))
@@ -69,7 +71,7 @@ def check(evidence: Evidence) -> Judgement:
         return Judgement(
             NAME,
             "not applicable",
-            f"there is no trace of {agents(untraced | set(silent))}, so what they sent and did cannot be checked",
+            f"the trace of {agents(untraced | set(silent))} is missing, so their messages and steps cannot be checked",
         )
     damaged = [agent_id for agent_id, trace in evidence.traces.items() if trace.problem]
     if damaged:
@@ -111,24 +113,24 @@ def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) ->
     match run.trigger:
         case MessageTrigger(name, sender, sequence):
             if _OF_MESSAGE.get(name) != run.handler:
-                return f"was triggered by a {name}, which is another handler's"
+                return f"was triggered by a {name}, which triggers another handler"
             if sequence not in sent[sender].get(name, ()):
                 return f"was triggered by {name} number {sequence}, which agent {sender} never sent"
         case TimerTrigger(timer):
             if _OF_TIMER.get(timer) != run.handler:
-                return f"was triggered by the {timer} timer, which is another handler's"
+                return f"was triggered by the {timer} timer, which triggers another handler"
         case LocalTrigger(by):
             if run.handler not in _LOCAL or by not in ran:
-                return f"was triggered by {by}, which had not run"
+                return f"was triggered by {by}, which did not run before"
         case EventTrigger():
             if run.handler != _OF_EVENT:
-                return "was triggered by a logged event, which is Build Data Block's"
+                return "was triggered by a logged event, which triggers only Build Data Block"
         case OperatorTrigger():
             if run.handler != "reconcile_begin":
-                return "was triggered by the operator, who can only begin a reconcile"
+                return "was triggered by the operator, which only begins a reconcile"
         case BootTrigger():
             if run.handler != "reconcile_finalize" or len(ran) > 1:
-                return "was triggered by a boot, which only ends a reconcile, and before anything else"
+                return "was triggered by a boot, which only ends a reconcile and is the first step"
         case _:
             return "has no trigger"
     return None

@@ -74,10 +74,10 @@ class _Signatures:
         if public_key is None:
             return f"and agent {block.agent_id} has no key in this mission"
         if block.signature is None:
-            return "without a signature: it was made or edited by somebody without keys"
+            return "without a signature: it was made or edited without keys"
         data = Block(block.agent_id, block.timestamp_us, block.event_bytes).block_data()
         if not self._verified(claim_of_block(public_key, self._keys.mission, data, base64.b64decode(block.signature))):
-            return f"whose signature is not agent {block.agent_id}'s of this block: it was forged or edited"
+            return f"whose signature does not match the key of agent {block.agent_id}: it was forged or edited"
         return None
 
 
@@ -117,26 +117,29 @@ def check(evidence: Evidence) -> Judgement:
                 continue
             else:
                 detail = f"holds block {name}, which agent {block.agent_id} never completed"
-                detail += ", signed with its key, which others must have" if signatures else ""
+                detail += (
+                    ", although the block is signed with its key, so its key is known to others" if signatures else ""
+                )
                 detail += _since(evidence.traces.get(agent_id), block.block_hash)
             findings.append(Finding(agent_id, detail, name, block.block_hash))
     for agent_id, export in evidence.before_final_reconcile.items():
         edited = _hashes_that_do_not_recompute(agent_id, export, evidence, recomputed)
         findings += [replace(finding, detail=f"{finding.detail}, before the final reconcile") for finding in edited]
     if findings:
-        return violated(NAME, "a block is not what an agent of this mission made", findings)
+        return violated(NAME, "a block was not made by an agent of this mission", findings)
     if not evidence.exports:
-        return Judgement(NAME, "not applicable", "there is no export to look at")
+        return Judgement(NAME, "not applicable", "the run has no chain exports")
     if unknown:
         return Judgement(
             NAME,
             "not applicable",
-            f"neither export nor trace tells what {agents(unknown)} completed, so who made their blocks is unknown",
+            f"neither an export nor a trace lists the completed blocks of {agents(unknown)}, so the makers of their "
+            "blocks are unknown",
         )
     made = "signed" if signatures else "completed"
     reason = f"all hashes recompute, and each of {blocks} blocks was {made} by the agent that it names"
     if not signatures and any(block.signature for export in evidence.exports.values() for block in export.blocks()):
-        reason += "; their signatures were not checked, for there is no public.json beside the exports"
+        reason += "; the signatures were not checked, because public.json is missing next to the exports"
     return Judgement(NAME, "holds", reason)
 
 
@@ -145,7 +148,7 @@ def _since(trace: Trace | None, block_hash: str) -> str:
     came = ("chain+", block_hash)
     for run in trace.runs if trace else ():
         if came in map(tuple, run.changes):
-            return f"; it came at t={run.t:g} s, by {run.handler}"
+            return f"; the block arrived at t={run.t:g} s, in {run.handler}"
     return ""
 
 
@@ -163,9 +166,7 @@ def _hashes_that_do_not_recompute(
         if not recomputed.is_block(block):
             name = evidence.name(block.block_hash)
             findings.append(
-                Finding(
-                    agent_id, f"block {name} does not hash to its block hash: it was edited", name, block.block_hash
-                )
+                Finding(agent_id, f"block {name} does not match its block hash: it was edited", name, block.block_hash)
             )
     below = export.inception.chain_hash
     for block in export.chain:
@@ -174,7 +175,7 @@ def _hashes_that_do_not_recompute(
             findings.append(
                 Finding(
                     agent_id,
-                    f"the chain hash at block {name} is not that of the blocks below it",
+                    f"the chain hash at block {name} does not match the blocks up to it",
                     name,
                     block.block_hash,
                 )

@@ -15,14 +15,14 @@ def check(evidence: Evidence) -> Judgement:
     if findings:
         return violated(NAME, "an idle agent held a completed block that was not in its chain", findings)
     if not evidence.exports:
-        return Judgement(NAME, "not applicable", "there is no export to look at")
+        return Judgement(NAME, "not applicable", "the run has no chain exports")
     busy = [agent_id for agent_id, export in evidence.exports.items() if not export.idle]
     if busy:
         return Judgement(
             NAME, "not applicable", f"{agents(busy)} {'was' if len(busy) == 1 else 'were'} not idle at the end"
         )
     if evidence.missing:
-        return Judgement(NAME, "not applicable", f"there is no export of {agents(evidence.missing)}")
+        return Judgement(NAME, "not applicable", f"the export of {agents(evidence.missing)} is missing")
     if unknown := evidence.unknown_word("operation"):
         return Judgement(NAME, "not applicable", unknown)
     looked = "at the end and after every traced step" if evidence.traces else "at the end"
@@ -42,7 +42,7 @@ def _in_exports(evidence: Evidence) -> list[Finding]:
             findings.append(
                 Finding(
                     agent_id,
-                    f"idle at export, and block {evidence.name(block_hash)} is not in its chain",
+                    f"idle at the export, but its completed block {evidence.name(block_hash)} is not in its chain",
                     evidence.name(block_hash),
                     block_hash,
                 )

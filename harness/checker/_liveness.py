@@ -29,18 +29,18 @@ def check(evidence: Evidence) -> Judgement:
 
 def _why_unknown(evidence: Evidence) -> str | None:
     if evidence.record is None:
-        return "exports alone do not tell whether the run had come to its end"
+        return "exports do not show whether the run ended normally"
     if evidence.record.outcome != "completed":
-        return f"the run did not come to its end ({evidence.record.outcome})"
+        return f"the run did not end normally ({evidence.record.outcome})"
     if not evidence.exports:
-        return "there is no export to look at"
+        return "the run has no chain exports"
     if evidence.missing:
-        return f"there is no export of {agents(evidence.missing)}"
+        return f"the export of {agents(evidence.missing)} is missing"
     early = [agent_id for agent_id in evidence.switched_off if not evidence.exports[agent_id].idle]
     if early and set(evidence.present) <= set(evidence.switched_off):
         return f"{agents(early)} {'was' if len(early) == 1 else 'were'} switched off before the swarm was idle"
     if evidence.paused_at_end and not evidence.busy:
-        return f"{agents(evidence.paused_at_end)} stood still to the end"
+        return f"{agents(evidence.paused_at_end)} stayed paused to the end"
     return None
 
 
@@ -60,18 +60,20 @@ def _not_finished(evidence: Evidence) -> str:
     still = f"{recurring_cycles.named(evidence.busy)} {'were' if len(evidence.busy) > 1 else 'was'} not idle"
     at = "" if evidence.ended_at_s is None else f" when the run ended at {evidence.ended_at_s:.0f} s"
     connected = evidence.connected_since_s is not None
-    conditions = "" if connected else f", not fully connected ({evidence.network_at_end or 'conditions not on record'})"
+    conditions = (
+        "" if connected else f", not fully connected ({evidence.network_at_end or 'network conditions not recorded'})"
+    )
     return f"{still}{at}{conditions}; {_needed(evidence)}"
 
 
 def _needed(evidence: Evidence) -> str:
     """How long it would still have taken, as far as anything tells: agents commit as fast as since the last block."""
     waiting = sum(len(export.blocks_to_be_committed) for export in evidence.exports.values())
-    blocks = f"{waiting} block{'s' if waiting != 1 else ''} waited to be committed"
+    blocks = f"{waiting} block{'s' if waiting != 1 else ''} waited for their commit"
     if not waiting:
-        return "no block waited any more, and nothing tells whether they would ever have been idle"
+        return "no block waited for its commit, and it is unknown whether the agents would have become idle"
     if not evidence.traces or evidence.ended_at_s is None:
-        return f"{blocks}, and without traces nothing tells how fast they were"
+        return f"{blocks}, and without traces the commit rate is unknown"
     runs = [run for trace in evidence.traces.values() for run in trace.runs]
     last_completed_s = max(
         (run.t for run in runs if any(operation == "complete" for operation, _ in run.changes)), default=0.0
@@ -79,10 +81,13 @@ def _needed(evidence: Evidence) -> str:
     committed_at = [run.t for run in runs for operation, _ in run.changes if operation == "deque-"]
     minutes = (evidence.ended_at_s - last_completed_s) / 60
     if not any(at_s > evidence.ended_at_s - 30 * minutes for at_s in committed_at):
-        return f"{blocks}, and none was in the last {minutes / 2:.1f} minutes: nothing tells whether they ever would be"
+        return (
+            f"{blocks}, and none was committed in the last {minutes / 2:.1f} minutes, so it is unknown whether "
+            "they would have been committed"
+        )
     rate = sum(at_s > last_completed_s for at_s in committed_at) / minutes
     more = max(1, round(waiting / rate))
-    return f"{blocks}, at {rate:.2g} a minute: that would have taken {more} minute{'s' if more > 1 else ''} more"
+    return f"{blocks}; at {rate:.2g} commits a minute this would have taken {more} minute{'s' if more > 1 else ''} more"
 
 
 def _left_to_do(evidence: Evidence, agent_id: int) -> str:

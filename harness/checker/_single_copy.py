@@ -26,10 +26,10 @@ def check(evidence: Evidence) -> Judgement:
     if findings:
         return violated(NAME, "an agent held a block twice", findings)
     if not evidence.exports:
-        return Judgement(NAME, "not applicable", "there is no export to look at")
+        return Judgement(NAME, "not applicable", "the run has no chain exports")
     if evidence.missing:
-        return Judgement(NAME, "not applicable", f"there is no export of {agents(evidence.missing)}")
+        return Judgement(NAME, "not applicable", f"the export of {agents(evidence.missing)} is missing")
     if unknown := evidence.unknown_word("operation"):
         return Judgement(NAME, "not applicable", unknown)
     looked = " and after every traced step" if evidence.traces else ""
-    return Judgement(NAME, "holds", f"no block twice in {len(evidence.exports)} exports{looked}")
+    return Judgement(NAME, "holds", f"no duplicate block in {len(evidence.exports)} exports{looked}")

@@ -97,18 +97,20 @@ def _replayed(life: Life, inception: str | None) -> Life:
             if state.reconciling != reconciling:
                 reconciling = state.reconciling
                 if run.handler in HANDLERS and run.handler not in BEGINS_OR_ENDS_A_RECONCILE:
-                    what = f"a reconcile {'begins' if reconciling else 'ends'}, as only Algorithms 7 and 20 can make it"
+                    what = (
+                        f"a reconcile {'begins' if reconciling else 'ends'} in a handler other than Algorithms 7 and 20"
+                    )
                     life.flags.append(Sight(line, run, what))
             if state.idle and reconciling:
                 life.flags.append(Sight(line, run, "idle and reconciling at once"))
         if state.idle and holds.anything_aside and not life.unknown:
             life.idle_too_early.append(holds.idle_too_early(line, run))
         if not now <= run.t <= LATEST_S:
-            life.back_in_time.append(Sight(line, run, f"the clock goes from {now:g} s to {run.t:g} s"))
+            life.back_in_time.append(Sight(line, run, f"the time goes back from {now:g} s to {run.t:g} s"))
         now = run.t
         for message in run.sent:
             if message.seq != sequence:
-                what = f"sent message number {message.seq}, where number {sequence} comes next"
+                what = f"sent message number {message.seq}, but the next number is {sequence}"
                 life.out_of_sequence.append(Sight(line, run, what))
                 sequence = message.seq
             sequence += 1
@@ -146,7 +148,9 @@ class _Holds:
                     life.impossible.append(Sight(line, run, impossible, block))
             else:
                 if run.handler == COMPLETES and block not in self._completed:
-                    life.impossible.append(Sight(line, run, "a block that it has not completed joins the deque", block))
+                    life.impossible.append(
+                        Sight(line, run, "a block joins the deque before the agent completed it", block)
+                    )
                 self._put(operation[:-1], place, block)
                 if self._copies[block] > 1:
                     life.second_copies.append(Sight(line, run, "", block))
@@ -169,7 +173,7 @@ class _Holds:
         elif block in place:
             place.remove(block)
         else:
-            return f"{block[:12]} leaves the {name} without having been there"
+            return f"{block[:12]} leaves the {name}, but was not in it"
         self._copies[block] -= 1
         if name == "chain":
             if block in self._completed:
@@ -178,20 +182,20 @@ class _Holds:
                 del self._chain_hashes[len(place) + 1 :]
         if in_turn or name == "stack":
             return None
-        return f"{block[:12]} leaves the {name}, and is not {'in front' if name == 'deque' else 'on top'}"
+        return f"{block[:12]} leaves the {name}, but is not {'in front' if name == 'deque' else 'on top'}"
 
     def compare(self, line: int, run: HandlerRun) -> bool:
         """Whether the state is what the changes have led to."""
         life, state = self._life, run.state
         if (state.chain, state.deque, state.stack) != (len(life.chain), len(life.deque), len(life.stack)):
             what = (
-                f"says that {_lengths(state.chain, state.deque, state.stack)}, and the changes up to there leave "
+                f"records that {_lengths(state.chain, state.deque, state.stack)}, but its changes so far lead to "
                 f"{_lengths(len(life.chain), len(life.deque), len(life.stack), '')}"
             )
             life.otherwise.append(Sight(line, run, what))
             return False
         if self._chain_hashes is not None and state.top != self._chain_hashes[-1].hex():
-            what = f"the top chain hash {state.top[:12]} is not that of the {state.chain} blocks of the chain (eq. 3.2)"
+            what = f"the top chain hash {state.top[:12]} does not match the {state.chain} blocks of the chain (eq. 3.2)"
             life.another_top.append(Sight(line, run, what, life.chain[-1] if life.chain else None))
             return False
         return True

@@ -67,7 +67,7 @@ def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
         vote_s, reconcile_s = longest(trace, VOTE_TIMERS), longest(trace, RECONCILE_TIMERS)
         for life in trace.lives():
             vote = _Wait("a vote began and did not end", vote_s)
-            reconcile = _Wait("a reconcile did not go on", reconcile_s)
+            reconcile = _Wait("a reconcile did not continue", reconcile_s)
             yield from _in_life(evidence, agent_id, life, vote, reconcile)
         whole = agent_id in evidence.exports and not trace.problem
         if whole and (ended_at_s := evidence.end_of(agent_id)) is not None:

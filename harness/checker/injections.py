@@ -99,9 +99,9 @@ def in_words(injection: RogueInjection) -> str:
     if len(branches) > BRANCHES_NAMED:
         done.append(f"and {sum(count for _, count in branches[BRANCHES_NAMED:])} more")
     of_them = [f"{sum(injection.refused.values())} of them malformed"] if injection.refused else []
-    of_them += [f"{injection.untraced} not told from their originals"] if injection.untraced else []
+    of_them += [f"{injection.untraced} indistinguishable from their originals"] if injection.untraced else []
     if unhandled := sum(of.unhandled or 0 for of in injection.messages):
-        done.append(f"{unhandled} handled by nobody")
+        done.append(f"{unhandled} handled by no agent")
     counts = "; ".join([f"{injection.sent} sent", *of_them, *([", ".join(done)] if done else [])])
     return f"{injection.what} at {injection.at_s:g} s, {injection.detail}: {counts}"
 
@@ -109,7 +109,9 @@ def in_words(injection: RogueInjection) -> str:
 def done_with(messages: InjectedMessages) -> str:
     """What the agents did: "held already 4, committed 1"."""
     done = [f"{branch} {count}" for branch, count in messages.handled.items()]
-    return ", ".join([*done, *([f"{messages.unhandled} handled by nobody"] if messages.unhandled else [])]) or "unknown"
+    return (
+        ", ".join([*done, *([f"{messages.unhandled} handled by no agent"] if messages.unhandled else [])]) or "unknown"
+    )
 
 
 def _take_down(line: _Line, tally: _Tally, copies: dict[_Key, list[tuple[float, int]]], *, secured: bool) -> None:

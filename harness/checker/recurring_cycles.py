@@ -181,17 +181,17 @@ def _waits(evidence: Evidence, rounds: dict[int, _Round], period_s: float) -> It
 def in_short(cycle: Cycle) -> str:
     """Who never finishes, and since when."""
     many = len(cycle.agents) > 1
-    goes = f"go{'' if many else 'es'} round in circles" if cycle.period_s is not None else f"hang{'' if many else 's'}"
-    return f"{named(cycle.agents)} {goes} since {cycle.since_s:.0f} s"
+    goes = "repeated the same cycle" if cycle.period_s is not None else "hung"
+    return f"{named(cycle.agents)} {'have' if many else 'has'} {goes} since {cycle.since_s:.0f} s"
 
 
 def in_words(cycle: Cycle) -> str:
     """Who goes round since when, what shows it, and who waits for whom."""
     if cycle.period_s is None:
-        return f"{in_short(cycle)}: not idle, and no timer runs that would end that"
+        return f"{in_short(cycle)}: not idle, and no running timer can change this"
     every = f"every {cycle.period_s:.4g} s"
     shown = (
-        f"the global state recurs {every}, and nothing is left to chance"
+        f"the global state recurs {every}, and no step depends on chance"
         if cycle.proven
         else f"the same handler runs follow each other {every}, {cycle.periods} times in a row"
     )
@@ -202,7 +202,7 @@ def _waits_in_words(waits: Sequence[CycleWait]) -> Iterator[str]:
     silent = {wait.agent_id: tuple(wait.for_agents) for wait in waits if wait.for_agents}
     refused_by = {wait.agent_id: tuple(wait.refused_by) for wait in waits if wait.refused_by}
     if _each_other(silent):
-        yield f"{named(silent)} ask each other in vain, for whoever reconciles answers nobody"
+        yield f"{named(silent)} ask each other in vain, because an agent that reconciles does not answer"
     else:
         for peers, alike in _alike(silent):
             yield f"{named(alike)} ask{'s' if len(alike) == 1 else ''} {named(peers)} in vain"
@@ -245,7 +245,7 @@ def _round_in_words(cycle: Cycle, agent_id: int) -> str:
     """From what follows the longest pause on, so that those that do the same one after another are told alike."""
     steps = [step for step in cycle.steps if step.agent_id == agent_id]
     if not steps or cycle.period_s is None:
-        return f"not idle, and has done nothing since {cycle.since_s:.0f} s"
+        return f"not idle, and inactive since {cycle.since_s:.0f} s"
     before = [steps[-1].after_s - cycle.period_s, *(step.after_s for step in steps[:-1])]
     pauses = [step.after_s - at_s for step, at_s in zip(steps, before, strict=True)]
     first = pauses.index(max(pauses))
@@ -255,7 +255,7 @@ def _round_in_words(cycle: Cycle, agent_id: int) -> str:
         if number > first:
             words += f", {_pause(pause_s)} later " if pause_s >= SHORTEST_PAUSE_S else ", "
         words += step.handler + (f" ({step.branch})" if step.branch else "")
-    return f"{words}; {_pause(pauses[first])} later it begins anew"
+    return f"{words}; {_pause(pauses[first])} later it starts again"
 
 
 def _pause(pause_s: float) -> str:

@@ -138,7 +138,7 @@ def in_words(survived: Survival) -> list[str]:
     if survived.losses and survived.gone is not None and survived.completed is not None:
         sentences.append(f"at the end {_of(survived.gone, survived.completed)} {_is(survived.gone)} gone")
     elif survived.losses:
-        sentences.append("at the end nobody knows how many completed blocks are gone")
+        sentences.append("at the end the number of lost completed blocks is unknown")
     if survived.before_final_reconcile is not None:
         sentences.append(f"before the final reconcile {_least_held_in_words(survived.before_final_reconcile)}")
     if survived.at_end is not None:
@@ -150,7 +150,7 @@ def _loss_in_words(loss: Loss) -> str:
     alone = len(loss.vehicles) == 1
     sentence = f"at {loss.at_s:.0f} s {_vehicles(loss.vehicles)} {'was' if alone else 'were'} lost ({loss.what})"
     if loss.completed is None or loss.gone is None:
-        return f"{sentence}; the traces do not tell what was where"
+        return f"{sentence}; the traces do not show which blocks were lost"
     return f"{sentence}, and with {'it' if alone else 'them'} {_of(loss.gone, loss.completed)}"
 
 
@@ -158,7 +158,7 @@ def _least_held_in_words(least: LeastHeld) -> str:
     if len(least.holders) == least.vehicles:
         what = "the block is" if least.of == 1 else f"all {least.of} blocks are"
         return f"{what} on all {least.vehicles} vehicles"
-    also = f", and {least.blocks} of {least.of} blocks are on no more vehicles than that" if least.blocks > 1 else ""
+    also = f", and {least.blocks} of {least.of} blocks are on as few vehicles" if least.blocks > 1 else ""
     losing = f"losing {_vehicles(least.holders)} would lose block {least.block}{also}"
     bearable = len(least.holders) - 1
     if not bearable:

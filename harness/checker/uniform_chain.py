@@ -37,9 +37,12 @@ def check(evidence: Evidence) -> Judgement:
         chain = chains[agent_id]
         shared = common_prefix([chain, most_common])
         parts = chain[shared] if shared < len(chain) else None
-        detail = f"reconciled while fully connected, and still parts from the most common chain after {shared} blocks"
+        detail = (
+            "reconciled while the system was fully connected, but its chain differs from the most common chain "
+            f"after {shared} blocks"
+        )
         findings.append(Finding(agent_id, detail, evidence.name(parts) if parts else None, parts))
-    return violated(NAME, "an agent that had the chance to reconcile holds another chain", findings)
+    return violated(NAME, "an agent that had the chance to reconcile holds a different chain", findings)
 
 
 def common_prefix(chains: list[tuple[str, ...]]) -> int:

@@ -63,7 +63,7 @@ def roster_of(text: str) -> int | list[int]:
     """As a scenario has it: a number of agents, or their IDs. Raises ScenarioError."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isascii() and part.isdecimal() and len(part) < 10 for part in parts):
-        raise ScenarioError(f"`--agents` is {text!r}: it should be a number of agents, or IDs as 10,28,32")
+        raise ScenarioError(f"`--agents` is {text!r}: use a number of agents, or IDs such as 10,28,32")
     return int(parts[0]) if len(parts) == 1 else [int(part) for part in parts]
 
 
@@ -71,7 +71,7 @@ def refuse_existing(paths: Iterable[Path]) -> None:
     """Raises RunDirectoryError if one of them is there already: before work begins that would be for nothing."""
     for path in paths:
         if path.exists():
-            raise RunDirectoryError(f"{path} exists: choose another file, nothing is overwritten")
+            raise RunDirectoryError(f"{path} exists: choose another file; existing files are not overwritten")
 
 
 def write_new(path: Path, parts: Iterable[str]) -> None:
@@ -79,9 +79,9 @@ def write_new(path: Path, parts: Iterable[str]) -> None:
     try:
         file = path.open("x", encoding="utf-8", newline="")
     except FileExistsError:
-        raise RunDirectoryError(f"{path} exists: choose another file, nothing is overwritten") from None
+        raise RunDirectoryError(f"{path} exists: choose another file; existing files are not overwritten") from None
     except OSError as error:
-        raise RunDirectoryError(f"{path} cannot be made: {error.strerror}; choose another file") from None
+        raise RunDirectoryError(f"{path} cannot be created: {error.strerror}; choose another file") from None
     try:
         with file:
             file.writelines(parts)
@@ -99,11 +99,11 @@ def newly(path: Path) -> Iterator[None]:
     """
     refuse_existing([path])
     if not path.absolute().parent.is_dir():
-        raise RunDirectoryError(f"{path} cannot be made: its directory is not there; choose another file")
+        raise RunDirectoryError(f"{path} cannot be created: its directory does not exist; choose another file")
     try:
         yield
     except FileExistsError:
-        raise RunDirectoryError(f"{path} exists: choose another file, nothing is overwritten") from None
+        raise RunDirectoryError(f"{path} exists: choose another file; existing files are not overwritten") from None
     except BaseException as error:
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)

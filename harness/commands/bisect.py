@@ -111,12 +111,18 @@ def bisect_command(
     console = Console(stderr=as_json, highlight=False)
     if once:
         if good is not None:
-            raise MistakenError("--good is for a search, and --once tries one state of the code: leave one of them out")
+            raise MistakenError(
+                "--good and --once exclude each other: --good starts a search, --once tries one state of the code"
+            )
         _try_once(console, asked, repository.resolve(), expect, out, as_json)
     elif good is None:
-        raise typer.BadParameter("name a commit with the expected outcome by --good, or try one state by --once")
+        raise typer.BadParameter(
+            "bisect needs a commit with the expected outcome (--good), or --once to try one state of the code"
+        )
     elif expect is not None or out is not None or len(asked.commands) > 1:
-        raise typer.BadParameter("--expect, --out and several --agent-command are for --once: leave them out")
+        raise typer.BadParameter(
+            "--expect, --out and several --agent-command need --once: add --once, or leave them out"
+        )
     else:
         _search(console, asked, repository.resolve(), good, bad, as_json)
 
@@ -174,7 +180,9 @@ def _try_once(
                 console.print(Text(f"{command or code}: {outcome.sentence}"), soft_wrap=True)
                 outcomes.append(outcome)
     except CannotBeTriedError as error:
-        complain(f"{code} cannot be tried: {error}; --repository names another directory, {ROOT} is the installed one")
+        complain(
+            f"{code} cannot be tried: {error}; name the repository with --repository (the installed code is in {ROOT})"
+        )
         raise typer.Exit(CANNOT_BE_TRIED) from None
     except InterruptedRunError:
         raise
@@ -230,7 +238,7 @@ def _show(console: Console, found: Found, good: str, bad: str) -> None:
         run = found.parting.agents[found.parting.first].run
         assert run is not None, "it is what makes it the first"
         where = " and ".join(f"{step.handler} ({step.branch})" if step else "nothing more" for step in (run.a, run.b))
-        lines.append(f"the runs part first at {run.at_s:.3f} s, with agent {found.parting.first}: {where}")
+        lines.append(f"the runs differ first at {run.at_s:.3f} s, at agent {found.parting.first}: {where}")
     for line in lines:
         console.print(Text(line), soft_wrap=True)
 

@@ -50,14 +50,14 @@ def chain_command(
 
 def _write_maps(made: list[Track], shown: logbook.Logbook, geojson_file: Path | None, kml_file: Path | None) -> None:
     if not made:
-        why = "the events are not those of vehicles, and no track is on record"
+        why = "the events are not of vehicles, and the run has no recorded tracks"
         if shown.telemetry:
             why = (
-                "they are sealed: give the depot's key by --depot-key"
+                "the positions are sealed: give the depot's key with --depot-key"
                 if shown.event_data.is_closed
-                else "no vehicle logged one"
+                else "no vehicle logged a position"
             )
-        raise ExportError(f"there is no position in these chains ({why}), so there is no map")
+        raise ExportError(f"these chains hold no positions, so there is no map: {why}")
     if geojson_file is not None:
         write_new(geojson_file, [json.dumps(geojson(made), ensure_ascii=False) + "\n"])
     if kml_file is not None:

@@ -63,17 +63,22 @@ def conformance_command(
     """
     refuse_existing(path for path in (junit, keep, write) if path is not None)
     if only is not None and only not in HANDLERS and only not in map(str, TITLES):
-        raise ConformanceRequestError(f"--only {only[:60]}: there are Algorithms 1 to 20, by number or by handler")
+        raise ConformanceRequestError(
+            f"--only {only[:60]}: no such Algorithm; give a number from 1 to 20 or the name of a handler"
+        )
     if write is not None:
         write_new(write, to_lines(generate(only)))
         return
     if matrix is not None:
         if command:
-            raise ConformanceRequestError("either --matrix with a file of agents, or one agent's command")
+            raise ConformanceRequestError("--matrix and the command of one agent exclude each other: give one of them")
         refuse_existing([page])
         raise typer.Exit(_all_of(read_agents(matrix), only, page, virtual=virtual))
     if not command:
-        raise ConformanceRequestError("which agent? `ucp-harness conformance -- python3 -m ucp.node` tests ours")
+        raise ConformanceRequestError(
+            "the command of the agent is missing: for example, `ucp-harness conformance -- "
+            "python3 -m ucp.node` tests the harness's own agent"
+        )
     console = Console(stderr=as_json, highlight=False)
     place = keep or Path("conformance-failures")
     with TemporaryDirectory(prefix="ucp-conformance-") as scratch, terminated_is_interrupted(), progress() as told:
@@ -86,7 +91,7 @@ def conformance_command(
     else:
         console.print(render(results), soft_wrap=True)
     if results.interrupted:
-        complain(f"interrupted; until then {summary(results)}")
+        complain(f"interrupted; results so far: {summary(results)}")
     raise typer.Exit(results.exit_status)
 
 

@@ -59,9 +59,11 @@ def consolidate_command(
     """
     refuse_existing(path for path in (out, html_file, kml_file, geojson_file, csv_file) if path is not None)
     if out is not None and out.suffix != RECORD:
-        raise ExportError(f"{out}: the record is a *{RECORD} file; other forms have options of their own, as --kml")
+        raise ExportError(
+            f"{out}: the name of the record must end in {RECORD}; other formats have their own options, such as --kml"
+        )
     if final_reconcile and out is None:
-        raise ExportError("--reconcile puts the exports beside the record: say where that is by -o NAME.jsonl")
+        raise ExportError("--reconcile writes the exports next to the record: name the record with -o NAME.jsonl")
     record = consolidate(came_home(paths), depot_of(depot_key))
     reconciliation = _reconcile(record, out.with_suffix(".reconciled")) if final_reconcile and out is not None else None
     reconciled = reconciliation.line if reconciliation else None
@@ -76,7 +78,7 @@ def consolidate_command(
     for sentence in findings[:MOST_TOLD]:
         complain(sentence)
     if len(findings) > MOST_TOLD:
-        complain(f"and {len(findings) - MOST_TOLD} findings more, all of which are in the record's header")
+        complain(f"and {len(findings) - MOST_TOLD} more findings; the header of the record lists all of them")
     if findings or (reconciled is not None and not reconciled.uniform):
         raise typer.Exit(FINDING)
 
@@ -114,7 +116,7 @@ def _written(
 
 def _maps(tracks: list[Track], forms: dict[Path | None, Callable[[Iterable[Track]], str]]) -> Iterator[str]:
     if not tracks:
-        raise ExportError("no vehicle logged a position, so there is no map; leave --kml and --geojson out")
+        raise ExportError("no vehicle logged a position, so there is no map: leave out --kml and --geojson")
     for path, form in forms.items():
         if path is not None:
             write_new(path, [form(tracks)])

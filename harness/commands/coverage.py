@@ -40,11 +40,16 @@ def coverage_command(
     for path in runs:
         evidence = checker.gather(RunArchive(path))
         if not evidence.traces:
-            raise RunDirectoryError(f"{path} has no traces, and without them nobody knows what agents came to")
+            raise RunDirectoryError(
+                f"{path} has no traces, and the coverage is computed from traces: name a run directory with traces"
+            )
         for trace in evidence.traces.values():
             its = _that_matter(trace.header.settings)
             if settings is not None and its != settings:
-                raise RunDirectoryError(f"{path} was played with other settings: ask about runs of one kind at a time")
+                raise RunDirectoryError(
+                    f"{path} was played with other settings than the runs before it: measure the "
+                    "coverage of runs with equal settings"
+                )
             settings = its
         reached.add(coverage.reached_in(evidence))
     chosen = tuple(name for name in faults.split(",") if name)
@@ -57,7 +62,7 @@ def coverage_command(
         for line in coverage.in_words(reached, there):
             console.print(line, highlight=False, soft_wrap=True, markup=False)
     if not reached.steps:
-        complain("no step of any agent could be followed")
+        complain("no trace has a step that could be followed, so nothing was measured")
         raise typer.Exit(WRONG_REQUEST)
 
 
@@ -88,7 +93,7 @@ def validate_command(
     installed. 130: interrupted; the result covers the runs before.
     """
     if not runs and scenario is None:
-        raise typer.BadParameter("name runs, or a --scenario to play")
+        raise typer.BadParameter("validate needs recorded runs, or a --scenario to play")
     those = specification.recorded(runs or ())
     count = len(runs or ())
     if scenario is not None:

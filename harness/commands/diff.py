@@ -17,7 +17,7 @@ from ucp.trigger import MessageTrigger, Trigger
 
 DIFFERENT = 1
 VALUE_CHARACTERS = 60
-OURS = "all agents ran the harness's own"
+OURS = "all agents ran the harness's own program"
 
 
 def diff_command(
@@ -52,7 +52,8 @@ def _lines(difference: Difference) -> Iterator[str]:
         case "identical":
             yield f"identical to the last byte: {runs}"
         case "same but for times":
-            yield f"the same: {runs}; what differs is not compared: times, hashes that cover them, tallies or states"
+            differences = "times, in hashes that cover times, in tallies or in states"
+            yield f"the same: {runs}; they differ only in {differences}, which are not compared"
         case _:
             yield from _differences(difference)
 
@@ -71,15 +72,15 @@ def _differences(difference: Difference) -> Iterator[str]:
     if first is not None:
         parting = difference.agents[first].run
         assert parting is not None, "it is what makes it the first"
-        yield f"the runs part first at {parting.at_s:.3f} s, with agent {first}"
+        yield f"the runs differ first at {parting.at_s:.3f} s, at agent {first}"
     for agent_id, agent_difference in difference.agents.items():
         yield f"agent {agent_id}: {'the same' if agent_difference == AgentDifference(None, None) else ''}".rstrip()
         if agent_difference.run is not None:
-            yield f"  parts at handler run {agent_difference.run.number}"
+            yield f"  differs from handler run {agent_difference.run.number} on"
             yield from (f"    {where}  {words}" for where, words in zip("AB", _both(agent_difference.run), strict=True))
         if agent_difference.chain is not None:
             a, b = (block or "not there" for block in (agent_difference.chain.a, agent_difference.chain.b))
-            yield f"  block {agent_difference.chain.place} of its chain is {a} in A, {b} in B"
+            yield f"  block {agent_difference.chain.place} of its chain: {a} in A, {b} in B"
 
 
 def _both(parting: Parting) -> tuple[str, str]:

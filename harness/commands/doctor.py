@@ -76,6 +76,6 @@ def clean_command() -> None:
     for name in cleaned.removed:
         console.print(f"removed {name}", highlight=False, soft_wrap=True)
     if not cleaned.removed:
-        console.print("there was nothing to remove", highlight=False)
+        console.print("no containers to remove", highlight=False)
     if cleaned.still:
-        console.print(f"{len(cleaned.still)} containers belong to runs that go on", highlight=False, style="dim")
+        console.print(f"{len(cleaned.still)} containers belong to active runs and stay", highlight=False, style="dim")

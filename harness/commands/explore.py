@@ -73,11 +73,12 @@ def explore_command(
     if for_time is not None or runs is not None:
         if seeds is not None or out is not None:
             raise typer.BadParameter(
-                "a hunt (--for, --runs) needs no --seeds and no --out: its findings are in --corpus"
+                "--seeds and --out do not apply to a hunt (--for, --runs): leave them out; a hunt writes its findings "
+                "into --corpus"
             )
         _hunt(scenario, secured, first_seed, for_time, runs, corpus, jobs, as_json)
     if corpus is not None or as_json:
-        raise typer.BadParameter("--corpus and --json are for a hunt: add --for TIME or --runs NUMBER")
+        raise typer.BadParameter("--corpus and --json need a hunt: add --for TIME or --runs NUMBER")
     console = Console()
     request, own_seed = _asked(scenario, secured)
     if first_seed is None:

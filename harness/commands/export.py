@@ -36,7 +36,7 @@ def export_command(
     formats = ((mcap, "messages", _mcap), (perfetto, "events", _perfetto), (rosbag, "messages", _rosbag))
     asked = [(path, counted, writer) for path, counted, writer in formats if path is not None]
     if not asked:
-        raise ExportError("say what to write: --mcap FILE, --perfetto FILE or --rosbag DIR")
+        raise ExportError("no output is named: add --mcap FILE, --perfetto FILE or --rosbag DIR")
     refuse_existing([path for path, _, _ in asked])
     writers = [(path, counted, writer()) for path, counted, writer in asked]
     recording = Recording(run, depot_of(depot_key))

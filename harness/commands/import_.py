@@ -43,10 +43,10 @@ def import_command(
     import.json name the sources that are left out.
     """
     if adapter is not None and format_ is not None:
-        raise FieldError("--adapter and --format are two ways to say the same: give one of them")
+        raise FieldError("--adapter and --format exclude each other: give one of them")
     own = [load_adapter(adapter)] if adapter else []
     adapters = [ADAPTERS[format_]()] if format_ else [*own, *(kind() for kind in ADAPTERS.values())]
-    with Console(stderr=True).status("looking for files") as status:
+    with Console(stderr=True).status("searching for files") as status:
         record = bring_in(sources, adapters, out, status.update, by_content=format_ is None)
     for remark in (*record.left_out, *record.remarks):
         complain(remark.sentence)

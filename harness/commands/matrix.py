@@ -72,7 +72,7 @@ def matrix_command(
             complain(f"{earlier.said_left_out}; {earlier.left_out[0]}")
     matrix_outputs.write(finished, directory, earlier)
     if finished.record.outcome == "interrupted":
-        complain(f"the same command with --out {directory} goes on from here")
+        complain(f"to continue, repeat the command with --out {directory}")
     if finished.record.tried is not None and not as_json:
         print_lines(matrix_summary.tried_in_words(finished.record.tried))
     end_sweep(finished.record, None if as_json else matrix_table.render(finished.record), directory / "report.html")

@@ -81,7 +81,10 @@ def new_command(
         depot = home.public().depot
         data = data if depot is None else seal_to(data, depot)
     if asked.has_wrong_agents:
-        complain(f"{scenario}: its quirks ({', '.join(in_words(asked.quirks))}) are left out: a mission asks for none")
+        complain(
+            f"{scenario}: its quirks ({', '.join(in_words(asked.quirks))}) are left out, because mission files "
+            "have no quirks"
+        )
     plan = Plan(
         asked,
         data,
@@ -118,7 +121,7 @@ def verify_command(
         if comparison.verdict == "same":
             print_lines([comparison.in_words()])
     if comparison.verdict == "nothing usable":
-        complain("none of these files says of which mission it is: give mission files, chain exports or traces")
+        complain("none of these files names its mission: give mission files, chain exports or traces")
         raise typer.Exit(WRONG_REQUEST)
     if comparison.verdict == "differ":
         raise typer.Exit(DIFFERENT)
@@ -127,7 +130,7 @@ def verify_command(
 def _scenario(path: Path | None, agents: str | None, name: str | None) -> Scenario:
     """What is asked for, as a scenario. Raises ScenarioError, MissionFileError."""
     if path is None and agents is None:
-        raise MissionFileError("whose mission is it? Give the roster by --agents 10,28,32, or a --scenario")
+        raise MissionFileError("the roster is missing: give it with --agents 10,28,32, or name a --scenario")
     if path is None:
         return parse({"name": name or "mission", "agents": roster_of(agents or "")})
     asked = load_scenario(path)
@@ -172,7 +175,7 @@ def _subnet(text: str | None) -> ipaddress.IPv4Network | None:
 
 def _agent_id(text: str) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) < 10):
-        raise MissionFileError(f"`--address` names vehicle {text!r}: it should be an ID, as 7=10.1.0.7")
+        raise MissionFileError(f"`--address` names vehicle {text!r}: use ID=ADDRESS, such as 7=10.1.0.7")
     return int(text)
 
 
@@ -181,7 +184,7 @@ def _texts(option: str, pairs: list[str] | None) -> dict[str, str]:
     for pair in pairs or ():
         key, equals, text = pair.partition("=")
         if not equals or not key:
-            raise MissionFileError(f"`{option}` is {pair!r}: it should be KEY=VALUE")
+            raise MissionFileError(f"`{option}` is {pair!r}: use KEY=VALUE")
         texts[key] = text
     return texts
 

@@ -116,7 +116,10 @@ def prove_command(
         raise BoundsError(f"--clocks must be one of {', '.join(CLOCKS)}, not {clocks!r}")
     quirks = _pairs("--quirk", quirk)
     if lies is not None and (captured is None or network == "any"):
-        raise BoundsError("--lies is for --captured, and not for --network any, where any number is heard")
+        raise BoundsError(
+            "--lies needs --captured, and does not apply to --network any, where the number of lies is "
+            "unlimited: leave it out"
+        )
     if edited := edited_files():
         complain(f"state reduction is disabled: it assumes the released core, and {', '.join(edited)} was edited")
     bounds = Bounds(
@@ -167,7 +170,7 @@ def _pairs(option: str, texts: list[str] | None) -> dict[str, Any]:
     for text in texts or ():
         name, equals, value = text.partition("=")
         if not equals:
-            raise BoundsError(f"{option} {text!r} should be a name, =, and a value")
+            raise BoundsError(f"{option} {text!r} is not of the form NAME=VALUE")
         try:
             pairs[name] = yaml.safe_load(value)
         except yaml.YAMLError:
@@ -177,8 +180,8 @@ def _pairs(option: str, texts: list[str] | None) -> dict[str, Any]:
 
 def _how_far(progress: Progress) -> str:
     if progress.asked is not None:
-        return f"{progress.states:,} states, all looked at; now asked: {progress.asked}"
+        return f"{progress.states:,} states, all explored; now checking: {progress.asked}"
     frontier = progress.states - progress.looked_at
     rate = progress.transitions / max(progress.seconds, 0.001)
-    known = f"{progress.states:,} states, {frontier:,} of them not looked at"
+    known = f"{progress.states:,} states, {frontier:,} of them not explored"
     return f"{known}, {progress.depth} instants, {rate:,.0f} transitions/s"

@@ -28,8 +28,8 @@ def reconstruct_command(
     where it fails is printed. 2: nothing is usable.
     """
     if out.exists():
-        raise RunDirectoryError(f"{out} exists: choose another --out, nothing is overwritten")
-    with Console(stderr=True).status("reading what came home") as status:
+        raise RunDirectoryError(f"{out} exists: choose another --out; existing files are not overwritten")
+    with Console(stderr=True).status("reading the records") as status:
         opener, depot = opener_of(bundle), depot_of(depot_key)
         homecoming = sort_out(paths, opener)
         flight = homecoming.largest()

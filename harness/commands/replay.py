@@ -43,11 +43,11 @@ def replay_command(
     Exit status 0: the agent did the same as the core. 1: it did not. 2: no step could be replayed.
     """
     if until is not None and not until >= 0:
-        raise typer.BadParameter(f"--until {until:g} is no mission second: it is 0 or more")
+        raise typer.BadParameter(f"--until {until:g} is not a mission second: use a number from 0 on")
     if as_json and (step or breaks):
-        raise typer.BadParameter("--json is for programs, which play the whole record: leave out --step and --break")
+        raise typer.BadParameter("--json prints the result of the whole record: leave out --step and --break")
     if debug and not breaks:
-        raise typer.BadParameter("--debug calls the debugger at each --break: name one, such as --break 812")
+        raise typer.BadParameter("--debug calls the debugger at each --break: add one, such as --break 812")
     console = Console(highlight=False)
     try:
         if step or breaks:

@@ -34,7 +34,7 @@ def report_command(run: Annotated[Path, typer.Argument(help="Run directory.")]) 
     try:
         page = report.write(left)
     except RunDirectoryError as error:
-        raise MachineError(f"{error}: make room or give yourself the right to write there") from None
+        raise MachineError(f"{error}: free some disk space, or make the directory writable") from None
     for sentence in _missing(left):
         complain(sentence)
     sys.stdout.write(f"{page}\n")
@@ -43,9 +43,9 @@ def report_command(run: Annotated[Path, typer.Argument(help="Run directory.")]) 
 def _missing(left: report.ReportSource) -> Iterator[str]:
     """A sentence for everything that a whole run would have left and this one has not."""
     if left.archive.recorded and left.record.outcome == "running":
-        yield "the run has not recorded its end: it is still going on, or it was killed"
+        yield "the end of the run is not recorded: the run is still active, or it was killed"
     if not left.record.characteristics:
-        yield f"there is no verdict: `ucp-harness check {left.run_dir}` judges what there is"
+        yield f"the run has no verdict: `ucp-harness check {left.run_dir}` judges the files that exist"
     yield from left.chains_missing
     yield from left.files_missing
 

@@ -105,13 +105,22 @@ def run_command(
         return
     if kernel is Kernel.uml:
         if by_hand:
-            raise ScenarioError("nobody is heard inside User Mode Linux: leave out --kernel uml, or --by-hand")
+            raise ScenarioError(
+                "--by-hand does not work with --kernel uml, because commands do not reach a run "
+                "inside User Mode Linux: leave out one of them"
+            )
         if watch:
-            raise ScenarioError("no page looks into User Mode Linux: leave out --kernel uml, or --watch")
+            raise ScenarioError(
+                "--watch does not work with --kernel uml, because the page cannot connect to a run "
+                "inside User Mode Linux: leave out one of them"
+            )
         if why := BACKENDS[backend].not_in_uml:
             raise HarnessError(why)
         if request.gcs:
-            raise ScenarioError("no ground station reaches into User Mode Linux: leave out --kernel uml, or --gcs")
+            raise ScenarioError(
+                "--gcs does not work with --kernel uml, because datagrams do not reach a ground "
+                "station outside User Mode Linux: leave out one of them"
+            )
         options = {"--seed": chosen_seed, "--speedup": speedup, "--vehicles": vehicles}
         given = [f"{option}={value}" for option, value in options.items() if value is not None]
         given += [f"{OUT}{directory.resolve()}"]
@@ -121,7 +130,7 @@ def run_command(
         raise typer.Exit(run_inside(["run", *given, "--", str(scenario)]))
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
     if wrong := ", ".join(in_words(request.quirks)):
-        console.print(f"wrong on purpose: {wrong}", style="dim", highlight=False)
+        console.print(f"deliberate mistakes: {wrong}", style="dim", highlight=False)
     if remark := BACKENDS[backend].remark(request):
         console.print(remark, style="dim")
     virtual = BACKENDS[backend].virtual_time
@@ -143,7 +152,7 @@ def run_command(
             if page.problem is not None:
                 complain(page.problem)
             if is_looked_at and finished.played.outcome != "interrupted":
-                console.print("The page stays until it is closed, or Ctrl-C.", style="dim")
+                console.print("The page stays open until you close it or press Ctrl-C.", style="dim")
                 page.wait()
     raise typer.Exit(finished.exit_status)
 
@@ -178,7 +187,7 @@ def _with_options(
     document: dict[str, Any] = scenario.model_dump()
     if speedup is not None:
         if not 0 < speedup <= 1000:
-            raise typer.BadParameter(f"{speedup:g} is not a speedup: it is more than 0 and at most 1000")
+            raise typer.BadParameter(f"{speedup:g} is not a speedup: use a number above 0 and at most 1000")
         document["speedup"] = speedup
     if vehicles is not None:
         document["vehicles"]["kind"] = vehicles.value
@@ -195,21 +204,23 @@ def _with_options(
 
 def _show_end(console: Console, finished: Run) -> None:
     if finished.played.outcome == "not supported":
-        complain(f"{finished.played.outcome_detail}; nothing is judged")
+        complain(f"{finished.played.outcome_detail}; the run has no verdict")
     elif finished.played.outcome != "completed":
-        complain(f"{finished.played.outcome_detail}; what there was has been exported and checked")
+        complain(
+            f"{finished.played.outcome_detail}; the chains and traces written before that are exported and checked"
+        )
     for error in finished.result.errors:
         complain(error)
     for sentence in finished.played.unmatched_fates:
-        complain(f"{sentence}, so this run does not show what it was meant to")
+        complain(f"{sentence}, so this run differs from its script")
     captured = finished.played.capture or {}
     if lacks := gaps({vehicle: CapturedFrames.model_validate(frames) for vehicle, frames in captured.items()}):
         complain(f"{lacks}: choose a smaller --speedup")
     station = finished.record.ground_station
     if station is not None and station.dropped:
         complain(
-            f"{station.dropped} datagrams of the ground station at {station.address} were dropped: they were too many, "
-            "or damaged"
+            f"{station.dropped} datagrams of the ground station at {station.address} were dropped, because they were "
+            "damaged or arrived too fast"
         )
     slow = [
         f"{vehicle} ({record['real_time_factor']:.2f})"
@@ -220,7 +231,7 @@ def _show_end(console: Console, finished: Run) -> None:
         complain(f"vehicles {', '.join(slow)} did not keep up with the clock: choose a smaller --speedup")
     late = finished.timer_lag
     if late is not None and not late.tolerable:
-        lateness = f"one in twenty of the agents' vote timers fired {late.late_s:.1f} or more mission seconds late"
+        lateness = f"one in twenty vote timers expired {late.late_s:.1f} or more mission seconds late"
         complain(f"this machine was too slow: {lateness} (set to {late.asked_s:g} s): choose a smaller --speedup")
     wall = f"{finished.wall_s:.0f}" if finished.wall_s >= 10 else f"{finished.wall_s:.1f}"
     console.print(f"{wall} s; report: {finished.report}", highlight=False, soft_wrap=True)

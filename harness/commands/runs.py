@@ -33,7 +33,7 @@ def runs_command(
     elif as_json:
         print_json([_document(run) for run in runs])
     else:
-        Console().print(_table(runs) if runs else f"there are no runs in {folder}", highlight=False)
+        Console().print(_table(runs) if runs else f"{folder} has no runs", highlight=False)
     for run in runs:
         if run.problem:
             complain(run.problem)
@@ -41,10 +41,10 @@ def runs_command(
 
 def _open(runs: list[PastRun], number: int, folder: Path) -> None:
     if number > len(runs):
-        raise RunDirectoryError(f"there are {len(runs)} runs in {folder}, and no {number}")
+        raise RunDirectoryError(f"{folder} has {len(runs)} runs, and no run {number}")
     report = runs[number - 1].report
     if not report.exists():
-        raise RunDirectoryError(f"{report} is not there: `ucp-harness report {report.parent}` writes it")
+        raise RunDirectoryError(f"{report} does not exist: `ucp-harness report {report.parent}` writes it")
     typer.echo(report)
     webbrowser.open(report.absolute().as_uri())
 

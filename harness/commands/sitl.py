@@ -48,7 +48,7 @@ def install_into_cache(
         with _Bar(console, BINARIES[vehicle]) as bar:
             outcome = install(vehicle, version, os.environ, bar, url)
     except KeyboardInterrupt:
-        raise InterruptedRunError("interrupted; the same command goes on where it stopped") from None
+        raise InterruptedRunError("interrupted; repeat the command to continue") from None
     except RequestError as error:
         raise HarnessError(str(error)) from None
     except VehicleError as error:
@@ -161,7 +161,7 @@ class _Bar:
         self._progress.stop()
 
     def waits(self) -> None:
-        self._progress.console.print("another install is under way: waiting for it to end", highlight=False)
+        self._progress.console.print("waiting for another install to end", highlight=False)
 
     def downloads(self, done: int, total: int) -> None:
         self._progress.update(self._task, completed=done, total=total)

@@ -54,7 +54,7 @@ def tell_command(
             typer.echo(f"{answer['at_s']:.3f} s")
     except OSError:
         raise RunDirectoryError(
-            f"{run}: no run goes on there that can be told anything: start it with `ucp-harness run SCENARIO --by-hand`"
+            f"{run}: no active run here takes commands: start one with `ucp-harness run SCENARIO --by-hand`"
         ) from None
 
 
@@ -69,7 +69,7 @@ def _requests(sentence: str) -> list[dict[str, Any]]:
     except ScenarioError:
         course.timeline.clear()
     if not course.timeline:
-        raise ScenarioError(f"{sentence[:80]!r} is nothing that a run can be told: there are {_WHAT_THERE_IS}")
+        raise ScenarioError(f"{sentence[:80]!r} is not a command: use {_WHAT_THERE_IS}")
     return [
         {"command": "happen", "entry": {key: value for key, value in entry.items() if key != "at_s"}}
         for entry in course.timeline
@@ -77,7 +77,7 @@ def _requests(sentence: str) -> list[dict[str, Any]]:
 
 
 def _show(state: dict[str, Any]) -> None:
-    pace = "as fast as it can" if state["factor"] is None else f"{state['factor']:g} mission seconds a second"
+    pace = "as fast as it can" if state["factor"] is None else f"{state['factor']:g} mission seconds per second"
     typer.echo(f"{state['at_s']:.3f} s, {'paused' if state['paused'] else pace}")
     for entry in state["by_hand"]:
         typer.echo(f"  {in_a_line(entry)}")
@@ -103,9 +103,9 @@ def shell_command(
         for path, vehicles in runs.items():
             typer.echo(f"{path}: vehicles {_listed(vehicles)}")
         for path in inside:
-            typer.echo(f"{path}: in User Mode Linux")
+            typer.echo(f"{path}: inside User Mode Linux")
         if not (runs or inside):
-            complain("no run goes on that can be seen from here")
+            complain("no active runs found")
         return
     directory = run.resolve()
     if directory in inside:
@@ -113,19 +113,19 @@ def shell_command(
         raise typer.Exit(enter(inside[directory], [*asked, *(["--", *command] if command else [])]))
     if directory not in runs:
         raise RunDirectoryError(
-            f"nobody of {run} is to be seen here: its run is over, or has not begun; {_what_runs([*runs, *inside])}"
+            f"{run} has no running vehicles: the run has ended, or has not begun; {_what_runs([*runs, *inside])}"
         )
     vehicles = runs[directory]
     if vehicle is None:
         typer.echo(f"{directory}: vehicles {_listed(vehicles)}")
         return
     if vehicle not in vehicles:
-        raise RunDirectoryError(f"nobody is in vehicle {vehicle} of {run}: there are {_listed(vehicles)}")
+        raise RunDirectoryError(f"vehicle {vehicle} of {run} has no running process: choose one of {_listed(vehicles)}")
     if shutil.which("nsenter") is None:
-        raise MachineError("there is no nsenter here: install util-linux (apt install util-linux)")
+        raise MachineError("nsenter is not installed: install util-linux (apt install util-linux)")
     argv = command or [os.environ.get("SHELL", "/bin/sh")]
     if not command:
-        complain(f"in the network of vehicle {vehicle}; `exit` leaves it, and the run goes on")
+        complain(f"in the network of vehicle {vehicle}; `exit` leaves it, and the run continues")
     way = way_into(vehicles[vehicle])
     os.execvp(way[0], [*way, *argv])  # noqa: S606 (Ctrl-C is the shell's, and so is the exit status)
 
@@ -135,4 +135,4 @@ def _listed(vehicles: dict[int, int]) -> str:
 
 
 def _what_runs(runs: list[Path]) -> str:
-    return "no other does" if not runs else f"there goes on {', '.join(map(str, runs))}"
+    return "no other run is active" if not runs else f"active runs: {', '.join(map(str, runs))}"

@@ -71,7 +71,7 @@ def end_sweep(record: "MatrixRecord", table: RenderableType | None, picture: Pat
         console.print(table)
         console.print(f"{record.wall_s:.0f} s; {picture}", highlight=False, soft_wrap=True)
     if record.outcome == "interrupted":
-        ended = f"the {record.runs} of {record.runs_asked} runs that had ended are in {picture.parent}"
+        ended = f"results of {record.runs} of {record.runs_asked} runs are in {picture.parent}"
         complain(f"interrupted; {ended}")
     raise typer.Exit(record.exit_status)
 

@@ -185,7 +185,7 @@ def _vote(approve: bool) -> Callable[[Model], Message | None]:
 
 for _approve, _word in ((True, "yes"), (False, "no")):
     _message(f"vote {_word}", _vote(_approve), _nobody_yet(_voters), "voting")
-    _message(f"vote {_word} of who has voted", _vote(_approve), _again(_voters), "voting", f"vote {_word}")
+    _message(f"vote {_word} of an agent that has voted", _vote(_approve), _again(_voters), "voting", f"vote {_word}")
     _message(
         f"vote {_word} for an unknown block",
         lambda model, approve=_approve: BlockAddResponse(UNKNOWN, approve, _chain_of_vote(model)),  # type: ignore[misc]
@@ -319,7 +319,7 @@ _message(
 # Chain Contain Response
 
 for _contained, _word in ((True, "yes"), (False, "no")):
-    for _who, _sender in (("", _nobody_yet(_of_phase_1)), (" of who has answered", _again(_of_phase_1))):
+    for _who, _sender in (("", _nobody_yet(_of_phase_1)), (" of an agent that has answered", _again(_of_phase_1))):
         _message(
             f"Chain Contain Response {_word}{_who}",
             lambda model, contained=_contained: ChainContainResponse(_top(model), contained),  # type: ignore[misc]
@@ -405,7 +405,7 @@ for _name, _says in {
     "the block that was named first": _next(_named_block),
 }.items():
     _message(
-        f"Next in Sequence Response of who has answered: {_name}",
+        f"Next in Sequence Response of an agent that has answered: {_name}",
         _says,
         _again(_of_phase_2),
         "phase two",

@@ -48,6 +48,6 @@ async def _play(air: Air, case: ByHand) -> Case:
     except (AgentEndedError, AgentRefusedError) as error:
         return replace(named, verdict="failed", reason=str(error), wrong=(str(error),))
     except (AttributeError, KeyError, LookupError, TypeError, ValueError, OSError) as error:
-        reason = f"what it answered cannot be used: {type(error).__name__}: {error}"
+        reason = f"its answer is not usable: {type(error).__name__}: {error}"
         return replace(named, verdict="failed", reason=reason, wrong=(reason,))
     return named

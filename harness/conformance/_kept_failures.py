@@ -31,8 +31,8 @@ from ucp.messages import PORT, decode
 from ucp.settings import Settings
 
 COMMENT = (
-    "Play it with `ucp-harness run FILE --backend sim`, for an agent that has virtual time.",
-    "Its verdict on every step says where the agent did otherwise than Algorithms 1 to 20.",
+    "Play it with `ucp-harness run FILE --backend sim`, if the agent supports virtual time.",
+    "The verdict on every step shows where the agent deviates from Algorithms 1 to 20.",
 )
 
 

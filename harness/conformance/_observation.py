@@ -56,7 +56,7 @@ def told_datagram(data: bytes, names: Names) -> str:
     try:
         return told(decode(data).message, names)
     except MalformedDatagramError as error:
-        return f"{len(data)} bytes that are no message ({error.reason}): {data[:24].hex()}"
+        return f"{len(data)} bytes that are an invalid message ({error.reason}): {data[:24].hex()}"
 
 
 COMPARED = ("idle", "reconcile_in_progress", "chain", "deque", "stack", "completed", "reconciles", "top_chain_hash")
@@ -132,13 +132,13 @@ def compare(
         sentences += [f"it did not send {told(message, names)}" for message in missing]
         sentences += [f"it sent {told(message, names)}" for message in unexpected[:SHOWN]]
         if not missing and not unexpected:
-            sentences.append("it sent its messages in another order, or one of them more than once")
+            sentences.append("it sent its messages in another order, or sent one of them twice")
     should = model.status()
     misstated = tuple(key for key in COMPARED if key in status and status[key] != should[key])
     sentences += [f"its status says {key} {status[key]!r}, not {should[key]!r}" for key in misstated]
     mistimed = _as_if_ended(model, outcome.sent, came, status) if sentences else None
     if mistimed is not None:
-        sentences.append(f"that is as if its timer {mistimed} had ended already")
+        sentences.append(f"its timer {mistimed} seems to have expired already")
     return Seen(
         pair_of(before, given),
         outcome,

@@ -199,7 +199,7 @@ def walk(variant: Variant, way: tuple[str, ...]) -> tuple[Model, float]:
     model, now = Model(variant.settings), 0.0
     for name in way:
         advanced = advance(model, INPUTS[name], now)
-        assert advanced is not None, f"{name} was there when the way was found"
+        assert advanced is not None, f"{name} was there when the path was found"
         now = advanced[1]
     return model, now
 
@@ -270,7 +270,7 @@ def _too_much(model: Model, before: State, given: Input) -> bool:
         return len(model.state.blocks_to_be_committed) >= MOST_WAITING
     if before.doing != "voting" and "waits behind" in given.name:
         return True
-    if given.tally != before.doing or "of who has" in given.name:
+    if given.tally != before.doing or "of an agent that has" in given.name:
         return False
     return _answers(model, before) >= 1 and (before.doing, before.holds) not in COUNTED_IN
 

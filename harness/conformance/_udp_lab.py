@@ -244,7 +244,7 @@ class Process:
                     reason = f"its control socket did not answer within {START_LIMIT_S:g} s"
                     raise AgentEndedError(f"{reason}: {last_line(self.output)}") from None
                 if self.output.stat().st_size > MAX_OUTPUT_BYTES:
-                    raise AgentEndedError("it prints and prints, and does not answer its control socket") from None
+                    raise AgentEndedError("it prints without end and does not answer its control socket") from None
                 await asyncio.sleep(LOOK_AGAIN_S)
 
     def raise_end(self) -> None:

@@ -139,7 +139,7 @@ class OverUdp(Subject):
         self.ear.drain()
         if self.ear.heard and not isinstance(action, Expire):  # what comes of the input could not be told from that
             heard = self.ear.take()
-            seen = compare(model, given, before, Outcome(()), _data(heard), {}, ["it sent something unasked"])
+            seen = compare(model, given, before, Outcome(()), _data(heard), {}, ["it sent a message without an input"])
             late = self._ended(deadline)
             if late:
                 self.in_step = self._explained(moment, [], heard, await self._status())
@@ -223,7 +223,7 @@ class OverUdp(Subject):
         early_s = until - self.ear.heard[0][0] if self.ear.heard else 0.0
         if early_s > self._pace.early_s:
             early = f"{early_s * self._pace.speedup:.1f} mission seconds"
-            return f"it sent something {early} before its timer {name} ends"
+            return f"it sent a message {early} before its timer {name} expires"
         return None
 
     def _first_heard(self) -> float:
@@ -323,12 +323,12 @@ def log_as(model: Model, action: Log, now: float, waiting: list[Any]) -> tuple[O
     except (MalformedEventsError, binascii.Error, KeyError, TypeError, ValueError):
         return model.feed(action, now, otherwise_us), ["the block in its export is not well-formed"]
     if [event.data for event in events] != [action.data] or events[0].event_id != EVENT_ID:
-        return model.feed(action, now, otherwise_us), ["the block does not hold the event that was logged"]
+        return model.feed(action, now, otherwise_us), ["the block does not contain the logged event"]
     outcome = model.feed(action, now, events[0].timestamp_us)
     if model.state.newest_block_timestamp_us != timestamp_us:
-        return outcome, ["the block's timestamp is not that of its newest event"]
+        return outcome, ["the timestamp of the block differs from that of its newest event"]
     if model.state.blocks_to_be_committed[-1].block_hash.hex() != block_hash:
-        return outcome, ["the block's hash in the export is not that of the block"]
+        return outcome, ["the hash of the block in the export does not match the block"]
     return outcome, []
 
 

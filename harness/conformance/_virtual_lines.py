@@ -55,7 +55,7 @@ class Writer:
 
     def line(self, given: Input) -> Line:
         action = given.make(self.model)
-        assert action is not None, f"{given.name} was there when the way was found"
+        assert action is not None, f"{given.name} was there when the path was found"
         deadline = self.model.agent.next_timer()
         self.now = deadline if isinstance(action, Expire) and deadline is not None else self.now + STEP_S
         timestamp_us = round(self.now * MICROSECONDS)

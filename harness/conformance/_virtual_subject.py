@@ -70,7 +70,7 @@ class Program:
                     start_new_session=True,
                 )
         except OSError as error:
-            raise NoAgentError(f"the agent could not be started: {error.strerror}") from None
+            raise NoAgentError(f"the agent cannot be started: {error.strerror}") from None
         try:
             return await cls._connected(process, errors)
         except BaseException:
@@ -100,13 +100,13 @@ class Program:
                 answer = json.loads(text) if text else None
         except (TimeoutError, OSError, ValueError, RecursionError) as error:
             self.broken = True
-            raise AgentEndedError(f"no answer that can be read: {str(error) or 'it is silent'}") from None
+            raise AgentEndedError(f"no readable answer: {str(error) or 'it is silent'}") from None
         if answer is None:
             self.broken = True
             with suppress(TimeoutError):
                 await asyncio.wait_for(_ended(self._process), GRACE_S)
             if self._process.returncode is None:
-                raise AgentEndedError("it has closed its standard output, and goes on")
+                raise AgentEndedError("it closed its standard output and still runs")
             raise AgentEndedError(f"it ended with status {self._process.returncode}: {last_line(self._errors)}")
         if not isinstance(answer, dict):
             self.broken = True
@@ -199,7 +199,7 @@ class InVirtualTime(Subject):
         except (AgentEndedError, UnsupportedError) as error:
             wrong.append(str(error))
         except (KeyError, TypeError, ValueError):
-            wrong.append("its answer has no list of datagrams in base64 as `sent`")
+            wrong.append("its answer has no `sent`, a list of datagrams in base64")
         if "datagram" in line:
             data = base64.b64decode(line["datagram"])
             self._record.append(Exchange(self._now, False, data, told_datagram(data, names)))
@@ -208,7 +208,7 @@ class InVirtualTime(Subject):
         seen = compare(model, given, before, outcome, sent, status, wrong)
         if _same_instant(ends, should):
             return replace(seen, started=timer)
-        sentence = f"it says that its next timer ends at {ends} s, not at {should} s"
+        sentence = f"according to its answer its next timer expires at {ends} s, not at {should} s"
         told = replace(seen, wrong=(*seen.wrong, sentence))
         if seen.wrong:  # what does something else starts other timers
             return told

@@ -39,12 +39,12 @@ def read_agents(path: Path) -> dict[str, list[str]]:
     form = "`name: [program, argument, ...]` for each agent"
     try:
         if path.stat().st_size > MOST_BYTES:
-            raise AgentsFileError(f"{path} is larger than {MOST_BYTES} bytes: it has to be {form}")
+            raise AgentsFileError(f"{path} is larger than {MOST_BYTES} bytes: it must be {form}")
         document: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise AgentsFileError(f"{path} cannot be read: {error.strerror}") from None
     except (yaml.YAMLError, ValueError, RecursionError):
-        raise AgentsFileError(f"{path} is not YAML: it has to be {form}") from None
+        raise AgentsFileError(f"{path} is not YAML: it must be {form}") from None
     right = isinstance(document, dict) and all(
         isinstance(name, str)
         and isinstance(command, list)
@@ -53,7 +53,7 @@ def read_agents(path: Path) -> dict[str, list[str]]:
         for name, command in document.items()
     )
     if not right or not 0 < len(document) <= MOST_AGENTS:
-        raise AgentsFileError(f"{path} has to be {form}, of 1 to {MOST_AGENTS} agents")
+        raise AgentsFileError(f"{path} must be {form}, with 1 to {MOST_AGENTS} agents")
     return {name: list(command) for name, command in document.items()}
 
 
@@ -66,7 +66,7 @@ def to_html(results: Mapping[str, Results | str]) -> str:
     return html.render(
         _TEMPLATE,
         styles=[html.PAGE_STYLE + _STYLE],
-        headline=(f"{failed} failed", "violated") if failed else (f"{len(tested)} agents, none fails", "holds"),
+        headline=(f"{failed} failed", "violated") if failed else (f"{len(tested)} agents, all passed", "holds"),
         names=list(results),
         table=[
             (Row(number).title, [_cell(rows.get(name, {}).get(number), name in tested) for name in results])

@@ -111,8 +111,7 @@ def _conclude(tallies: Sequence[Tally], asked: Asked, results: Results) -> None:
         results.cases += [_case(failure, evidence) for failure in tally.failures]
         if tally.set_aside:
             results.notes.append(
-                f"{tally.set_aside} vectors were set aside: the branches that they take had failed "
-                f"{FAILURES_OF_A_KIND} times"
+                f"{tally.set_aside} vectors were not run, because their branches had failed {FAILURES_OF_A_KIND} times"
             )
 
 

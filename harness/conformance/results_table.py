@@ -18,8 +18,8 @@ EXCHANGES_SHOWN = 14
 FAILURES_SHOWN = 12
 WRONG_SHOWN = 6
 NOT_TRIED = (
-    "Some vectors could not be tried in the time that there is: try again on a less busy machine, with one Algorithm "
-    "(--only), or in virtual time (--virtual)."
+    "Some vectors were not run within the time limit. Try again on a less busy machine, with one Algorithm (--only), "
+    "or in virtual time (--virtual)."
 )
 
 
@@ -63,7 +63,7 @@ def _counts(row: Row) -> list[Text]:
 
 
 def headline(case: Case) -> str:
-    """ "Algorithm 4 Receive Vote Add Block, counted already: vote no of who has voted"."""
+    """ "Algorithm 4 Receive Vote Add Block, counted already: vote no of an agent that has voted"."""
     where = f"Algorithm {case.algorithm} {case.handler}" if case.algorithm else case.handler or "the program"
     branch = f", branch {case.branch!r}" if case.branch else ""
     settings = f" (settings: {case.settings})" if case.settings not in ("", "default") else ""

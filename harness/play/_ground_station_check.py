@@ -11,7 +11,10 @@ def refuse_what_no_ground_station_sees(scenario: Scenario) -> None:
     if scenario.gcs is None:
         return
     if scenario.vehicles.kind == "none":
-        raise ScenarioError("a ground station sees vehicles, and `vehicles.kind` is none: leave out one of them")
+        raise ScenarioError(
+            "a ground station needs vehicles, and `vehicles.kind` is none: leave out the ground "
+            "station, or give another kind"
+        )
     try:
         connected(Address.parse(scenario.gcs)).close()
     except VehicleError as error:

@@ -30,7 +30,7 @@ def located(command: Sequence[str], what: str) -> list[str]:
     if path is None:
         raise ScenarioError(f"{what}: {_why_none(program)}")
     if (interpreter := _interpreter(Path(path))) is not None and not interpreter.exists():
-        raise ScenarioError(f"{what}: the first line of {program} names {interpreter}, and that is not there")
+        raise ScenarioError(f"{what}: the first line of {program} names {interpreter}, which does not exist")
     files = (str(Path(word).absolute()) if Path(word).is_file() else word for word in arguments)
     return [str(Path(path).absolute()), *files]
 
@@ -48,9 +48,9 @@ def _interpreter(program: Path) -> Path | None:
 
 def _why_none(program: str) -> str:
     if Path(program).name != program and Path(program).is_file():
-        return f"{program} is a file that may not be executed: chmod +x, or name its interpreter before it"
+        return f"{program} is not executable: make it executable (chmod +x), or put its interpreter in front of it"
     from_here = "" if Path(program).name == program or Path(program).is_absolute() else f" from {Path.cwd()}"
-    return f"{program} is no program: give a path{from_here}, or a name on PATH"
+    return f"{program} is not a program: give a path{from_here}, or a name on PATH"
 
 
 LOOKED_AT_BYTES = 4096
@@ -154,7 +154,9 @@ class AgentControl:
                     answer = await self._exchange({"command": command, **arguments})
             except (TimeoutError, OSError, ValueError, RecursionError) as error:
                 self.close()
-                what = f"no answer to {command} for {timeout_s:g} s" if isinstance(error, TimeoutError) else str(error)
+                what = (
+                    f"no answer to {command} within {timeout_s:g} s" if isinstance(error, TimeoutError) else str(error)
+                )
                 raise AgentSilentError(what) from None
             except asyncio.CancelledError:
                 self.close()  # an answer is still to come on this connection, and would be taken for the next one's

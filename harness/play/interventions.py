@@ -116,7 +116,7 @@ class Interventions(GrowingTimeline):
         self._loop: asyncio.AbstractEventLoop | None = None
         """Of the run, while it goes on."""
         self._swarm: Swarm | None = None
-        self._closed: str | None = "the mission has not begun"
+        self._closed: str | None = "the mission has not started"
         """Why nothing can happen to the swarm any more, or yet."""
         self._asked: deque[tuple[Entry, Future[float]]] = deque()
         self._something_is_asked = asyncio.Event()
@@ -164,7 +164,7 @@ class Interventions(GrowingTimeline):
             if self._loop is None or self._closed is not None:
                 answer.set_exception(ScenarioError(self._closed or "the run has ended"))
             elif len(self._asked) >= MOST_WAITING:
-                answer.set_exception(ScenarioError(f"{MOST_WAITING} things wait to be done: ask again in a moment"))
+                answer.set_exception(ScenarioError(f"{MOST_WAITING} commands are waiting: repeat this command later"))
             else:
                 self._asked.append((dict(entry), answer))
                 self._loop.call_soon_threadsafe(self._something_is_asked.set)
@@ -183,13 +183,13 @@ class Interventions(GrowingTimeline):
     def set_factor(self, factor: float | None) -> Future[float]:
         """Mission seconds per second of wall time, more than 0; None: as fast as it can."""
         if factor is not None and not 0 < factor <= MOST_FACTOR:
-            return _refused(f"{factor:g} is not how fast time can go: it is more than 0 and at most {MOST_FACTOR:g}")
+            return _refused(f"{factor:g} is not a speed: use a number above 0 and at most {MOST_FACTOR:g}")
         return self._at_pace(lambda pace, _: pace.set(factor))
 
     def step(self, seconds: float) -> Future[float]:
         """Pause, but go on for so many mission seconds; the answer is the mission second at which it stands again."""
         if not 0 < seconds <= MOST_STEP_S:
-            return _refused(f"{seconds:g} s is no step: it is more than 0 and at most {MOST_STEP_S:g} s")
+            return _refused(f"{seconds:g} s is not a step: use a time above 0 and at most {MOST_STEP_S:g} s")
         return self._at_pace(lambda pace, answer: pace.step(self.now_s + seconds, answer), answers=False)
 
     def step_to_next_run(self) -> Future[float]:
@@ -200,7 +200,7 @@ class Interventions(GrowingTimeline):
         answer: Future[float] = Future()
         pace = self.pace
         if pace is None:
-            return _refused("real processes cannot stand still: use --backend sim, where time is virtual")
+            return _refused("the time of real processes cannot be paused: use --backend sim, where time is virtual")
 
         def act() -> None:
             if not answer.set_running_or_notify_cancel():
@@ -211,7 +211,7 @@ class Interventions(GrowingTimeline):
 
         with self._lock:
             if self._loop is None:
-                return _refused("the run does not go on: it has not begun, or has ended")
+                return _refused("the run is not active: it has not started, or has ended")
             self._loop.call_soon_threadsafe(act)
         return answer
 
@@ -225,7 +225,7 @@ class Interventions(GrowingTimeline):
             swarm.enter("mission")
             self._open(swarm)
             await self._mission(swarm)
-            self._close(f"the mission is over: nothing happens to a swarm after {self.scenario.duration_s:g} s")
+            self._close(f"the mission is over: no event is possible after {self.scenario.duration_s:g} s")
             await mission.settle(swarm, self.scenario)
         finally:
             self._close("the run has ended")
@@ -302,7 +302,7 @@ class Interventions(GrowingTimeline):
 
     async def _happen(self, swarm: Swarm, entry: Entry) -> float:
         if "at_s" in entry:
-            raise ScenarioError("`at_s` is now: leave it out")
+            raise ScenarioError("a command acts now: leave out `at_s`")
         at_s, document = self.next_instant(swarm), self.scenario.model_dump()
         document["timeline"].append({"at_s": at_s, **entry})
         self._end_what_it_takes_the_place_of(document["timeline"])
@@ -339,8 +339,8 @@ class Interventions(GrowingTimeline):
             return
         if entry.injection and self._begun_with.rogue is None:
             raise ScenarioError(
-                f"`{entry.injection[0]}` needs a rogue node, which there is, among agents of another make, if the "
-                "timeline that the mission begins with injects something"
+                f"`{entry.injection[0]}` needs a rogue node; a run with other agents than the harness's own has one "
+                "only if the timeline of its scenario injects something"
             )
         ready = {
             agent_id
@@ -350,8 +350,8 @@ class Interventions(GrowingTimeline):
         }
         if (fault := entry.fault) is not None and fault.disk_left == "kept" and (diskless := {*fault.agents} - ready):
             raise ScenarioError(
-                f"agent {min(diskless)} has no disk: in a swarm with agents of another make only those have one that "
-                "the timeline that the mission begins with reboots so; `disk: lost` can be"
+                f"agent {min(diskless)} has no disk: in a swarm with other agents than the harness's own an agent has "
+                "a disk only if the timeline of its scenario reboots it with `disk: kept`; use `disk: lost`"
             )
 
     def as_asked(self, change: Change) -> Change:

@@ -43,7 +43,7 @@ class RunOutcome:
     unmatched_fates: list[str] = field(default_factory=list)
 
     def end_early(self, outcome: Outcome, error: HarnessError) -> None:
-        """The mission did not come to its end, because of `error`."""
+        """The mission did not end normally, because of `error`."""
         self.outcome = "not supported" if isinstance(error, UnsupportedError) else outcome
         self.outcome_detail = str(error)
         self.exit_status = error.exit_status

@@ -52,6 +52,7 @@ class Lines:
         self._console = console
         self._stage = ""
         self._last = 0.0
+        self._line = ""
 
     def show(self, snapshot: Snapshot) -> None:
         now = time.monotonic()
@@ -64,7 +65,9 @@ class Lines:
             chains = " ".join(f"{agent}:{status.chain}" for agent, status in known.items())
             reconciling = [agent for agent, status in known.items() if status.reconcile_in_progress]
             line += f"; chain lengths {chains}; {_reconciling(reconciling)}; {snapshot.network}"
-        self._console.print(line, highlight=False, soft_wrap=True)
+        if line != self._line:  # time that is paused repeats no line
+            self._console.print(line, highlight=False, soft_wrap=True)
+        self._line = line
 
     def close(self) -> None:
         pass
@@ -112,4 +115,4 @@ def _minutes(seconds: float) -> str:
 
 
 def _reconciling(agents: list[int]) -> str:
-    return f"reconciling {' '.join(map(str, agents))}" if agents else "nobody reconciles"
+    return f"reconciling: {' '.join(map(str, agents)) or 'none'}"

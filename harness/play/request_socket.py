@@ -93,7 +93,7 @@ async def _serve(hand: Interventions, reader: asyncio.StreamReader, writer: asyn
         try:
             line = await reader.readline()
         except ValueError:
-            line, answer = b"", {"ok": False, "error": f"a line of more than {MAX_REQUEST_BYTES} bytes asks too much"}
+            line, answer = b"", {"ok": False, "error": f"the request has more than {MAX_REQUEST_BYTES} bytes"}
         else:
             if not line:
                 return
@@ -116,20 +116,20 @@ async def _done(hand: Interventions, line: bytes) -> dict[str, Any]:
     try:
         request = from_json(line, allow_inf_nan=False)
     except ValueError:
-        raise ScenarioError("what is asked is no line of JSON") from None
+        raise ScenarioError("the request is not a line of JSON") from None
     command = request.get("command") if isinstance(request, dict) else None
     if command == "state":
         return _state(hand)
     ask = _COMMANDS.get(command) if isinstance(command, str) else None
     if ask is None:
-        raise ScenarioError(f"nothing is asked that can be: `command` is one of {', '.join(_COMMANDS)}, state")
+        raise ScenarioError(f"the request has no known command: `command` must be one of {', '.join(_COMMANDS)}, state")
     return {"at_s": await asyncio.wrap_future(ask(hand, request))}
 
 
 def _happen(hand: Interventions, request: Mapping[str, Any]) -> Future[float]:
     entry = request.get("entry")
     if not isinstance(entry, dict):
-        raise ScenarioError('`entry` is what happens: keys of an entry of a timeline, such as {"heal": true}')
+        raise ScenarioError('`entry` must have keys of an entry of a timeline, such as {"heal": true}')
     return hand.ask(entry)
 
 
@@ -144,7 +144,7 @@ def _pace(hand: Interventions, request: Mapping[str, Any]) -> Future[float]:
 def _number(request: Mapping[str, Any], key: str) -> float:
     number = request[key]
     if isinstance(number, bool) or not isinstance(number, int | float):
-        raise ScenarioError(f"`{key}` should be a number")
+        raise ScenarioError(f"`{key}` must be a number")
     return float(min(number, 1e18))
 
 

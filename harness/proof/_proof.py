@@ -31,24 +31,24 @@ CLAIMS = {
     "2": "an idle agent has committed every block that it completed",
     "3": "no agent holds a block twice",
     "4": "every block is genuine",
-    "hang": "no agent reconciles without a timer that would end it",
+    "hang": "no agent reconciles without a timer that ends the reconcile",
     "crash": "no handler ends by an error",
     "steps": "every step is that of a right agent",
 }
 """Properties that the proof checks in every state. "steps" is optional."""
 OF_CAPTORS = {
-    "1": "every message that is believed was sent by the vehicle that it names",
+    "1": "every accepted message was sent by the vehicle that it names",
     "4": "every block is genuine",
 }
 """Properties that an attacker with captured keys can violate although all agents are correct."""
 SHOWN = {
-    "1": "an agent believes what the captured vehicle never sent",
-    "4": "an agent holds a block in the captured vehicle's name that it never completed",
+    "1": "an agent accepts a message that the captured vehicle never sent",
+    "4": "an agent holds a block under the ID of the captured vehicle that this vehicle never completed",
 }
 OF_OTHERS = {
-    "honest": "every block in the name of another than the captured vehicle is genuine",
-    "name": "nothing is heard in another's name, and no block that its maker did not sign",
-    "revoked": "nothing is heard of the captured vehicle by who knows that it is revoked",
+    "honest": "every block of the other vehicles is genuine",
+    "name": "no forged message is accepted, and no block without the signature of its maker",
+    "revoked": "an agent that knows the revocation accepts no message of the captured vehicle",
 }
 """Properties that an attacker with captured keys must not be able to violate."""
 RUN_LOOKED_FOR_S = 60.0
@@ -285,10 +285,12 @@ def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
         proof.livelocks = list(_livelock.show(graph, ways_round, path, name))
         proof.example = proof.livelocks[0].example
     elif live is not None and live.lost is not None:
-        proof.example = _example(graph, live.lost, "no way was found from here to rest with one chain", path, name)
+        proof.example = _example(
+            graph, live.lost, "no path from here to an idle swarm with one chain was found", path, name
+        )
     if live is not None and live.fork is not None:
         beside = path.with_stem(f"{path.stem}_fork")
-        sentence = "all are at rest, and chains differ: they will until somebody votes"
+        sentence = "all agents are idle and their chains differ: they stay so until an agent starts a vote"
         proof.fork = _example(graph, live.fork, sentence, beside, f"{name} fork")
     if live is not None and live.reluctant is not None and live.lost is None and live.decided:
         beside = path.with_stem(f"{path.stem}_votes")
@@ -301,5 +303,5 @@ def _example(graph: Graph, number: int, sentence: str, path: Path, name: str) ->
     script = Script(graph, way)
     played = play(script.document(name))
     said = [f"{sentence.capitalize()}: {len(way) - 1} instants after the beginning."]
-    said += [f"On this way it comes to that only {NO_CLOCKS}."] if script.contradictory else []
+    said += [f"This path needs a condition: it happens only {NO_CLOCKS}."] if script.contradictory else []
     return keep(played, path, graph.swarm.bounds, len(way) - 1, said)

@@ -7,7 +7,7 @@ from harness.proof.bounds import Bounds
 from harness.proof.examples._example import Example
 
 WHY = {
-    "flaw": "it ends where the first flaw is",
+    "flaw": "the search stopped at the first flaw",
     "memory": "the bound of --memory was reached",
     "time": "the bound of --for was reached",
     "interrupted": "it was interrupted",
@@ -18,14 +18,14 @@ def in_words(proof: Proof) -> Iterator[str]:
     figures = proof.figures
     ended = "complete" if proof.complete else f"not complete: {WHY[proof.ended]}"
     yield f"{proof.bounds.in_words()}: {ended}"
-    left = "" if proof.complete else f", of which {figures.looked_at:,} were looked at"
-    instants = "of agents by themselves" if figures.depth is None else f"up to {figures.depth} instants"
+    left = "" if proof.complete else f", {figures.looked_at:,} of them explored"
+    instants = "of single agents" if figures.depth is None else f"up to {figures.depth} instants"
     yield (
         f"  {figures.states:,} states{left}, {figures.transitions:,} transitions, {figures.local_states:,} "
         f"local states, {figures.zones:,} zones, {instants}, in {figures.seconds:.1f} s"
     )
     if proof.ended in ("memory", "time") and (tighter := _tighter(proof.bounds)):
-        yield f"  what comes to an end sooner: the same with {' or '.join(tighter)}"
+        yield f"  a smaller state space: the same bounds with {' or '.join(tighter)}"
     for kind, claim in proof.claims.items():
         yield f"{_mark(proof, kind)} {_name(kind)}: {claim}"
         if (shown := proof.shown.get(kind)) is not None:
@@ -35,19 +35,19 @@ def in_words(proof: Proof) -> Iterator[str]:
         yield f"    {proof.flaw.sentence}"
     yield from _of_the_whole(proof)
     if proof.way:
-        yield f"  an agent may, if all that it hears can be sent in one run: {'; '.join(proof.way)}"
+        yield f"  path of one agent, if one run can send all its received messages: {'; '.join(proof.way)}"
     for livelock in proof.livelocks:
-        ways = f"{livelock.ways} way{'s' if livelock.ways > 1 else ''}"
-        yield f"  {ways} of one form, {livelock.in_words()}: {livelock.example.replay}"
+        cycles = f"{livelock.ways} cycle{'s' if livelock.ways > 1 else ''}"
+        yield f"  {cycles} of one form, {livelock.in_words()}: {livelock.example.replay}"
         yield from _played(livelock.example)
     live = proof.liveness
     if live is not None and (more := len(live.cycles) - sum(livelock.ways for livelock in proof.livelocks)):
         yield f"  {more} more, of other forms, {'was' if more == 1 else 'were'} not played"
     example = proof.example
     if example is not None and not proof.livelocks:
-        yield f"  a shortest way there, {example.instants} instants: {example.replay}"
+        yield f"  a shortest path to it, {example.instants} instants: {example.replay}"
         if proof.flaw is not None and PLAYED[proof.flaw.kind] not in example.judged:
-            yield "    not shown by playing: the simulation goes another way"
+            yield "    not confirmed: the simulation takes another path"
         yield from _played(example)
 
 
@@ -67,7 +67,7 @@ def _played(example: Example) -> Iterator[str]:
     for key, judgement in example.judged.items():
         yield f"    played: {key} {judgement.verdict}, {judgement.reason}"
     if not example.judged:
-        yield "    played: the simulation goes another way in the end, and nothing is bad about it"
+        yield "    played: the simulation takes another path in the end and shows no violation"
 
 
 def _name(kind: str) -> str:
@@ -85,41 +85,53 @@ def _mark(proof: Proof, kind: str) -> str:
 def _of_the_whole(proof: Proof) -> Iterator[str]:
     live = proof.liveness
     if proof.bounds.network == "any":
-        yield "- not looked at, one chain, livelock: they are about all agents together; see the network lossy"
+        yield "- not looked at, one chain, livelock: they need the states of all agents together: use --network lossy"
         return
     if live is None:
         if proof.whole_ended != "complete":
-            yield f"  of the whole graph: {WHY[proof.whole_ended]}"
-        yield "- not decided, one chain: from every state some way without losses leads to rest with one chain"
+            yield f"  the whole graph is not complete: {WHY[proof.whole_ended]}"
+        yield (
+            "- not decided, one chain: from every state some path without losses leads to an idle swarm with one chain"
+        )
         if proof.livelocks:
-            yield "✘ violated, livelock: what was looked at has ways to go round for ever, though nothing is lost"
+            yield "✘ violated, livelock: the explored states have cycles without losses that never end"
         else:
-            yield "- not decided, livelock: the swarm cannot go round for ever"
+            yield "- not decided, livelock: no cycle lasts for ever"
         return
     votes = len(live.astray) - 1
     after = (
         "without another vote" if not votes else "after one more vote" if votes == 1 else f"after {votes} more votes"
     )
     if not live.decided:
-        yield "- not decided, one chain: what may follow more votes is more than is looked at"
+        yield "- not decided, one chain: the states after more votes exceed the limit of the search"
     elif live.lost is None:
-        yield f"✔ holds, one chain: from every state some way without losses leads to rest with one chain, {after}"
+        yield (
+            "✔ holds, one chain: from every state some path without losses leads to an idle swarm with one chain, "
+            f"{after}"
+        )
     else:
         states = f"{live.astray[-1]:,} states"
-        yield f"✘ not shown, one chain: from {states} no way without losses leads to rest with one chain, even {after}"
+        yield (
+            f"✘ not shown, one chain: from {states} no path without losses leads to an idle swarm with one chain, "
+            f"even {after}"
+        )
     if votes and live.decided:
         counts = ", ".join(f"{count:,} with {number}" for number, count in enumerate(live.astray[:-1]))
-        yield f"    states that cannot yet, by how many more votes there are: {counts}"
+        yield f"    states without such a path, by number of further votes: {counts}"
     if proof.reluctant is not None:
         nearest = proof.reluctant
         yield f"    the nearest that needs more than one vote, {nearest.instants} instants: {nearest.replay}"
-    yield f"    {live.forks:,} states are at rest with several chains, and stay so until somebody votes"
+    yield f"    {live.forks:,} states are idle with several chains, and stay idle until an agent starts a vote"
     if proof.fork is not None:
         fork = proof.fork
-        yield f"    the nearest of them, {fork.instants} instants, {fork.chains} chains when played: {fork.replay}"
+        yield (
+            f"    the nearest of them, {fork.instants} instants, {fork.chains} chains in the simulation: {fork.replay}"
+        )
     if live.cycles:
         count = len(live.cycles)
-        ways = "is 1 way" if count == 1 else f"are {count} ways"
-        yield f"✘ violated, livelock: there {ways} to go round for ever, though nothing is lost"
+        cycles = (
+            "is 1 cycle without losses that lasts" if count == 1 else f"are {count} cycles without losses that last"
+        )
+        yield f"✘ violated, livelock: there {cycles} for ever"
     else:
-        yield "✔ holds, livelock: the swarm cannot go round for ever if nothing is lost and no new block comes"
+        yield "✔ holds, livelock: without losses and new blocks no cycle lasts for ever"

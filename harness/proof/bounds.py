@@ -82,11 +82,15 @@ class Bounds:
         if self.losses is not None and not 0 <= self.losses <= MAX_LOSSES:
             raise BoundsError(f"--losses must be 0..{MAX_LOSSES}, not {self.losses}")
         if self.losses is not None and self.network != "lossy":
-            raise BoundsError("--losses is for --network lossy, where messages are lost")
+            raise BoundsError("--losses needs --network lossy: leave out --losses")
         if not self.crossing and self.network == "any":
-            raise BoundsError("--no-crossing is not for --network any, where a message takes as long as it likes")
+            raise BoundsError(
+                "--no-crossing does not apply to --network any, where messages take any time: leave out --no-crossing"
+            )
         if self.stagger and self.network == "any":
-            raise BoundsError("--stagger is not for --network any, where each agent is looked at by itself")
+            raise BoundsError(
+                "--stagger does not apply to --network any, which explores each agent alone: leave out --stagger"
+            )
         for name, step_s in self.stagger.items():
             if name not in get_args(Staggered) or type(step_s) not in (int, float) or not 0 <= step_s <= MAX_TIMER_S:
                 known = ", ".join(get_args(Staggered))
@@ -94,7 +98,7 @@ class Bounds:
         names = [field.name for field in dataclasses.fields(Settings)]
         for name in self.settings:
             if name not in names:
-                raise BoundsError(f"--settings {name} is unknown: there are {', '.join(names)}")
+                raise BoundsError(f"--settings {name} is unknown: use one of {', '.join(names)}")
         try:
             self.agent_settings(self.agents)
             for name, value in self.quirks.items():
@@ -110,16 +114,16 @@ class Bounds:
         if not 0 <= self.lies <= MAX_LIES:
             raise BoundsError(f"--lies must be 0..{MAX_LIES}, not {self.lies}")
         if self.quirks or "death" in self.faults:
-            raise BoundsError("--captured is for right agents that stay: leave out --quirk and the fault death")
+            raise BoundsError("--captured excludes --quirk and the fault death: leave them out")
 
     def _check_time(self) -> None:
         if self.coincidences is not None and not 0 <= self.coincidences <= MAX_COINCIDENCES:
             raise BoundsError(f"--coincidences must be 0..{MAX_COINCIDENCES}, not {self.coincidences}")
         for option, given in (("--coincidences", self.coincidences is not None), ("--clocks any", self.clocks_any)):
             if given and (self.timers_any or self.network == "any"):
-                raise BoundsError(f"{option} is not for --timers any, nor for --network any")
+                raise BoundsError(f"{option} does not apply to --timers any and --network any: leave it out")
         if self.clocks_any and (self.quirks or self.captured is not None):
-            raise BoundsError("--clocks any is for right agents: leave out --quirk and --captured")
+            raise BoundsError("--clocks any excludes --quirk and --captured: leave them out")
 
     @property
     def nameless(self) -> bool:
@@ -154,7 +158,7 @@ class Bounds:
             f"network {self.network}",
         ]
         if self.captured is not None:
-            lies = "as many lies as it likes" if self.network == "any" else f"{self.lies} lie{'s' * (self.lies != 1)}"
+            lies = "any number of lies" if self.network == "any" else f"{self.lies} lie{'s' * (self.lies != 1)}"
             parts.append(f"agent {self.captured} captured, {lies}")
         parts += [f"faults {', '.join(self.faults)}"] if self.faults else []
         parts += [] if self.crossing else ["nothing crosses"]

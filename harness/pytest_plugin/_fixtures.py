@@ -70,7 +70,7 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
     marker = node.get_closest_marker("scenario")
     if marker is None or len(marker.args) != 1 or not marker.kwargs.keys() <= DEFAULTS.keys():
         raise ScenarioError(
-            "the fixture `scenario` needs a marker that says which, and may say where and from what seed: "
+            "the fixture `scenario` needs a marker with a scenario, and optionally a backend and a seed: "
             '@pytest.mark.scenario("loss_15.yaml", backend="sim", seed=3)'
         )
     return node.path.parent / marker.args[0], {**DEFAULTS, **marker.kwargs}
@@ -80,7 +80,7 @@ def _backend_and_seed(backend: Any, seed: Any, options: Options) -> tuple[Backen
     """What a marker says of them, unless the command line says something else. Raises ScenarioError."""
     if backend not in BACKEND_NAMES:
         *names, last = map(repr, BACKEND_NAMES)
-        raise ScenarioError(f"`backend` is {backend!r}: it should be {', '.join(names)} or {last}")
+        raise ScenarioError(f"`backend` is {backend!r}: use {', '.join(names)} or {last}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ScenarioError(f"`seed` is {seed!r}: it should be a number, 0 or more")
+        raise ScenarioError(f"`seed` is {seed!r}: use a number from 0 on")
     return options.backend or backend, seed if options.seed is None else options.seed

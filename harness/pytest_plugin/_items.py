@@ -109,7 +109,7 @@ class StoryItem(pytest.Item):
             self._rewrite(text)
         elif text != self._story.text:
             if unknown := self._unknown_word(archive):
-                pytest.skip(f"what agents do cannot be compared: {unknown}")
+                pytest.skip(f"the traces cannot be compared with the story: {unknown}")
             pytest.fail(
                 "\n".join([*self._difference(text), *archive.problems, *archive.gaps, f"report: {finished.report}"]),
                 pytrace=False,
@@ -130,7 +130,7 @@ class StoryItem(pytest.Item):
             pytest.fail(f"{self.path} cannot be written: {error.strerror}", pytrace=False)
 
     def _told(self, archive: RunArchive) -> str:
-        """The story as it was played."""
+        """The story as played."""
         telling = Telling(archive.traces, self._story.scenario.roster)
         answers = [telling.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
         return self._story.with_answers(answers)
@@ -143,12 +143,12 @@ class StoryItem(pytest.Item):
         return None
 
     def _difference(self, text: str) -> Iterator[str]:
-        yield "agents do not do what the story tells; if they are right, --ucp-rewrite writes it anew"
+        yield "agents deviate from the story; if the agents are right, --ucp-rewrite rewrites the story"
         yield from unified_diff(
             self._story.text.splitlines(),
             text.splitlines(),
-            f"{self.path.name}, as it is told",
-            "as it was played",
+            f"{self.path.name}, as written",
+            "as played",
             lineterm="",
             n=CONTEXT_LINES,
         )

@@ -55,7 +55,7 @@ class Trial:
         played = finished.played
         lines = [played.outcome_detail] if played.outcome_detail else []
         if played.outcome == "completed":
-            lines += [f"{fate}, so this run does not show what it was meant to" for fate in played.unmatched_fates]
+            lines += [f"{fate}, so this run differs from its script" for fate in played.unmatched_fates]
         for key, judgement in finished.result.judgements.items():
             if not self._expect.as_expected(key, judgement.verdict):
                 expected = self._expect.verdict(key)
@@ -70,7 +70,7 @@ class Trial:
             return []
         wrong = ", ".join(in_words(self._quirks))
         ran = in_sentence(programs(finished.record))
-        return [*lines, *([f"wrong on purpose: {wrong}"] if wrong else []), *([ran] if ran else [])]
+        return [*lines, *([f"deliberate mistakes: {wrong}"] if wrong else []), *([ran] if ran else [])]
 
     def _other_chains(self, finished: Run) -> list[str]:
         if not self._expect.chains:
@@ -112,7 +112,7 @@ def new_directory(node: pytest.Item, options: Options) -> Path:
         except FileExistsError:
             continue
         except OSError as error:
-            raise RunDirectoryError(f"--ucp-keep: {directory} cannot be made: {error.strerror}") from None
+            raise RunDirectoryError(f"--ucp-keep: {directory} cannot be created: {error.strerror}") from None
         return directory
     raise AssertionError("numbers do not end")
 

@@ -99,8 +99,8 @@ class Told(GrowingTimeline):
             self.retell(document)
         except ScenarioError:
             raise ScenarioError(
-                "the block cannot be undone, for the same was changed in it for longer: give that change a block of "
-                "its own, or a `for_s` that ends before"
+                "the `with` block cannot undo its change, because the same condition was changed inside it for a "
+                "longer time: give that change its own `with` block, or a `for_s` that ends earlier"
             ) from None
         await self.until(swarm, over_s)
         self._completed = await swarm.completed()
@@ -108,7 +108,7 @@ class Told(GrowingTimeline):
     async def hold(self, swarm: mission.Swarm, **which: Any) -> int:
         """From now on hold back the messages that a fate with these keys is about; its number. Raises ScenarioError."""
         if unknown := next((key for key in which if key not in HOLDABLE), None):
-            raise ScenarioError(f"`{unknown}` is unknown: what is held is said by {', '.join(HOLDABLE)}")
+            raise ScenarioError(f"`{unknown}` is unknown: use one of {', '.join(HOLDABLE)}")
         if which in self._holds.values():
             raise ScenarioError(f"{_in_words(which)} is held already")
         now = swarm.now()
@@ -128,7 +128,7 @@ class Told(GrowingTimeline):
         """Let go of what was held by these words, or of everything. Raises ScenarioError if there is no such hold."""
         if which and which not in self._holds.values():
             held = ", ".join(map(_in_words, self._holds.values())) or "nothing"
-            raise ScenarioError(f"{_in_words(which)} is not held: {held} is")
+            raise ScenarioError(f"{_in_words(which)} is not held; held: {held}")
         for number in [number for number, held in self._holds.items() if which in ({}, held)]:
             await self.let_go(swarm, number)
 
@@ -158,19 +158,19 @@ class Told(GrowingTimeline):
 
     def _check(self, sought: Sought) -> None:
         if sought.handler not in list(HANDLER_BRANCHES):
-            raise ScenarioError(f"there is no handler {sought.handler!r}: there are {', '.join(HANDLER_BRANCHES)}")
+            raise ScenarioError(f"no handler {sought.handler!r}: use one of {', '.join(HANDLER_BRANCHES)}")
         branches = HANDLER_BRANCHES[sought.handler]
         by_the_book = not self.scenario.foreign and not self.scenario.has_wrong_agents
         if by_the_book and sought.branch is not None and sought.branch not in branches:
             named = ", ".join(map(repr, branches))
-            raise ScenarioError(f"{sought.handler} has no branch {sought.branch!r}: it has {named}")
+            raise ScenarioError(f"{sought.handler} has no branch {sought.branch!r}: use one of {named}")
         if sought.agent is not None and sought.agent not in self.scenario.roster:
-            raise ScenarioError(f"there is no agent {sought.agent!r}: there are {_ids(self.scenario.roster)}")
+            raise ScenarioError(f"no agent {sought.agent!r}: use one of {_ids(self.scenario.roster)}")
 
     async def from_now_until(self, swarm: mission.Swarm, mission_s: float) -> None:
         """As `until`. Raises ScenarioError if that is over, or never comes."""
         if not swarm.now() <= mission_s < math.inf:
-            raise ScenarioError(f"a mission does not go on until {mission_s:g} s: it is at {swarm.now():g} s")
+            raise ScenarioError(f"a mission cannot run until {mission_s:g} s: it is at {swarm.now():g} s")
         await self.until(swarm, mission_s)
 
     async def until_idle(self, swarm: mission.Swarm, limit_s: float) -> RunOutcome | None:
@@ -210,7 +210,7 @@ class Told(GrowingTimeline):
         """The end of the mission, if it has not been. Raises ScenarioError if a second final reconcile is asked for."""
         if swarm.played.final_reconcile is not None:
             if reconcile_finally:
-                raise ScenarioError("the final reconcile has been: a mission has one, at its end")
+                raise ScenarioError("the final reconcile is over: a mission has one, at its end")
             return
         await self.release(swarm)
         if not self.scenario.schedule:  # which lasts as long as the mission was meant to

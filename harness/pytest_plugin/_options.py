@@ -40,7 +40,7 @@ class Options:
             config.getoption(f"--ucp-{name}") for name in ("backend", "seed", "speedup", "keep")
         )
         if seed is not None and seed < 0:
-            raise ScenarioError(f"--ucp-seed is {seed}: it should be 0 or more")
+            raise ScenarioError(f"--ucp-seed is {seed}: use a number from 0 on")
         return cls(
             backend,
             seed,
@@ -96,5 +96,5 @@ def _words(command: str) -> list[str]:
     except ValueError as error:
         raise ScenarioError(f"--ucp-agent is {command!r}: {str(error).lower()}") from None
     if not words:
-        raise ScenarioError("--ucp-agent names no program")
+        raise ScenarioError("--ucp-agent is empty: name a program")
     return words

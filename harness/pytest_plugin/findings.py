@@ -64,7 +64,7 @@ class Findings:
         __tracebackhide__ = True
         characteristic = self.result.characteristics.get(str(number))
         if characteristic is None:
-            raise ScenarioError(f"there is no characteristic {number!r}: they are 1 to 6")
+            raise ScenarioError(f"no characteristic {number!r}: use 1 to 6")
         return JudgementInTest.of(str(number), characteristic)
 
     def judgement(self, key: str) -> JudgementInTest:
@@ -72,7 +72,7 @@ class Findings:
         __tracebackhide__ = True
         judgement = self.result.beside.get(key)
         if judgement is None:
-            raise ScenarioError(f"there is no judgement {key!r}: there are {', '.join(BESIDE)}")
+            raise ScenarioError(f"no judgement {key!r}: use one of {', '.join(BESIDE)}")
         return JudgementInTest.of(key, judgement)
 
     @property
@@ -88,7 +88,7 @@ class Findings:
         __tracebackhide__ = True
         exports = RunArchive(self.directory).exports.by_agent
         if agent not in exports:
-            raise ScenarioError(f"there is no chain of agent {agent!r}: there are those of {sorted(exports)}")
+            raise ScenarioError(f"no chain of agent {agent!r}; agents with a chain: {sorted(exports)}")
         names = name_blocks(exports)
         return [names[block_hash] for block_hash in exports[agent].chain_of_block_hashes]
 

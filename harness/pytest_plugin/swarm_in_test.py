@@ -135,7 +135,7 @@ class Swarm:
         """Set the conditions from one agent to another: `link(1, 2, loss=0.9)`; with `both`, also the way back."""
         __tracebackhide__ = True
         if not keys:
-            raise ScenarioError("a link needs what is other on it than elsewhere, such as loss=0.9")
+            raise ScenarioError("a link needs a condition of its own, such as loss=0.9")
         return self.network(for_s, links=[{"from": sender, "to": receiver, "both": both, **keys}])
 
     def hold(self, message: str | None = None, **which: Any) -> AbstractContextManager[None]:
@@ -168,7 +168,7 @@ class Swarm:
         if verb in INJECTIONS:
             return partial(self._inject, verb)
         if fault is None:
-            raise AttributeError(f"a swarm has no {verb!r}; what can happen to it: {', '.join(_VERBS)}")
+            raise AttributeError(f"a swarm has no {verb!r}; use one of {', '.join(_VERBS)}")
 
         def happen(*agents: int, **further: Any) -> None:
             __tracebackhide__ = True
@@ -197,7 +197,7 @@ class Swarm:
         """Let the mission go on for `seconds` mission seconds."""
         __tracebackhide__ = True
         if not 0 <= seconds < math.inf:
-            raise ScenarioError(f"a mission does not go on for {seconds:g} s")
+            raise ScenarioError(f"a mission cannot run for {seconds:g} s: use a time above 0")
         self._act(lambda swarm: self._told.until(swarm, swarm.now() + seconds))
 
     def run_until(self, mission_s: float) -> None:
@@ -215,7 +215,7 @@ class Swarm:
         """
         __tracebackhide__ = True
         if not 0 <= limit_s < math.inf:
-            raise ScenarioError(f"nobody waits for {limit_s:g} s")
+            raise ScenarioError(f"a wait needs a limit of 0 s or more, not {limit_s:g} s")
         sought = Sought(handler, branch, agent)
         found = self._act(lambda swarm: self._told.until_run(swarm, sought, limit_s))
         if found is None:

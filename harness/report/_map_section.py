@@ -74,9 +74,9 @@ def _drawn(tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink], types:
     ]
     notes = [*tracks.problems, *network.problems]
     if not known:
-        notes.append("network.jsonl: who could reach whom is not on record")
+        notes.append("network.jsonl: the network conditions are not recorded")
     elif len(kept) < len(known):
-        notes.append(f"network.jsonl: of {len(known) - 1} changes the map has the {len(kept) - 1} that lasted longest")
+        notes.append(f"network.jsonl: the map shows the {len(kept) - 1} longest of {len(known) - 1} network states")
     return Section(
         map_svg.draw_tracks(flown, reboots, land, ink, _description(tracks, land, moments)),
         [*_legend(flown, rebooted=bool(reboots)), *_legend_of_moments(moments, set(types.values()))],
@@ -120,7 +120,7 @@ def _moment(
     links = network.links(at_s) if division else []
     lost = [life.end for life in flown if life.lost and life.end.at_s <= at_s and life.vehicle not in living]
     what = division.what if division and division.at_s == at_s and division.what not in (RANGE, "start") else ""
-    state = "the network is not on record" if division is None else division.in_words()
+    state = "network not recorded" if division is None else division.in_words()
     losses = {pair: network.loss(pair, at_s) for pair in links if pair[0] in seen and pair[1] in seen}
     if lossy := _in_words(losses.values()):
         state += f", {lossy}"
@@ -147,7 +147,11 @@ def _legend(flown: Sequence[Life], *, rebooted: bool) -> list[tuple[Markup, str]
             parts.setdefault(map_svg.look(stretch.division, life.vehicle), set()).update(
                 () if part is None else (part,)
             )
-    means = {"whole": "in one part with all", "unknown": "network not on record", "alone": "alone, cut off from all"}
+    means = {
+        "whole": "connected to all others",
+        "unknown": "network not recorded",
+        "alone": "disconnected from all others",
+    }
     entries = [
         (which, means.get(which) or f"part {', '.join(map(letter, sorted(parts[which])))}")
         for which in map_svg.LOOKS

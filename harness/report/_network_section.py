@@ -87,7 +87,7 @@ def happened(record: RunRecord) -> list[tuple[str, str, str]]:
     rows.sort(key=lambda row: row[0])
     told = [(text.duration(at_s), what, detail) for at_s, what, detail in rows]
     if station is not None and station.commands_left_out:
-        told.append(("later", "operator", f"{station.commands_left_out} more commands, which nobody has kept"))
+        told.append(("later", "operator", f"{station.commands_left_out} more commands, which are not recorded"))
     return told
 
 
@@ -96,7 +96,7 @@ def _of_fault(fault: FaultRecord) -> str:
     if fault.fully_connected is not None:
         details.append(f"fully connected: {text.value(fault.fully_connected)}")
     if fault.by_hand:
-        details.append("asked for by hand")
+        details.append("caused by hand")
     return "; ".join(details)
 
 
@@ -117,6 +117,12 @@ def ground_station(record: RunRecord) -> str | None:
     if (station := record.ground_station) is None:
         return None
     dropped = f", and {text.value(station.dropped)} were dropped" if station.dropped else ""
-    came = f"{text.value(station.received)} came from it{dropped}"
-    refused = " Its commands were refused: tracks are computed." if in_virtual_time(record.backend) else ""
-    return f"Ground station at {station.address}: {text.value(station.sent)} datagrams went there, {came}.{refused}"
+    came = f"{text.value(station.received)} datagrams came from it{dropped}"
+    refused = (
+        " Its commands were refused, because virtual time computes the tracks."
+        if in_virtual_time(record.backend)
+        else ""
+    )
+    return (
+        f"Ground station at {station.address}: {text.value(station.sent)} datagrams were sent to it, {came}.{refused}"
+    )

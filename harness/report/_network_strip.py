@@ -64,7 +64,7 @@ def draw(lanes: Sequence[tuple[str, list[Span]]], ticks: Sequence[tuple[float, s
         )
     return Markup(
         '<svg xmlns="http://www.w3.org/2000/svg" class="strip" role="img" width="100%" height="{}"'
-        ' aria-label="The network along mission time">{}</svg>'
+        ' aria-label="The network over mission time">{}</svg>'
     ).format(height + 20, Markup("").join(parts))
 
 

@@ -62,7 +62,7 @@ def read_source(archive: RunArchive) -> ReportSource:
     """Raises RunDirectoryError if this is no run directory, or one of another version."""
     error, directory = archive.record_error, archive.directory
     if directory is None or not (archive.recorded or archive.roster):
-        raise error or RunDirectoryError(f"{directory}: there is nothing of a run here; is this a run directory?")
+        raise error or RunDirectoryError(f"{directory}: no files of a run found; is this a run directory?")
     if error is not None and not isinstance(error, DamagedRecordError):
         raise error
     return ReportSource(archive, directory, _swarm_section.agent_inks(archive))

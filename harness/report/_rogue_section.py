@@ -45,7 +45,9 @@ def sentences(injections: Sequence[RogueInjection]) -> list[str]:
 def _rows(injection: RogueInjection) -> list[Row]:
     outcomes = [(of.message, of.sent, done_with(of), text.value(of.changed)) for of in injection.messages]
     outcomes += [(f"none: {reason}", count, "refused", "\u2013") for reason, count in injection.refused.items()]
-    outcomes += [("any", injection.untraced, "not told from their originals", "\u2013")] if injection.untraced else []
+    outcomes += (
+        [("any", injection.untraced, "indistinguishable from their originals", "\u2013")] if injection.untraced else []
+    )
     begun = (text.duration(injection.at_s), injection.what, injection.detail)
     return [
         Row(*begun, message, text.value(sent), done, changed)

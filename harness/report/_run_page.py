@@ -53,9 +53,9 @@ def draw(left: ReportSource) -> str:
         headline=verdict_section.headline(judged, completed=outcome is None),
         outcome=outcome,
         missing=[
-            ("Not all chains are known. What is below is drawn from the others.", left.chains_missing),
-            ("Not all that a run leaves is here. What is below is drawn from the rest.", left.files_missing),
-            ("This run does not show all that it was meant to.", record.unmatched_fates),
+            ("Some chains are unknown. The page shows the other chains.", left.chains_missing),
+            ("Some files of the run are missing. The page shows the other files.", left.files_missing),
+            ("This run differs from its script.", record.unmatched_fates),
         ],
         verdicts=judged,
         figures=facts.figures(record),
@@ -90,9 +90,9 @@ def _pictures(
         for agent_id, export in before.items()
     )
     if not changed:
-        return [_picture("As the mission left them; the final reconcile changed nothing", before, ink, "chains")]
+        return [_picture("At the end of the mission; the final reconcile changed nothing", before, ink, "chains")]
     return [
-        _picture("As the mission left them", before, ink, "before"),
+        _picture("At the end of the mission", before, ink, "before"),
         _picture("After the final reconcile", exports, ink, "chains"),
     ]
 

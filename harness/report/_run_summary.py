@@ -92,7 +92,7 @@ def _cases(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> Iterator[C
     if record.outcome == "not supported":
         yield Case("run", skipped=record.outcome_detail or record.outcome)
         return
-    if wrong := [*_wrong_with_run(record), *([] if judged else ["There is no verdict."])]:
+    if wrong := [*_wrong_with_run(record), *([] if judged else ["No verdict."])]:
         yield Case("run", wrong)
     for verdict in judged:
         yield _characteristic(verdict, expect)
@@ -110,7 +110,7 @@ def _wrong_with_run(record: RunRecord) -> Iterator[str]:
     if ended := facts.outcome(record):
         yield ": ".join(filter(None, ended))
     for fate in record.unmatched_fates:
-        yield f"{fate}, so this run does not show what it was meant to"
+        yield f"{fate}, so this run differs from its script"
 
 
 def _characteristic(verdict: Verdict, expect: Expect) -> Case:

@@ -55,4 +55,4 @@ def _row(loss: Loss, ink: Mapping[int, Ink]) -> LossRow:
 
 
 def _listed(vehicles: list[int]) -> str:
-    return ", ".join(ranges(vehicles)) or "nobody"
+    return ", ".join(ranges(vehicles)) or "none"

@@ -47,7 +47,7 @@ def _fate(agent: AgentRecord | None) -> str:
     if agent is None:
         return ": no usable export"
     if agent.outcome == "killed":
-        return ": killed, with all that was held there"
+        return ": killed, with all its blocks"
     why = ", ".join(filter(None, (agent.outcome, agent.detail)))
     return ": no usable export" + (f" ({why})" if why else "")
 
@@ -125,11 +125,11 @@ def counts(exports: Mapping[int, Export], record: RunRecord) -> str | None:
         return None
     parts = [f"of {len(completed)} completed blocks {_are(len(completed & in_chains))} in a chain"]
     if waiting := len(completed & aside):
-        parts.append(f"{_are(waiting)} in a deque or on a reconcile stack")
+        parts.append(f"{_are(waiting)} only in a deque or on a reconcile stack")
     if gone := len(completed - in_chains - aside):
-        parts.append(f"{_are(gone)} held by nobody whose export is here")
+        parts.append(f"{_are(gone)} in no available export")
     if strange := len((in_chains | aside) - completed):
-        parts.append(f"beside them {_are(strange)} held whose makers do not say here what they completed")
+        parts.append(f"beside these {_are(strange)} held without a record of completion")
     return "; ".join(parts).capitalize() + "."
 
 

@@ -86,7 +86,7 @@ def _chart(
     base = Markup('<path class="base" d="M0 {}H{}"/>').format(n(HEIGHT - _BOTTOM), short(end_s))
     scale = Markup('<text class="scale" x="4" y="11">{}</text>').format(text.value(highest))
     at_end = ", ".join(f"{what} {text.value(figure(moments[-1]))}" for what, figure in figures)
-    description = f"{name} along mission time, at most {text.value(highest)}; at the end {at_end}"
+    description = f"{name} over mission time: maximum {text.value(highest)}; at the end {at_end}"
     return Chart(
         name,
         [
@@ -142,12 +142,12 @@ def row(cycle: Cycle, end_s: float) -> Chart:
         short(start_s), short(end_s - start_s), CYCLE_HEIGHT, f"{in_words(cycle)}. {told}"
     )
     label = (
-        f"every {cycle.period_s:.4g} s since {start_s:.0f} s" if cycle.period_s else f"nothing since {start_s:.0f} s"
+        f"every {cycle.period_s:.4g} s since {start_s:.0f} s" if cycle.period_s else f"inactive since {start_s:.0f} s"
     )
     anchor = "end" if start_s > end_s / 2 else "start"
     text = Markup('<text class="scale" text-anchor="{}">{}</text>').format(anchor, label)
     return Chart(
-        "goes round" if cycle.period_s else "hangs",
+        "repeats a cycle" if cycle.period_s else "hangs",
         [],
         plot([*brackets, tip], [pin(start_s, end_s, _TEXT, text)], CYCLE_HEIGHT, end_s, f"{in_words(cycle)}. {told}"),
     )

@@ -70,7 +70,7 @@ def draw(
     ]
     by_phase = sum(len(reconcile.phases) for reconcile in reconciles) <= MAX_BARS
     if not by_phase:
-        notes.append("Reconciles are drawn as one bar each: there are too many phases")
+        notes.append("Each reconcile is drawn as one bar, because there are too many phases")
     drawn: dict[int, list[Markup]] = {agent: [] for agent in agents}
     for vote in votes:
         drawn[vote.agent].append(_vote(vote, names))
@@ -133,7 +133,7 @@ def _legend(
         for meaning, mark in meanings.items()
     ]
     if shades:
-        entries.append(('<rect class="shade" x="4" y="1" width="26" height="14"/>', "network parted"))
+        entries.append(('<rect class="shade" x="4" y="1" width="26" height="14"/>', "network partitioned"))
     if any(not fault.agents for fault in faults):
         entries.append(('<path class="change" d="M17 0v16"/>', "network changed"))
     return [

@@ -81,12 +81,12 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
     if untold:
         first, more = first_of(unknown[untold[0]]), len(untold) - 1
         others = f", and such words in {more} more" if more else ""
-        notes.append(f"not all that agent {untold[0]} did is shown: {first} in its trace{others}")
+        notes.append(f"some steps of agent {untold[0]} are not shown: {first} in its trace{others}")
     shades, shades_left_out = _shades(left.network, ends_s)
     if shades_left_out:
-        notes.append(f"{shades_left_out} shorter stretches of a parted network are not shaded")
+        notes.append(f"{shades_left_out} shorter partitions are not shaded")
     if len(faults) > MAX_FAULTS:
-        notes.append(f"of {len(faults)} faults and changes of the network the first {MAX_FAULTS} are drawn")
+        notes.append(f"the first {MAX_FAULTS} of {len(faults)} faults and network changes are drawn")
         faults = faults[:MAX_FAULTS]
     agents = [(agent, ink[agent]) for agent in sorted(traces)]
     messages, without = _messages(course.messages, [agent for agent, _ in agents], names)
@@ -148,11 +148,11 @@ def _messages(
 ) -> tuple[str, list[str]]:
     """Names of messages, agents, and of each message: when, from which lane, name, block, and [lane, when] handled."""
     if messages is None:
-        return "null", ["Messages are left out: the traces are too large to draw them from"]
+        return "null", ["Messages are not drawn, because the traces are too large"]
     heard = [message for message in messages if message.receipts]
     arrows = sum(len(message.receipts) for message in heard)
     if arrows > MAX_ARROWS:
-        return "null", [f"Messages are left out: {arrows} would be too many for a page"]
+        return "null", [f"Messages are not drawn, because {arrows} are too many for a page"]
     lanes = {agent: lane for lane, agent in enumerate(agents)}
     kinds = {name: place for place, name in enumerate(dict.fromkeys(message.name for message in heard))}
     sent = [
@@ -204,5 +204,5 @@ def _in_words(course: History, agents: int, end_s: float, unknown: bool) -> str:
         f"Timeline of {agents} agents over {text.duration(round(end_s, 1))}: {len(course.votes)} votes, {approved} of"
         f" them approved, {len(course.commits)} commits, {len(course.reconciles)} reconciles, {len(course.ties)} ties."
         " The tables below list votes and reconciles."
-        f"{' There may be more, in words that are not known.' if unknown else ''}"
+        f"{' The traces contain unknown words, so there may be more.' if unknown else ''}"
     )

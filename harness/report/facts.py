@@ -17,7 +17,7 @@ FIGURES = {
     "blocks": "blocks completed",
     "mutual_chain": "blocks in the mutual chain",
     "distinct_chains": "distinct chains",
-    "uniform_at_s": "mission seconds until the chains were one",
+    "uniform_at_s": "mission seconds until all chains were equal",
     "reconciles": "reconciles",
     "copies_min": "fewest copies of a block",
     "copies_mean": "copies of a block, mean",
@@ -68,9 +68,9 @@ def outcome(record: RunRecord) -> tuple[str, str] | None:
         return None
     detail = record.outcome_detail
     if record.outcome == "running":
-        return "This run has not recorded its end", detail or "It is still going on, or it was killed."
+        return "The end of this run is not recorded", detail or "The run is still active, or it was killed."
     if record.outcome == "not supported":
-        return "This run is not judged", detail or "An agent said that it lacks what the run needs."
+        return "This run has no verdict", detail or "An agent lacks a feature that the run needs."
     return f"This run did not complete: {record.outcome}", detail or ""
 
 
@@ -87,7 +87,7 @@ def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
     dropped = sum(frames.dropped for frames in captured.values())
     received = sum(frames.received for frames in captured.values())
     whose = f"vehicle{'s' if len(lacking) > 1 else ''} {', '.join(ranges(lacking))}"
-    return f"the capture lacks {dropped} of {received} frames, of {whose}: this machine was too slow to keep up"
+    return f"the capture lacks {dropped} of {received} frames, of {whose}, because this machine was too slow"
 
 
 def link_qualities() -> list[str]:

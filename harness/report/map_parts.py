@@ -72,7 +72,7 @@ class Division:
         if self.alone:
             few = len(ranges(sorted(self.alone))) <= MAX_NAMED
             phrases.append(f"alone {listed(self.alone)}" if few else f"{len(self.alone)} alone")
-        return "; ".join(phrases) or "nobody left"
+        return "; ".join(phrases) or "no vehicle left"
 
 
 @dataclass(frozen=True, slots=True)

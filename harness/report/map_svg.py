@@ -169,7 +169,7 @@ def draw_moment(
         desc=description,
         font=FONT,
         links=_links(at, links, division),
-        crosses=Markup("").join(_cross(to_px(fix), "a vehicle was lost here") for fix in lost),
+        crosses=Markup("").join(_cross(to_px(fix), "vehicle lost here") for fix in lost),
         dots=Markup("").join(dots),
         tags=tags(tagged, [to_px(fix) for fix in lost], to_px, ink),
     )
@@ -285,12 +285,12 @@ def _told(stretch: Stretch) -> str:
 
 def _whereabouts(division: Division | None, vehicle: int) -> str:
     if division is None:
-        return "network not on record"
+        return "network not recorded"
     part, fellows = division.place_of(vehicle)
     others = listed(fellows - {vehicle})
     if not others:
         return "alone"
-    return f"in one part with all, {others}" if part is None else f"part {letter(part)}, with {others}"
+    return f"connected to all others: {others}" if part is None else f"part {letter(part)}, with {others}"
 
 
 def _marks(

@@ -11,11 +11,11 @@ STATEMENTS = {
     "2": "An idle agent has all blocks that it completed in its chain.",
     "3": "No agent holds more than one copy of a block.",
     "4": "Every block was made by an agent of the mission.",
-    "5": "Fully connected, all blocks come into all chains.",
-    "6": "Fully connected and reconciled, one uniform chain emerges.",
-    "steps": "Every agent did at every step what the 20 algorithms say.",
-    "records": "What two records tell about the same thing agrees.",
-    "liveness": "The swarm became idle once no more events came.",
+    "5": "When the system is fully connected, all blocks enter all chains.",
+    "6": "When the system is fully connected and reconciled, all chains are equal.",
+    "steps": "Every step of every agent follows the 20 algorithms.",
+    "records": "Independent records of the same facts agree.",
+    "liveness": "The swarm became idle after the last event.",
 }
 ICONS = {"good": "✓", "bad": "✗", "unknown": "\u2013"}
 KINDS = {"good": "holds", "bad": "violated", "unknown": "unknown"}

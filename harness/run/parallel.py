@@ -179,10 +179,10 @@ class _Pool(Generic[T, R]):
 
 def _death(exit_code: int) -> str:
     if exit_code >= 0:
-        return f"the process that worked on it ended with status {exit_code}"
+        return f"its worker process ended with status {exit_code}"
     name = signal.Signals(-exit_code).name
     hint = ", as the kernel does when memory runs out" if name == "SIGKILL" else ""
-    return f"the process that worked on it was killed by {name}{hint}"
+    return f"its worker process was killed by {name}{hint}"
 
 
 @contextlib.contextmanager

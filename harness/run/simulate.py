@@ -229,12 +229,12 @@ def evidence_lines(violated: dict[str, Judgement]) -> list[str]:
 def claim(out: Path | None, name: str) -> Path:
     """Return the path of the new file: `out`, or a new name under `runs/`. Raises RunDirectoryError if it exists."""
     if out is not None and out.exists():
-        raise RunDirectoryError(f"{out} exists: choose another --out, nothing is overwritten")
+        raise RunDirectoryError(f"{out} exists: choose another --out; existing files are not overwritten")
     path = out or default_path(f"{name} shrunk").with_suffix(".yaml")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RunDirectoryError(f"{path.parent} cannot be made: {error.strerror}; choose another --out") from None
+        raise RunDirectoryError(f"{path.parent} cannot be created: {error.strerror}; choose another --out") from None
     return path
 
 

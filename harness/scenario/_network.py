@@ -234,7 +234,7 @@ class Disturbance(Model):
     @model_validator(mode="after")
     def _says_no_loss_twice(self) -> "Disturbance":
         if self.loss is not None and self.network is not None and self.network.loss is not None:
-            raise ValueError("`loss` and `network.loss` are the same thing: leave one of them out")
+            raise ValueError("`loss` and `network.loss` are the same setting: leave out one of them")
         return self
 
     def changes(self) -> NetworkValues:
@@ -304,9 +304,11 @@ def _values_of(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> Netw
         keys = link.given()
         for sender, receiver in link.pairs():
             if sender == receiver:
-                raise ConditionsError(f"links.{index}: a link from vehicle {sender} to itself carries nothing")
+                raise ConditionsError(f"links.{index}: a link from vehicle {sender} to itself is impossible")
             if (sender, receiver) in differences:
-                raise ConditionsError(f"links.{index}: from {sender} to {receiver} is named twice: which one counts?")
+                raise ConditionsError(
+                    f"links.{index}: from {sender} to {receiver} is named twice: leave out one of them"
+                )
             differences[sender, receiver] = keys
     return differences
 

@@ -37,11 +37,11 @@ def _commands(asked: Any) -> Any:
     if isinstance(asked, Mapping):
         for agent, words in asked.items():
             if not _is_agent(agent):
-                raise ValueError(f"{shown(agent)} is not an agent ID: it should be 1..{MAX_AGENT_ID}")
+                raise ValueError(f"{shown(agent)} is not an agent ID: use 1..{MAX_AGENT_ID}")
             if not _is_command(words):
-                raise ValueError(f"agent {shown(agent)} needs a program and its arguments, as a list")
+                raise ValueError(f"agent {shown(agent)} needs a list of a program and its arguments")
     elif asked is not None and not _is_command(asked):
-        raise ValueError("should be a program and its arguments, as a list, or a mapping of agent IDs to such lists")
+        raise ValueError("must be a program and its arguments, as a list, or a mapping of agent IDs to such lists")
     return asked
 
 

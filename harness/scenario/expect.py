@@ -63,7 +63,7 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 def _known_number(key: Any) -> int:
     number = NUMBERS.get(str(key))
     if number is None or isinstance(key, float):
-        raise ValueError(f"there is no characteristic {shown(key)}: they are 1 to 6")
+        raise ValueError(f"no characteristic {shown(key)}: use 1 to 6")
     return number
 
 
@@ -155,7 +155,7 @@ class Expect(Model):
     def _known_figures(cls, figures: Any) -> Any:
         for name in figures if isinstance(figures, Mapping) else ():
             if name not in get_args(FigureName):
-                raise ValueError(f"there is no figure {shown(name)}: there are {', '.join(get_args(FigureName))}")
+                raise ValueError(f"no figure {shown(name)}: use one of {', '.join(get_args(FigureName))}")
         return figures
 
     @field_validator("deviations")
@@ -164,7 +164,7 @@ class Expect(Model):
         for handler in deviations.values():
             if handler not in HANDLERS:
                 near = ", ".join(get_close_matches(handler[:80], HANDLERS, cutoff=0.0))
-                raise ValueError(f"there is no handler {shown(handler)}: the nearest are {near}")
+                raise ValueError(f"no handler {shown(handler)}: the nearest are {near}")
         return deviations
 
     @model_validator(mode="after")
@@ -177,7 +177,7 @@ class Expect(Model):
     @classmethod
     def _each_once(cls, values: list[Any]) -> list[Any]:
         if len(set(values)) < len(values):
-            raise ValueError("names one twice: each is a test of its own")
+            raise ValueError("names one expectation twice: leave out one of them")
         return values
 
     def verdict(self, key: str) -> str | None:
@@ -206,9 +206,9 @@ class Expect(Model):
         for agent_id, wanted in self.chains.items():
             ended = top_chain_hashes.get(agent_id)
             if ended is None:
-                yield f"agent {agent_id} has left no chain, and should end with {wanted[:12]} on top"
+                yield f"agent {agent_id} has no chain, but must end with {wanted[:12]} on top"
             elif ended != wanted:
-                yield f"agent {agent_id} ends with the chain hash {ended[:12]} on top, and should with {wanted[:12]}"
+                yield f"agent {agent_id} ends with the chain hash {ended[:12]} on top, but must end with {wanted[:12]}"
 
     def named(self) -> Iterator[tuple[str, int]]:
         """Yield each agent ID, with the key that contains it."""

@@ -39,9 +39,11 @@ FateName = Annotated[str, Field(min_length=1, max_length=100)]
 
 def _quoted(value: Any) -> Any:
     if isinstance(value, float):
-        raise ValueError(f'should be quoted, as in "{value}": 4.1 and 4.10 are one number and two blocks')
+        raise ValueError(
+            f'should be quoted, as in "{value}": without quotes, YAML reads the blocks 4.1 and 4.10 as the same number'
+        )
     if isinstance(value, str) and not re.match(_BLOCK_NAME, value):
-        raise ValueError('should be an agent and the number of its block, as in "4.11"')
+        raise ValueError('must be an agent and the number of its block, such as "4.11"')
     return value
 
 
@@ -102,7 +104,7 @@ class Fate(Model):
         if self.arrivals is not None:
             others = [key for key in ("message", "block", "count", "from_s", "until_s", "name") if getattr(self, key)]
             if self.sender is None or self.receiver is None or others:
-                raise ValueError("`arrivals` are from a `sender` to a `receiver`, and need no other key")
+                raise ValueError("`arrivals` need `sender` and `receiver`, and exclude all other keys")
         if self.from_s is not None and self.until_s is not None and self.from_s >= self.until_s:
             raise ValueError(f"from_s {self.from_s:g} is not before until_s {self.until_s:g}")
         return self

@@ -137,9 +137,9 @@ class Forge(Model):
     @model_validator(mode="after")
     def _means_something(self) -> "Forge":
         if (self.for_s is None) != (self.message == "Commit Block"):
-            raise ValueError(f"`for_s` belongs to a forged answer, and each needs it: {', '.join(self.ANSWERS)}")
+            raise ValueError(f"`for_s` is needed by forged answers ({', '.join(self.ANSWERS)}), and by nothing else")
         if self.approve is not None and self.message not in self.ANSWERS[:2]:
-            raise ValueError(f"`approve` belongs to {' and '.join(self.ANSWERS[:2])}: a {self.message} says neither")
+            raise ValueError(f"`approve` belongs to {' and '.join(self.ANSWERS[:2])}; a {self.message} has no vote")
         return self
 
     def in_words(self) -> str:
@@ -160,7 +160,7 @@ class Flood(_Lasting):
     @model_validator(mode="after")
     def _can_be_counted(self) -> "Flood":
         if self.for_s * self.per_s > MAX_FLOOD:
-            raise ValueError(f"{self.for_s * self.per_s:g} messages are too many: a flood has {MAX_FLOOD} at most")
+            raise ValueError(f"{self.for_s * self.per_s:g} messages are too many: a flood has at most {MAX_FLOOD}")
         return self
 
     def in_words(self) -> str:
@@ -221,7 +221,7 @@ class Lie(Model):
         given = {key for key in ("block", "chain", "approve", "timestamp_s") if getattr(self, key) is not None}
         if not {*needs} <= given <= {*needs, *may}:
             allowed = f", and may have {' and '.join(f'`{key}`' for key in may)}" if may else ""
-            raise ValueError(f"a {self.message} says {' and '.join(f'`{key}`' for key in needs)}{allowed}")
+            raise ValueError(f"a {self.message} needs {' and '.join(f'`{key}`' for key in needs)}{allowed}")
         return self
 
     def in_words(self) -> str:

@@ -59,7 +59,7 @@ def load_scenario(path: Path | str) -> Scenario:
     path = Path(path)
     document = read_yaml(path, "scenario")
     if "scenario" in document:
-        raise ScenarioError(f"{path}: this is a matrix, which `ucp-harness matrix {path}` plays")
+        raise ScenarioError(f"{path}: this is a matrix: play it with `ucp-harness matrix {path}`")
     try:
         return parse(document, beside=find(path).parent)
     except ScenarioError as error:
@@ -93,7 +93,7 @@ class _Loader(yaml.SafeLoader):
         seen: set[str] = set()
         for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
             if key.value in seen:
-                problem = f"{shown_key(key.value)} is there twice"
+                problem = f"{shown_key(key.value)} is repeated"
                 raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
@@ -110,7 +110,7 @@ def parse_yaml(text: str) -> Any:
         where = f" at line {mark.line + 1}" if mark else ""
         problem = str(getattr(error, "problem", None) or getattr(error, "reason", None) or "it cannot be read")
     except ValueError as error:  # a date that is none, a number of thousands of digits
-        where, problem = "", f"a value in it is none: {str(error).partition(':')[0].partition(';')[0]}"
+        where, problem = "", f"an invalid value: {str(error).partition(':')[0].partition(';')[0]}"
     raise ScenarioError(f"not YAML{where}: {problem[:MAX_PROBLEM]}")
 
 
@@ -123,19 +123,19 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise ScenarioError(f"{path}: not a file that holds a {what}")
+            raise ScenarioError(f"{path}: not a file with a {what}")
         if status.st_size > MAX_SCENARIO_BYTES:
-            raise ScenarioError(f"{path}: larger than {MAX_SCENARIO_BYTES} bytes, which no {what} is")
+            raise ScenarioError(f"{path}: larger than {MAX_SCENARIO_BYTES} bytes, which is too large for a {what}")
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        names = "`ucp-harness scenarios` lists those that come along"
-        raise ScenarioError(f"{path}: there is no such file or {what}; {names}") from None
+        names = "`ucp-harness scenarios` lists the included scenarios"
+        raise ScenarioError(f"{path}: no such file or {what}; {names}") from None
     except OSError as error:
         raise ScenarioError(f"{str(path)[:MAX_PROBLEM]}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise ScenarioError(f"{path}: not YAML: it is not UTF-8 text") from None
     except ValueError:  # NUL
-        raise ScenarioError(f"{shown(str(path))}: no file can be called that") from None
+        raise ScenarioError(f"{shown(str(path))}: not a valid file name") from None
     try:
         document = parse_yaml(text)
     except ScenarioError as error:
@@ -154,7 +154,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         there_are = _siblings(model, problem["loc"])
         nearest = get_close_matches(str(problem["loc"][-1]), there_are, n=1)
         meant = f"; did you mean `{nearest[0]}`?" if nearest else ""
-        return f"`{key}` is unknown: there are {', '.join(there_are)}{meant}"
+        return f"`{key}` is unknown: use one of {', '.join(there_are)}{meant}"
     if problem["type"] == "missing":
         return f"`{key}` is missing"
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ").removeprefix("String ")
@@ -163,7 +163,11 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     value = shown(problem["input"])
     if problem["type"] == "list_type" and isinstance(problem["input"], int | float | str):
         message += f", as [{value}]"
-    return f"`{key}` is {value}: it {message}" if message.startswith("should") else f"`{key}` is {value}: {message}"
+    return (
+        f"`{key}` is {value}: it {message}"
+        if message.startswith(("should", "must"))
+        else f"`{key}` is {value}: {message}"
+    )
 
 
 def _siblings(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:

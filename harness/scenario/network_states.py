@@ -133,8 +133,8 @@ def refuse_ambiguity(timeline: Sequence[TimelineEntry]) -> None:
                 other_until_s, other_number = earlier[-1]
                 lasts = "for good" if entry.for_s is None else f"until {until_s:g} s"
                 raise ValueError(
-                    f"timeline.{number} changes {key}{of_whom(where)} {lasts}, and timeline.{other_number} until "
-                    f"{other_until_s:g} s: which holds when? Have timeline.{number} begin then, or be over by then"
+                    f"timeline.{number} changes {key}{of_whom(where)} {lasts}, but timeline.{other_number} changes it "
+                    f"until {other_until_s:g} s: let timeline.{number} begin at that time, or end before it"
                 )
             earlier.append((until_s, number))
 

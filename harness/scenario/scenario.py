@@ -219,10 +219,10 @@ class Scenario(Model):
     def _count_or_ids(cls, agents: Any) -> Any:
         ids = range(1, agents + 1) if isinstance(agents, int) and agents <= MAX_AGENTS else agents
         if not isinstance(ids, range | list) or not 1 <= len(ids) <= MAX_AGENTS:
-            raise ValueError(f"it should be a number of agents 1..{MAX_AGENTS}, or a list of their IDs")
+            raise ValueError(f"use a number of agents 1..{MAX_AGENTS}, or a list of their IDs")
         for agent in ids:
             if isinstance(agent, bool) or not isinstance(agent, int) or not 1 <= agent <= MAX_AGENT_ID:
-                raise ValueError(f"{shown(agent)} is not an agent ID: it should be 1..{MAX_AGENT_ID}")
+                raise ValueError(f"{shown(agent)} is not an agent ID: use 1..{MAX_AGENT_ID}")
         if len(set(ids)) < len(ids):
             raise ValueError(f"names {Counter(ids).most_common(1)[0][0]} twice")
         return agents
@@ -233,7 +233,7 @@ class Scenario(Model):
         known = [field.name for field in dataclasses.fields(Settings)]
         for name in settings if isinstance(settings, dict) else ():
             if name not in known:
-                raise ValueError(f"{name} is unknown: there are {', '.join(known)}")
+                raise ValueError(f"{name} is unknown: use one of {', '.join(known)}")
         return settings
 
     @field_validator("quirks", mode="before")
@@ -248,13 +248,13 @@ class Scenario(Model):
         roster = set(self.roster)
         for key, vehicle in self._named():
             if vehicle not in roster:
-                raise ValueError(f"{key} names vehicle {vehicle}, which does not exist: {_names(roster)}")
+                raise ValueError(f"{key} names vehicle {vehicle}, which is not on the roster: {_names(roster)}")
         names = Counter(fate.name for fate in self.fates if fate.name is not None)
         for index, fate in enumerate(self.fates):
             if fate.name is not None and names[fate.name] > 1:
-                raise ValueError(f"fates.{index}.name {fate.name!r} is taken by another fate")
+                raise ValueError(f"fates.{index}.name {fate.name!r} is the name of another fate")
             if fate.after is not None and fate.after not in names:
-                raise ValueError(f"fates.{index}.after {fate.after!r} is the name of no fate")
+                raise ValueError(f"fates.{index}.after {fate.after!r} is not the name of a fate")
         return self
 
     def _named(self) -> Iterator[tuple[str, int]]:
@@ -298,7 +298,7 @@ class Scenario(Model):
     def _plans_can_be_flown(self) -> "Scenario":
         for key, asked in (("flight", self.flight), ("network.radio", self.network.radio)):
             if asked and self.vehicles.kind == "none":
-                raise ValueError(f"`{key}` needs vehicles, and `vehicles.kind` is none: leave one of them out")
+                raise ValueError(f"`{key}` needs vehicles, but `vehicles.kind` is none: leave out one of them")
         self.vehicles.check_frames(self.roster)
         for index, vehicle in enumerate(self.roster):
             try:
@@ -308,12 +308,12 @@ class Scenario(Model):
         types = {self.vehicles.type_of(vehicle) for vehicle in self.roster}
         if self.vehicles.binary is not None and len(types) > 1:
             raise ValueError(
-                f"`vehicles.binary` is one program, and there are {' and '.join(sorted(types))}: "
-                f"name the directory of their binaries in ARDUPILOT_SITL instead"
+                f"`vehicles.binary` is one program, but the vehicles are of types {' and '.join(sorted(types))}: set "
+                "ARDUPILOT_SITL to the directory of their binaries"
             )
         twice = Counter(vehicle for flight in self.flight for vehicle in flight.vehicles).most_common(1)
         if twice and twice[0][1] > 1:
-            raise ValueError(f"`flight` names vehicle {twice[0][0]} twice: a vehicle flies one plan")
+            raise ValueError(f"`flight` names vehicle {twice[0][0]} twice: a vehicle has one plan")
         for index, flight in enumerate(self.flight):
             for vehicle in flight.vehicles:
                 try:
@@ -379,7 +379,7 @@ class Scenario(Model):
                 end = f"the mission's end at {self.duration_s:g} s"
                 raise ValueError(f"{where}.{key} would last until {entry.ends_at_s:g} s, after {end}")
             if instants[entry.at_s] > 1:
-                raise ValueError(f"{where}.at_s {entry.at_s:g} has two entries: which comes first?")
+                raise ValueError(f"{where}.at_s {entry.at_s:g} has two entries: give each entry its own time")
             try:
                 NetworkConditions(partition=entry.groups).validate(self.roster)
             except ConditionsError as error:
@@ -408,16 +408,18 @@ class Scenario(Model):
             except ValueError as error:
                 raise ValueError(f"{where} {error}") from None
             if fault.needs_keys and self.security is None:
-                raise ValueError(f"{where} is about keys, which a mission has with `security: {{keys: fresh}}`")
+                raise ValueError(f"{where} needs a mission with keys: add `security: {{keys: fresh}}`")
             for agent in fault.agents:
                 if state[agent] not in fault.needs:
-                    raise ValueError(f"{where}: agent {agent} is {state[agent]} then, not {' or '.join(fault.needs)}")
+                    raise ValueError(
+                        f"{where}: agent {agent} is {state[agent]} at that time, not {' or '.join(fault.needs)}"
+                    )
                 state[agent] = fault.leads_to or state[agent]
         if set(state.values()) == {KILLED}:
-            raise ValueError("the timeline leaves nobody: at the end all agents are killed; spare or restart one")
+            raise ValueError("the timeline kills all agents: keep or restart at least one")
         return self
 
 
 def _names(roster: set[int]) -> str:
     ordered = sorted(roster)
-    return f"there are {', '.join(map(str, ordered[:20]))}{', ...' if len(ordered) > 20 else ''}"
+    return f"use one of {', '.join(map(str, ordered[:20]))}{', ...' if len(ordered) > 20 else ''}"

@@ -28,7 +28,7 @@ def _decodable(text: str) -> str:
     try:
         base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError):
-        raise ValueError("should be base64") from None
+        raise ValueError("must be base64") from None
     return text
 
 

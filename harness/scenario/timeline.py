@@ -73,7 +73,7 @@ class _Entry(Disturbance):
     def _an_injection(cls, value: Any, info: ValidationInfo) -> Any:
         if isinstance(value, int | float):
             of_the_network = f"`network: {{{info.field_name}: {value}}}`"
-            raise ValueError(f"it is what a rogue node does; {of_the_network} is the network's")
+            raise ValueError(f"it is an action of a rogue node; {of_the_network} belongs to the network")
         return value
 
     @property
@@ -181,12 +181,12 @@ class Ramp(Model):
         if self.network is not None:
             first, last = ({(where, key): value for where, key, value in _values(end)} for end in self._ends())
             for where, key in first.keys() ^ last.keys():
-                raise ValueError(f"{key}{of_whom(where)} is in one `network` of the two: from what, or to what?")
+                raise ValueError(f"{key}{of_whom(where)} is in one `network` of the ramp only: give it in both")
             for (where, key), value in [*first.items(), *last.items()]:
                 if where is None and getattr(self, key, None) is not None:
-                    raise ValueError(f"`{key}` and `network.{key}` are the same thing: leave one of them out")
+                    raise ValueError(f"`{key}` and `network.{key}` are the same setting: leave out one of them")
                 if not isinstance(value, float):
-                    raise ValueError(f"{key}{of_whom(where)} is {value!r}: a ramp goes from one number to another")
+                    raise ValueError(f"{key}{of_whom(where)} is {value!r}: a ramp needs two numbers")
         return self
 
     def _ends(self) -> tuple[NetworkValues, NetworkValues]:
@@ -223,7 +223,7 @@ class Repeated(Disturbance):
         if all(value is None for value in (self.loss, self.delay, self.partition, self.network)):
             raise ValueError("needs at least one of `loss`, `delay`, `partition` or `network`")
         if self.delay is not None and self.network is not None and self.network.delay is not None:
-            raise ValueError("`delay` and `network.delay` are the same thing: leave one of them out")
+            raise ValueError("`delay` and `network.delay` are the same setting: leave out one of them")
         return self
 
     def changes(self) -> NetworkValues:
@@ -266,12 +266,12 @@ class Schedule(Model):
             raise ValueError(f"until_s {self.until_s:g} is not after from_s {self.from_s:g}")
         if self.ramp is not None:
             if self.for_s is not None:
-                raise ValueError("for_s is for `repeat` and `nemesis`: a ramp lasts until until_s")
+                raise ValueError("for_s belongs to `repeat` and `nemesis`; a ramp ends at until_s: leave out for_s")
         elif self.every_s is None or self.for_s is None:
             raise ValueError("needs `every_s` and `for_s`")
         elif self.for_s >= self.every_s:
             raise ValueError(
-                f"for_s {self.for_s:g} is not less than every_s {self.every_s:g}: it would never be undone"
+                f"for_s {self.for_s:g} is not less than every_s {self.every_s:g}: otherwise the change never ends"
             )
         return self
 

@@ -37,7 +37,7 @@ def _read(read: Callable[[str, Path], Any], written_out: Any) -> BeforeValidator
             return asked
         beside = (info.context or {}).get("beside")
         if beside is None:
-            raise ValueError("only a scenario that is a file itself can name one: write out what is in it")
+            raise ValueError("only a scenario in a file can name another file: write out its content")
         try:
             return read(asked, beside)
         except VehicleError as error:
@@ -61,7 +61,7 @@ def _sound(values: dict[str, float]) -> dict[str, float]:
 
 def _flown_here(frame: str) -> str:
     if program := NOT_FLOWN.get(frame):
-        raise ValueError(f"flies by {program}, which no pilot of the harness knows: there are copter, plane and rover")
+        raise ValueError(f"has the type {program}, which is unknown: use copter, plane or rover")
     return frame
 
 
@@ -69,7 +69,7 @@ def _no_options_of_ours(arguments: list[str]) -> list[str]:
     for argument in arguments:
         is_ours = argument.partition("=")[0] in SET_BY_US or argument[:2] in SHORT_AND_SET_BY_US
         if is_ours or "\0" in argument:
-            raise ValueError(f"has {argument!r}, which the harness sets itself: leave it out")
+            raise ValueError(f"has {argument!r}, which the harness sets: leave it out")
     return arguments
 
 
@@ -78,7 +78,7 @@ def _on_earth(home: tuple[float, float, float, float]) -> tuple[float, float, fl
     if not all(math.isfinite(value) for value in home) or abs(latitude) > 90 or abs(longitude) > 180:
         raise ValueError("needs latitude -90..90, longitude -180..180, altitude (m) and heading (degrees)")
     if latitude == longitude == 0:
-        raise ValueError("latitude and longitude 0 are ArduPilot's word for no position: move it by a metre")
+        raise ValueError("ArduPilot reads latitude and longitude 0 as no position: move it by one metre")
     return home
 
 
@@ -211,8 +211,8 @@ class Vehicles(Model):
             frame, own = self.setup_of(vehicle).frame, self.type_of(vehicle)
             if frame and type_of(frame) not in (None, own):
                 raise ValueError(
-                    f"frame {frame} is a {type_of(frame)}'s, and vehicle {vehicle} is a {own}: say so with "
-                    f"`vehicles.type` or `vehicles.types`, or give it another frame in `vehicles.each`"
+                    f"frame {frame} belongs to a {type_of(frame)}, but vehicle {vehicle} is a {own}: change "
+                    "`vehicles.type` or `vehicles.types`, or give it another frame in `vehicles.each`"
                 )
 
 

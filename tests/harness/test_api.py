@@ -104,5 +104,5 @@ def test_fixture_swarm_has_the_public_type(swarm: Swarm) -> None:
 
 def test_errors_have_one_base() -> None:
     assert issubclass(MachineError, HarnessError)
-    with pytest.raises(HarnessError, match="there is no such file or scenario"):
+    with pytest.raises(HarnessError, match="no such file or scenario"):
         load_scenario("nowhere")

@@ -134,7 +134,7 @@ def test_an_interpreter_that_a_user_cannot_reach_is_named_and_nothing_else_is_bl
     done = run_script(_INTERPRETER_OUT_OF_REACH)
     said, findings = done.stdout.splitlines()
     user = pwd.getpwuid(os.geteuid() or pwd.getpwnam("nobody").pw_uid).pw_name
-    assert said.startswith(f"The lab's first process could not be started: user {user} cannot execute /"), done.stderr
+    assert said.startswith(f"The lab's first process cannot be started: user {user} cannot execute /"), done.stderr
     assert "/program (Permission denied). Let that user reach it" in said
     assert findings == "[('namespaces', True), ('network', False)]"
 
@@ -142,7 +142,7 @@ def test_an_interpreter_that_a_user_cannot_reach_is_named_and_nothing_else_is_bl
 @pytest.mark.lab
 def test_a_program_that_a_user_cannot_execute_is_named_with_the_user() -> None:
     done = run_script(_STORY.replace('["/bin/true"]', '["/etc/shadow"]'))
-    assert "The program could not be started: [Errno 13] Permission denied to user" in done.stderr
+    assert "The program cannot be started: [Errno 13] Permission denied to user" in done.stderr
     assert done.stderr.rstrip().endswith(": '/etc/shadow'")
 
 

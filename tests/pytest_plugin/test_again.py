@@ -40,7 +40,7 @@ def test_the_run_of_a_failing_test_is_played_again_and_explored(pytester: pytest
 
 @pytest.mark.parametrize(
     ("record", "sentence"),
-    [('{"schema": "ucp-run/1"}', "it does not say what was played; name a scenario"), ("{", "truncated or damaged")],
+    [('{"schema": "ucp-run/1"}', "it does not name the scenario; give a scenario"), ("{", "truncated or damaged")],
 )
 def test_a_record_without_a_scenario_is_one_sentence(tmp_path: Path, record: str, sentence: str) -> None:
     (tmp_path / "run.json").write_text(record)

@@ -65,14 +65,15 @@ def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester)
         [
             "*_ tie.yaml::sim-seed1 _*",
             "characteristic 1, distributed: violated: *",
-            "    agent 1: *a reconcile did not go on within*",
+            "    agent 1: *a reconcile did not continue within*",
             "steps: deviates: 1 difference in *",
             "    agent 1: *Algorithm 15, reconcile_phase_2_timer_expiration: it took the branch 'crashed by *",
-            "liveness: never finishes: agent 1 hangs since 42 s: not idle, and no timer runs that would end that",
-            "wrong on purpose: crash_on_tie (all agents)",
+            "liveness: never finishes: agent 1 has hung since 42 s: not idle, and no running timer can change this",
+            "deliberate mistakes: crash_on_tie (all agents)",
             "report: *",
             "*_ expected.yaml::sim-seed1 _*",
-            "characteristic 5, all committed everywhere: violated: fully connected, and yet agent 1 hangs since 42 s",
+            "characteristic 5, all committed everywhere: violated: the system is fully connected, but agent 1 has hung "
+            "since 42 s",
             "    expected: holds",
         ]
     )
@@ -83,17 +84,17 @@ def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester)
 @pytest.mark.parametrize(
     ("expect", "sentence"),
     [
-        ({"characteristics": {7: "holds"}}, "*there is no characteristic '7': they are 1 to 6"),
+        ({"characteristics": {7: "holds"}}, "*no characteristic '7': use 1 to 6"),
         ({"characteristics": {6: "hold"}}, "*is 'hold': it should be 'holds', 'violated' or 'not applicable'"),
-        ({"figures": {"block": 1}}, "*there is no figure 'block': there are agents, blocks, *"),
+        ({"figures": {"block": 1}}, "*no figure 'block': use one of agents, blocks, *"),
         ({"figures": {"blocks": "many"}}, "*is 'many': it should be a number, or {min: number, max: number}"),
         ({"figures": {"blocks": {"min": 3, "max": 2}}}, "*min 3 is more than max 2"),
-        ({"seeds": [1, 1]}, "*`expect.seeds` is *: names one twice: each is a test of its own"),
+        ({"seeds": [1, 1]}, "*`expect.seeds` is *: names one expectation twice: leave out one of them"),
         ({"backends": ["kernel"]}, "*`expect.backends.0` is 'kernel': it should be 'process', 'docker' or 'sim'"),
-        ({"characterstics": {1: "holds"}}, "*`expect.characterstics` is unknown: there are characteristics, *"),
+        ({"characterstics": {1: "holds"}}, "*`expect.characterstics` is unknown: use one of characteristics, *"),
         (
             {"seed": [1], "figures": {}},
-            "*`expect.seed` is unknown: there are characteristics, steps, *",
+            "*`expect.seed` is unknown: use one of characteristics, steps, *",
         ),
     ],
 )
@@ -160,7 +161,7 @@ def test_run_directories_are_kept_where_asked_for_and_never_overwritten(pytester
     ("option", "value", "sentence"),
     [
         ("--ucp-speedup", 0, "*`speedup` is 0*: it should be greater than 0"),
-        ("--ucp-seed", -1, "--ucp-seed is -1: it should be 0 or more"),
+        ("--ucp-seed", -1, "--ucp-seed is -1: use a number from 0 on"),
     ],
 )
 def test_an_option_that_means_nothing_is_one_sentence(

@@ -43,10 +43,10 @@ def test_what_the_scenario_expects_is_judged_with_the_test(pytester: pytest.Pyte
 @pytest.mark.parametrize(
     ("marker", "sentence"),
     [
-        ("", "the fixture `scenario` needs a marker that says which, *"),
-        ('@pytest.mark.scenario("s.yaml", agents=3)', "the fixture `scenario` needs a marker that says which, *"),
-        ('@pytest.mark.scenario("none.yaml")', "*none.yaml: there is no such file or scenario*"),
-        ('@pytest.mark.scenario("s.yaml", seed="one")', "`seed` is 'one': it should be a number, 0 or more"),
+        ("", "the fixture `scenario` needs a marker with a scenario, *"),
+        ('@pytest.mark.scenario("s.yaml", agents=3)', "the fixture `scenario` needs a marker with a scenario, *"),
+        ('@pytest.mark.scenario("none.yaml")', "*none.yaml: no such file or scenario*"),
+        ('@pytest.mark.scenario("s.yaml", seed="one")', "`seed` is 'one': use a number from 0 on"),
         ('@pytest.mark.scenario("fates.yaml", backend="process")', "`fates` needs virtual time: use --backend sim"),
     ],
 )
@@ -67,7 +67,7 @@ def test_a_fate_that_never_matched_fails_the_test(pytester: pytest.Pytester) -> 
     pytester.makepyfile('import pytest\n@pytest.mark.scenario("s.yaml")\ndef test_s(scenario): pass')
     result = run(pytester)
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*block 1.900*, so this run does not show what it was meant to"])
+    result.stdout.fnmatch_lines(["*block 1.900*, so this run differs from its script"])
 
 
 def test_a_backend_that_this_machine_cannot_is_skipped_with_the_way_out(

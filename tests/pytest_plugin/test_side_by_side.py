@@ -166,4 +166,4 @@ def test_a_project_with_a_package_of_the_same_name_keeps_its_tests(pytester: pyt
     for command in ([sys.executable, "-m", "pytest"], [Path(sys.executable).with_name("pytest")]):
         result = pytester.run(*command, "--strict-markers")
         result.assert_outcomes(passed=1, errors=1)
-        result.stdout.fnmatch_lines([f"*ucp-harness is not there: *{ours} has the name of one of its packages; *"])
+        result.stdout.fnmatch_lines([f"*ucp-harness is not importable: *{ours} has the name of one of its packages; *"])

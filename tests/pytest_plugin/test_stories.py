@@ -74,9 +74,9 @@ def test_an_agent_that_does_otherwise_fails_with_the_lines_that_differ(pytester:
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
         [
-            "agents do not do what the story tells; if they are right, --ucp-rewrite writes it anew",
-            "--- missed.story, as it is told",
-            "+++ as it was played",
+            "agents deviate from the story; if the agents are right, --ucp-rewrite rewrites the story",
+            "--- missed.story, as written",
+            "+++ as played",
             "-      2           6  Receive Commit Block from 1: committed; chain +1.1",
             "+      2           6  Receive Commit Block from 1: ignored by quirk",
             "report: *",
@@ -128,7 +128,9 @@ def test_what_an_agent_tells_in_words_that_nobody_knows_is_not_compared(pytester
     command = f"2={shlex.quote(sys.executable)} -P {shlex.quote(str(agent))}"
     result = run(pytester, written(pytester), "--ucp-agent", command, "-rs")
     result.assert_outcomes(skipped=1)
-    result.stdout.fnmatch_lines(["*cannot be compared: unknown branch 'agrees' of receive_request_add_block in the *"])
+    result.stdout.fnmatch_lines(
+        ["*cannot be compared with the story: unknown branch 'agrees' of receive_request_add_block in the *"]
+    )
 
 
 @pytest.mark.lab
@@ -144,9 +146,9 @@ def test_what_an_agent_does_not_support_is_skipped(pytester: pytest.Pytester) ->
 @pytest.mark.parametrize(
     ("asked", "sentence"),
     [
-        (["9=my_agent"], "agent_command names vehicle 9, which does not exist: there are 1, 2, 3"),
+        (["9=my_agent"], "agent_command names vehicle 9, which is not on the roster: use one of 1, 2, 3"),
         (["2=my_agent", "2=yours"], "--ucp-agent names two programs for 2"),
-        (["2="], "--ucp-agent names no program"),
+        (["2="], "--ucp-agent is empty: name a program"),
     ],
 )
 def test_an_agent_of_the_command_line_that_cannot_be_is_one_sentence(
@@ -163,34 +165,37 @@ def test_in_virtual_time_any_agent_does_as_the_story_tells(pytester: pytest.Pyte
     run(pytester, path, "--ucp-agent", f"2={shlex.quote(sys.executable)} -P -m ucp.node").assert_outcomes(passed=1)
     result = run(pytester, path, "--ucp-agent", "./my_agent --quick")
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["`agent_command` of agent 1: ./my_agent is no program*"])
+    result.stdout.fnmatch_lines(["`agent_command` of agent 1: ./my_agent is not a program*"])
     no_internals(result)
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("agents: 3\n", "there is no sentence in it, such as `1 s: 1 logs`"),
-        ("1 s: 1 logs\n", "it has no end: the last sentence should be one such as `60 s: end`"),
-        ("1 s: 1 sings\n", "line 1: '1 sings' is no sentence of a story: there are `1 2 log`"),
-        ("1 s: 1 logs\n\nand then\n2 s: end\n", "line 3: 'and then' is no sentence: those begin with their second"),
-        ("9 s: 1 logs\n2 s: end\n", "line 2: 2 s is before 9 s, which was told already"),
-        ("9 s: end\n10 s: 1 logs\n", "line 2: something is told after the end"),
+        ("agents: 3\n", "it has no sentence, such as `1 s: 1 logs`"),
+        ("1 s: 1 logs\n", "it has no end: add a last sentence such as `60 s: end`"),
+        ("1 s: 1 sings\n", "line 1: '1 sings' is not a sentence of a story: use `1 2 log`"),
+        (
+            "1 s: 1 logs\n\nand then\n2 s: end\n",
+            "line 3: 'and then' is not a sentence: start it with its mission second",
+        ),
+        ("9 s: 1 logs\n2 s: end\n", "line 2: 2 s is before 9 s of an earlier sentence"),
+        ("9 s: end\n10 s: 1 logs\n", "line 2: a sentence follows the end"),
         (
             "agents: [\n1 s: end\n",
-            "before its first sentence are a scenario's keys: not YAML at line 1: expected the node content",
+            "the keys before its first sentence are wrong: not YAML at line 1: expected the node content",
         ),
-        ("- 3\n1 s: end\n", "before its first sentence are a scenario's keys, each with its value"),
-        ("timeline: []\n1 s: end\n", "`timeline` is what its sentences tell"),
-        ("agents: 3\n1 s: kill 7\n2 s: end\n", "line 2: kill names vehicle 7, which does not exist"),
+        ("- 3\n1 s: end\n", "the text before its first sentence must be keys of a scenario with their values"),
+        ("timeline: []\n1 s: end\n", "`timeline` is set by the sentences of the story: leave it out"),
+        ("agents: 3\n1 s: kill 7\n2 s: end\n", "line 2: kill names vehicle 7, which is not on the roster"),
         (
             "agents: 3\n\n1 s: 1 logs 900 bytes\n2 s: end\n",
             "line 3: by `settings.max_event_bytes` an event has",
         ),
-        ("agents: 2001-02-30\n1 s: end\n", "not YAML: a value in it is none: day is out of range for month"),
+        ("agents: 2001-02-30\n1 s: end\n", "not YAML: an invalid value: day is out of range for month"),
         ("agents: " + "[" * 99 + "\n1 s: end\n", "not YAML at line 1: it is nested too deeply"),
-        ("1 s: {kill: [1}\n2 s: end\n", "line 1: '{kill: [1}' is not YAML"),
-        ("1 s: {at_s: 3}\n2 s: end\n", "is no entry of a timeline, whose instant the story tells"),
+        ("1 s: {kill: [1}\n2 s: end\n", "line 1: '{kill: [1}' is not an entry of a timeline in YAML"),
+        ("1 s: {at_s: 3}\n2 s: end\n", "is not an entry of a timeline without `at_s`"),
     ],
 )
 def test_a_mistake_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> None:

@@ -96,9 +96,9 @@ FAULTS = """
     def test_faults(swarm):
         swarm.run_until(100)
         swarm.kill(3)
-        with pytest.raises(Exception, match="kill: agent 3 is killed then"):
+        with pytest.raises(Exception, match="kill: agent 3 is killed at that time"):
             swarm.kill(3)
-        with pytest.raises(Exception, match="reconcile: agent 3 is killed then, not running"):
+        with pytest.raises(Exception, match="reconcile: agent 3 is killed at that time, not running"):
             swarm.reconcile(3)
         swarm.pause(7)
         swarm.run_for(50)
@@ -115,7 +115,7 @@ FAULTS = """
         swarm.loss(0.5)
         swarm.run_for(20)
         swarm.final_reconcile()
-        with pytest.raises(Exception, match="the final reconcile has been"):
+        with pytest.raises(Exception, match="the final reconcile is over"):
             swarm.final_reconcile()
         assert swarm.characteristic(6).holds
         assert len(swarm.chain(3)) == len(swarm.chain(20)) > held
@@ -202,7 +202,7 @@ def test_a_violation_fails_the_test_with_its_evidence_and_its_report(pytester: p
         [
             "*_ test_tie _*",
             "characteristic 1, distributed: violated: 1 time: *",
-            "    agent 1: trace line *, t=* s: a reconcile did not go on within * s",
+            "    agent 1: trace line *, t=* s: a reconcile did not continue within * s",
             "report: *",
         ]
     )
@@ -281,17 +281,17 @@ def test_the_network_changes_for_a_while_and_a_test_that_ends_waits_for_that(pyt
     [
         ("swarm.partition([1], [9])", "partition[[]1]: unknown vehicle 9; allowed is any of 1, 2, 3, 4, 5"),
         ("swarm.loss(2)", "`loss` is 2: *"),
-        ("swarm.network(lost=1)", "`network.lost` is unknown: there are loss, delay, *"),
-        ("swarm.loss(0.5, for_s=9); swarm.heel()", "a swarm has no 'heel'; what can happen to it: *kill, *"),
+        ("swarm.network(lost=1)", "`network.lost` is unknown: use one of loss, delay, *"),
+        ("swarm.loss(0.5, for_s=9); swarm.heel()", "a swarm has no 'heel'; use one of *kill, *"),
         ("swarm.reboot(2, disk='half')", "`disk` is 'half': it should be 'kept' or 'lost'"),
-        ("swarm.restart(2)", "restart: agent 2 is running then, not killed"),
-        ("swarm.kill(1, 2, 3, 4, 5)", "the timeline leaves nobody: *"),
-        ("swarm.characteristic(7)", "there is no characteristic 7: they are 1 to 6"),
-        ("swarm.judgement('6')", "there is no judgement '6': there are steps, records, liveness"),
-        ("swarm.run_for(-5)", "a mission does not go on for -5 s"),
-        ("swarm.run_for(9); swarm.run_until(8)", "a mission does not go on until 8 s: it is at 9 s"),
-        ("swarm.run_until(float('inf'))", "a mission does not go on until inf s: it is at 0 s"),
-        ("swarm.chain(6)", "there is no chain of agent 6: there are those of [[]1, 2, 3, 4, 5[]]"),
+        ("swarm.restart(2)", "restart: agent 2 is running at that time, not killed"),
+        ("swarm.kill(1, 2, 3, 4, 5)", "the timeline kills all agents: *"),
+        ("swarm.characteristic(7)", "no characteristic 7: use 1 to 6"),
+        ("swarm.judgement('6')", "no judgement '6': use one of steps, records, liveness"),
+        ("swarm.run_for(-5)", "a mission cannot run for -5 s: use a time above 0"),
+        ("swarm.run_for(9); swarm.run_until(8)", "a mission cannot run until 8 s: it is at 9 s"),
+        ("swarm.run_until(float('inf'))", "a mission cannot run until inf s: it is at 0 s"),
+        ("swarm.chain(6)", "no chain of agent 6; agents with a chain: [[]1, 2, 3, 4, 5[]]"),
         ("swarm.pause(1); swarm.wait_idle(20)", "within 20 mission seconds not every agent has voted and become idle"),
     ],
 )
@@ -309,10 +309,10 @@ def test_what_cannot_be_is_one_sentence_at_the_test_s_own_line(
 @pytest.mark.parametrize(
     ("marker", "sentence"),
     [
-        ("agent=7", "`agent` is unknown: there are name, *"),
-        ("backend='kernel'", "`backend` is 'kernel': it should be 'process', 'docker' or 'sim'"),
-        ("seed=-1", "`seed` is -1: it should be a number, 0 or more"),
-        ("agent_command=['./x']", "`agent_command`: ./x is no program: *"),
+        ("agent=7", "`agent` is unknown: use one of name, *"),
+        ("backend='kernel'", "`backend` is 'kernel': use 'process', 'docker' or 'sim'"),
+        ("seed=-1", "`seed` is -1: use a number from 0 on"),
+        ("agent_command=['./x']", "`agent_command`: ./x is not a program: *"),
     ],
 )
 def test_a_swarm_that_cannot_be_is_one_sentence(pytester: pytest.Pytester, marker: str, sentence: str) -> None:

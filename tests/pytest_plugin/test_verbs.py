@@ -133,7 +133,7 @@ def test_a_hold_that_holds_nothing_fails_the_test(pytester: pytest.Pytester) -> 
     pytester.makepyfile("def test_nothing(swarm):\n    swarm.hold('Block Response')\n    swarm.run_for(9)")
     result = run(pytester)
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["fates.0 (hold until * s Block Response *) never matched a message, so this run *"])
+    result.stdout.fnmatch_lines(["fates.0 (hold until * s Block Response *) matched no message, so this run *"])
 
 
 def test_conditions_last_as_long_as_their_block(pytester: pytest.Pytester, tmp_path: Path) -> None:
@@ -211,36 +211,39 @@ def test_what_needs_virtual_time_is_said_and_the_story_goes_on(pytester: pytest.
 @pytest.mark.parametrize(
     ("told", "sentence"),
     [
-        ("swarm.wait_for('commit')", "ScenarioError: there is no handler 'commit': there are build_data_block, *"),
+        ("swarm.wait_for('commit')", "ScenarioError: no handler 'commit': use one of build_data_block, *"),
         (
             "swarm.wait_for('vote_timer_expiration', 'won')",
-            "ScenarioError: vote_timer_expiration has no branch 'won': it has '*",
+            "ScenarioError: vote_timer_expiration has no branch 'won': use one of '*",
         ),
         (
             "swarm.wait_for('vote_timer_expiration', agent=9)",
-            "ScenarioError: there is no agent 9: there are 1, 2, 3, 4, 5",
+            "ScenarioError: no agent 9: use one of 1, 2, 3, 4, 5",
         ),
-        ("swarm.wait_for('vote_timer_expiration', limit_s=-1)", "ScenarioError: nobody waits for -1 s"),
+        (
+            "swarm.wait_for('vote_timer_expiration', limit_s=-1)",
+            "ScenarioError: a wait needs a limit of 0 s or more, not -1 s",
+        ),
         (
             "swarm.wait_for('vote_timer_expiration', agent=3, limit_s=0.5)",
             "AssertionError: within 0.5 mission seconds agent 3 has not run vote_timer_expiration",
         ),
         ("swarm.hold('Commit')", "ScenarioError: `message` is 'Commit': it should be *"),
-        ("swarm.hold(sender=9)", "ScenarioError: *sender names vehicle 9, which does not exist: *"),
-        ("swarm.hold(drop=True)", "ScenarioError: `drop` is unknown: what is held is said by message, sender, *"),
+        ("swarm.hold(sender=9)", "ScenarioError: *sender names vehicle 9, which is not on the roster: *"),
+        ("swarm.hold(drop=True)", "ScenarioError: `drop` is unknown: use one of message, sender, *"),
         ("swarm.hold(sender=2); swarm.hold(sender=2)", "ScenarioError: sender=2 is held already"),
-        ("swarm.release(sender=2)", "ScenarioError: sender=2 is not held: nothing is"),
+        ("swarm.release(sender=2)", "ScenarioError: sender=2 is not held; held: nothing"),
         (
             "swarm.hold(sender=2); swarm.release('Commit')",
-            "ScenarioError: message='Commit' is not held: sender=2 is",
+            "ScenarioError: message='Commit' is not held; held: sender=2",
         ),
-        ("swarm.wait_for(['vote'])", "ScenarioError: there is no handler [[]'vote'[]]: there are *"),
-        ("swarm.link(1, 1, loss=1)", "ScenarioError: *a link from vehicle 1 to itself carries nothing"),
-        ("swarm.link(1, 9, loss=1)", "ScenarioError: *names vehicle 9, which does not exist: *"),
-        ("swarm.link(1, 2)", "ScenarioError: a link needs what is other on it than elsewhere, such as loss=0.9"),
+        ("swarm.wait_for(['vote'])", "ScenarioError: no handler [[]'vote'[]]: use one of *"),
+        ("swarm.link(1, 1, loss=1)", "ScenarioError: *a link from vehicle 1 to itself is impossible"),
+        ("swarm.link(1, 9, loss=1)", "ScenarioError: *names vehicle 9, which is not on the roster: *"),
+        ("swarm.link(1, 2)", "ScenarioError: a link needs a condition of its own, such as loss=0.9"),
         (
             "with swarm.loss(0.3): swarm.run_for(5); swarm.loss(0.5)",
-            "ScenarioError: the block cannot be undone, for the same was changed in it for longer: *",
+            "ScenarioError: the `with` block cannot undo its change, because the same *",
         ),
         ("swarm.replay(count=0)", "ScenarioError: `replay.count` is 0: *"),
         ("swarm.flood(for_s=5)", "ScenarioError: `flood.per_s` is missing*"),

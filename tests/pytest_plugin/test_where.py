@@ -64,7 +64,7 @@ def test_without_user_mode_linux_processes_are_skipped_with_the_reason(
     result.stdout.fnmatch_lines_random(
         [
             "SKIPPED *--ucp-kernel uml: User Mode Linux is not installed (Debian, Ubuntu: apt install *",
-            "SKIPPED *there is no Docker engine in User Mode Linux: *",
+            "SKIPPED *--backend docker does not work with --kernel uml, *",
         ]
     )
 

@@ -234,7 +234,7 @@ def test_what_is_no_address_is_one_sentence(text: str) -> None:
 
 
 def test_a_host_that_nobody_knows_is_one_sentence() -> None:
-    with pytest.raises(VehicleError, match=r"the ground station at nobody\.invalid:14550 cannot be sent anything"):
+    with pytest.raises(VehicleError, match=r"the ground station at nobody\.invalid:14550 cannot be sent"):
         asyncio.run(GroundStation.open(Address("nobody.invalid", 14550), lambda: 0.0, lambda vehicles: None))
 
 

@@ -51,7 +51,9 @@ class SecuredAgent(Agent):
         super().__init__(*arguments, **options)
         without = sorted(self.roster - session.public_keys.keys())
         if without or session.agent_id != self.agent_id:
-            raise ValueError(f"the keys are of agent {session.agent_id}, and there are none of {without or 'others'}")
+            raise ValueError(
+                f"the keys belong to agent {session.agent_id}, and keys of {without or 'others'} are missing"
+            )
         self.session = session
         self.revocation: Revocation | None = None
         """The newest that is known."""

@@ -59,7 +59,7 @@ class Names:
         if hashes:
             raise CaptureError(f"--follow {wanted} fits {len(hashes)} blocks: give more digits of the hash")
         way_out = "--bundle shows what is sealed" if self._sealed else "give a name or a hash that is printed here"
-        raise CaptureError(f"--follow {wanted}: no message is known to be about that block; {way_out}")
+        raise CaptureError(f"--follow {wanted}: no known message is about that block; {way_out}")
 
     def _learn_from_exports(self, run: Path) -> None:
         try:

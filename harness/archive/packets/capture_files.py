@@ -82,7 +82,7 @@ def read_captures(paths: Iterable[Path], opener: "Opener | None" = None) -> Capt
         if capture.about is not None:
             own = Clock(capture.about.epoch_us * 1000, capture.about.speedup, True)
             if clock not in (None, own):
-                errors.append(f"{path}: of another run than the captures before it; look at each run by itself")
+                errors.append(f"{path}: of another run than the captures before it; print each run separately")
                 continue
             clock = own
         used.append(capture)

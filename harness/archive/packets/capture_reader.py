@@ -155,7 +155,7 @@ class Capture:
             return About.model_validate_json(comment)
         except ValidationError:
             self.problems.append(
-                f"{self.path}: its comment is damaged or of a newer version: read as one from the field"
+                f"{self.path}: its comment is damaged or of a newer version: it is read as a capture from the field"
             )
             return None
 

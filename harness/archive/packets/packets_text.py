@@ -131,7 +131,7 @@ def life(chapters: Sequence[Chapter], exchanges: Exchanges, wording: Wording) ->
                 yield f"{_INDENT}   {wording.answers(missing)}"
     reached = sorted(carried_to(chapters).items(), key=lambda item: (item[1], item[0]))
     carried = ", ".join(f"{vehicle} at {at_s:.3f} s" for vehicle, at_s in reached)
-    yield f"the block itself reached {carried or 'nobody'}"
+    yield f"the block reached {carried or 'no vehicle'}"
 
 
 def tail(captures: Captures, transmissions: Sequence[Transmission]) -> Iterator[str]:
@@ -160,7 +160,7 @@ def tail(captures: Captures, transmissions: Sequence[Transmission]) -> Iterator[
 
 def _receivers(transmission: Transmission) -> str:
     if not transmission.received:
-        return "nobody"
+        return "no vehicle"
     if len(transmission.received) <= _NAMED:
         return _list(transmission.reached)
     return f"{len(transmission.received)} of {len(transmission.received) + len(transmission.lost_by)}"

@@ -86,8 +86,8 @@ class CaptureFile:
                     raise CaptureError(f"{self.path}: empty: {why}")
                 if magic not in MAGICS:
                     raise CaptureError(
-                        f"{self.path}: not a capture: it begins neither as pcapng nor as pcap; "
-                        "`ucp-harness run --capture` and `tcpdump -w` write such files"
+                        f"{self.path}: not a pcapng or pcap file; `ucp-harness run --capture` and `tcpdump -w` write "
+                        "such files"
                     )
                 broken = ""
                 try:
@@ -95,7 +95,7 @@ class CaptureFile:
                 except _BrokenError as error:
                     broken = str(error)
                 if file.trouble or broken:
-                    self.trouble = f"{file.trouble or broken}; what is before it was read"
+                    self.trouble = f"{file.trouble or broken}; the part before is read"
         except OSError as error:
             raise CaptureError(f"{self.path}: cannot be read: {error.strerror}") from None
 
@@ -217,7 +217,7 @@ def _read(file: BinaryIO, count: int, offset: int) -> bytes:
 
 
 def _breaks_off(offset: int) -> _BrokenError:
-    return _BrokenError(f"breaks off in the middle of what begins at byte {offset}")
+    return _BrokenError(f"ends within the block that starts at byte {offset}")
 
 
 def _damaged(offset: int) -> _BrokenError:

@@ -25,7 +25,7 @@ class Selection:
 
     def __post_init__(self) -> None:
         if self.message is not None and self.message.lower() not in map(str.lower, MESSAGES):
-            raise CaptureError(f"--message {self.message}: there is no such message; there are {', '.join(MESSAGES)}")
+            raise CaptureError(f"--message {self.message}: no such message; use one of {', '.join(MESSAGES)}")
         if self.between_s is not None and not self.between_s[0] <= self.between_s[1]:
             raise CaptureError("--between {:g} {:g}: the first second is not before the last".format(*self.between_s))
 
@@ -34,7 +34,7 @@ class Selection:
         vehicles = sorted({capture.vehicle for capture in captures.used if capture.vehicle is not None})
         if self.receiver is not None and self.receiver not in vehicles:
             known = f"captures are of {', '.join(map(str, vehicles))}" if vehicles else "nor of any other vehicle"
-            raise CaptureError(f"--to {self.receiver}: there is no capture of that vehicle; {known}")
+            raise CaptureError(f"--to {self.receiver}: no capture of that vehicle; {known}")
         for transmission in transmissions:
             if self._fits(transmission):
                 if self.receiver is None:

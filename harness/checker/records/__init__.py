@@ -57,7 +57,7 @@ def cross_examine(evidence: Evidence) -> Examination:
         if contradiction.short:
             short.setdefault(contradiction.finding.agent_id, contradiction.finding.detail)
     for agent_id in _untold(evidence):
-        short.setdefault(agent_id, "the run did not come to its end, and nothing tells where the trace should have its")
+        short.setdefault(agent_id, "the run did not end normally, so the expected end of the trace is unknown")
     return Examination(contradictions, short)
 
 
@@ -76,16 +76,20 @@ def check(evidence: Evidence) -> Judgement:
     examination = evidence.once(cross_examine)
     findings = [contradiction.finding for contradiction in examination.contradictions]
     if findings:
-        reason = f"{times(len(findings))}: what two records tell about the same thing does not agree"
+        reason = f"{times(len(findings))}: two records contradict each other"
         return Judgement(NAME, "contradict", reason, findings[:MAX_EVIDENCE])
     if not evidence.traces:
-        return Judgement(NAME, "not applicable", "there are no traces to hold against the exports")
+        return Judgement(NAME, "not applicable", "the run has no traces to compare with the exports")
     if untraced := sorted(set(evidence.roster or evidence.exports) - set(evidence.traces)):
-        return Judgement(NAME, "not applicable", f"there is no trace of {agents(untraced)} to hold against the rest")
+        return Judgement(
+            NAME,
+            "not applicable",
+            f"the trace of {agents(untraced)} is missing, so it is not compared with the other records",
+        )
     if examination.short:
         return Judgement(NAME, "not applicable", not_whole(examination))
     if not evidence.exports:
-        return Judgement(NAME, "not applicable", "there is no export to hold against the traces")
+        return Judgement(NAME, "not applicable", "the run has no chain exports to compare with the traces")
     if unknown := evidence.unknown_word("trigger", "handler", "branch", "message", "operation"):
         return Judgement(NAME, "not applicable", unknown)
     runs = sum(len(trace.runs) for trace in evidence.traces.values())
@@ -99,5 +103,5 @@ def not_whole(examination: Examination) -> str:
     """Whose trace is not whole, and how one knows; there is one at least."""
     agent_id, why = next(iter(examination.short.items()))
     others = len(examination.short) - 1
-    more = f"; nor is that of {others} more" if others else ""
-    return f"the trace of agent {agent_id} is not whole: {why}{more}"
+    more = f"; so are the traces of {others} more" if others else ""
+    return f"the trace of agent {agent_id} is incomplete: {why}{more}"

@@ -36,17 +36,15 @@ def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
         sent: Datagrams = Counter((agent_id, message.seq) for run in trace.runs for message in run.sent)
         unsent = sum((sent - left[agent_id]).values()) - _not_sent(evidence, agent_id)
         if unsent > 0:
-            detail = (
-                f"{times(unsent)} its trace says that it sent a message, which its vehicle's capture did not see leave"
-            )
+            detail = f"{times(unsent)} its trace has a sent message that is missing in the capture of its vehicle"
             yield of_agent(agent_id, detail, "1")
         if untold := sum((left[agent_id] - sent).values()):
-            detail = f"{times(untold)} its vehicle's capture saw a message leave that its trace does not tell of"
+            detail = f"{times(untold)} the capture of its vehicle has a sent message that is missing in its trace"
             yield of_agent(agent_id, detail, "1", short=True)
         triggers = (run.trigger for run in trace.runs)
         heard = {(each.sender, each.sequence) for each in triggers if isinstance(each, MessageTrigger)}
         if unheard := len(heard - reached[agent_id].keys()):
-            detail = f"{times(unheard)} it handled a message that its vehicle's capture did not see arrive"
+            detail = f"{times(unheard)} it handled a message that is missing in the capture of its vehicle"
             yield of_agent(agent_id, detail, "1")
 
 
@@ -92,11 +90,13 @@ def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
         by = record.mission_s - slack_s(trace)
         heard = sum(isinstance(run.trigger, MessageTrigger) for run in trace.runs if run.t < by)
         if heard > counted.passed:
-            detail = f"it handled {heard} messages, and the kernel let {counted.passed} through to its vehicle"
+            detail = f"it handled {heard} messages, but the kernel counted {counted.passed} messages to its vehicle"
             yield of_agent(agent_id, detail, "1")
         on_the_way = sum(messages for sender, messages in sent.items() if sender != agent_id)
         if on_the_way > (told_of := counted.passed + counted.lost + counted.cut):
-            detail = f"the others sent {on_the_way} messages, and on the way to its vehicle the kernel counted "
+            detail = (
+                f"the other agents sent {on_the_way} messages, but the counters of the kernel for its vehicle have "
+            )
             yield of_agent(agent_id, f"{detail}{told_of}", "1")
 
 

@@ -29,19 +29,17 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     recorded.update(_change(fault, fated_until) for fault in faults)
     taken_down = Counter(_change(condition, fated_until) for condition in log if condition.detail is not None)
     for change in recorded - taken_down:
-        yield of_agent(
-            min(change[4], default=of_all), f"run.json says, and network.jsonl does not: {_in_words(change)}"
-        )
+        yield of_agent(min(change[4], default=of_all), f"only run.json has: {_in_words(change)}")
     for change in taken_down - recorded:
         if change[1] != RANGE:
-            detail = f"network.jsonl says, and run.json does not: {_in_words(change)}"
+            detail = f"only network.jsonl has: {_in_words(change)}"
             yield of_agent(min(change[4], default=of_all), detail)
     for fault in record.faults:
         if fault.fully_connected is not None and not taken_down[_change(fault, fated_until)]:
-            detail = f"the faults of run.json say, and network.jsonl does not: {_in_words(_change(fault, fated_until))}"
+            detail = f"the faults of run.json imply, but network.jsonl lacks: {_in_words(_change(fault, fated_until))}"
             yield of_agent(of_all, detail)
     if any(condition.counters not in (None, record.counters) for condition in log):
-        yield of_agent(of_all, "run.json and network.jsonl say that the kernel counted different things")
+        yield of_agent(of_all, "run.json and network.jsonl have different counters of the kernel")
     for name, times_s in (
         ("network.jsonl", [condition.at_s for condition in log]),
         ("the network of run.json", [state.at_s for state in record.network]),

@@ -33,16 +33,23 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
         export = evidence.exports.get(agent_id)
         if export is not None and recorded.outcome == "exported" and recorded.idle not in (None, export.idle):
             idle, not_idle = ("idle", "not idle") if recorded.idle else ("not idle", "idle")
-            yield of_agent(agent_id, f"by run.json it was {idle} at the end, and by its export {not_idle}")
+            yield of_agent(
+                agent_id, f"it was {idle} at the end according to run.json, but {not_idle} according to its export"
+            )
         yield from _dropped(agent_id, recorded, trace)
         if trace.cut_off and recorded.outcome == "exported":
-            yield of_agent(agent_id, "its trace ends in half a line, and the agent ended by itself", short=True)
+            yield of_agent(
+                agent_id, "its trace ends in the middle of a line, although the agent ended by itself", short=True
+            )
 
 
 def _lives(agent_id: int, recorded: AgentRecord, lives: list[Life]) -> Iterator[Contradiction]:
     expected = 1 + recorded.restarts + recorded.reboots
     if len(lives) != expected:
-        detail = f"its trace has {_count(len(lives), 'header')}, and by run.json it began {_count(expected, 'time')}"
+        detail = (
+            f"its trace has {_count(len(lives), 'header')}, but it started {_count(expected, 'time')} according "
+            "to run.json"
+        )
         yield of_agent(agent_id, detail, short=len(lives) < expected)
 
 
@@ -51,7 +58,9 @@ def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: lis
     expected = 1 + recorded.restarts + recorded.reboots
     if len(recorded.handler_runs) not in (0, expected):
         counts = _count(len(recorded.handler_runs), "count")
-        yield of_agent(agent_id, f"run.json has {counts} of its handler runs, and it began {_count(expected, 'time')}")
+        yield of_agent(
+            agent_id, f"run.json has {counts} of its handler runs, but it started {_count(expected, 'time')}"
+        )
     if len(recorded.handler_runs) != len(lives):
         return  # of agents that count none, and where lives are lacking anyway
     for life, counted in zip(lives, recorded.handler_runs, strict=True):
@@ -61,8 +70,8 @@ def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: lis
         if not at_least <= counted.counted <= at_most:
             lines = at_most if counted.counted > at_most else at_least
             detail = (
-                f"it had counted {_count(counted.counted, 'handler run')} at {counted.until_s:g} s, and its trace has "
-                f"{_count(lines, 'line')} of them"
+                f"the agent had counted {_count(counted.counted, 'handler run')} at {counted.until_s:g} s, but its "
+                f"trace has {_count(lines, 'line')} by then"
             )
             yield of_agent(agent_id, detail, "1", short=counted.counted > at_most)
 
@@ -84,22 +93,32 @@ def _counted(
     """What it counted itself over all its lives."""
     sent = sum(life.sent for life in lives)
     if recorded.messages_sent is not None and recorded.messages_sent != sent:
-        detail = f"by run.json it sent {_count(recorded.messages_sent, 'message')}, and by its trace {sent}"
+        detail = (
+            f"it sent {_count(recorded.messages_sent, 'message')} according to run.json, but {sent} according to "
+            "its trace"
+        )
         yield of_agent(agent_id, detail, "1")
     sent_bytes = _bytes_sent(trace) if trace.header.has_inputs else None
     if sent_bytes is not None and recorded.bytes_sent is not None and recorded.bytes_sent > sent_bytes:
-        yield of_agent(agent_id, f"by run.json it sent {recorded.bytes_sent} bytes, and by its trace {sent_bytes}", "1")
+        yield of_agent(
+            agent_id,
+            f"it sent {recorded.bytes_sent} bytes according to run.json, but {sent_bytes} according to its trace",
+            "1",
+        )
     if recorded.reconciles is not None and not evidence.unknown_word("handler", "branch", agent_id=agent_id):
         begun = sum([run.handler == "reconcile_begin" and run.branch == "begun" for run in trace.runs])
         if recorded.reconciles != begun:
-            detail = f"by run.json it began {_count(recorded.reconciles, 'reconcile')}, and by its trace {begun}"
+            detail = (
+                f"it began {_count(recorded.reconciles, 'reconcile')} according to run.json, but {begun} "
+                "according to its trace"
+            )
             yield of_agent(agent_id, detail)
     if recorded.chain_changed_at_s is not None and not any(life.unknown for life in lives):
         changed_at_s = _chain_changed_at(lives[-1])
         if abs(recorded.chain_changed_at_s - changed_at_s) > ROUNDED_S + slack_s(trace):
             detail = (
-                f"by run.json its chain changed last at {recorded.chain_changed_at_s:g} s, and by its trace at "
-                f"{changed_at_s:g} s"
+                f"its chain changed last at {recorded.chain_changed_at_s:g} s according to run.json, but at "
+                f"{changed_at_s:g} s according to its trace"
             )
             yield of_agent(agent_id, detail)
 
@@ -127,7 +146,10 @@ def _dropped(agent_id: int, recorded: AgentRecord, trace: Trace) -> Iterator[Con
     traced = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, Dropped))
     for reason, count in recorded.dropped.items():
         if traced[reason] < count:
-            detail = f"by run.json it dropped {_count(count, 'datagram')} ({reason}), and by its trace {traced[reason]}"
+            detail = (
+                f"it dropped {_count(count, 'datagram')} ({reason}) according to run.json, but {traced[reason]} "
+                "according to its trace"
+            )
             yield of_agent(agent_id, detail, short=True)
 
 
@@ -155,15 +177,19 @@ def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
         for source, blocks in (("its export", exported), ("run.json", before)):
             untraced = [block for block in blocks if block not in traced]
             if untraced:
-                detail = f"{source} says that it completed {_named(evidence, untraced)}, and its trace does not"
+                detail = (
+                    f"it completed {_named(evidence, untraced)} according to {source}, but not according to its trace"
+                )
                 yield _of_block(evidence, agent_id, detail, untraced[0], short=True)
         if recorded is not None and (recorded.outcome == "killed" or (recorded.outcome == "exported" and export)):
             told = {*exported, *before}
             if untold := [block for block in traced if block not in told]:
-                detail = f"its trace says that it completed {_named(evidence, untold)}, and its export does not"
+                detail = (
+                    f"it completed {_named(evidence, untold)} according to its trace, but not according to its export"
+                )
                 yield _of_block(evidence, agent_id, detail, untold[0])
         if export is not None and _out_of_order(exported, lives[-1].completed):
-            detail = "its export names the blocks that it completed in another order than its trace"
+            detail = "its export and its trace list its completed blocks in different order"
             yield _of_block(evidence, agent_id, detail, exported[0])
 
 
@@ -175,7 +201,7 @@ def _over_brown_outs(evidence: Evidence, agent_id: int, lives: list[Life]) -> It
         restored = [block for operation, block in after.runs[0].changes if operation == "complete"]
         if restored[: len(before.completed)] != before.completed:
             lost = next((block for block in before.completed if block not in restored), before.completed[0])
-            detail = f"at {after.runs[0].t:g} s it goes on with other blocks completed than it had when it went down"
+            detail = f"at {after.runs[0].t:g} s it restarts with other completed blocks than it had when it stopped"
             yield _of_block(evidence, agent_id, detail, lost)
 
 

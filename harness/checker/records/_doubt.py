@@ -11,7 +11,7 @@ def in_doubt(number: str, judgement: Judgement, examination: Examination) -> Jud
     """The judgement on the characteristic with this number, as it can stand."""
     touching = examination.touching(number)
     if touching:
-        contradict = f"{times(len(touching))}: the records that show it contradict each other"
+        contradict = f"{times(len(touching))}: the records behind this verdict contradict each other"
         violated = judgement.verdict == "violated"
         reason = f"{judgement.reason}; {contradict}" if violated else contradict
         evidence = [*(judgement.evidence if violated else ()), *touching]

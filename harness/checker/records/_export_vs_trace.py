@@ -44,7 +44,7 @@ def compare_export(evidence: Evidence) -> Iterator[Contradiction]:
 def _before_final_reconcile(evidence: Evidence, agent_id: int, export: Export) -> Iterator[Contradiction]:
     what = "its export before the final reconcile"
     if evidence.roster is not None and agent_id not in evidence.roster:
-        yield of_agent(agent_id, f"{what} is of no agent of this run")
+        yield of_agent(agent_id, f"{what} belongs to no agent of this run")
     trace = evidence.traces.get(agent_id)
     if trace is None or trace.problem:
         return
@@ -54,7 +54,7 @@ def _before_final_reconcile(evidence: Evidence, agent_id: int, export: Export) -
     elif any(life.unknown for life in evidence.lives[agent_id]):
         return
     elif export.completed not in _completed_when(export, evidence.lives[agent_id]):
-        yield of_agent(agent_id, f"{what} names other blocks that it had completed than its trace", "5")
+        yield of_agent(agent_id, f"{what} and its trace list different completed blocks", "5")
 
 
 def _state(export: Export) -> StateSummary:
@@ -106,7 +106,7 @@ def _otherwise(
         if ours != theirs
     ]
     touches = "6" if {"chain", "top"} & {name for name, _ in differing} else "2"
-    detail = f"{what} is not what its trace has led to by then: {', '.join(text for _, text in differing)}"
+    detail = f"{what} differs from its trace: {', '.join(text for _, text in differing)}"
     return of_agent(agent_id, detail, touches, short=short)
 
 
@@ -125,7 +125,9 @@ def _contents(agent_id: int, export: Export, life: Life) -> Iterator[Contradicti
     ):
         if [block.block_hash for block in exported] != traced:
             yield of_agent(
-                agent_id, f"its export has other blocks in the {place} than its trace, or in another order", touches
+                agent_id,
+                f"its export and its trace have different blocks in the {place}, or in different order",
+                touches,
             )
 
 
@@ -161,7 +163,7 @@ def _between_lives(evidence: Evidence, agent_id: int, lives: list[Life]) -> Iter
     now = 0.0
     for life in lives:
         if life.runs and life.runs[0].t < now - slack:
-            what = f"a life begins at {life.runs[0].t:g} s, before the one before it has ended, at {now:g} s"
+            what = f"an incarnation starts at {life.runs[0].t:g} s, before the previous one ends at {now:g} s"
             line, run = next(life.numbered())
             sight = Sight(line, run, what)
             yield Contradiction(finding(evidence, agent_id, sight))

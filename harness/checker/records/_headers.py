@@ -32,7 +32,7 @@ def compare_headers(evidence: Evidence) -> Iterator[Contradiction]:
             common, source = first.setdefault(name, (value, f"the trace of agent {agent_id}"))
             if value != common:
                 what = WORDS.get(name, name)
-                detail = f"its trace says that {what} is {_short(value)}, and {source} that it is {_short(common)}"
+                detail = f"its trace has {_short(value)} as {what}, but {source} has {_short(common)}"
                 yield of_agent(agent_id, detail)
 
 
@@ -63,5 +63,5 @@ def compare_algorithms(evidence: Evidence) -> Iterator[Contradiction]:
         said = dict.fromkeys((run.handler, run.algorithm) for run in trace.runs)
         for handler, number in said:
             if handler in ALGORITHM and number != ALGORITHM[handler]:
-                detail = f"its trace has {handler} as Algorithm {number}, and that is Algorithm {ALGORITHM[handler]}"
+                detail = f"its trace has {handler} as Algorithm {number}, but it is Algorithm {ALGORITHM[handler]}"
                 yield of_agent(agent_id, detail)

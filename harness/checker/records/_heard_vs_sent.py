@@ -41,11 +41,14 @@ def _unlike(
 ) -> Iterator[tuple[Sight, str]]:
     """What was heard otherwise than it was sent, and the characteristic that it touches."""
     if run.t < earliest_s:
-        yield Sight(line, run, f"heard {_named(trigger)}, which was sent at {sent[0][0]:g} s"), "1"
+        yield Sight(line, run, f"handled {_named(trigger)} before it was sent at {sent[0][0]:g} s"), "1"
     if run.input is not None and not _as_it_went(run.input, sent):
-        yield Sight(line, run, f"heard {_named(trigger)} with another content than it was sent with"), "1"
+        yield Sight(line, run, f"handled {_named(trigger)}, whose content differs from the sent message"), "1"
     elif run.changes and (other := _another_block(run, trigger, sent)):
-        yield Sight(line, run, f"took this block from {_named(trigger)}, which carried another", other), "4"
+        yield (
+            Sight(line, run, f"took this block from {_named(trigger)}, but that message carried another block", other),
+            "4",
+        )
 
 
 def _named(trigger: MessageTrigger) -> str:

@@ -33,7 +33,7 @@ def check(evidence: Evidence) -> Judgement:
     steps, unjudged, lost = 0, dict[int, str](), list[str]()
     for agent_id, trace in evidence.traces.items():
         if not trace.header.has_inputs:
-            unjudged[agent_id] = "the trace is of ucp-trace/1, which lacks what the agent received"
+            unjudged[agent_id] = "the trace has the version ucp-trace/1, which lacks received messages"
             continue
         try:
             header = checked(trace.header)
@@ -53,18 +53,18 @@ def check(evidence: Evidence) -> Judgement:
     for agent_id in sorted(set(evidence.roster or evidence.exports) - set(evidence.traces)):
         unjudged[agent_id] = "there is no trace"
     for agent_id, words in evidence.unknown.items():
-        unjudged.setdefault(agent_id, f"the trace is not wholly understood: {first_of(words)}")
+        unjudged.setdefault(agent_id, f"the trace has unknown words: {first_of(words)}")
     unjudged |= {
-        agent_id: f"the trace is not whole: {why}" for agent_id, why in evidence.once(cross_examine).short.items()
+        agent_id: f"the trace is incomplete: {why}" for agent_id, why in evidence.once(cross_examine).short.items()
     }
     if unjudged or not evidence.traces:
         return Judgement(NAME, "not applicable", _why(unjudged))
-    return Judgement(NAME, "as specified", f"{steps} handler runs, each as Algorithms 1 to 20 say")
+    return Judgement(NAME, "as specified", f"{steps} handler runs, each following Algorithms 1 to 20")
 
 
 def _why(unjudged: dict[int, str]) -> str:
     if not unjudged:
-        return "no traces: exports do not show steps"
+        return "the run has no traces, and exports do not show steps"
     by_reason: dict[str, list[int]] = {}
     for agent_id, why in sorted(unjudged.items()):
         by_reason.setdefault(why, []).append(agent_id)
@@ -107,7 +107,7 @@ def wrongly_dropped(header: CheckedHeader, line: int, aside: Dropped | Commanded
         return None
     if why_not_handled(header.agent_id, header.roster, sender, message) is not None:
         return None
-    what = f"it was not given a {message.NAME} of agent {sender}, which was dropped as {aside.dropped[:60]!r}"
+    what = f"it dropped a {message.NAME} of agent {sender} as {aside.dropped[:60]!r} and did not handle it"
     return Deviation(header.agent_id, line, aside.t, ON_MESSAGE[type(message)].name, what)
 
 
@@ -137,4 +137,4 @@ def _known(deviation: Deviation) -> str | None:
 
 def _title(handler: str | None) -> str:
     """ "Algorithm 5, vote_timer_expiration"."""
-    return f"Algorithm {HANDLERS[handler].algorithm}, {handler}" if handler else "what is no handler of the protocol"
+    return f"Algorithm {HANDLERS[handler].algorithm}, {handler}" if handler else "an unknown handler"

@@ -164,7 +164,7 @@ class Adopting(_Core):
         state = run.state
         held = len(self.chain), len(self.blocks_to_be_committed), len(self.reconcile_stack)
         if held != (state.chain, state.deque, state.stack):
-            raise NotOnRecordError("it does not hold what its changes come to")
+            raise NotOnRecordError("its state differs from the result of its changes")
         self._adopt_top(state.top)
         self.reconcile_in_progress = state.reconciling
         self.triggered.clear()
@@ -183,7 +183,7 @@ class Adopting(_Core):
                     self.chain.append(block)
                 case "chain-":
                     if self.chain.pop() != block:
-                        raise NotOnRecordError("it took a block off its chain that was not on top")
+                        raise NotOnRecordError("it removed a block from its chain that was not on top")
                 case "deque+":
                     self.blocks_to_be_committed.append(block)
                 case "deque-":
@@ -193,11 +193,9 @@ class Adopting(_Core):
                 case "stack-":
                     self.reconcile_stack.remove(block)
                 case _:
-                    raise NotOnRecordError(f"there is no change {operation[:20]!r}")
+                    raise NotOnRecordError(f"the change {operation[:20]!r} is unknown")
         except (ValueError, IndexError):
-            raise NotOnRecordError(
-                f"its change {operation} {block.block_hash.hex()[:12]} is one that no agent can make"
-            ) from None
+            raise NotOnRecordError(f"its change {operation} {block.block_hash.hex()[:12]} is impossible") from None
 
     def _adopt_top(self, top: str) -> None:
         if self.chain.top_chain_hash.hex() != top:
@@ -206,7 +204,7 @@ class Adopting(_Core):
             except ValueError:
                 chain_hash = b""
             if len(chain_hash) != HASH_BYTES:
-                raise NotOnRecordError("its top chain hash is none")
+                raise NotOnRecordError("its top chain hash is not a hash")
             self.chain.top_chain_hash = chain_hash
 
     def _adopt_sent(self, sent: Iterable[Sent]) -> None:
@@ -290,4 +288,4 @@ def _as_hash(text: str) -> bytes:
     try:
         return bytes.fromhex(text)
     except ValueError:
-        raise NotOnRecordError("its candidates are no block hashes") from None
+        raise NotOnRecordError("its candidates are not block hashes") from None

@@ -99,7 +99,7 @@ def _content(message: Sent, other: Sent) -> str:
     try:
         content = decoded(message.datagram).message
     except MalformedDatagramError as malformed:
-        return f"what is no message ({malformed.reason})"
+        return f"an invalid message ({malformed.reason})"
     try:
         expected: object = decoded(other.datagram).message
     except MalformedDatagramError:

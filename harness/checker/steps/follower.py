@@ -66,7 +66,7 @@ class AnotherHandlerError(NotHandledError):
 
     def __init__(self, run: HandlerRun, handler: Handler) -> None:
         ran = HANDLERS[run.handler].algorithm if run.handler in HANDLERS else run.algorithm
-        super().__init__(f"ran as Algorithm {ran}; what came is for Algorithm {handler.algorithm}, {handler.name}")
+        super().__init__(f"ran as Algorithm {ran}, but the input is for Algorithm {handler.algorithm}, {handler.name}")
 
 
 class Follower:
@@ -143,7 +143,7 @@ class Follower:
         except NotHandledError as error:
             self._differ(line, run.t, run.handler, f"it {error}")
         except (AssertionError, ValueError, KeyError, IndexError):  # the agent is where no agent comes to
-            self._differ(line, run.t, run.handler, "it ran in a state in which the protocol does not run it")
+            self._differ(line, run.t, run.handler, "it ran in a state in which the protocol does not allow it")
         else:
             self._began = True
             if branch == "another block" and run.handler == PAUSES:
@@ -207,21 +207,21 @@ class Follower:
         if by is None:
             self._not_run()
             return
-        event = EVENT_OF.get(run.handler, "what is no local event")
+        event = EVENT_OF.get(run.handler, "an unknown local event")
         expected, truly_by = triggered[0] if triggered else (None, None)
         is_expected = expected is not None and ON_LOCAL_EVENT[expected].name == run.handler
         if is_expected and by == truly_by:
             triggered.popleft()
             return
         if is_expected:
-            what = f"it said to be triggered by {by[:60]}, and was by {truly_by}"
+            what = f"it recorded the trigger {by[:60]}, but the trigger is {truly_by}"
             by = run.handler
         elif by == truly_by:
-            what = f"it triggered {event}, and should have triggered {expected}"
+            what = f"it triggered {event}; it should have triggered {expected}"
         elif by in self._ran:
-            what = f"it triggered {event}, which it should not have, or not again"
+            what = f"it triggered {event}; it should not have triggered this, or not twice"
         else:
-            what = "it ran without having been triggered"
+            what = "it ran without a trigger"
             by = run.handler
         at_line, at_s = self._ran.get(by, (line, run.t))
         self._differ(at_line, at_s, by, what)
@@ -233,7 +233,7 @@ class Follower:
         triggered = self._core.triggered
         if triggered and not self._adopted:
             event, by = triggered[0]
-            self._differ(*self._ran[by], by, f"it triggered nothing, and should have triggered {event}")
+            self._differ(*self._ran[by], by, f"it triggered nothing; it should have triggered {event}")
         triggered.clear()
 
     def _overdue(self, line: int, at_s: float, now: float) -> None:
@@ -244,7 +244,7 @@ class Follower:
             if timer.deadline is not None and timer.deadline < late:
                 ended_s = at_s - (now - timer.deadline) / self._header.rate
                 if not self._was_paused(ended_s, at_s):
-                    what = f"it had not run by then, and the {timer.name} timer ended at t={ended_s:g} s"
+                    what = f"it did not run, although the {timer.name} timer expired at t={ended_s:g} s"
                     if timer is self._core.phase_three_timer:
                         what += self._after_a_pause(timer.deadline)
                     self._differ(line, at_s, ON_TIMER[timer.name].name, what)
@@ -285,14 +285,14 @@ class Follower:
             self._boot(run)
             handler, inputs = on_local_event["Reconcile Finalize"], ()
         else:
-            raise NotHandledError("ran without a trigger that there is")
+            raise NotHandledError("ran without a known trigger")
         if handler.name != run.handler:
             raise AnotherHandlerError(run, handler)
         return handler, inputs
 
     def _local(self, run: HandlerRun) -> Handler:
         if run.handler not in EVENT_OF or run.handler == LOGS:
-            raise NotHandledError("ran for a local event, which is no such event's handler")
+            raise NotHandledError("ran for a local event that triggers another handler")
         if self._adopted:
             self._core.go_along(run)
         handler: Handler = self._implementation.handlers[run.handler]
@@ -303,16 +303,16 @@ class Follower:
         try:
             sender, sequence, message = decoded(run.input)
         except MalformedDatagramError as malformed:
-            raise NotHandledError(f"handled a datagram that is to be dropped: {malformed.reason}") from None
+            raise NotHandledError(f"handled a datagram that it must drop: {malformed.reason}") from None
         if type(message) in CARRY_A_BLOCK:
             self._blocks.add_from(message)
         if reason := why_not_handled(self._header.agent_id, self._header.roster, sender, message):
-            raise NotHandledError(f"handled a datagram that is to be dropped: {reason}")
+            raise NotHandledError(f"handled a datagram that it must drop: {reason}")
         name, by, number = trigger.message, trigger.sender, trigger.sequence
         if name != message.NAME or by != sender or number != sequence:
             raise NotHandledError(
-                f"said to have got {name[:60]} {number} from agent {by}, "
-                f"and the datagram is {message.NAME} {sequence} from agent {sender}"
+                f"recorded {name[:60]} {number} from agent {by}, but the datagram is {message.NAME} {sequence} from "
+                f"agent {sender}"
             )
         handler: Handler = self._on_message[type(message)]
         if handler.name != run.handler:
@@ -322,11 +322,11 @@ class Follower:
     def _timer(self, name: str, now: float) -> Handler:
         timer = self._timers.get(name)
         if timer is None or timer.deadline is None:
-            raise NotHandledError(f"ran as the {name[:60]} timer ended, which was not running")
+            raise NotHandledError(f"ran at the expiry of the {name[:60]} timer, which was not running")
         early = timer.deadline - now
         timer.stop()
         if early > self._header.early_s:
-            raise NotHandledError(f"ran {early:.3g} s before the {name} timer ended")
+            raise NotHandledError(f"ran {early:.3g} s before the {name} timer expired")
         handler: Handler = self._implementation.on_timer[name]
         return handler
 
@@ -334,9 +334,9 @@ class Follower:
         try:
             event = event_of(record)
         except MalformedEventsError as malformed:
-            raise NotHandledError(f"logged what is no event: {malformed}") from None
+            raise NotHandledError(f"logged an invalid event: {malformed}") from None
         if event.event_id != event_id:
-            raise NotHandledError(f"said to have logged event {event_id}, and what it logged is {event.event_id}")
+            raise NotHandledError(f"recorded the event {event_id}, but logged {event.event_id}")
         if event.encoded_bytes > (largest := self._header.settings.max_event_bytes):
             raise NotHandledError(
                 f"logged an event of {event.encoded_bytes} bytes, more than max_event_bytes {largest}"
@@ -346,11 +346,11 @@ class Follower:
     def _boot(self, run: HandlerRun) -> None:
         """What was found is there before the handler runs: as its changes say, with the blocks of its input."""
         if self._began:
-            raise NotHandledError("booted, which is only possible before anything else")
+            raise NotHandledError("booted after other steps; a boot must be the first step")
         try:
             left = list(stored_blocks(run.input))
         except ValueError:
-            raise NotHandledError("booted from a store that is none") from None
+            raise NotHandledError("booted from an invalid store") from None
         places: dict[str, list[Block]] = {"chain+": [], "deque+": [], "stack+": []}
         changes = iter(run.changes)
         completed = []

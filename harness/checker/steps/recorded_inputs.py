@@ -48,7 +48,7 @@ def event_of(record: Recorded | None) -> LoggableEvent:
         raise MalformedEventsError("the event is not base64") from None
     event, end = decode_event(data, 0)
     if end != len(data):
-        raise MalformedEventsError("there is more than an event")
+        raise MalformedEventsError("the event is followed by other data")
     return event
 
 
@@ -99,6 +99,6 @@ class Blocks:
         if block is None and (exported := self._exported.get(block_hash)) is not None:
             block = Block(exported.agent_id, exported.timestamp_us, exported.event_bytes)
         if block is None or block.block_hash.hex() != block_hash:
-            raise NotOnRecordError(f"no record has the data of block {block_hash[:12]}")
+            raise NotOnRecordError(f"the data of block {block_hash[:12]} is not recorded")
         self._blocks[block_hash] = block
         return block

@@ -50,12 +50,12 @@ def checked(header: Header) -> CheckedHeader:
         initial_data = base64.b64decode(header.initial_data or "", validate=True)
         settings = Settings(**{name: value for name, value in header.settings.items() if name in _SETTINGS})
     except (ValueError, TypeError) as error:
-        raise ImpossibleHeaderError(f"its trace begins with settings that cannot be: {str(error)[:200]}") from None
+        raise ImpossibleHeaderError(f"the header of its trace has invalid settings: {str(error)[:200]}") from None
     if not 1 <= header.agent_id <= MAX_AGENT_ID:
-        raise ImpossibleHeaderError(f"its trace begins with an agent ID that cannot be: {str(header.agent_id)[:20]}")
+        raise ImpossibleHeaderError(f"the header of its trace has an invalid agent ID: {str(header.agent_id)[:20]}")
     speedup, drift = _clock(header, "speedup", 1.0), _clock(header, "drift", 0.0)
     if speedup <= 0 or drift <= -1:
-        raise ImpossibleHeaderError("its trace begins with a clock that cannot be")
+        raise ImpossibleHeaderError("the header of its trace has an invalid clock")
     return CheckedHeader(
         header.agent_id,
         frozenset(header.roster),
@@ -72,5 +72,5 @@ def checked(header: Header) -> CheckedHeader:
 def _clock(header: Header, key: str, default: float) -> float:
     value: Any = header.clock.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ImpossibleHeaderError(f"its trace begins with a clock that cannot be: {key} {str(value)[:20]}")
+        raise ImpossibleHeaderError(f"the header of its trace has an invalid clock: {key} {str(value)[:20]}")
     return float(value)

@@ -44,11 +44,13 @@ async def _votes(bench: Bench) -> None:
         for peer in PEERS[:2]:
             agent.say(peer, BlockAddResponse(proposed.block_hash, False))
         asked, again, committed = await agent.hear(
-            3, "Chain Contain Query, then the proposal again, then its commit, as nobody answers", 10.0
+            3, "Chain Contain Query, then the proposal again, then its commit, because no agent answers", 10.0
         )
         must(isinstance(asked, ChainContainQuery), "a Chain Contain Query after the vote is lost", asked.NAME)
-        must(again == proposed, "the same Block Add Request after a reconcile that nobody answers", again.NAME)
-        must(isinstance(committed, CommitBlock), "a Commit Block, as nobody has disapproved this time", committed.NAME)
+        must(again == proposed, "the same Block Add Request after a reconcile that no agent answers", again.NAME)
+        must(
+            isinstance(committed, CommitBlock), "a Commit Block, because no agent disapproved this time", committed.NAME
+        )
 
 
 @case("an agent that is stopped at the end of its vote decides once, late", "contract, Time", 5)

@@ -69,8 +69,8 @@ async def _comes_back(bench: Bench, spoil: Callable[[Path], None] | None) -> Non
         if spoil is not None:
             spoil(directory / STORE_FILE)
         async with bench.agent(STORE, port=port, directory=directory) as second:
-            (again,) = await second.hear(1, "the proposal of the block that waited, from who comes back")
-            must(again == proposed, "the proposal of the block that waited", again.NAME)
+            (again,) = await second.hear(1, "the proposal of the waiting block from the restarted agent")
+            must(again == proposed, "the proposal of the waiting block", again.NAME)
             assert isinstance(proposed, BlockAddRequest)
             export = await second.process.export()
             held = [block["block_hash"] for block in export["chain"]]

@@ -129,13 +129,13 @@ async def _broken(bench: Bench) -> None:
 
 @case("an unknown feature gives an error and exit status 127", "contract, The mission file")
 async def _feature(bench: Bench) -> None:
-    await _ends_with(bench, UNSUPPORTED, "a feature that nobody has", {"features": ["a feature that nobody has"]})
+    await _ends_with(bench, UNSUPPORTED, "an unknown feature", {"features": ["an unknown feature"]})
 
 
 @case("unknown keys of the mission file are ignored", "contract, The mission file")
 async def _unknown_keys(bench: Bench) -> None:
     async with bench.agent({"something": {"else": [1, 2, 3]}}) as agent:
-        await agent.answers_only(INCEPTION, "a mission with a key that nobody knows")
+        await agent.answers_only(INCEPTION, "a mission with an unknown key")
 
 
 @case("a port in use gives an error and exit status 2", "contract, The program")

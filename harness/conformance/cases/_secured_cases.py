@@ -112,7 +112,7 @@ async def _authentic(bench: Bench) -> None:
             "of another mission": strangers.seal(500, query, None, None, 0),
             "of an earlier life": elder.seal(501, query, None, None, 0),
             "that is cut off": fresh[:-1],
-            "that answers what nobody asked": air.sealed(ASKS, ChainContainResponse(INCEPTION, True)),
+            "that answers no request": air.sealed(ASKS, ChainContainResponse(INCEPTION, True)),
             **{
                 f"with a bit flipped in its {name}": fresh[:at] + bytes([fresh[at] ^ 1]) + fresh[at + 1 :]
                 for name, at in parts.items()

@@ -101,14 +101,14 @@ class Adapter:
         raise NotImplementedError
 
 
-_HOW = "give MODULE:CLASS, as my_logs:MyAdapter or path/to/my_logs.py:MyAdapter (docs/how-to/import-other-logs.md)"
+_HOW = "give MODULE:CLASS, such as my_logs:MyAdapter or path/to/my_logs.py:MyAdapter (docs/how-to/import-other-logs.md)"
 
 
 def load_adapter(name: str) -> Adapter:
     """Raises FieldError if there is no such adapter, or it cannot be made."""
     module_name, separator, class_name = name.rpartition(":")
     if not separator or not module_name or not class_name.isidentifier():
-        raise FieldError(f"{name!r} names no adapter: {_HOW}")
+        raise FieldError(f"{name!r} is not an adapter: {_HOW}")
     try:
         if module_name.endswith(".py"):
             path = Path(module_name)
@@ -123,6 +123,6 @@ def load_adapter(name: str) -> Adapter:
         raise FieldError(f"the adapter {name} cannot be loaded: {type(error).__name__}: {error}; {_HOW}") from None
     if not isinstance(adapter, Adapter):
         raise FieldError(
-            f"{name} is no subclass of harness.field.adapters.Adapter: see docs/how-to/import-other-logs.md"
+            f"{name} is not a subclass of harness.field.adapters.Adapter: see docs/how-to/import-other-logs.md"
         )
     return adapter

@@ -54,7 +54,9 @@ class CommaSeparated(Adapter):
                     layout = _layout(row)
                     if layout is None:
                         layout = _Layout(",", {name: place for place, name in enumerate(COLUMNS)})
-                        yield Unusable(f"it does not name the columns: they are taken for {','.join(COLUMNS)}", number)
+                        yield Unusable(
+                            f"it has no header with column names: the columns are read as {','.join(COLUMNS)}", number
+                        )
                     else:
                         continue
                 if row.strip("\0\r\n "):
@@ -131,17 +133,17 @@ def _observation(cells: dict[str, str] | None, row: int) -> Observation:
         return Unusable("the row is damaged: columns are missing, or a quote in it is not closed", row, of_a_trace=True)
     kind, data = cells["kind"].strip().lower(), cells["data"]
     if kind not in KINDS:
-        return Unusable(f"its kind is {kind[:20]!r}, and not one of {', '.join(KINDS)}", row, of_a_trace=True)
+        return Unusable(f"its kind is {kind[:20]!r}: use one of {', '.join(KINDS)}", row, of_a_trace=True)
     if kind == "export":
         return ChainExport(data, row)
     agent = cells["agent"].strip()
     if not (agent.isascii() and agent.isdecimal() and len(agent) <= 6 and 1 <= int(agent) <= MAX_AGENT_ID):
-        return Unusable(f"its agent is {agent[:20]!r}, and not an ID from 1 to {MAX_AGENT_ID}", row, kind == "trace")
+        return Unusable(f"its agent is {agent[:20]!r}: use an ID from 1 to {MAX_AGENT_ID}", row, kind == "trace")
     if kind == "trace":
         return TraceLine(int(agent), data, row)
     time_ns = _time_ns(cells.get("time_s", ""))
     if time_ns is None:
-        return Unusable(f"its time_s is {cells.get('time_s', '')[:20]!r}, and not seconds since the Unix epoch", row)
+        return Unusable(f"its time_s is {cells.get('time_s', '')[:20]!r}: use seconds since the Unix epoch", row)
     try:
         content = base64.b64decode(data.strip(), validate=True)
     except (binascii.Error, ValueError):
@@ -150,7 +152,7 @@ def _observation(cells: dict[str, str] | None, row: int) -> Observation:
         return Datagram(int(agent), time_ns, kind == "sent", content, row)
     event = cells.get("event", "").strip()
     if not (event.isascii() and event.isdecimal() and len(event) <= 3 and 1 <= int(event) <= MAX_EVENT_ID):
-        return Unusable(f"its event is {event[:20]!r}, and not an ID from 1 to {MAX_EVENT_ID}", row)
+        return Unusable(f"its event is {event[:20]!r}: use an ID from 1 to {MAX_EVENT_ID}", row)
     return LoggedEvent(int(agent), time_ns, int(event), content, row)
 
 

@@ -82,7 +82,7 @@ class RosBag(Adapter):
         if others:
             names = ", ".join(topic[:60] for topic, _ in others.most_common(_OTHERS_TOLD))
             more = ", ..." if len(others) > _OTHERS_TOLD else ""
-            yield Unusable(f"{others.total()} messages are on other topics than those of agents: {names}{more}")
+            yield Unusable(f"{others.total()} messages are on topics of no agent: {names}{more}")
 
     def payload(self, message: BagMessage) -> str | bytes:
         """The text of a String, and the bytes of a UInt8MultiArray. What it raises is told of the message."""
@@ -103,12 +103,12 @@ class RosBag(Adapter):
         except MachineError:
             raise
         except Exception as error:  # rosbags has many ways to say that bytes are no message of a type
-            why = f"it is no sound {message.type_name[:40] or 'message of a known type'} ({type(error).__name__})"
+            why = f"it is a damaged {message.type_name[:40] or 'message of a known type'} ({type(error).__name__})"
             yield Unusable(why, number, kind == "trace", agent)
             return
         text, data = (content, content.encode()) if isinstance(content, str) else ("", content)
         if kind in ("trace", "chain") and not isinstance(content, str):
-            yield Unusable(f"it is a {message.type_name[:40]}, and should be a String", number)
+            yield Unusable(f"it is a {message.type_name[:40]}, not a String", number)
         elif kind == "trace":
             yield from (TraceLine(agent, line, number) for line in text.splitlines() if line.strip())
         elif kind == "chain":
@@ -118,7 +118,7 @@ class RosBag(Adapter):
         elif kind in ("sent", "received"):
             yield Datagram(agent, message.time_ns, kind == "sent", data, number)
         else:
-            yield Unusable("there is no event in it", number)
+            yield Unusable("it contains no event", number)
 
     @cached_property
     def _patterns(self) -> dict[re.Pattern[str], str]:
@@ -140,5 +140,5 @@ def _types(store: str) -> Any:
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise MachineError("reading ROS bags takes the package rosbags: `pip install ucp-harness[ros]`") from None
+        raise MachineError("reading ROS bags needs the package rosbags: `pip install ucp-harness[ros]`") from None
     return get_typestore(Stores[store])

@@ -254,7 +254,7 @@ def bring_in(
             streams[whole].take(path, sorter)
         for stream in streams.values():
             stream.end(sorter)
-        tell("putting together what is of one flight")
+        tell("grouping the records by flight")
         homecoming = sorter.sorted_out()
         homecoming.largest()
         tell("writing")
@@ -293,9 +293,7 @@ class _Stream:
             for observation in self._adapter.observations(path):
                 last = max(last, observation.where or 0)
                 if self._dropped > MAX_DROPPED or any(reader.hopeless for reader in self._readers.values()):
-                    self._drop(
-                        f"there are too many {self._adapter.counts}s without use: what follows is not read", None
-                    )
+                    self._drop(f"there are too many {self._adapter.counts}s without use: the rest is not read", None)
                     break
                 self._take(observation, self._before + observation.where if observation.where else None, sorter)
         except MachineError:
@@ -303,7 +301,7 @@ class _Stream:
         except Exception as error:  # an adapter is anybody's code, and what it reads anybody's file
             what = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {str(error)[:200]}"
             after = f" after {self._adapter.counts} {last}" if last else ""
-            self._drop(f"reading it broke off{after}: {what}", None)
+            self._drop(f"reading failed{after}: {what}", None)
             for reader in self._readers.values():
                 reader.lose_unseen()
         self._before += last
@@ -319,7 +317,7 @@ class _Stream:
         if isinstance(observation, ChainExport):
             sorter.take_exports(self._path, _text(observation.text), where, self._adapter.counts)
         elif not 1 <= observation.agent_id <= MAX_AGENT_ID:
-            self._drop(f"agent {str(observation.agent_id)[:20]} is none: IDs go from 1 to {MAX_AGENT_ID}", where)
+            self._drop(f"agent {str(observation.agent_id)[:20]} is not an agent ID: use 1 to {MAX_AGENT_ID}", where)
         elif isinstance(observation, TraceLine):
             self._take_line(observation, where)
         elif not 0 <= observation.time_ns <= LAST_NS:
@@ -342,7 +340,7 @@ class _Stream:
         try:
             sender = decode(datagram.data)[0]
         except MalformedDatagramError as malformed:
-            self._drop(f"it is no UCP datagram ({malformed.reason})", where)
+            self._drop(f"it is not a UCP datagram ({malformed.reason})", where)
             return
         capture = self._captures.get(datagram.agent_id)
         if capture is None:
@@ -365,13 +363,13 @@ class _Stream:
             sorter.lives += lives
             if not lives:
                 self._drop(
-                    f"what it has of agent {agent_id}'s trace, {self._lines[agent_id]} line(s), says nothing", None
+                    f"its {self._lines[agent_id]} line(s) of the trace of agent {agent_id} hold no handler run", None
                 )
         if not self._said and not self._dropped:
-            self._drop("there is nothing in it that is of an agent", None)
+            self._drop("it contains no records of agents", None)
         self._left_out += self._unusable
         if rest := self._dropped - len(self._unusable):
-            self._left_out.append(LeftOut(self._path, f"{rest} more places in it say nothing usable"))
+            self._left_out.append(LeftOut(self._path, f"{rest} more places in it hold no usable record"))
 
     def _drop(self, why: str, where: int | None) -> None:
         self._dropped += 1

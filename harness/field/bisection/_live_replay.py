@@ -195,7 +195,7 @@ def play_live(record: Record, command: Sequence[str], place: Path, *, speedup: f
     Raises MachineError, NotStartedError, ReplayFailedError; FieldError if the record is in words that nobody knows.
     """
     if unknown := first_of(unknown_words(record.trace.runs), ("trigger", "handler", "branch", "timer")):
-        raise FieldError(f"{record.path}: {unknown}, so nobody knows what is to be played; give another record")
+        raise FieldError(f"{record.path}: {unknown}, so it cannot be played; give another record")
     script = script_of(record)
     try:
         heard = asyncio.run(_Air(record, script, command, place, speedup).play())
@@ -355,12 +355,12 @@ def _compare(script: Script, heard: list[tuple[float, Message]], slack_s: float)
             left.remove(other)
         elif script.is_close(said.t, slack_s):
             continue
-        did = f"it sent {_words(other[1])}" if other is not None else "it sent nothing of that"
+        did = f"it sent {_words(other[1])}" if other is not None else "it did not send it"
         detail = f"{did}; the record sent {_words(said.message)}, at {said.t:g} s"
         yield said.t, Difference(line=said.line, handler=said.handler, detail=detail)
     for t, message in left:
         if not script.is_close(t, slack_s):
-            detail = f"it sent {_words(message)} at {t:.1f} s, which the record did not"
+            detail = f"it sent {_words(message)} at {t:.1f} s; the record has no such message"
             yield t, Difference(line=script.line_at(t), handler=None, detail=detail)
 
 

@@ -16,7 +16,7 @@ from harness.field.replay import open_record
 from harness.scenario import Scenario
 
 SPEEDUP = 20.0
-"""Mission seconds in a second, of a record that is given to a process."""
+"""Mission seconds per second, of a record that is given to a process."""
 RECORD_CORE = "harness.field.bisection._record_core"
 """The module that runs as a process and gives records to the core under test."""
 CODE = "{code}"
@@ -73,7 +73,7 @@ class Workshop:
 
     def _in_virtual_time(self, code: Path, scenario: Scenario, place: Path) -> tuple[Outcome, Path]:
         if not (code / "ucp").is_dir():
-            raise CannotBeTriedError("there is no ucp/ in it")
+            raise CannotBeTriedError("it has no directory ucp/")
         starts = run_python(["-c", "import ucp.agent, harness.cli"], first=[code], cwd=place, limit_s=self._limit_s)
         if starts.status != 0:
             raise CannotBeTriedError(f"it does not start: {starts.last_words}")
@@ -108,7 +108,7 @@ class Workshop:
     def _judged(self, played: Ended, run_dir: Path, *, exact: bool) -> Outcome:
         """By the judge that runs now, whichever state of the code was played. Raises CannotBeTriedError."""
         if played.status is None:
-            raise CannotBeTriedError(f"it had not ended after {self._limit_s:g} s; --limit-s gives it longer")
+            raise CannotBeTriedError(f"it did not end within {self._limit_s:g} s; allow more time with --limit-s")
         said = played.last_words.replace(f"{run_dir.parent}/", "")
         if played.status == INTERRUPTED:
             raise InterruptedRunError("interrupted")
@@ -127,7 +127,7 @@ class Workshop:
 
     def _given_records(self, code: Path, place: Path) -> Outcome:
         if not (code / "ucp").is_dir():
-            raise CannotBeTriedError("there is no ucp/ in it")
+            raise CannotBeTriedError("it has no directory ucp/")
         only = place / "core"
         only.mkdir()
         (only / "ucp").symlink_to(code.resolve() / "ucp", target_is_directory=True)
@@ -139,7 +139,7 @@ class Workshop:
             limit_s=self._limit_s,
         )
         if played.status is None:
-            raise CannotBeTriedError(f"it had not ended after {self._limit_s:g} s; --limit-s gives it longer")
+            raise CannotBeTriedError(f"it did not end within {self._limit_s:g} s; allow more time with --limit-s")
         if crashed := played.raised_in(only / "ucp"):
             file = f"/{RECORD_CORE.replace('.', '/')}.py"
             if f'{file}"' in played.stderr and ", in main" in played.stderr:
@@ -191,7 +191,7 @@ def _words(command: str, code: Path) -> list[str]:
     try:
         words = [word.replace(CODE, str(code)) for word in shlex.split(command)]
     except ValueError as error:
-        raise HarnessError(f"--agent-command {command!r} is no command: {error}") from None
+        raise HarnessError(f"--agent-command {command!r} is not a command: {error}") from None
     if not words:
         raise HarnessError("--agent-command is empty: name a program, with its arguments")
     if shutil.which(words[0]) is None:

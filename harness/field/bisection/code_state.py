@@ -109,7 +109,7 @@ def interrupted_by_sigterm() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        raise InterruptedRunError("interrupted; nothing is left behind") from None
+        raise InterruptedRunError("interrupted; all temporary files are removed") from None
     finally:
         signal.signal(signal.SIGTERM, before)
 
@@ -171,9 +171,7 @@ class History:
             asked = f"{revision}^{{commit}}"
             return self._git(self._repository, "rev-parse", "--verify", "--quiet", "--end-of-options", asked).strip()
         except RepositoryError:
-            raise RepositoryError(
-                f"{self._repository}: there is no commit {revision!r}; `git log` lists them"
-            ) from None
+            raise RepositoryError(f"{self._repository}: no commit {revision!r}; `git log` lists the commits") from None
 
     def check_out(self, commit: str) -> None:
         self._git(self.tree, "checkout", "--quiet", "--force", "--detach", commit)
@@ -220,7 +218,7 @@ class History:
                 check=False,
             )
         except FileNotFoundError:
-            raise MachineError("there is no git here: apt install git") from None
+            raise MachineError("git is not installed: apt install git") from None
         except NotADirectoryError:
             raise RepositoryError(f"{where}: not a directory") from None
         if ended.returncode not in accept:

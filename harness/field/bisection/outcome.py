@@ -112,7 +112,7 @@ def _differences(before: Outcome, after: Outcome) -> Iterator[str]:
     for key in {**before.verdicts, **after.verdicts}:
         if (was := before.verdicts.get(key)) != (now := after.verdicts.get(key)):
             what = f"characteristic {key}" if key.isdecimal() else key
-            yield f"{what}: {now or 'not judged'}, and was {was or 'not judged'}"
+            yield f"{what}: {now or 'not judged'}, was {was or 'not judged'}"
     for agent in sorted({*before.agents, *after.agents}):
         was_of, now_of = before.agents.get(agent, OfAgent()), after.agents.get(agent, OfAgent())
         yield from (f"agent {agent}: {words}" for words in _of_agent(was_of, now_of))
@@ -122,8 +122,8 @@ def _of_agent(was: OfAgent, now: OfAgent) -> Iterator[str]:
     if was.deviates != now.deviates:
         words = {None: "nowhere", "": "in no known handler"}
         yield (
-            f"it deviates first {words.get(now.deviates, f'in {now.deviates}')}, "
-            f"and did {words.get(was.deviates, f'in {was.deviates}')}"
+            f"its first deviation is {words.get(now.deviates, f'in {now.deviates}')}, was "
+            f"{words.get(was.deviates, f'in {was.deviates}')}"
         )
     if was.top != now.top:
         old, new = was.chain or [], now.chain or []
@@ -131,8 +131,8 @@ def _of_agent(was: OfAgent, now: OfAgent) -> Iterator[str]:
         if shared is None:
             shared = min(len(old), len(new))
         yield (
-            f"its chain has {len(new)} blocks, and had {len(old)}; block {shared + 1} is "
-            f"{_at(new, shared)}, and was {_at(old, shared)}"
+            f"its chain has {len(new)} blocks, was {len(old)}; block {shared + 1} is "
+            f"{_at(new, shared)}, was {_at(old, shared)}"
         )
     if was.differences != now.differences:
         old_differences, new_differences = was.differences or [], now.differences or []
@@ -143,7 +143,7 @@ def _of_agent(was: OfAgent, now: OfAgent) -> Iterator[str]:
             yield f"line {first.line}{f', {first.handler}' if first.handler else ''}: {first.detail}"
         else:
             gone = len(old_differences) - len(new_differences)
-            yield f"{gone} differences from the record are no longer there"
+            yield f"{gone} differences from the record have disappeared"
 
 
 def _at(chain: list[str], place: int) -> str:
@@ -154,7 +154,7 @@ def read(path: Path) -> Outcome:
     """An outcome that was kept. Raises RunDirectoryError."""
     try:
         if path.stat().st_size > MAX_OUTCOME_BYTES:
-            raise RunDirectoryError(f"{path}: larger than {MAX_OUTCOME_BYTES} bytes, which no outcome is")
+            raise RunDirectoryError(f"{path}: larger than {MAX_OUTCOME_BYTES} bytes, which is too large for an outcome")
         return Outcome.model_validate_json(path.read_bytes())
     except OSError as error:
         raise RunDirectoryError(f"{path}: cannot be read: {error.strerror}") from None
@@ -197,10 +197,10 @@ def subject_of(path: Path, seed: int | None, agent: int | None) -> Subject:
         subject = Subject(path.resolve(), played[0], played[1] if seed is None else seed)
     else:
         if not path.exists():
-            raise ScenarioError(f"{path}: there is no such file, directory or scenario")
+            raise ScenarioError(f"{path}: no such file, directory or scenario")
         subject = Subject(path.resolve(), None, 0, agent)
     if subject.scenario is not None and agent is not None:
-        raise ScenarioError("--agent chooses one of several records, and this is a scenario: leave it out")
+        raise ScenarioError("--agent selects a record, but the subject is a scenario: leave it out")
     return subject
 
 

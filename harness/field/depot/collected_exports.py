@@ -136,9 +136,9 @@ def came_home(paths: Iterable[Path]) -> CameHome:
         except ExportError as error:
             left_out.append(str(error))
     if not brought:
-        why = left_out[0] if left_out else "there is no file with a chain export in it"
+        why = left_out[0] if left_out else "no file contains a chain export"
         more = f" (and {len(left_out) - 1} files more)" if len(left_out) > 1 else ""
-        raise ExportError(f"nothing of this is usable: {why}{more}")
+        raise ExportError(f"none of these files is usable: {why}{more}")
     mission = _largest_mission(brought)
     left_out += _of_other_missions(brought, mission)
     home = _by_agent([each for each in brought if each.export.inception.block_hash == mission], left_out)
@@ -154,7 +154,9 @@ def _look_beside(home: CameHome, carried: Iterable[Carried]) -> None:
             trace = read_trace(each.path, skim=True)
             home.traced.setdefault(each.agent_id, []).extend(trace.completed() if trace else ())
             if unknown := unknown_words(trace.runs if trace else ()).get("operation"):
-                home.remarks.append(f"{each.path}: {unknown}, so nobody knows all that agent {each.agent_id} completed")
+                home.remarks.append(
+                    f"{each.path}: {unknown}, so the completed blocks of agent {each.agent_id} are unknown"
+                )
         if ROSTER in each.shared:
             home.roster.update(each.shared[ROSTER].value)  # type: ignore[arg-type]
         if each.mission is not None and each.mission.events.source == "random":
@@ -214,8 +216,8 @@ def _by_agent(brought: Iterable[Brought], left_out: list[str]) -> CameHome:
         earlier, home.latest[agent_id] = (other, each) if age >= its_age else (each, other)
         home.earlier.append(earlier)
         home.remarks.append(
-            f"{earlier.path}: agent {agent_id} exported its chain again, later, in {home.latest[agent_id].path}: what "
-            "it holds now is that, and what it held before is on record, too"
+            f"{earlier.path}: agent {agent_id} exported its chain again later, in {home.latest[agent_id].path}: the "
+            "later export is current; the earlier one is recorded as well"
         )
     home.latest = dict(sorted(home.latest.items()))
     return home
@@ -264,7 +266,7 @@ class _Reader:
             chain_hash=inception.chain_hash.hex(),
         )
         if true != export.inception:
-            problems.append(f"{path}: the hashes of its inception block are not those of its data: it was edited")
+            problems.append(f"{path}: the hashes of its inception block do not match its data: it was edited")
         claims: dict[str, str] = {}
         chain, chain_hash, broken_at = list[ExportedBlock](), inception.chain_hash, None
         for position, block in enumerate(export.chain, 1):
@@ -278,7 +280,7 @@ class _Reader:
             chain.append(self._block(block, block_hash, chain_hash.hex()))
         if broken_at is not None and not claims:
             problems.append(
-                f"{path}: the chain hash at block {broken_at} of its chain is not that of the blocks below it"
+                f"{path}: the chain hash at block {broken_at} of its chain does not match the blocks up to it"
             )
         aside = []
         for place, blocks in (
@@ -321,7 +323,7 @@ class _Reader:
 
 
 def _edited(path: Path, which: str, claimed: str) -> str:
-    return f"{path}: {which} does not hash to {claimed[:HASH_DIGITS]}, as it says: it was edited or damaged"
+    return f"{path}: {which} does not match its hash {claimed[:HASH_DIGITS]}: it was edited or damaged"
 
 
 def _content(path: Path, named: bool) -> bytes:
@@ -332,7 +334,7 @@ def _content(path: Path, named: bool) -> bytes:
                 raise NotAnExportError(f"{path}: not a chain export")
             data = file.read()
             if file.trouble and len(data) >= MAX_EXPORT_BYTES:
-                raise ExportError(f"{path}: larger than {MAX_EXPORT_BYTES} bytes, which no mission's export is")
+                raise ExportError(f"{path}: larger than {MAX_EXPORT_BYTES} bytes, which is too large for an export")
             return data
     except OSError as error:
         raise ExportError(f"{path}: cannot be read: {error.strerror}") from None
@@ -352,9 +354,9 @@ def _what_is_whole(path: Path, data: bytes, problems: list[str]) -> Export:
             after = [*_whole_blocks(text[damage:])]
             before = document.get("chain")
             document["chain"] = [*(before if isinstance(before, list) else ()), *after]
-        problems.append(f"{path}: cut off or damaged at {_place(text, damage)}: what is whole of it is used; {AGAIN}")
+        problems.append(f"{path}: cut off or damaged at {_place(text, damage)}: its undamaged part is used; {AGAIN}")
     if not isinstance(document, dict):
-        raise ExportError(f"{path}: nothing of it is whole")
+        raise ExportError(f"{path}: no part of it is undamaged")
     if document.get("schema") != SCHEMA:
         said = str(document.get("schema"))[:40]
         raise ExportError(f"{path}: its schema is {said!r}, and this version reads {SCHEMA!r}")
@@ -366,9 +368,7 @@ def _what_is_whole(path: Path, data: bytes, problems: list[str]) -> Export:
         problems += [f"{path}: {misfit}; the rest of it is used" for misfit in misfits]
     if read.agent_id is None or read.inception is None:
         missing = "agent_id" if read.agent_id is None else "inception"
-        raise ExportError(
-            f"{path}: `{missing}` is missing or damaged, so nobody knows whose it is, or of which mission"
-        )
+        raise ExportError(f"{path}: `{missing}` is missing or damaged, so its agent or its mission is unknown")
     completed = [block for block in read.completed if re.fullmatch("[0-9a-f]{64}", block)]
     return Export.model_construct(
         **{name: getattr(read, name) for name in type(read).model_fields if name != "completed"}, completed=completed

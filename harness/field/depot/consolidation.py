@@ -306,11 +306,11 @@ def _lost_blocks(
         for block_hash in brought.export.completed:
             if block_hash in blocks or block_hash in lost:
                 continue
-            why = f"agent {agent_id} completed it, and its export does not have it"
+            why = f"agent {agent_id} completed it, but its export does not contain it"
             if absent:
-                why += f"; vehicles that may have it did not come home: {', '.join(ranges([*absent]))}"
+                why += f"; vehicles without an export may have it: {', '.join(ranges([*absent]))}"
             if block_hash in edited:
-                why += "; what a file has under its hash is other data"
+                why += "; a file has other data under its hash"
             lost[block_hash] = Lost(
                 agent_id=agent_id,
                 block=names[block_hash],
@@ -321,7 +321,7 @@ def _lost_blocks(
     for agent_id, completed in home.traced.items():
         for block_hash in completed:
             if block_hash not in blocks:
-                why = f"agent {agent_id} completed it, by its trace, and nobody has it"
+                why = f"agent {agent_id} completed it according to its trace, but no export contains it"
                 lost[block_hash] = Lost(
                     agent_id=agent_id, block=names[block_hash], block_hash=block_hash, agents=[agent_id], why=why
                 )
@@ -329,8 +329,8 @@ def _lost_blocks(
 
 
 def _missing(agent_id: int, blocks: int) -> Lost:
-    others = {0: "nobody has a block of it", 1: "others have 1 block of it"}.get(
-        blocks, f"others have {blocks} of its blocks"
+    others = {0: "no export has blocks of it", 1: "other exports have 1 block of it"}.get(
+        blocks, f"other exports have {blocks} of its blocks"
     )
-    why = f"no export of vehicle {agent_id} came home: {others}; whatever else it had logged is in none"
+    why = f"vehicle {agent_id} has no export: {others}; its other logged events are missing"
     return Lost(agent_id=agent_id, agents=[agent_id], why=why)

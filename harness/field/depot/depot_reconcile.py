@@ -164,7 +164,7 @@ def _line(record: Consolidation, exports: Mapping[int, Export], rounds: int) -> 
         line = block.line
         if line.block_hash is None or line.block_hash in in_all:
             continue
-        why = "it was edited or damaged" if line.claimed_hash else "not every chain has it"
+        why = "it was edited or damaged" if line.claimed_hash else "some chains lack it"
         left_out.append(f"{line.name}: {why}")
     return Reconciled(
         uniform=uniform,

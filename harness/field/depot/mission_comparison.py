@@ -94,7 +94,7 @@ class Comparison:
         alike = "are of one mission" if len(self.carried) > 1 else "is of a mission"
         sentence = f"{counted} {alike}: {what}"
         if not kinds["mission file"]:
-            sentence += "; there is no mission file, so settings, network and seeds were not compared"
+            sentence += "; without a mission file, settings, network and seeds were not compared"
         return sentence
 
     def to_json(self) -> dict[str, Any]:
@@ -163,7 +163,7 @@ def read(path: Path) -> Carried:
         problem = error.errors()[0]
         where = ".".join(map(str, problem["loc"]))
         raise UnreadableFileError(f"`{where}` is wrong: {problem['msg'].lower()}") from None
-    raise UnreadableFileError("neither mission file, manifest, chain export nor trace")
+    raise UnreadableFileError("not a mission file, manifest, chain export or trace")
 
 
 def _beginning(path: Path) -> dict[str, Any]:
@@ -180,9 +180,9 @@ def _beginning(path: Path) -> dict[str, Any]:
         raise UnreadableFileError(f"cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError):
         why = "damaged: not JSON" if text.strip() else "empty"
-        raise UnreadableFileError(f"{why}; what it should say, nobody can compare") from None
+        raise UnreadableFileError(f"{why}; so its values are not compared") from None
     if not isinstance(document, dict):
-        raise UnreadableFileError("neither mission file, manifest, chain export nor trace")
+        raise UnreadableFileError("not a mission file, manifest, chain export or trace")
     return document
 
 
@@ -209,14 +209,14 @@ def _of_export(path: Path) -> Carried:
     initial_data = base64.b64decode(export.inception.block_data)
     inception = InceptionBlock(initial_data)
     if inception.block_hash.hex() != export.inception.block_hash:
-        raise UnreadableFileError("`inception.block_hash` is not that of `inception.block_data`: it was edited")
+        raise UnreadableFileError("`inception.block_hash` does not match `inception.block_data`: it was edited")
     return Carried(path, "chain export", export.agent_id, {INCEPTION: _inception("inception.block_data", initial_data)})
 
 
 def _of_trace(path: Path, document: dict[str, Any]) -> Carried:
     header = HEADER.validate_python(document)
     if header.initial_data is None:
-        raise UnreadableFileError("a trace of version 1 has no `initial_data`, so nobody knows of which mission it is")
+        raise UnreadableFileError("a trace of version 1 has no `initial_data`, so its mission is unknown")
     try:
         initial_data = base64.b64decode(header.initial_data, validate=True)
     except ValueError:
@@ -306,7 +306,10 @@ def _not_distinct(carried: Sequence[Carried]) -> Iterator[Difference]:
             value: Hashable = file.mission.network.address if key == "network.address" else getattr(file.mission, key)
             if value in first:
                 yield Difference(
-                    file.path, key, f"{file.path}: `{key}` is {_shown(value)}, as in {first[value].path}: one is wrong"
+                    file.path,
+                    key,
+                    f"{file.path}: `{key}` is {_shown(value)}, as in {first[value].path}, but must be "
+                    "unique: one is wrong",
                 )
             first.setdefault(value, file)
 
@@ -325,11 +328,13 @@ def _off_the_roster(carried: Sequence[Carried]) -> Iterator[Difference]:
     with_file = {file.agent_id for file in carried if file.kind == "mission file"}
     for member in dict.fromkeys(roster):
         if member not in with_file:
-            yield Difference(None, "roster", f"agent {member} is on the `roster`, and its mission file is not here")
+            yield Difference(None, "roster", f"agent {member} is on the `roster`, but its mission file is missing")
     for file in carried:
         if file.agent_id is not None and file.agent_id not in roster:
             yield Difference(
-                file.path, "agent_id", f"{file.path}: `agent_id` {file.agent_id} is not on the roster of the others"
+                file.path,
+                "agent_id",
+                f"{file.path}: `agent_id` {file.agent_id} is not on the roster of the other files",
             )
 
 
@@ -343,7 +348,7 @@ def _files(paths: Iterable[Path]) -> list[tuple[Path, bool]]:
         if path.is_dir():
             inside = _in_directory(path)
             if not inside:
-                raise RunDirectoryError(f"{path}: holds no *{MISSION_SUFFIX}, and nothing else that can be compared")
+                raise RunDirectoryError(f"{path}: holds no *{MISSION_SUFFIX} and no other files to compare")
             for file in inside:
                 files.setdefault(file.resolve(), (file, False))
         elif path.exists():

@@ -105,7 +105,7 @@ class Plan:
         """The mission file of each agent. Raises MissionFileError."""
         if len(self.initial_data) > MAX_INITIAL_DATA_BYTES:
             raise MissionFileError(
-                f"the initial data is {len(self.initial_data)} bytes: at most {MAX_INITIAL_DATA_BYTES} are possible"
+                f"the initial data is {len(self.initial_data)} bytes: the maximum is {MAX_INITIAL_DATA_BYTES}"
             )
         strangers = sorted(self.addresses.keys() - {*self.scenario.roster})
         if strangers:
@@ -116,7 +116,10 @@ class Plan:
             its_address = document["network"]["address"]
             other = vehicles.setdefault(its_address, agent_id)
             if other != agent_id:
-                raise MissionFileError(f"vehicles {other} and {agent_id} would both have the address {its_address}")
+                raise MissionFileError(
+                    f"vehicles {other} and {agent_id} have the same address {its_address}: choose "
+                    "another `--address` for one of them"
+                )
         return documents
 
     def _document(self, agent_id: int) -> dict[str, Any]:
@@ -152,7 +155,7 @@ class Plan:
             return address(agent_id)
         if not 0 < agent_id < self.subnet.num_addresses - 1:
             raise MissionFileError(
-                f"vehicle {agent_id} has no place in {self.subnet}: choose a wider `--subnet`, or give "
+                f"vehicle {agent_id} has no address in {self.subnet}: choose a wider `--subnet`, or give "
                 f"`--address {agent_id}=...`"
             )
         return str(self.subnet[agent_id])
@@ -194,10 +197,10 @@ def manifest(name: str, missions: Mapping[str, Mission]) -> Manifest:
 def _refuse(directory: Path, names: Sequence[str], overwrite: bool) -> None:
     there = [name for name in names if (directory / name).exists()]
     if there and not overwrite:
-        raise RunDirectoryError(f"{directory / there[0]} exists: choose another --out, or allow it by --overwrite")
+        raise RunDirectoryError(f"{directory / there[0]} exists: choose another --out, or replace it with --overwrite")
     stale = sorted(path.name for path in directory.glob(f"*{SUFFIX}") if path.name not in names)
     if stale:
         raise RunDirectoryError(
-            f"{directory / stale[0]} is of another mission, for its agent is not on this roster: move it away first, "
-            "or choose another --out"
+            f"{directory / stale[0]} belongs to another mission, because its agent is not on this roster: move it "
+            "away, or choose another --out"
         )

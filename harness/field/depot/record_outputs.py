@@ -98,28 +98,28 @@ def in_words(record: Consolidation, reconciled: Reconciled | None = None, *, ope
         f"{len(home)} of {len(header.roster)} vehicles" if len(home) < len(header.roster) else _count(home, "vehicle")
     )
     building = sum(block.line.events for block in record.unfinished)
-    being_built = f", of which {building} in blocks that were being built" if building else ""
+    being_built = f", {building} of them in current blocks" if building else ""
     blocks = header.blocks - len(record.unfinished)
     events = "1 event" if header.events == 1 else f"{header.events} events"
-    yield f"{of_all} came home ({agents(home)}), with {_blocks(blocks)} and {events}{being_built}"
+    yield f"{of_all} have an export ({agents(home)}), with {_blocks(blocks)} and {events}{being_built}"
     if header.distinct_chains == 1:
         whose = "all have one chain" if len(home) > 1 else "it has a chain"
         yield f"{whose} of {_blocks(header.mutual_chain)}"
     else:
         yield (
-            f"{header.distinct_chains} distinct chains: the mutual chain has {_blocks(header.mutual_chain)}, "
+            f"{header.distinct_chains} distinct chains; the mutual chain has {_blocks(header.mutual_chain)}, "
             f"the longest {header.longest_chain}"
         )
     if sealed := sum(block.line.sealed for block in record.blocks):
         closed = _blocks(sealed)
         yield (
-            f"{closed} not opened by this key: not sealed by the agent that it names, or damaged"
+            f"{closed} not opened by this key: sealed by another agent than the one named, or damaged"
             if opened
-            else f"{closed} sealed to the depot: --depot-key, with the key of this mission's, opens what it can"
+            else f"{closed} sealed to the depot: read them with --depot-key and the depot key of this mission"
         )
     yield from map(fork_in_words, record.forks[:FORKS_TOLD])
     if len(record.forks) > FORKS_TOLD:
-        yield f"and they part at {len(record.forks) - FORKS_TOLD} more places"
+        yield f"and the chains differ at {len(record.forks) - FORKS_TOLD} more places"
     yield from _rare(record)
     yield from lost_in_words(record.lost_blocks)
     yield from (missing.why for missing in record.missing)
@@ -129,7 +129,7 @@ def in_words(record: Consolidation, reconciled: Reconciled | None = None, *, ope
 
 def fork_in_words(fork: Fork) -> str:
     where = f"after {_blocks(fork.height)}, at {fork.after}" if fork.after else "at the inception block"
-    return f"chains part {where}: {'; '.join(map(way_in_words, fork.ways))}"
+    return f"chains differ {where}: {'; '.join(map(way_in_words, fork.ways))}"
 
 
 def way_in_words(way: Way) -> str:
@@ -159,7 +159,7 @@ def reconciled_in_words(reconciled: Reconciled) -> Iterator[str]:
         yield f"reconciled in {rounds}: the chains did not become one, there are {len(chains)} of them"
     gains = [f"{vehicle.agent_id} gained {len(vehicle.gained)}" for vehicle in vehicles if vehicle.gained]
     if gains:
-        yield f"blocks that vehicles have now and had not: {', '.join(gains)}"
+        yield f"blocks that vehicles received: {', '.join(gains)}"
     if reconciled.left_out:
         yield f"not in all chains: {_few(reconciled.left_out)}"
 

@@ -107,6 +107,6 @@ def _insert(life: Life, position: int, copy: Life, start: int, end: int) -> int:
 
 
 def _of_copy(life: Life, twin: Life, taken: int) -> str:
-    where = "in this file, too" if life.path == twin.path else f"in {twin.path}"
-    used = f"{taken} handler runs that are lost there are taken from here" if taken else "what stands there is used"
-    return f"what begins here stands {where}, from {twin.counts} {twin.first_line} on; {used}"
+    where = "also in this file" if life.path == twin.path else f"in {twin.path}"
+    used = f"{taken} handler runs that are lost there are read from here" if taken else "the lines there are used"
+    return f"the records from here on are {where}, from {twin.counts} {twin.first_line} on; {used}"

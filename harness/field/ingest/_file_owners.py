@@ -39,8 +39,8 @@ def glance(path: Path, left_out: list[LeftOut], opener: "Opener | None" = None) 
     capture.read(datagrams, ENOUGH_FRAMES, opener=opener)
     left_out += [LeftOut(path, problem.removeprefix(f"{path}: ")) for problem in capture.problems]
     if not datagrams:
-        what = "no frame" if not capture.frames else f"none of its first {capture.frames} frames is of UCP"
-        left_out.append(LeftOut(path, f"a capture, but there is {what} in it" if not capture.frames else what))
+        what = "no frame" if not capture.frames else f"none of its first {capture.frames} frames is a UCP datagram"
+        left_out.append(LeftOut(path, f"a capture, but it has {what}" if not capture.frames else what))
         return None
     named = (name for each in datagrams.values() for name in (each.summary.block_hash, each.summary.chain_hash))
     hashes = frozenset(name.hex() for name in named if name is not None)
@@ -57,7 +57,7 @@ def read_public_keys(path: Path, left_out: list[LeftOut]) -> "PublicKeys | None"
         from ucp.secure.bundle import load_public
         from ucp.secure.keyfile import KeyFileError
     except ModuleNotFoundError:
-        left_out.append(LeftOut(path, "public keys, which take the package cryptography (extra `secure`)"))
+        left_out.append(LeftOut(path, "public keys, which need the package cryptography (extra `secure`)"))
         return None
     try:
         return load_public(path)
@@ -77,7 +77,7 @@ def give_keys(flights: Sequence[Flight], found: Sequence[tuple[Path, "PublicKeys
                 unused.pop(path, None)
                 break
     if any(signed.values()):
-        left_out += [LeftOut(path, "public keys that no block here is signed with") for path in unused]
+        left_out += [LeftOut(path, "public keys of another mission, which sign no block here") for path in unused]
 
 
 def _signed(flight: Flight) -> Iterator[ExportedBlock]:

@@ -29,10 +29,12 @@ def files_of(paths: Iterable[Path], left_out: list[LeftOut]) -> list[Path]:
     of_size: dict[int, list[Path]] = {}
     for path in paths:
         if not os.path.lexists(path):
-            raise FieldError(f"{path}: does not exist; give files that came home from a flight, or directories of them")
+            raise FieldError(f"{path}: does not exist; give files of a flight, or directories of such files")
         for file in _walk(path, left_out, named=True):
             if len(files) == MAX_FILES:
-                left_out.append(LeftOut(file, f"it and all after it are beyond {MAX_FILES} files, and are not read"))
+                left_out.append(
+                    LeftOut(file, f"it and all later files are not read, because at most {MAX_FILES} files are read")
+                )
                 return [*files.values()]
             try:
                 real, size = file.resolve(strict=True), file.stat().st_size
@@ -41,13 +43,13 @@ def files_of(paths: Iterable[Path], left_out: list[LeftOut]) -> list[Path]:
                 twins = (other for other in of_size.get(size, ()) if size and filecmp.cmp(other, file, shallow=False))
                 twin = next(twins, None)
             except (OSError, RuntimeError) as error:
-                why = getattr(error, "strerror", None) or "its links lead in a circle"
+                why = getattr(error, "strerror", None) or "its links form a loop"
                 left_out.append(LeftOut(file, f"it cannot be read: {why}"))
                 continue
             if twin is not None and is_of_a_life(file):
                 continue
             if twin is not None:
-                left_out.append(LeftOut(file, f"it is the same as {twin}, byte by byte"))
+                left_out.append(LeftOut(file, f"its content equals {twin}"))
                 continue
             files[real] = file
             of_size.setdefault(size, []).append(file)
@@ -65,10 +67,10 @@ def _walk(
     """Links that were not named themselves are not followed: what they lead to is here by itself, or not meant."""
     try:
         if path.is_symlink() and not named:
-            left_out.append(LeftOut(path, "it is a link; name what it leads to, if it belongs here"))
+            left_out.append(LeftOut(path, "it is a link; name its target if the target belongs to the flight"))
         elif path.is_dir():
             if depth > MAX_DEPTH:
-                left_out.append(LeftOut(path, f"it is more than {MAX_DEPTH} directories deep"))
+                left_out.append(LeftOut(path, f"it is below more than {MAX_DEPTH} directories"))
                 return
             of_run = of_run or (path / RUN_FILE).is_file()
             not_here = _BY_THE_HARNESS if of_run else {_IMPORT_FILE}
@@ -78,7 +80,7 @@ def _walk(
         elif path.is_file():
             yield path
         else:
-            left_out.append(LeftOut(path, "it is not a file: a fifo, a socket, a device, or a link to nowhere"))
+            left_out.append(LeftOut(path, "it is not a regular file, but a FIFO, a socket, a device or a broken link"))
     except OSError as error:
         left_out.append(LeftOut(path, f"it cannot be read: {error.strerror}"))
 

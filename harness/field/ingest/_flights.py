@@ -102,7 +102,7 @@ def _by_mission(lives: Iterable[Life], left_out: list[LeftOut]) -> tuple[list[_G
         if life.header is None:
             headless.append(life)
         elif life.header.agent_id not in life.header.roster:
-            why = f"agent {life.header.agent_id} is not on the roster that its own trace names"
+            why = f"agent {life.header.agent_id} is not on the roster in its own trace"
             left_out.append(LeftOut(life.path, why, life.first_line, life.counts))
         else:
             by_header[_mission_of(life.header), life.header.agent_id].append(life)
@@ -185,7 +185,7 @@ def _add_headless(gatherings: list[_Gathering], life: Life, left_out: list[LeftO
     """A life whose header is lost is under that of the others of its flight, whose mission it shares."""
     agent_id, hashes = life.agent_id, _hashes_of(life)
     if agent_id is None or not life.runs:
-        left_out.append(LeftOut(life.path, "its header is lost, and nothing else says whose trace it is"))
+        left_out.append(LeftOut(life.path, "its header is lost, so its agent is unknown"))
         return
     able = [gathering for gathering in gatherings if agent_id in gathering.mission.roster and gathering.lives]
     likeliest = max(
@@ -194,7 +194,7 @@ def _add_headless(gatherings: list[_Gathering], life: Life, left_out: list[LeftO
         default=None,
     )
     if likeliest is None or not (likeliest.hashes & hashes or life.path.parent in likeliest.directories):
-        why = f"its header is lost, and no other trace is of a mission that agent {agent_id} can have flown"
+        why = f"its header is lost, and no other trace belongs to a mission of agent {agent_id}"
         left_out.append(LeftOut(life.path, why))
         return
     own = likeliest.lives.get(agent_id, [])
@@ -207,7 +207,11 @@ def _add_headless(gatherings: list[_Gathering], life: Life, left_out: list[LeftO
     kept = next(told_apart([*own, life], left_out))
     if life in kept:
         whose = "another of its files" if own else f"the trace of agent {lender.header.agent_id}"
-        remarks.append(Remark(life.path, f"its header is lost; as agent {agent_id}'s it is read with that of {whose}"))
+        remarks.append(
+            Remark(
+                life.path, f"its header is lost; it is read as a trace of agent {agent_id}, with the header of {whose}"
+            )
+        )
     likeliest.lives[agent_id] = kept
     likeliest.hashes |= hashes
 
@@ -360,7 +364,7 @@ def _clock_remarks(agent_id: int, lives: list[Life], trace: Trace) -> Iterator[R
     jumps = [(life, position) for life in lives for position in life.jumps]
     for life, position in jumps[:1]:
         before, after = life.runs[position - 1].t, life.runs[position].t
-        more = f", and {len(jumps) - 1} times more" if len(jumps) > 1 else ""
+        more = f", and {len(jumps) - 1} more times" if len(jumps) > 1 else ""
         yield Remark(
             life.path,
             f"the clock of agent {agent_id} jumps from {before:.3f} s to {after:.3f} s here{more}",

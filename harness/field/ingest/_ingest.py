@@ -83,7 +83,7 @@ class Homecoming:
         """The flight with the most in it. Raises FieldError if nothing can be used."""
         if not self.flights:
             why = f": {self.left_out[0].sentence}" if self.left_out else ""
-            error = FieldError(f"nothing of this is a usable trace, chain export or capture{why}")
+            error = FieldError(f"none of these files is a usable trace, chain export or capture{why}")
             error.details = [left_out.sentence for left_out in self.left_out[1:]]
             raise error
         return self.flights[0]
@@ -94,4 +94,4 @@ class Homecoming:
         yield from (remark.sentence for remark in self.remarks)
         for flight in self.flights[1:]:
             agents = ", ".join(map(str, flight.agents)) or "none"
-            yield f"{flight.files} of the files are of another flight than the largest (agents: {agents})"
+            yield f"{flight.files} of the files belong to another flight than the largest one (agents: {agents})"

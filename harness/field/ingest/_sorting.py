@@ -71,7 +71,7 @@ class Sorter:
             with Opened(path) as file:
                 begins = file.peek(4096)[:4096]
             if begins.startswith(_BAGS):
-                self._drop(path, "a ROS bag, or what a recorder packed: `ucp-harness import` reads it")
+                self._drop(path, "a ROS bag, or a compressed recording: read it with `ucp-harness import`")
             elif begins[:4] in MAGICS:
                 seen = glance(path, self._left_out, self._opener)
                 self.captures += [seen] if seen else []
@@ -90,7 +90,7 @@ class Sorter:
         with Opened(path, MAX_EXPORT_BYTES) as file:
             data = file.read()
             if file.trouble:
-                self._drop(path, f"it is no whole file: {file.trouble}")
+                self._drop(path, f"it is incomplete: {file.trouble}")
                 return
         try:
             text = data.decode("utf-8").strip(_BLANK)
@@ -134,14 +134,14 @@ def _documents(text: str) -> Iterator[Any]:
 
 def _what_else(data: bytes) -> str:
     if not data.strip(b"\0\r\n\t "):
-        return "it is empty" if not data else "there is nothing in it but NUL and blanks, as a loss of power leaves it"
+        return "it is empty" if not data else "it holds only NUL bytes and blanks, as after a loss of power"
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return "it is text in UTF-16, as PowerShell writes it: `iconv -f UTF-16 -t UTF-8` makes it readable"
+        return "it is UTF-16 text, as written by PowerShell: convert it with `iconv -f UTF-16 -t UTF-8`"
     if data.startswith(_ARCHIVES):
-        return "it is an archive, or packed by other means than gzip: unpack it first"
+        return "it is an archive, or compressed with another program than gzip: unpack it first"
     printable = sum(byte >= 32 or byte in b"\t\r\n" for byte in data[:4096])
     text = "text" if printable > 0.9 * len(data[:4096]) else "neither text nor a capture"
-    return f"it is no trace, chain export or capture: {text} that says nothing of UCP here"
+    return f"it is not a trace, chain export or capture: {text} without UCP records"
 
 
 def _summed_up(left_out: list[LeftOut]) -> Iterator[LeftOut]:
@@ -155,4 +155,6 @@ def _summed_up(left_out: list[LeftOut]) -> Iterator[LeftOut]:
         yield from group[:ALIKE_TOLD]
         if more := group[ALIKE_TOLD:]:
             names = ", ".join(each.path.name for each in more[:10]) + (", ..." if len(more) > 10 else "")
-            yield LeftOut(more[0].path.parent, f"{len(more)} more files ({names}) are left out likewise: {why}")
+            yield LeftOut(
+                more[0].path.parent, f"{len(more)} more files ({names}) are left out for the same reason: {why}"
+            )

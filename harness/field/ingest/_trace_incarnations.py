@@ -151,7 +151,7 @@ class TraceReader:
         if self._runs == MAX_RUNS or len(self.lives) > MAX_LIVES or self._lost == MAX_LOST:
             if not self.hopeless:
                 limit = f"{MAX_RUNS} handler runs, {MAX_LIVES} lives of agents, or {MAX_LOST} damaged lines"
-                what = f"it and all after it are not read: more than {limit} are in no trace"
+                what = f"it and all later lines are not read: a trace has at most {limit}"
                 self._damaged = [*self._damaged[:_PLACES_TOLD], _Damage(number, number, what)]
             self.hopeless = True
             return
@@ -163,14 +163,14 @@ class TraceReader:
         pieces = [piece for piece in _NULS.split(line) if piece.strip()]
         for piece in pieces:
             if piece.startswith(b"\0"):
-                self._lose(number, piece, "bytes of NUL stand here, as a loss of power leaves them")
+                self._lose(number, piece, "NUL bytes here, as after a loss of power")
             elif entry := _entry(piece):
                 self._add(entry, number)
             elif lost := gap_in(piece):
                 self._was_lost(number, *lost)
             elif rescued := _rescued(piece):
                 lost_bytes, at_its_end = rescued
-                self._lose(number, piece[:lost_bytes], "it is damaged; what can be read at its end is used")
+                self._lose(number, piece[:lost_bytes], "it is damaged; its readable end is used")
                 self._add(at_its_end, number)
             elif ended or piece is not pieces[-1]:
                 self._lose(number, piece, "it is damaged" if _said(piece) is None else "its time cannot be")
@@ -215,8 +215,8 @@ class TraceReader:
         """Before this file was made, as an import says."""
         if self.lives:
             self.lives[-1].lose(lines, lost_bytes)
-        what = "what was before this" if not lines else "a line" if lines == 1 else f"{lines} lines"
-        self._say(number, f"{what} was lost already when this file was made")
+        what = "the part before this" if not lines else "1 line" if lines == 1 else f"{lines} lines"
+        self._say(number, f"{what} {'were' if lines > 1 else 'was'} lost before this file was written")
 
     def ended(self, left_out: list[LeftOut]) -> list[Life]:
         """The lives; what was damaged is told if there are any."""
@@ -226,15 +226,17 @@ class TraceReader:
 
     def _left_out(self) -> Iterator[LeftOut]:
         for damage in self._damaged[:_PLACES_TOLD]:
-            more = f", and so is what follows up to {self._counts} {damage.last}" if damage.last > damage.first else ""
+            more = f", and so is the rest up to {self._counts} {damage.last}" if damage.last > damage.first else ""
             yield LeftOut(self.path, f"{damage.why}{more}", damage.first, self._counts)
         if rest := self._damaged[_PLACES_TOLD:]:
             places = "1 more place" if len(rest) == 1 else f"{len(rest)} more places"
-            yield LeftOut(self.path, f"{places} in it are damaged, the last at {self._counts} {rest[-1].last}")
-        if self._cut_off is not None:
             yield LeftOut(
-                self.path, "it is cut off in the middle, and the file ends there", self._cut_off, self._counts
+                self.path,
+                f"{places} in it {'is' if len(rest) == 1 else 'are'} damaged, the last at "
+                f"{self._counts} {rest[-1].last}",
             )
+        if self._cut_off is not None:
+            yield LeftOut(self.path, "it is truncated at the end of the file", self._cut_off, self._counts)
 
 
 def _lines(file: Opened) -> Iterator[tuple[int, bytes, bool]]:

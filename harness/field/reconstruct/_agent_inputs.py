@@ -105,7 +105,7 @@ class _Reader:
                 raise UnusableInputError(f"line {line}: {first_of(words)}")
             if isinstance(run.trigger, LocalTrigger):
                 if current is None:
-                    raise UnusableInputError(f"line {line}: {run.handler} ran for a local event before anything came")
+                    raise UnusableInputError(f"line {line}: {run.handler} ran for a local event before any input")
                 current.runs.append(run)
                 continue
             if current is not None:
@@ -132,7 +132,7 @@ class _Reader:
             return Asked()
         if isinstance(trigger, BootTrigger):
             return Booted()
-        raise UnusableInputError(f"line {line}: {run.handler} ran without a trigger that there is")
+        raise UnusableInputError(f"line {line}: {run.handler} ran without a known trigger")
 
     def _datagram(self, line: int, run: HandlerRun, trigger: MessageTrigger) -> bytes:
         if run.input is not None:
@@ -142,7 +142,8 @@ class _Reader:
             if trigger.message == decode(datagram).message.NAME:
                 return datagram
         raise UnusableInputError(
-            f"line {line}: datagram {sequence} of agent {sender} is on no record: bring its trace, or a capture"
+            f"line {line}: datagram {sequence} of agent {sender} is not recorded: add the trace of agent {sender}, or "
+            "a capture"
         )
 
     def _event(self, line: int, event_id: int) -> LoggableEvent:
@@ -150,5 +151,5 @@ class _Reader:
             self._events = iter(self._missing.events(self._header.agent_id))
         event = next(self._events, None)
         if event is None or event.event_id != event_id:
-            raise UnusableInputError(f"line {line}: the event that was logged is in no block that came home")
+            raise UnusableInputError(f"line {line}: the logged event is in no exported block")
         return event

@@ -38,8 +38,8 @@ class FirstDifference:
     def sentence(self) -> str:
         where = f"trace line {self.line}" if self.line else "after the end of its trace"
         return (
-            f"agent {self.agent_id} at {self.at_s:.3f} s, {where}, {self.handler}: "
-            f"the record says it {self.recorded}, and in virtual time it {self.played}"
+            f"agent {self.agent_id} at {self.at_s:.3f} s, {where}, {self.handler}: in the record it {self.recorded}; "
+            f"in virtual time it {self.played}"
         )
 
 
@@ -122,7 +122,7 @@ class Alone:
         if not self._by_captures:
             return self._remarks
         which = agents(self._by_captures)
-        inferred = f"what reached {which} is from captures and blocks, and when timers ended there is inferred"
+        inferred = f"the inputs of {which} come from captures and blocks; the expiry of its timers is inferred"
         return [*self._remarks, inferred]
 
     def rehearse(self, header: CheckedHeader) -> None:
@@ -142,15 +142,13 @@ class Alone:
             explained = self._with_a_quirk(header, lives, rehearsal.parting)
             rehearsal = explained or self._with_what_is_not_right(header, lives) or rehearsal
         elif not rehearsal.to_the_word and (words := self._judged(agent_id)):
-            self._remarks.append(f"agent {agent_id} is wrong to no effect: {words}")
+            self._remarks.append(f"agent {agent_id} deviates without effect: {words}")
         if (parting := rehearsal.parting) is not None:
             words = self._judged(agent_id) or f"trace line {parting.line}, t={parting.at_s:g} s: it {parting.what}"
-            self.why[agent_id] = (
-                f"does not do what the protocol says, and is played up to trace line {parting.line}: {words}"
-            )
+            self.why[agent_id] = f"deviates from the protocol, and is played up to trace line {parting.line}: {words}"
         elif problem is not None:
             rehearsal.broken_off = True
-            self.why[agent_id] = f"cannot be played to the end of its trace: {problem}"
+            self.why[agent_id] = f"can be played only in part: {problem}"
         return rehearsal
 
     def _by_capture(self, header: CheckedHeader, by_trace: Rehearsal | None) -> Rehearsal | None:
@@ -197,13 +195,13 @@ class Alone:
             first = ignoring.ignored[0]
             many = f"{len(ignoring.ignored)} messages" if len(ignoring.ignored) > 1 else "a message"
             self._remarks.append(
-                f"{who} did nothing with {many} with which it should have done something, "
-                f"the first on trace line {first.line} ({first.runs[0].handler}): lost on their way here"
+                f"{who} did not react to {many}, the first on trace line {first.line} ({first.runs[0].handler}): in "
+                "the scenario these messages are lost"
             )
             return ignoring
         early = rehearse(header, lives, allowed=Allowed(early_timers=True))
         if early.parting is None:
-            self._remarks.append(f"{who} had timers end too early by its clock, as if that had been set back")
+            self._remarks.append(f"timers of {who} expired too early by its clock, as if the clock had been set back")
             return early
         return None
 

@@ -310,7 +310,7 @@ class _Attempt:
             if self._explained == len(self._left) or self._left[self._explained].datagram != encode(
                 agent.agent_id, sequence, message
             ):
-                self.problem = f"by t={now:.3f} s should have sent a {message.NAME}, and did not, as its capture says"
+                self.problem = f"should have sent a {message.NAME} by t={now:.3f} s, but its capture has none"
                 self._look_whether_still(at_s)
                 return
             self._explained += 1
@@ -325,9 +325,7 @@ class _Attempt:
 
     def _fail(self, seen: Seen) -> None:
         message = decode(seen.datagram).message
-        self.problem = (
-            f"sent a {message.NAME} at t={seen.at_s:.3f} s, which nothing explains that is known to have reached it"
-        )
+        self.problem = f"sent a {message.NAME} at t={seen.at_s:.3f} s, which no recorded input explains"
 
 
 def _feed(agent: Agent, now: float, what: What, stored: StoredState | None) -> None:

@@ -93,10 +93,7 @@ def _last_event_bytes(event_data: bytes) -> int | None:
     return events[-1].encoded_bytes if events else None
 
 
-NOTHING = (
-    "no agent's record says what reached it: bring traces (*.trace.jsonl), or captures beside exports, "
-    "so that there is something to fly again"
-)
+NOTHING = "the records hold no inputs of agents: add traces (*.trace.jsonl), or captures together with exports"
 
 
 @dataclass(frozen=True)
@@ -132,8 +129,8 @@ def told(
         captured = {agent_id: elsewhere.captured[agent_id] for agent_id in untraced}
         settings = common[0][0] if common else likely(elsewhere, captured, whole)
         headers |= {agent_id: whole(agent_id, settings) for agent_id in untraced}
-        whose = "as the others'" if common else f"those that explain the most: {_in_words(settings)}"
-        remarks.append(f"settings of {agents(untraced)} are not on record, and assumed to be {whose}")
+        whose = "as the others'" if common else f"the best fit to the records: {_in_words(settings)}"
+        remarks.append(f"settings of {agents(untraced)} are not recorded; assumed: {whose}")
     settings = Counter(header.settings for header in headers.values()).most_common(1)[0][0] if headers else Settings()
     if not headers:
         raise FieldError("; ".join([*elsewhere.problems[:1], NOTHING]))

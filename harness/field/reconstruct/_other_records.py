@@ -77,7 +77,7 @@ class Elsewhere:
         closed = {agent_id: captured.closed for agent_id, captured in self.captured.items() if captured.closed}
         self.captured = {agent_id: captured for agent_id, captured in self.captured.items() if captured.seen}
         if closed:
-            why = "are not read without --bundle" if opener is None else "are not authentic by that bundle"
+            why = "are not read without --bundle" if opener is None else "are not authentic according to that bundle"
             self.problems.append(f"{sum(closed.values())} datagrams in captures of {agents([*closed])} {why}")
         for captured in self.captured.values():
             for seen in captured.seen:

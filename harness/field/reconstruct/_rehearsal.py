@@ -199,21 +199,21 @@ class _Life:
                 try:
                     agent.add_event(event, now)
                 except ValueError as error:
-                    return f"logged what cannot be: {error}"
+                    return f"logged an invalid event: {error}"
             case Heard(datagram):
                 agent.receive_datagram(datagram, now)
             case TimerEnded(name):
                 timer = next((timer for timer in agent.state.timers if timer.name == name), None)
                 if timer is None or timer.deadline is None:
-                    return f"had its {name[:MAX_NAME]} timer end, which was not running"
+                    return f"recorded the expiry of its {name[:MAX_NAME]} timer, which was not running"
                 if now < timer.deadline - self._early_s:
-                    return f"had its {name} timer end {timer.deadline - now:.3g} s early"
+                    return f"recorded the expiry of its {name} timer {timer.deadline - now:.3g} s early"
                 agent.end_timer(timer, max(now, timer.deadline))
             case Asked():
                 agent.begin_reconcile(now)
             case Booted():
                 if stored is None:
-                    return "went on from what was on its disk, and how that came there is not on record"
+                    return "restarted from its disk, whose content is not recorded"
                 agent.boot(stored, now)
         return None
 
@@ -254,13 +254,13 @@ def _differs(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str | 
     for ours, theirs in zip_longest(runs, recorded):
         if ours is None:
             if theirs.changes or theirs.sent or isinstance(theirs.trigger, LocalTrigger):
-                return f"ran {theirs.handler}, which should have done nothing"
+                return f"ran {theirs.handler}, but should have done nothing"
         elif theirs is None:
             return f"did not run {ours.handler}, which was triggered"
         elif ours.handler != theirs.handler:
-            return f"ran {theirs.handler}, and should have run {ours.handler}"
+            return f"ran {theirs.handler}; it should have run {ours.handler}"
         elif ours.changes != theirs.changes or not same_sent(ours.sent, theirs.sent):
-            return f"did something else in {ours.handler} than the protocol does"
+            return f"deviated from the protocol in {ours.handler}"
     return None
 
 

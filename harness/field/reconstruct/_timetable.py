@@ -218,8 +218,8 @@ class _Planner:
         self._as_stray.add((agent, place))
         line = self._played[agent][place].input.line
         self._table.impossible.append(
-            f"agent {agent} has on record to have received what agent {sent[0]} sent only later "
-            f"(trace line {line}, t={self._played[agent][place].input.at_s:g} s): it is put on the air as it came"
+            f"agent {agent} recorded a message before agent {sent[0]} sent it (trace line {line}, "
+            f"t={self._played[agent][place].input.at_s:g} s): the scenario sends it at the recorded time"
         )
         heappush(self._ready, (at_s, agent))
 

@@ -122,7 +122,7 @@ def reconstruct(
 
     Of a secured mission `opener` opens captures, and `depot` blocks.
     """
-    tell("reading what each agent was told")
+    tell("reading the inputs of each agent")
     remarks: list[str] = []
     elsewhere = Elsewhere(flight, opener, depot)
     mission, headers = told(flight, elsewhere, name, remarks)
@@ -133,30 +133,35 @@ def reconstruct(
         if header.settings == mission.settings:
             alone.rehearse(header)
         else:
-            why[agent_id] = "was set otherwise than the others, and a scenario has one set of settings"
+            why[agent_id] = "has other settings than the other agents, and a scenario has one set of settings"
     remarks += dict.fromkeys(elsewhere.problems)
     if any(header.secured for header in headers.values()):
-        remarks.append("it was secured, and is flown again without keys: what was dropped for them is not on the air")
+        remarks.append(
+            "the flight was secured and is reproduced without keys: datagrams that agents dropped as not "
+            "authentic are left out"
+        )
     remarks += alone.remarks
     if not any(rehearsal.played for rehearsal in rehearsals.values()):
         first = next((f"agent {agent_id} {words}; " for agent_id, words in why.items()), "")
         raise FieldError(first + NOTHING)
-    tell("putting everything in order")
+    tell("ordering the inputs")
     table = timetable(rehearsals)
     lost = {agent_id for agent_id in rehearsals if flight.exports and agent_id not in flight.exports}
     if lost:
-        remarks.append(f"no export of {agents(lost)}: taken to have been lost with the end of the trace")
+        remarks.append(f"no export of {agents(lost)}: the vehicle counts as lost at the end of its trace")
     document = scenario_of(mission, table, rehearsals, lost, elsewhere.sealed)
-    tell("flying it again")
+    tell("playing the scenario")
     simulated = simulate_in_memory(InMemory(tracing=True), parse(document), SEED)
     difference = first_difference(table, rehearsals, simulated)
     _compare_chains(flight, rehearsals, simulated, why)
     came_home = sorted({*flight.traces, *flight.exports})
     for agent_id in came_home:
         if agent_id not in rehearsals and agent_id not in why:
-            why[agent_id] = "has left no trace, and what reached it is not on record"
+            why[agent_id] = "has no trace, and its inputs are not recorded"
     if absent := set(mission.roster) - set(rehearsals):
-        remarks.append(f"{agents(absent)} not played: what others heard of them is put on the air as they heard it")
+        remarks.append(
+            f"{agents(absent)} not played: the scenario sends the messages that other agents received from them"
+        )
     remarks += table.impossible
     remarks += _clocks_in_words(table)
     outcomes = [AgentOutcome(agent_id, _blocks(simulated, agent_id), why.get(agent_id)) for agent_id in came_home]
@@ -174,7 +179,7 @@ def _compare_chains(
         chain = list(played.chain_of_block_hashes) if played else None
         home = flight.exports.get(agent_id)
         if chain != rehearsal.chain:
-            why[agent_id] = "ends with another chain in virtual time than by its trace"
+            why[agent_id] = "ends with another chain in virtual time than in its trace"
         elif home is not None and list(home.chain_of_block_hashes) != chain:
             why[agent_id] = _export_differs(home, rehearsal, flight)
 
@@ -182,11 +187,11 @@ def _compare_chains(
 def _export_differs(home: Export, rehearsal: Rehearsal, flight: Flight) -> str:
     trace = flight.traces.get(home.agent_id)
     if trace is None:
-        return f"has another chain in its export, of {len(home.chain)} blocks, than what reached it leads to"
+        return f"has another chain in its export ({len(home.chain)} blocks) than its recorded inputs lead to"
     last_s = trace.runs[-1].t if trace.runs else 0.0
     return (
-        f"is played up to the end of its trace at t={last_s:g} s, with {len(rehearsal.chain)} blocks in its chain: "
-        f"its export has {len(home.chain)}, and how it came to those is not on record"
+        f"is played up to the end of its trace at t={last_s:g} s, with {len(rehearsal.chain)} blocks in its chain; "
+        f"its export has {len(home.chain)}, and the inputs between are not recorded"
     )
 
 
@@ -232,7 +237,7 @@ def _sentences(
     yield from (f"- {problem}" for problem in reconstruction.problems[1:])
     yield from (f"- {remark}" for remark in reconstruction.remarks)
     yield from (f"- not used: {sentence}" for sentence in left_out)
-    yield "Nobody is reached but by `fates` and `datagrams`; messages that no handler does anything with are left out."
-    yield "`expect` is what happened. Where that is a mistake which is mended now, say what should happen instead."
+    yield "Agents receive only the messages of `fates` and `datagrams`; messages without effect are left out."
+    yield "`expect` is the recorded result. If it shows a mistake that is fixed now, write the correct result instead."
     yield f"  ucp-harness run {path} --backend sim --seed {SEED}"
     yield f"  pytest {path}"

@@ -64,15 +64,15 @@ class Record:
         self.lives = len(trace.starts) + 1
         if not trace.header.has_inputs:
             raise FieldError(
-                f"{path}: it is of ucp-trace/1, which lacks what the agent received; agents are to write ucp-trace/2"
+                f"{path}: it has the version ucp-trace/1, which lacks received messages; agents must write ucp-trace/2"
             )
         try:
             self.header: CheckedHeader = checked(trace.header)
         except ImpossibleHeaderError as error:
-            raise FieldError(f"{path}: {error}; nothing of it can be played") from None
+            raise FieldError(f"{path}: {error}; it cannot be played") from None
         self.entries = list(_entries(trace))
         if not self.entries:
-            raise FieldError(f"{path}: agent {self.agent_id} did nothing in it: there is nothing to play")
+            raise FieldError(f"{path}: it has no handler runs of agent {self.agent_id}, so there is nothing to play")
 
     def position_of_line(self, line: int) -> int:
         """How many entries stand before this line of the file."""

@@ -46,11 +46,11 @@ class Others:
         top = player.state.chain.top_chain_hash.hex()
         run = entry.what if entry and isinstance(entry.what, HandlerRun) else None
         if not self._traces:
-            yield shown("  no other agent's record lies beside this one", style="yellow")
+            yield shown("  no records of other agents in this directory", style="yellow")
         for agent_id in sorted({*self._record.header.roster, *self._traces} - {self._record.agent_id}):
             other = self._traces.get(agent_id)
             if other is None:
-                yield shown(f"  agent {agent_id}: its record is not here", style="dim")
+                yield shown(f"  agent {agent_id}: no record in this directory", style="dim")
                 continue
             yield shown(f"  agent {agent_id}: ", style="bold").append(shown(other.held(now, top), "not bold"))
             if run is not None:

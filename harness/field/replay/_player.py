@@ -156,30 +156,33 @@ class Player:
     def _follow(self, entry: Entry, run: HandlerRun) -> None:
         follower, found = self._follower, self.found
         if entry.gap is not None and follower.lost is None:
-            follower.lost = f"before line {entry.line} {entry.gap}, and what the agent held then is not on record"
+            follower.lost = (
+                f"before line {entry.line} {entry.gap}, and the state of the agent at that time is not recorded"
+            )
             found.lost.append(follower.lost)
         if follower.lost is not None:
             found.unjudged += 1
             resumed = self._born()
             if self._resumption.goes_on(resumed, self.position):
-                found.lost[-1] += f"; on from line {entry.line}, after which it was idle with a chain that is on record"
+                found.lost[-1] += f"; continues after line {entry.line}, where the agent was idle with a recorded chain"
                 self._follower = resumed
             return
         words = unknown_words([run]) if self._unknown else {}
         if words:
             found.unjudged += 1
             if words.keys() - COMPARED_WITHOUT:
-                follower.lost = f"line {entry.line} is not understood: {first_of(words)}"
+                follower.lost = f"line {entry.line} has unknown words: {first_of(words)}"
                 found.lost.append(follower.lost)
                 return
-            if (sentence := f"not all of line {entry.line} is understood: {first_of(words)}") not in found.lost:
+            sentence = f"line {entry.line} is compared without its unknown words: {first_of(words)}"
+            if sentence not in found.lost:
                 found.lost.append(sentence)
         else:
             found.steps += 1
         follower.follow(entry.line, run)
         if follower.deviations and (why := self._excused(follower.deviations)) is not None:
             follower.deviations.clear()
-            follower.lost = f"before line {entry.line} {why} and what the agent held then is not on record"
+            follower.lost = f"before line {entry.line} {why} and the state of the agent at that time is not recorded"
             if not words:
                 found.steps, found.unjudged = found.steps - 1, found.unjudged + 1
         if follower.deviations:

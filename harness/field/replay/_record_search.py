@@ -81,7 +81,7 @@ def open_record(path: Path, agent_id: int | None = None) -> Record:
     records = open_records(path, agent_id)
     if len(records) > 1:
         names = ", ".join(str(record.agent_id) for record in records)
-        raise FieldError(f"{path}: whose record is to be played? Choose with --agent: {names}")
+        raise FieldError(f"{path}: several records: choose one with --agent: {names}")
     return records[0]
 
 
@@ -95,7 +95,7 @@ def open_records(path: Path, agent_id: int | None = None) -> list[Record]:
     if not files:
         return _sorted_out(path, agent_id, [path])
     if agent_id is not None and traces[0].header.agent_id != agent_id:
-        raise FieldError(f"{files[0]}: the trace is of agent {traces[0].header.agent_id}, not of agent {agent_id}")
+        raise FieldError(f"{files[0]}: the trace belongs to agent {traces[0].header.agent_id}, not to agent {agent_id}")
     run = _Run(directory) if (directory / RUN_FILE).is_file() else None
     found = []
     for file, trace in zip(files, traces, strict=True):
@@ -168,10 +168,10 @@ def _sorted_out(path: Path, agent_id: int | None, sources: Sequence[Path]) -> li
         return []
     if not flights:
         why = f": {homecoming.left_out[0].why}" if homecoming.left_out else ""
-        raise FieldError(f"{path}: nothing of it is a trace that can be played{why}; give one, or a directory of them")
+        raise FieldError(f"{path}: no trace here can be played{why}; give a trace, or a directory of traces")
     whose = sorted({agent for flight in flights for agent in flight.traces})
     if agent_id is not None and agent_id not in whose:
-        raise FieldError(f"{path}: there is no trace of agent {agent_id}, but of {', '.join(map(str, whose))}")
+        raise FieldError(f"{path}: no trace of agent {agent_id}; choose one of {', '.join(map(str, whose))}")
     chosen = whose if agent_id is None else [agent_id]
     directory = path if path.is_dir() else _directory_of(path)
     run = _Run(directory) if (directory / RUN_FILE).is_file() else None
@@ -181,7 +181,7 @@ def _sorted_out(path: Path, agent_id: int | None, sources: Sequence[Path]) -> li
         trace, file = flown[0].traces[agent], flown[0].sources[agent][0]
         problems = [*_remarks(homecoming, agent)]
         if len(flown) > 1:
-            problems.append(f"{path}: agent {agent} has flown {len(flown)} flights; that with the most files is played")
+            problems.append(f"{path}: agent {agent} has {len(flown)} flights; the one with the most files is played")
         beside = run or (_OfFlight(flown[0]) if path.is_dir() and path in sources else _Around(trace, file.parent))
         named = _named(path, agent if path.is_dir() or len(whose) > 1 else None)
         records.append(partial(Record, file, named, trace, beside, problems))

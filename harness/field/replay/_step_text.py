@@ -126,7 +126,7 @@ class Words:
             case MessageTrigger(name, sender, sequence):
                 return f"{name[:60]} {sequence} of agent {sender}: {self._datagram(run.input)}"
             case TimerTrigger(name):
-                return f"the {name[:60]} timer ended"
+                return f"the {name[:60]} timer expired"
             case LocalTrigger(handler):
                 return f"triggered by {handler[:60]}"
             case EventTrigger(event_id):
@@ -134,14 +134,14 @@ class Words:
             case OperatorTrigger(command):
                 return f"the operator asked: {command[:60]}"
             case BootTrigger(blocks):
-                return f"it began again, and found a chain of {blocks} blocks on its disk"
-        return "nothing that there is"
+                return f"it restarted with a chain of {blocks} blocks from its disk"
+        return "an unknown trigger"
 
     def _datagram(self, record: Recorded | None) -> str:
         try:
             return self._message(decoded(record).message)
         except MalformedDatagramError as malformed:
-            return f"no message ({malformed.reason})"
+            return f"an invalid message ({malformed.reason})"
 
     def _message(self, message: Message) -> str:
         if isinstance(message, CommitBlock | BlockResponse):
@@ -183,7 +183,7 @@ class Words:
     def in_short(self) -> Text:
         """The state in a line."""
         if self._player.lost is not None:
-            return shown("  what the agent holds now is not known", style="yellow")
+            return shown("  the state of the agent is not known", style="yellow")
         state = self._player.state
         held = (
             f"chain {len(state.chain)}, deque {len(state.blocks_to_be_committed)}, stack {len(state.reconcile_stack)}"

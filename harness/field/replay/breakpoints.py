@@ -40,8 +40,8 @@ def place(words: str, names: Names) -> Place:
         return lambda entry: any(block_hash.startswith(begins) for block_hash in blocks_of(entry))
     near = get_close_matches(words, HANDLERS, n=3, cutoff=0.0)
     raise FieldError(
-        f"{words[:60]!r} is no place to stop at: it is a line's number, a handler (the nearest are {', '.join(near)}), "
-        "an Algorithm such as A13, or a block such as 4.11"
+        f"{words[:60]!r} is not a breakpoint: use a line number, a handler (the nearest are {', '.join(near)}), an "
+        "Algorithm such as A13, or a block such as 4.11"
     )
 
 

@@ -80,7 +80,7 @@ class Prompt(cmd.Cmd):
         known = {command.removeprefix("do_").replace("_", "-") for command in self.get_names() if command[:3] == "do_"}
         meant = [command for command in sorted(known) if command.startswith(name)]
         if name not in known and len(meant) != 1:
-            self._say(f"there is no command {line.strip()[:60]!r}; help shows which there are")
+            self._say(f"no command {line.strip()[:60]!r}; help lists the commands")
             return False
         self.lastcmd = line
         run: Callable[[str], bool | None] = getattr(
@@ -141,7 +141,7 @@ class Prompt(cmd.Cmd):
             try:
                 at_s = float(arg.removesuffix("s"))
             except ValueError:
-                raise FieldError('goto wants a line ("goto 812"), a second ("goto 300s"), start or end') from None
+                raise FieldError('goto needs a line ("goto 812"), a second ("goto 300s"), start or end') from None
             player.to(record.position_of_second(at_s))
         self._show()
 
@@ -156,13 +156,13 @@ class Prompt(cmd.Cmd):
     def do_clear(self, arg: str) -> None:
         """clear HANDLER | LINE | BLOCK: do not stop there any more"""
         if self._breaks.pop(arg, None) is None:
-            self._say(f"there is no break at {arg[:60]!r}")
+            self._say(f"no breakpoint at {arg[:60]!r}")
 
     def do_debug(self, arg: str) -> None:
         """debug (d): play this step once more in the debugger, pdb or the IDE's; `step` from there is in its handler"""
         player = self._player
         if not player.position:
-            raise FieldError("nothing has been played yet: next, and then debug")
+            raise FieldError("nothing is played yet: enter next, then debug")
         position = player.position
         player.to(position - 1)
         try:
@@ -185,13 +185,13 @@ class Prompt(cmd.Cmd):
         """compare: the agent's own record of this step beside what the reference does"""
         deviations = self._player.deviations_here()
         if not deviations:
-            self._say("no difference here: what the agent's record says is what the reference does")
+            self._say("no difference here: the record equals the reference")
         for deviation in deviations:
             self._print(self._words.beside(deviation))
 
     def do_others(self, arg: str) -> None:
         """others (o): what the other agents did at this moment, and who heard what this one sent"""
-        with self._console.status("reading the records of the others"):
+        with self._console.status("reading the records of other agents"):
             shown = [*self._others.at(self._player)]
         self._print(*shown)
 
@@ -215,7 +215,7 @@ class Prompt(cmd.Cmd):
         if not arg or arg.isdigit():
             steps = int(arg or 1)
             if (player.position == 0) if backward else player.at_end:
-                self._say("this is the start" if backward else "this is the end")
+                self._say("start of the record" if backward else "end of the record")
                 return
             player.to(player.position + (-steps if backward else steps))
         elif "difference".startswith(arg):
@@ -235,7 +235,7 @@ class Prompt(cmd.Cmd):
         if backward:
             earlier = [position for position in positions if position < player.position]
             if not earlier:
-                self._say("there is no difference before this")
+                self._say("no difference before this step")
                 return
             player.to(earlier[-1])
         else:
@@ -243,7 +243,7 @@ class Prompt(cmd.Cmd):
             while not player.at_end and len(player.found.positions) == known:
                 player.forward()
             if len(player.found.positions) == known:
-                self._say("there is no difference after this")
+                self._say("no difference after this step")
         self._show()
 
     def _stops_at(self, entry: Entry) -> bool:

@@ -119,8 +119,8 @@ def summary(record: Record, found: Found, names: Names) -> Iterator[Text]:
     steps = f"{found.steps:,} handler run{'s' if found.steps != 1 else ''}"
     match verdict(found):
         case "as specified":
-            words = "all" if not found.unjudged else "as far as it could be played,"
-            yield shown(f"✔ no difference: {steps}, {words} as Algorithms 1 to 20 say", style="green")
+            words = "all" if not found.unjudged else "all that could be played"
+            yield shown(f"✔ no difference: {steps}, {words} follow Algorithms 1 to 20", style="green")
         case "not judged":
             yield shown("- nothing could be judged", style="yellow")
         case "deviates":
@@ -153,5 +153,5 @@ def title(deviation: Deviation) -> str:
     """ "Algorithm 13, receive_request_next_in_sequence (ucp/reconcile.py:130)"."""
     handler = HANDLERS.get(deviation.handler or "")
     if handler is None:
-        return "what is no handler of the protocol"
+        return "an unknown handler"
     return f"Algorithm {handler.algorithm}, {handler.name} ({source_of(handler.name)})"

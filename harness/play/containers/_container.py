@@ -108,7 +108,7 @@ class Container:
             limit = f": it may use {self._memory_mib} MiB (`docker.memory_mib`)" if self._memory_mib else ""
             return f"{in_words(returncode)}, out of memory{limit}"
         if returncode == _NO_SUCH_PROGRAM:
-            return f"{in_words(returncode)}: there is no such program in its image"
+            return f"{in_words(returncode)}: its image does not hold this program"
         return in_words(returncode)
 
     async def wait(self) -> int:

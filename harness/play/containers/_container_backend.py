@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 class Containers(Processes):
     name: ClassVar[BackendName] = "docker"
-    not_in_uml = "there is no Docker engine in User Mode Linux: leave out --kernel uml, or --backend docker"
+    not_in_uml = (
+        "--backend docker does not work with --kernel uml, because User Mode Linux has no Docker engine: "
+        "leave out one of them"
+    )
 
     def refuse(self, scenario: Scenario) -> None:
         from harness.play.containers._container_preflight import (

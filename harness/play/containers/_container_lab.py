@@ -142,8 +142,8 @@ class ContainerLab:
             if identity in Path(f"/proc/{pid}/cgroup").read_text():  # and not some process of the same number
                 return os.open(f"/proc/{pid}/ns/net", os.O_RDONLY | os.O_CLOEXEC)
         raise DockerError(
-            "the Docker engine's containers are not processes of this machine (it runs in a virtual machine or "
-            "elsewhere), so they cannot be given a network: use an engine that runs here"
+            "the Docker engine runs in a virtual machine or on another machine, so the harness cannot connect its "
+            "containers to a network: use an engine that runs on this machine"
         )
 
     # As netem.lab.Lab
@@ -240,24 +240,24 @@ class ContainerLab:
         except docker.errors.APIError as error:
             if error.status_code == 409:
                 raise DockerError(
-                    f"there is a container {name} already, of a run in the same directory: if that is over, "
-                    f"`ucp-harness clean` removes it, else docker rm -f {name}"
+                    f"the container {name} of another run in the same directory exists: if that run has ended, remove "
+                    f"the container with `ucp-harness clean`, otherwise with docker rm -f {name}"
                 ) from None
-            raise SpawnError(f"the container {name} could not be made: {error.explanation}") from None
+            raise SpawnError(f"the container {name} cannot be created: {error.explanation}") from None
         return name, made["Id"]
 
     async def _start(self, name: str, identity: str) -> None:
         try:
             await self._engine.ask(f"start {name}", self._engine.api.start, identity)
         except docker.errors.APIError as error:
-            raise SpawnError(f"the container {name} could not be started: {error.explanation}") from None
+            raise SpawnError(f"the container {name} cannot be started: {error.explanation}") from None
 
     def _hear(self, event: dict[str, Any]) -> None:
         """What the engine says of our containers."""
         if self._closed or self._failure.done():
             return
         if not event:
-            self._fail(self._engine.give_up(f"the Docker engine has ended: once it is back, {CLEAN}"))
+            self._fail(self._engine.give_up(f"the Docker engine has stopped: start it, then {CLEAN}"))
             return
         identity = event["Actor"]["ID"]
         container = self._containers.get(identity)
@@ -269,7 +269,12 @@ class ContainerLab:
             case "die" if identity in self._holders:
                 vehicle = self._holders[identity]
                 name = f"{self._name}-network-{vehicle}"
-                self._fail(DockerError(f"the container {name}, which holds a vehicle's network, was ended by somebody"))
+                self._fail(
+                    DockerError(
+                        f"the container {name}, which holds the network of a vehicle, was stopped from "
+                        "outside the harness"
+                    )
+                )
 
     def _fail(self, error: DockerError) -> None:
         self._failure.set_exception(error)

@@ -32,12 +32,12 @@ def refuse_debuggers_that_are_not_in_the_image(scenario: Scenario) -> None:
         here = shutil.which(debugger)
         if here is not None and not _images.is_shared(Path(here)):
             raise DockerError(
-                f"{here} is in no directory that containers share with this machine: install {debugger} with this "
-                "machine's packages, or leave out `debugger`"
+                f"{here} is in a directory that containers do not share with this machine: install {debugger} from "
+                "the packages of this machine, or leave out `debugger`"
             )
 
 
 def require_root() -> None:
     """Raises DockerError."""
     if os.geteuid() != 0:
-        raise DockerError("the Docker backend puts network cables into containers, for which it must be root: use sudo")
+        raise DockerError("the Docker backend must be root to add network interfaces to containers: use sudo")

@@ -86,7 +86,7 @@ def is_shared(program: Path) -> bool:
 def named(engine: Engine, name: str) -> Image:
     """Raises DockerError if it is not here."""
     if not _exists(engine, name):
-        raise DockerError(f"there is no image {name} on this machine: docker pull {name}, or build it")
+        raise DockerError(f"this machine has no image {name}: docker pull {name}, or build it")
     return Image(name, "python3", foreign=True)
 
 
@@ -137,7 +137,7 @@ def _build(engine: Engine, name: str, say: Callable[[str], object]) -> None:
     now = ""
     for step in steps:
         if "error" in step:
-            raise DockerError(f"the project's image could not be built ({step['error'].strip()}): {INSTEAD}")
+            raise DockerError(f"the project's image cannot be built ({step['error'].strip()}): {INSTEAD}")
         word = step.get("stream", "").strip()
         now = word if word.startswith("Step ") else now
         say(f"building the image: {now}")
@@ -207,5 +207,5 @@ def idle_command() -> list[str]:
     """A program of this machine that does nothing, for ever. Raises DockerError."""
     sleep = shutil.which("sleep")
     if sleep is None:
-        raise DockerError("there is no sleep(1) on PATH, which the containers that hold a network run")
+        raise DockerError("sleep(1) is not on PATH, and containers that hold a network run it: install coreutils")
     return [sleep, "infinity"]

@@ -49,12 +49,14 @@ def write_compose(
     """Write `file` and the directory beside it, which is returned. Raises RunDirectoryError if one is there already."""
     keys = _keys(scenario)
     if scenario.gcs:
-        raise ScenarioError("`gcs` needs a run, which no compose file is: leave it out, or --emit-compose")
+        raise ScenarioError(
+            "`gcs` does not work with --emit-compose, because a compose file has no run: leave out one of them"
+        )
     refuse_debuggers_that_are_not_in_the_image(scenario)
     beside = file.with_suffix("")
     for path in (file, beside):
         if path.exists():
-            raise RunDirectoryError(f"{path} is there already: choose another name, nothing is overwritten")
+            raise RunDirectoryError(f"{path} exists: choose another name; existing files are not overwritten")
     try:
         (beside / "agents").mkdir(parents=True)
         services = _services(scenario, seed, kinds, system_ids, beside, keys)
@@ -63,7 +65,7 @@ def write_compose(
             name=scenario.name.replace("\n", " "),
             count=len(scenario.roster),
             vehicles=" on their vehicles" if kinds else "",
-            grounded="; and nobody flies the vehicles" if kinds else "",
+            grounded="; and the vehicles have no pilot" if kinds else "",
             file=file.name,
             directory=beside.name,
             speedup=scenario.speedup,
@@ -82,8 +84,8 @@ def _keys(scenario: Scenario) -> MissionKeys | None:
     bundles = [Path(scenario.security.keys) / _bundle(vehicle) for vehicle in scenario.roster]
     if scenario.security.keys == FRESH or not all(bundle.exists() for bundle in bundles):
         raise ScenarioError(
-            "`security.keys`: a compose file hands out the files of a directory of bundles, and holds no keys itself: "
-            "write them with `ucp-harness keys bundle HOME --out bundles`, and say {keys: bundles}"
+            "`security.keys`: a compose file needs key bundles in a directory, because it holds no keys itself: write "
+            "them with `ucp-harness keys bundle HOME --out bundles`, and set {keys: bundles}"
         )
     return keys_of(scenario, bytes(FRESH_BYTES))
 

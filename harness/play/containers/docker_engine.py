@@ -52,8 +52,8 @@ class Engine:
         host = os.environ.get("DOCKER_HOST") or DEFAULT_HOST
         if not host.startswith("unix://"):
             raise DockerError(
-                f"DOCKER_HOST is {host}: only containers on this machine can be given a network; unset it, or name a "
-                f"local engine's socket (unix://...)"
+                f"DOCKER_HOST is {host}: the harness connects only containers on this machine to a network: unset it, "
+                "or name the socket of a local engine (unix://...)"
             )
         _knock(host.removeprefix("unix://"))
         try:
@@ -78,7 +78,7 @@ class Engine:
                 ) from None
             raise
         except (requests.exceptions.RequestException, OSError):
-            sentence = f"the Docker engine stopped answering ({what}): once it does again (docker ps), {CLEAN}"
+            sentence = f"the Docker engine stopped answering ({what}): once it answers again (docker ps), {CLEAN}"
             raise self.give_up(sentence) from None
 
     def give_up(self, sentence: str) -> DockerError:
@@ -143,14 +143,14 @@ def _knock(path: str) -> None:
             door.connect(path)
     except FileNotFoundError:
         raise DockerError(
-            f"there is no Docker engine: {path} is not there; install it (Debian, Ubuntu: apt install docker.io) and "
+            f"there is no Docker engine: {path} does not exist; install it (Debian, Ubuntu: apt install docker.io) and "
             f"start it (systemctl start docker)"
         ) from None
     except ConnectionRefusedError:
         raise DockerError(
-            f"the Docker engine is not running: nobody listens at {path}; start it (systemctl start docker)"
+            f"the Docker engine is not running: no process listens at {path}; start it (systemctl start docker)"
         ) from None
     except PermissionError:
-        raise DockerError(f"{path} may not be used by this user: run it with sudo") from None
+        raise DockerError(f"{path} is not accessible to this user: use sudo") from None
     except OSError as error:
         raise DockerError(f"the Docker engine cannot be reached at {path}: {error.strerror or error}") from None

@@ -89,4 +89,4 @@ def remove(engine: Engine, identity: str, name: str) -> None:
         engine.do(f"remove {name}", engine.api.remove_container, identity, v=True, force=True)
     except docker.errors.APIError as error:
         if error.status_code not in (404, 409):  # it is gone, or somebody is at it
-            raise DockerError(f"the container {name} could not be removed: {error.explanation}") from None
+            raise DockerError(f"the container {name} cannot be removed: {error.explanation}") from None

@@ -22,7 +22,7 @@ def main(directory: Path) -> int:
     deadline = time.monotonic() + LIMIT_S
     while missing := [name for name in names if not Path(name).exists()]:
         if time.monotonic() > deadline:
-            sys.stderr.write(f"not started: there is no {', '.join(missing)} after {LIMIT_S:g} s\n")
+            sys.stderr.write(f"not started: {', '.join(missing)} missing after {LIMIT_S:g} s\n")
             return 1
         time.sleep(ASK_AGAIN_S)
     epoch_us = time.time_ns() // 1000

@@ -59,7 +59,7 @@ def _user_mode_linux() -> Requirement:
     try:
         return Requirement("User Mode Linux", True, False, f"{uml.examine()}; for {use}")
     except UmlError as error:
-        return Requirement("User Mode Linux", False, False, str(error), f"with it there is {use}")
+        return Requirement("User Mode Linux", False, False, str(error), f"it enables {use}")
 
 
 def _docker() -> Requirement:
@@ -73,7 +73,7 @@ def _docker() -> Requirement:
         engine.close()
         require_root()
     except DockerError as error:
-        return Requirement("Docker", False, False, str(error), f"with it there is {use}")
+        return Requirement("Docker", False, False, str(error), f"it enables {use}")
     return Requirement("Docker", True, False, f"{version}, for {use}")
 
 
@@ -83,7 +83,10 @@ def _ardupilot() -> Requirement:
     except VehicleError as error:
         return Requirement("ArduPilot SITL", False, False, f"{error}", "without it runs use the embedded vehicle")
     if ardupilot.defaults is None:
-        way_out = "put ArduPilot's default parameters, copter.parm, beside it: without them it may refuse to arm"
+        way_out = (
+            "put ArduPilot's default parameters, copter.parm, in the same directory: without them the vehicle "
+            "may refuse to arm"
+        )
         return Requirement("ArduPilot SITL", False, False, f"{ardupilot.binary}, without copter.parm", way_out)
     return Requirement("ArduPilot SITL", True, False, str(ardupilot.binary))
 
@@ -156,4 +159,6 @@ def _lateness(measured: Measured) -> str:
         f"{late[key]['median_s'] * 1000:.2g} ms (1 in 100: {late[key]['p99_s'] * 1000:.2g} ms or more)"
         for key in ("way", "timers")
     )
-    return f"{measured.engine}: this machine by itself took {way} on the way, and its timers were {timers} late"
+    return (
+        f"{measured.engine}: without conditions, packets took {way} on this machine, and its timers were {timers} late"
+    )

@@ -228,7 +228,7 @@ class AgentProcess:
             status = await self._process.terminate(STOP_GRACE_S)
             self._lives[-1].switched_off = True
             if status != 0:
-                raise self._failed("not exported", f"was switched off (SIGTERM), and ended with {self._process.end}")
+                raise self._failed("not exported", f"was switched off (SIGTERM) and ended with {self._process.end}")
             self.outcome, self.detail = "exported", f"switched off at {at_s:.1f} s"
             self._rundir.bring_export(self.agent_id, self._lives[-1].directory)
 
@@ -251,7 +251,7 @@ class AgentProcess:
         try:
             return await self._control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
         except AgentUnsupportedError as error:
-            raise self._unsupported(f"asked to {command}, it says: {last_words(str(error))}") from None
+            raise self._unsupported(f"refused the command {command}: {last_words(str(error))}") from None
         except AgentRefusedError as error:
             raise AgentRefusedError(f"agent {self.agent_id} refused to {command}: {error}") from None
         except AgentSilentError as error:
@@ -294,7 +294,7 @@ class AgentProcess:
             await self.ask("export")
         except AgentRefusedError as error:
             self.outcome, self.detail = "not exported", str(error)
-            raise MachineError(f"{error}; what was written before is there") from None
+            raise MachineError(f"{error}; the part written before is kept") from None
         self._rundir.bring_export(self.agent_id, self._lives[-1].directory)
 
     async def export_finally(self) -> None:

@@ -63,7 +63,7 @@ class Fleet:
             await self._take_charge_of(vehicle, lab)
         readied = [self._watchers.task(vehicle.get_ready()) for vehicle in self._vehicles.values()]
         for ready, next_one in enumerate(asyncio.as_completed(readied)):
-            show(f"vehicles get ready, {ready} of {len(readied)} are")
+            show(f"{ready} of {len(readied)} vehicles are ready")
             await next_one
 
     async def _boot(self, vehicle: VehicleProcess, lab: MissionLab) -> None:

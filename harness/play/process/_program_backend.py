@@ -208,8 +208,8 @@ class ProcessRun:
         if isinstance(change, Injected):
             if self._rogue is None:
                 raise ScenarioError(
-                    f"`{change.what}` needs a rogue node, which real processes have if the timeline that the mission "
-                    "begins with injects something: use --backend sim"
+                    f"`{change.what}` needs a rogue node; a run with real processes has one only if the timeline of "
+                    "its scenario injects something: use --backend sim"
                 )
             self._injected.append(change)
             self.played.record(change.to_json(round(max(change.at_s, self.clock.now()), 3)))
@@ -269,7 +269,7 @@ class ProcessRun:
 
     async def befall(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
         if not self._fleet:
-            raise ScenarioError(f"`{what}` needs vehicles, and this run has none")
+            raise ScenarioError(f"`{what}` needs vehicles, but this run has none")
         at_s = round(self.clock.now(), 3)
         if not by_hand:
             self._watchers.task(self._befall(agent_id, what, circumstance, at_s))
@@ -344,7 +344,7 @@ class ProcessRun:
         raise ScenarioError("`hold` needs virtual time: use --backend sim")
 
     async def release(self, number: int, fate: Fate) -> None:
-        raise AssertionError("nothing was held")
+        raise AssertionError("no message was held")
 
     async def stop_events(self) -> None:
         self._watchers.stop("script")

@@ -243,4 +243,4 @@ class VehicleProcess:
             lines = []
         words = " / ".join(line.strip() for line in lines if line.strip())
         where = f"vehicles/{self._directory.name}/{self._output.name}"
-        return f"; its last words ({where}): {words}" if words else f"; it said nothing ({where})"
+        return f"; its last output ({where}): {words}" if words else f"; it printed nothing ({where})"

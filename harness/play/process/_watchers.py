@@ -58,7 +58,7 @@ async def unless_interrupted(opening: Awaitable[T], interrupted: asyncio.Event) 
         opened.cancel()
         await asyncio.wait({opened})
     if opened.cancelled():
-        raise InterruptedRunError("the run was interrupted before it began")
+        raise InterruptedRunError("the run was interrupted before its start")
     return opened.result()
 
 

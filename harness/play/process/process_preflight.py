@@ -94,7 +94,8 @@ def refuse_what_this_machine_cannot(scenario: Scenario) -> None:
             raise MachineError(str(error)) from None
         except EngineError as error:
             raise MachineError(
-                f"this kernel cannot do what the network asks; play it in virtual time (--backend sim): {error}"
+                "this kernel does not support these network conditions; play the scenario in virtual time (--backend "
+                f"sim): {error}"
             ) from None
         except NetemError as error:
             raise MachineError(f"the lab could not be built: {error}") from None

@@ -84,7 +84,7 @@ class RogueNode:
 
     def _send(self) -> None:
         """Send what there is to send, and wait for what is due next."""
-        assert self._rogue is not None, "there is nothing to send before the start"
+        assert self._rogue is not None, "no messages to send before the start"
         for injected in self._rogue.to_send():
             now = self._clock.now()
             self._mouth.send(udp_broadcast(injected.source, PORT, injected.datagram))

@@ -20,7 +20,7 @@ from ucp.messages import (
 )
 
 NOBODYS = b"\xff" * HASH_BYTES
-"""A hash of nothing that there is."""
+"""A hash of an unknown trigger."""
 MADE = "made "
 
 
@@ -74,7 +74,7 @@ class Overheard:
             case NextInSequenceResponse.NAME, bytes(chain_hash):
                 timestamp_us = self._epoch_us + round((lie.timestamp_s or 0.0) * MICROSECONDS)
                 return NextInSequenceResponse(chain_hash, None if lie.block is None else of_block, timestamp_us)
-        raise AssertionError("a lie is of a kind of message, and says all that this says")
+        raise AssertionError("a lie needs a kind of message and all its fields")
 
     def _chain_hash(self, sender: int, chain: Sequence[str] | str) -> bytes:
         if isinstance(chain, str):

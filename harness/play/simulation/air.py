@@ -41,7 +41,7 @@ class InFlight:
     rank: int
     lots: RandomDraws
     datagram: Recorded | None
-    """None if there are no traces to have it."""
+    """None if no traces found to have it."""
     sealed: bytes | None = None
     """As it is on the air in a secured mission."""
 

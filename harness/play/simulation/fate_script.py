@@ -138,7 +138,7 @@ class FateScript:
         for part in self._parts:
             fate = f"fates.{part.index} ({part.fate.describe()})"
             if not part.decided:
-                sentences.append(f"{fate} never matched a message")
+                sentences.append(f"{fate} matched no message")
             elif part.arrivals:
                 numbers = f"{len(part.arrivals)} of its datagrams, the first number {min(part.arrivals)}"
                 sentences.append(f"{fate}: {numbers}, never left")

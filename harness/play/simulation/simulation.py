@@ -479,8 +479,8 @@ def no_vehicles(keys: Sequence[str]) -> str:
     """Why these keys cannot be played here, and the way out."""
     named = ", ".join(f"`{key}`" for key in keys)
     return (
-        f"{named} need{'s' if len(keys) == 1 else ''} vehicles that fly, and tracks in virtual time are computed: "
-        "use --backend process, or leave it out"
+        f"{named} need{'s' if len(keys) == 1 else ''} flying vehicles, but virtual time computes the tracks: use "
+        "--backend process, or leave it out"
     )
 
 

@@ -176,8 +176,8 @@ def _refuse_what_foreign_agents_cannot(scenario: Scenario) -> None:
     late = sorted(agent_id for agent_id in scenario.lateness if agent_id in scenario.foreign)
     if late:
         raise ScenarioError(
-            f"`lateness` names agent {late[0]}, and nobody sees the single timers of an agent that is not our own: "
-            "leave it out, or its `agent_command`"
+            f"`lateness` names agent {late[0]}, but the harness controls the timers of its own agents only: leave out "
+            "`lateness`, or the `agent_command` of this agent"
         )
 
 

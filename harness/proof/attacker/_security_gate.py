@@ -27,9 +27,7 @@ class Gate:
         try:
             from ucp.secure.bundle import KeySet
         except ModuleNotFoundError:
-            raise MachineError(
-                "--captured needs the package cryptography, which comes with the extra `secure`: install that"
-            ) from None
+            raise MachineError("--captured needs the package cryptography: `pip install ucp-harness[secure]`") from None
         self._keys = KeySet.derived(b"the keys of a proof".ljust(32), roster)
         self._roster = tuple(roster)
         self._captured = captured

@@ -133,9 +133,9 @@ def in_words(reached: Reached, there: Existing | None) -> Iterator[str]:
         f"with an input"
     )
     if there is not None:
-        yield f"of what exists within {there.bounds.in_words()}:"
+        yield f"share of the states within {there.bounds.in_words()}:"
         if there.ended != "complete":
-            yield f"  not all of it is known ({there.ended}): the shares are too large"
+            yield f"  the state space is incomplete ({there.ended}), so the shares are too large"
         yield f"  {Share.of(reached.states, there.states).in_words('local states')}"
         yield f"  {Share.of(reached.pairs, there.pairs).in_words('pairs')}"
     missing = not_taken(reached)
@@ -146,4 +146,4 @@ def in_words(reached: Reached, there: Existing | None) -> Iterator[str]:
     for handler, branches in by_handler.items():
         yield f"  not taken: {handler}: {', '.join(branches)}"
     if reached.untold:
-        yield f"not everything is known: {reached.untold}"
+        yield f"some steps are unknown: {reached.untold}"

@@ -52,7 +52,7 @@ class Reached:
             if len(mine) < MOST:
                 mine |= its
             elif not its <= mine:
-                self.untold = f"of local states and pairs only the first {MOST:,} are looked at"
+                self.untold = f"only the first {MOST:,} local states and pairs are counted"
         self.branches.update(other.branches)
         self.steps += other.steps
         self.untold = self.untold or other.untold

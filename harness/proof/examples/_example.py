@@ -72,7 +72,7 @@ def keep(played: Played, path: Path, bounds: Bounds, instants: int, sentences: S
     """Write it to `path`; `sentences` say what it is."""
     comment = [
         *sentences,
-        f"A shortest way within {bounds.in_words()}.",
+        f"A shortest path within {bounds.in_words()}.",
         *evidence_lines(played.judged),
         f"  ucp-harness run {path} --backend sim --seed {SEED}",
     ]

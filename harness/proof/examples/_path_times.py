@@ -47,8 +47,8 @@ def windows_s(count: int, runs: Sequence[Run]) -> list[tuple[float, float]]:
     begin = [0.0, *[-inf] * (count - 1)]
     earliest = _longest(begin, later)
     latest = _longest(begin, [(after, before, least) for before, after, least in later])
-    assert earliest is not None, "the way was found"
-    assert latest is not None, "the way was found"
+    assert earliest is not None, "the path was found"
+    assert latest is not None, "the path was found"
     return [(first + 0.0, 0.0 - last) for first, last in zip(earliest, latest, strict=True)]
 
 

@@ -213,12 +213,12 @@ class _Other:
             answer = self._worker.connection.recv()
         except EOFError:
             raise HarnessError(
-                "a process that looked at states was killed, maybe for want of memory: lower --memory or --cores"
+                "a worker process was killed, perhaps because memory ran out: lower --memory or --cores"
             ) from None
         if isinstance(answer, HarnessError):
             raise answer
         if isinstance(answer, Failed):
-            raise HarnessError(f"a process that looked at states failed: {answer.reason}")
+            raise HarnessError(f"a worker process failed: {answer.reason}")
         assert isinstance(answer, Answer)
         self.memory_bytes = answer.memory_bytes
         self.processor_s = answer.processor_s

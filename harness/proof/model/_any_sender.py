@@ -238,7 +238,7 @@ class _Division:
         self._collected.transitions += 1
         if step.local != local or step.sent or step.started:
             self._collected.shown.add("1")
-            self._go(state, step, f"it hears a {self.local.messages[message].NAME} of the captor's")
+            self._go(state, step, f"it hears a {self.local.messages[message].NAME} of the attacker")
 
     def _known_flaw(self, local: int) -> bool:
         return self.local.known[local].flaw is not None

@@ -38,14 +38,16 @@ def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | N
         return Flaw("3", "an agent holds a block twice")
     if any(completed.get(made) != maker != captured for made, maker in _makers(state).items()):
         kind = "4" if captured is None else "honest"
-        return Flaw(kind, "an agent holds a block that the agent that it names never completed")
+        return Flaw(kind, "an agent holds a block that its named maker never completed")
     chain_hash = state.chain.inception.chain_hash
     for block, said in state.chain.with_chain_hashes():
         chain_hash = next_chain_hash(chain_hash, block.block_hash)
         if said != chain_hash:
-            return Flaw("4", "a chain hash is not that of the blocks below it")
+            return Flaw("4", "a chain hash does not match the blocks up to it")
     if state.reconcile_in_progress and all(timer.deadline is None for timer in state.reconcile_timers):
-        return Flaw("hang", "an agent reconciles, and no timer of the reconcile runs: it answers nobody for ever")
+        return Flaw(
+            "hang", "an agent reconciles, but no timer of the reconcile runs: it never answers another agent again"
+        )
     return None
 
 

@@ -189,16 +189,16 @@ class LocalStates(KnownStates):
         revoked = self.agents.revoked[known.agent_id]
         put_back(revoked, known.snapshot)
         if is_heard(revoked, self._sealed(message), known.snapshot):
-            return Flaw("revoked", f"a {said.NAME} of a vehicle that is known to be revoked is heard")
+            return Flaw("revoked", f"a {said.NAME} of a vehicle whose revocation is known is accepted")
         for datagram in self.agents.gate.forged(said, known.agent_id, NOW_S):
             agent = self._restored(local)
             if is_heard(agent, datagram, known.snapshot):
-                return Flaw("name", f"a {said.NAME} is heard that only another vehicle could have signed")
+                return Flaw("name", f"a {said.NAME} is accepted that only another vehicle could sign")
             self.agents.leave_in(known.agent_id, known.snapshot)
         return None
 
     def _sealed(self, message: int) -> bytes:
-        """A new datagram of the captor's that says this."""
+        """A new datagram of the attacker that says this."""
         said = self.messages[message]
         genuine = type(said) in CARRY_A_BLOCK and said.block.block_hash in self.blocks.makers  # type: ignore[union-attr]
         return self.agents.gate.sealed(said, NOW_S, genuine=genuine)
@@ -272,7 +272,7 @@ class LocalStates(KnownStates):
             return Step(local, sent, started)
         if self.bounds.reduced:
             if hears and any(self.timers[timer] == "voting" for timer, _ in started):
-                raise ReductionError("an agent begins a vote because of a message: try again with --whole")
+                raise ReductionError("an agent starts a vote because of a message: try again with --whole")
             check_that_nothing_is_lost(before.snapshot, agent.state)
         local = self._intern(before.agent_id, agent, after, before.snapshot, flaw, keep=not boots)
         return Step(local, sent, started)

@@ -73,7 +73,7 @@ class Agents:
         agent = self.new(FIRST)
         log(agent, ordinal)
         if agent.state.current_block:
-            raise ReductionError("an event is left over where a block is completed: try again with --whole")
+            raise ReductionError("an event remains after a block is completed: try again with --whole")
         (block,) = agent.state.blocks_to_be_committed
         return block
 

@@ -174,10 +174,10 @@ def _first_difference(did: Sequence[_Run], should: Sequence[_Run], name_of: Call
         if words:
             return run.handler, f"{_title(run)}: {'; '.join(words)}"
         if left != should_leave and _handler(did, alike) == _handler(should, alike):
-            return run.handler, f"{_title(run)}: its state, or a timer, is not what it should be after it"
+            return run.handler, f"{_title(run)}: the state or a timer is wrong after it"
     whose = (did or should)[max(alike - 1, 0)].run
     follows, should_follow = _handler(did, alike), _handler(should, alike)
-    return whose.handler, f"{_title(whose)}: what follows it is {follows}; it should be {should_follow}"
+    return whose.handler, f"{_title(whose)}: it triggers {follows}; it should trigger {should_follow}"
 
 
 def _handler(runs: Sequence[_Run], number: int) -> str:

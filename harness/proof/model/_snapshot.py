@@ -293,4 +293,4 @@ def check_that_nothing_is_lost(before: Snapshot, state: AgentState) -> None:
     held = {block.block_hash for name in ("blocks_to_be_committed", "reconcile_stack") for block in before[name]}
     held.update(before["chain"].parts["_block_of_hash"])
     if not all(state.holds(block_hash) for block_hash in held):
-        raise ReductionError("a block that an agent held is gone: try again with --whole")
+        raise ReductionError("a block of an agent has disappeared: try again with --whole")

@@ -102,7 +102,7 @@ class Tallies:
             self._settled_ends(local, timer) != self._settled_ends(settled, timer)
             for timer in self._states.known[local].running
         ):
-            raise ReductionError("an agent asks more of a tally than it should: try again with --whole")
+            raise ReductionError("an agent uses a tally in an unknown way: try again with --whole")
 
     def _settled_ends(self, local: int, timer: int) -> set[Step]:
         return {end.step._replace(local=self.settled(end.step.local)) for end in self._ends(local, timer)}

@@ -1,4 +1,4 @@
-"""Whether the swarm can always come to rest with one chain, and whether it can go round for ever: on the whole graph.
+"""Whether the swarm can always come to rest with one chain, and whether a cycle lasts for ever.
 
 Both are asked of what follows when nothing is lost any more and no new block comes, beside some more votes.
 """
@@ -41,10 +41,10 @@ class Liveness:
 @cycles_left_alone()
 def look(graph: Graph, watch: Watch = lambda asked: None, crew: Crew | None = None) -> Liveness:
     """Of a graph that is complete; a crew, if there is one, lets those vote who are at rest with several chains."""
-    at_rest = dict(_at_rest(graph, partial(watch, "who is at rest")))
+    at_rest = dict(_at_rest(graph, partial(watch, "idle states")))
     forks = [number for number, chains in at_rest.items() if chains > 1]
-    result = Liveness(len(forks), forks[0] if forks else None, cycles(graph, partial(watch, "ways round")))
-    safe = Attractor(graph.quiet, graph.swarm.bounds.timers_any, partial(watch, "ways to one chain"))
+    result = Liveness(len(forks), forks[0] if forks else None, cycles(graph, partial(watch, "cycles")))
+    safe = Attractor(graph.quiet, graph.swarm.bounds.timers_any, partial(watch, "paths to one chain"))
     safe.add(number for number, chains in at_rest.items() if chains <= 1)
     result.astray.append(safe.left)
     if not safe.left:

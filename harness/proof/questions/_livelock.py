@@ -65,13 +65,13 @@ class Livelock:
         if self.contradictory:
             return NO_CLOCKS
         if self.coincidences is None:
-            return "if timers can end like that, and one of them may wait for ever"
+            return "if timers can expire in this order, and one of them may wait for ever"
         if not self.coincidences and self.cycle is None:
-            return "without a coincidence, if what is sent at the same moment is heard in the same order in every round"
+            return "without a coincidence, if messages sent at the same instant arrive in the same order in every round"
         if not self.coincidences:
-            return "which takes no coincidence"
-        moments = "two moments are" if self.coincidences == 1 else f"{self.coincidences} times two moments are"
-        return f"on this way there {moments} the same by chance, to within the time that a message takes"
+            return "which needs no coincidence"
+        moments = "two instants are" if self.coincidences == 1 else f"{self.coincidences} times two instants are"
+        return f"on this path {moments} equal by chance, to within the transit time of a message"
 
 
 def forms(graph: Graph, cycles: Sequence[list[int]]) -> list[list[list[int]]]:
@@ -143,7 +143,7 @@ def _shown(graph: Graph, ways: int, rounds: Sequence[_Round], path: Path, name: 
     (begin, cycle, script, _), played = went
     several = Script(graph, [*begin, *(cycle[1:] + cycle[:1]) * ROUNDS])
     completions = () if bounds.timers_any else tuple(several.completions())
-    sentence = f"The swarm can go round in circles for ever: {len(begin) - 1} instants after the beginning."
+    sentence = f"The swarm can repeat a cycle for ever: {len(begin) - 1} instants after the beginning."
     said = [sentence, *([f"It does {NO_CLOCKS}."] if script.contradictory else [])]
     example = keep(played, path, bounds, len(begin) - 1 + len(cycle), said)
     known = None if bounds.timers_any else script.coincidences

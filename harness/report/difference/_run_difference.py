@@ -202,7 +202,7 @@ class _Run:
 
     def problems(self) -> Iterator[str]:
         if self.record.outcome == "running":
-            yield f"{self.path}: the run has not recorded its end, and is compared up to there"
+            yield f"{self.path}: the end of the run is not recorded, so the comparison covers the recorded part"
         yield from self.archive.record_problems
         yield from self.exports.errors
 
@@ -215,14 +215,14 @@ class _Run:
 def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
     for run in (a, b):
         if not run.roster:
-            raise RunDirectoryError(f"{run.path / RUN_FILE}: it names no agents: play the run again")
+            raise RunDirectoryError(f"{run.path / RUN_FILE}: it names no agents; play the run again")
     if a.roster != b.roster:
         roster_a, roster_b = (", ".join(ranges([*run.roster])) for run in (a, b))
-        raise RunDirectoryError(f"A has agents {roster_a}, and B has {roster_b}: compare runs of the same agents")
+        raise RunDirectoryError(f"A has agents {roster_a}, but B has {roster_b}: compare runs of the same agents")
     if a.record.backend != b.record.backend:
         raise RunDirectoryError(
-            "one run was in virtual time, whose traces leave out messages that change nothing, and one was not: "
-            "compare runs of the same backend"
+            "only one run was in virtual time, and traces of virtual time omit messages without effect: compare runs "
+            "of the same backend"
         )
 
 

@@ -68,16 +68,14 @@ class Recording:
         self._depot = depot
         self._problems: list[str] = []
         if self.archive.recorded and self.archive.record.outcome == "running":
-            self.add_problem("the run has not recorded its end: it is still going on, or it was killed")
+            self.add_problem("the end of the run is not recorded: the run is still active, or it was killed")
         headers = {agent: trace.header for agent, trace in self.archive.traces.items()}
         self.time: MissionTime = mission_time(headers, self.archive.record, self._problems)
         if not any((self.agents, self._telemetry, self._logs)):
-            raise ExportError(
-                f"{directory}: no traces, chains, telemetry or logs are in it: there is nothing to export"
-            )
+            raise ExportError(f"{directory}: nothing to export: it holds no traces, chains, telemetry or logs")
         if len(self.agents) > MAX_AGENTS:
             raise ExportError(
-                f"{directory}: {len(self.agents)} agents are named in it, and a run has at most {MAX_AGENTS}; "
+                f"{directory}: {len(self.agents)} agents are named in it, but a run has at most {MAX_AGENTS}; "
                 "run.json was edited or damaged"
             )
 
@@ -167,7 +165,7 @@ class Recording:
     def _by_tracks(self) -> Iterator[Position]:
         scenario = self.archive.record.scenario
         if scenario is None:
-            self._problems.append("where the field lies is not known: vehicles are in metres, and on no map")
+            self._problems.append("the location of the field is unknown: positions are in metres, without a map")
         home = scenario.vehicles.field if scenario else None
         for vehicle, fixes in self.tracks.by_vehicle.items():
             for fix in fixes:
@@ -183,7 +181,7 @@ class Recording:
         untimed, field = 0, None
         read = logbook.read(self.archive, self._depot)
         if read.event_data.is_closed:
-            self._problems.append("event data is sealed to the depot: positions are not known without --depot-key")
+            self._problems.append("event data is sealed to the depot: positions need --depot-key")
         for track in tracks(read):
             for timestamp_us, logged in track.fixes:
                 place = Place(*(logged.lat_e7 / 1e7, logged.lon_e7 / 1e7, logged.alt_mm / 1e3))
@@ -199,7 +197,9 @@ class Recording:
 
     def _losses(self) -> Iterator[LossesChanged]:
         if len(self.agents) > MAX_LINKED:
-            self._problems.append(f"links are told one by one of up to {MAX_LINKED} vehicles, and here are more")
+            self._problems.append(
+                f"single links are exported for up to {MAX_LINKED} vehicles only, and this run has more"
+            )
             return
         for at_s, losses in self.archive.link_losses(self.agents):
             if at_s <= LATEST_S:

@@ -186,7 +186,9 @@ def mission_time(headers: Mapping[int, Header], record: RunRecord, problems: lis
         if type(epoch_us) is int and 0 <= epoch_us <= MAX_EPOCH_S * 1_000_000:
             epochs[agent] = epoch_us * 1000
         else:
-            problems.append(f"agent {agent}: its trace does not say when its mission began; taken for the others' time")
+            problems.append(
+                f"agent {agent}: the start of its mission is not in its trace; the start of the other agents is used"
+            )
     epoch_ns = Counter(epochs.values()).most_common(1)[0][0] if epochs else _began(record)
     return MissionTime(epoch_ns, _speedup(headers, record), epochs)
 

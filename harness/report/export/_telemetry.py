@@ -32,7 +32,10 @@ def read_telemetry(vehicle: int, path: Path, time: MissionTime, problems: list[s
         return
     try:
         if path.stat().st_size > MAX_BYTES:
-            problems.append(f"{path}: larger than {MAX_BYTES // 1024**2} MiB, which no flight's log is; it is left out")
+            problems.append(
+                f"{path}: larger than {MAX_BYTES // 1024**2} MiB, which is too large for a log of a "
+                "flight; it is left out"
+            )
             return
         log = mavutil.mavlogfile(str(path), robust_parsing=True)
     except OSError as error:

@@ -27,7 +27,7 @@ try:
 
     from harness.report.export._scene import Scene, colours_of
 except ImportError:
-    raise MachineError("writing MCAP takes further packages: `pip install ucp-harness[export]`") from None
+    raise MachineError("writing MCAP needs further packages: `pip install ucp-harness[export]`") from None
 
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _SEVERITIES = (Log.FATAL, Log.FATAL, Log.FATAL, Log.ERROR, Log.WARNING, Log.INFO, Log.INFO, Log.DEBUG)

@@ -31,7 +31,7 @@ try:
     )
     from perfetto.trace_builder.proto_builder import StreamingTraceProtoBuilder
 except ImportError:
-    raise MachineError("writing Perfetto traces takes a further package: `pip install ucp-harness[export]`") from None
+    raise MachineError("writing Perfetto traces needs a further package: `pip install ucp-harness[export]`") from None
 
 SWARM = "swarm"
 MAX_TEXT = 500
@@ -106,8 +106,8 @@ class _Trace:
         self._arrows = _Arrows(recording.history.messages or ())
         if self._arrows.backwards:
             recording.add_problem(
-                f"{self._arrows.backwards} messages were received before they were sent, by the agents' clocks: "
-                "they have no arrow"
+                f"{self._arrows.backwards} messages were received before they were sent, according to the clocks of "
+                "the agents: they have no arrow"
             )
         self._uuids = count(1)
         self._tracks: dict[tuple[str, str], int] = {}
@@ -145,7 +145,7 @@ class _Trace:
             case NetworkChanged():
                 yield from self._count(at_ns, SWARM, "mean loss (%)", 100 * sample.mean_loss)
                 yield from self._count(at_ns, SWARM, "worst loss (%)", 100 * sample.worst_loss)
-                yield from self._count(at_ns, SWARM, "groups that hear each other", len(sample.groups))
+                yield from self._count(at_ns, SWARM, "connected groups", len(sample.groups))
             case Spread(replication=replication):
                 yield from self._count(at_ns, SWARM, "longest chain (blocks)", replication.longest_chain)
                 yield from self._count(at_ns, SWARM, "mutual chain (blocks)", replication.mutual_chain)

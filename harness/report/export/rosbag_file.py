@@ -33,7 +33,7 @@ try:
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 except ImportError:
-    raise MachineError("writing ROS bags takes a further package: `pip install ucp-harness[export]`") from None
+    raise MachineError("writing ROS bags needs a further package: `pip install ucp-harness[export]`") from None
 
 Timed = tuple[int, str, Any]
 """Time, topic, and message."""

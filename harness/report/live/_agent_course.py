@@ -111,7 +111,7 @@ class Course:
                 try:
                     entry = parsed(line)
                 except ValueError:
-                    self.problem = f"the trace of agent {self.agent_id} is damaged, and read up to there"
+                    self.problem = f"the trace of agent {self.agent_id} is damaged, and is read up to the damage"
                     return None
             if isinstance(entry, Header):
                 self._begin()

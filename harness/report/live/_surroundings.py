@@ -62,7 +62,7 @@ class _Lines(Generic[Line]):
             try:
                 self._play(entry)
             except (ValueError, TypeError, AttributeError, KeyError):
-                self.problems[f"{name} has lines that mean nothing, which are left out"] = None
+                self.problems[f"{name} has unknown lines, which are left out"] = None
         return True
 
     def close(self) -> None:

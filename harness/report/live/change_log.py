@@ -35,7 +35,7 @@ class Story:
             return
         if self.size + len(lines) > MAX_BYTES:
             self._full = True
-            note = f"there is more than {MAX_BYTES >> 20} MiB to tell: what follows is left out"
+            note = f"the page shows only the first {MAX_BYTES >> 20} MiB of changes"
             lines = (_encode(["note", note]) + "\n").encode()
         self._file.write(lines)
         self._file.flush()

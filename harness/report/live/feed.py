@@ -70,11 +70,11 @@ class Feed:
         self._directory = directory
         self._roster = archive.roster
         if not self._roster:
-            raise RunDirectoryError(f"{directory}: it has neither {RUN_FILE} nor traces, so there is nothing to watch")
+            raise RunDirectoryError(f"{directory}: nothing to watch: it has neither {RUN_FILE} nor traces")
         if len(self._roster) > MAX_VEHICLES:
             raise RunDirectoryError(
-                f"{directory}: {len(self._roster)} vehicles flew, and the page shows at most {MAX_VEHICLES}: "
-                "`ucp-harness report` and `export` take them all"
+                f"{directory}: {len(self._roster)} vehicles are in this run, but the page shows at most "
+                f"{MAX_VEHICLES}: use `ucp-harness report` or `export`"
             )
         agents = agents_directory(directory)
         self._bit = {agent_id: 1 << number for number, agent_id in enumerate(self._roster)}

@@ -91,7 +91,7 @@ class Server:
             except OSError as error:
                 why = os.strerror(error.errno or 0)
                 raise MachineError(
-                    f"port {port} of 127.0.0.1 cannot be had: {why}; choose another, or leave it to us"
+                    f"port {port} of 127.0.0.1 is not available: {why}; choose another port, or 0 for a free one"
                 ) from None
             bound = runner.addresses[0][1]
             self._hosts = f"127.0.0.1:{bound}", f"localhost:{bound}"
@@ -109,7 +109,7 @@ class Server:
         origin = request.headers.get("Origin")
         strange = request.host not in self._hosts or origin not in (None, *(f"http://{host}" for host in self._hosts))
         if strange or not hmac.compare_digest(token.encode(), self._token.encode()):
-            return web.Response(status=403, text="This page is for whoever has the address that ucp-harness printed.\n")
+            return web.Response(status=403, text="This page needs the full address that ucp-harness printed.\n")
         try:
             response = await handler(request)
         except web.HTTPException as error:
@@ -146,7 +146,7 @@ class Server:
 
     async def _tell(self, request: web.Request) -> web.WebSocketResponse:
         if self.readers >= MAX_READERS:
-            raise web.HTTPServiceUnavailable(reason=f"{MAX_READERS} pages are open: close one")
+            raise web.HTTPServiceUnavailable(reason=f"{MAX_READERS} pages are open, which is the maximum: close one")
         socket = web.WebSocketResponse(heartbeat=GONE_S, max_msg_size=MAX_MESSAGE_BYTES, compress=False)
         await socket.prepare(request)
         self._opened += 1

@@ -79,13 +79,13 @@ class Beside:
         self._say(["over"])
         self._hearing.join(LAST_LOOK_S)
         if self._hearing.is_alive():
-            self.problem = f"the page hung: {LAST_LOOK_S:g} s after the run its server had not answered"
+            self.problem = f"the page hung: its server did not answer within {LAST_LOOK_S:g} s after the run"
         elif self._readers is None:
             from netem.lab import in_words  # which takes its time to import
 
             end = in_words(self._process.wait())
             self._complaining.join(ENDING_S)  # it may not have come to the last words yet
-            self.problem = f"the page's server ended by itself with {end} ({self._last_words}), and the run went on"
+            self.problem = f"the server of the page ended by itself with {end} ({self._last_words}); the run continued"
         return bool(self._readers)
 
     def wait(self) -> None:
@@ -211,7 +211,7 @@ def _do(hand: Interventions, asked: dict[str, Any]) -> Future[float]:
         case "speed":
             return hand.set_factor(None if asked["factor"] is None else float(asked["factor"]))
         case _:
-            raise ValueError("nobody knows what that is")
+            raise ValueError("the request is unknown")
 
 
 @contextmanager
@@ -229,4 +229,4 @@ def require_packages() -> None:
     try:
         import aiohttp  # noqa: F401
     except ImportError:
-        raise MachineError("watching a run takes a further package: `pip install ucp-harness[watch]`") from None
+        raise MachineError("watching a run needs a further package: `pip install ucp-harness[watch]`") from None

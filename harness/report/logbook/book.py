@@ -39,7 +39,7 @@ class Logbook:
         known = (
             f"exports here are of agents {', '.join(map(str, self.exports))}" if self.exports else "nor of any other"
         )
-        raise ExportError(f"{self.absent.get(agent_id, f'there is no export of agent {agent_id}')}; {known}")
+        raise ExportError(f"{self.absent.get(agent_id, f'the export of agent {agent_id} is missing')}; {known}")
 
 
 def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
@@ -49,7 +49,7 @@ def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
     """
     exports = archive.exports
     if not exports.by_agent and not exports.errors:
-        why = f"holds no exports (*{SUFFIX}): no agent of this run left its chain"
+        why = f"holds no exports (*{SUFFIX}), so there are no chains"
         raise RunDirectoryError(f"{archive.directory}: {why}")
     record = archive.origin
     absent = sorted({*record.roster} - {*exports.by_agent})

@@ -162,7 +162,7 @@ class Telling:
                 chain.replay(run)
             chains[agent_id] = self._names.of(chain.blocks)
         if not chains:
-            return ["no chains: no agent has left a trace"]
+            return ["no chains: no agent has a trace"]
         return ["chains", *_tree({agent_id: [INCEPTION, *chain] for agent_id, chain in chains.items()}, "  ")]
 
 

@@ -44,7 +44,7 @@ class Course:
         elif sentence != "chains" and not any(
             tell(at_s, told) for pattern, tell in self._patterns() if (told := pattern.fullmatch(sentence))
         ):
-            raise ScenarioError(f"{sentence[:80]!r} is no sentence of a story: there are {SENTENCES}")
+            raise ScenarioError(f"{sentence[:80]!r} is not a sentence of a story: use {SENTENCES}")
 
     def _patterns(self) -> list[tuple[re.Pattern[str], Callable[[int, re.Match[str]], bool]]]:
         return [
@@ -92,7 +92,7 @@ def _entry(sentence: str) -> dict[str, Any]:
     try:
         entry = parse_yaml(sentence)
     except ScenarioError:
-        raise ScenarioError(f"{sentence[:80]!r} is not YAML, as an entry of a timeline is") from None
+        raise ScenarioError(f"{sentence[:80]!r} is not an entry of a timeline in YAML") from None
     if not isinstance(entry, dict) or "at_s" in entry:
-        raise ScenarioError(f"{sentence[:80]!r} is no entry of a timeline, whose instant the story tells")
+        raise ScenarioError(f"{sentence[:80]!r} is not an entry of a timeline without `at_s`")
     return entry

@@ -90,7 +90,7 @@ def read_story(path: Path) -> Story:
     """Raises ScenarioError: one sentence that names the file and the line."""
     try:
         if not path.is_file() or path.stat().st_size > MAX_BYTES:
-            raise ScenarioError(f"{path}: not a file, or larger than any story")
+            raise ScenarioError(f"{path}: not a file, or too large for a story")
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = "it is not UTF-8 text" if isinstance(error, UnicodeDecodeError) else error.strerror
@@ -105,7 +105,7 @@ def _parsed(path: Path, text: str) -> Story:
     given = text.splitlines()
     begins = next((number for number, line in enumerate(given) if _SENTENCE.fullmatch(line)), None)
     if begins is None:
-        raise ScenarioError("there is no sentence in it, such as `1 s: 1 logs`")
+        raise ScenarioError("it has no sentence, such as `1 s: 1 logs`")
     while begins and given[begins - 1].startswith("#"):  # a remark on the first sentence
         begins -= 1
     lines, course = [*given[:begins], ""], Course()
@@ -119,12 +119,16 @@ def _parsed(path: Path, text: str) -> Story:
             continue
         sentence = _SENTENCE.fullmatch(line)
         if sentence is None:
-            raise ScenarioError(f"line {number}: {line[:80]!r} is no sentence: those begin with their second, `12 s: `")
+            raise ScenarioError(
+                f"line {number}: {line[:80]!r} is not a sentence: start it with its mission second, such as `12 s: `"
+            )
         at_s, words = int(sentence[1]), sentence[2].rstrip()
         if told and at_s < told[-1][1]:
-            raise ScenarioError(f"line {number}: {at_s} s is before {told[-1][1]} s, which was told already")
+            raise ScenarioError(
+                f"line {number}: {at_s} s is before {told[-1][1]} s of an earlier sentence: order the sentences by time"
+            )
         if course.ends_at_s is not None:
-            raise ScenarioError(f"line {number}: something is told after the end")
+            raise ScenarioError(f"line {number}: a sentence follows the end")
         try:
             course.tell(at_s, words)
         except ScenarioError as error:
@@ -134,7 +138,7 @@ def _parsed(path: Path, text: str) -> Story:
         lines.append(line)
         told.append((len(lines) - 1, at_s, words in ("chains", "end")))
     if course.ends_at_s is None:
-        raise ScenarioError("it has no end: the last sentence should be one such as `60 s: end`")
+        raise ScenarioError("it has no end: add a last sentence such as `60 s: end`")
     try:
         scenario = _scenario(path, given[:begins], course)
     except ScenarioError as error:
@@ -167,11 +171,11 @@ def _scenario(path: Path, header: Sequence[str], course: Course) -> Scenario:
     try:
         keys = parse_yaml("\n".join(header)) or {}
     except ScenarioError as error:
-        raise ScenarioError(f"before its first sentence are a scenario's keys: {error}") from None
+        raise ScenarioError(f"the keys before its first sentence are wrong: {error}") from None
     if not isinstance(keys, dict):
-        raise ScenarioError("before its first sentence are a scenario's keys, each with its value")
+        raise ScenarioError("the text before its first sentence must be keys of a scenario with their values")
     if taken := {"timeline", "duration_s", "events"} & keys.keys():
-        raise ScenarioError(f"`{min(taken)}` is what its sentences tell")
+        raise ScenarioError(f"`{min(taken)}` is set by the sentences of the story: leave it out")
     document: dict[str, Any] = {
         "name": path.stem.replace("_", " "),
         "vehicles": {"kind": "none"},

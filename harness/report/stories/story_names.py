@@ -142,7 +142,7 @@ _SAYS: dict[type[Message], Callable[[Any, Naming], str]] = {
 def told(sent: Sent, names: Names) -> str:
     """A message that an agent's trace has."""
     if sent.datagram is None:
-        return f"{sent.message} (not on record)"
+        return f"{sent.message} (not recorded)"
     try:
         message = decode(base64.b64decode(sent.datagram.text, validate=True)).message
     except (MalformedDatagramError, binascii.Error):

@@ -35,7 +35,7 @@ class Crash(Fault):
 
     def check(self, vehicles: Vehicles) -> None:
         if vehicles.kind == "none":
-            raise ValueError("needs vehicles that can fall: `vehicles.kind` is none, where `kill` does the same")
+            raise ValueError("needs vehicles that can fall, but `vehicles.kind` is none: use `kill` instead")
 
     async def strike(self, lives: Lives, agent_id: int) -> None:
         await lives.fall(agent_id)

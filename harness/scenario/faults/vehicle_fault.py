@@ -24,7 +24,7 @@ from sitl.vehicle import VEHICLE_TYPES, VehicleType
 FALLING = "M-5-2l5 6 5-6M0-6v4"
 """Marks of the faults in this module: the start of a problem of a vehicle, and its end."""
 RISING = "M-5 4l5-6 5 6"
-TROUBLED, WELL_AGAIN = "its vehicle is in trouble", "its vehicle is well again"
+TROUBLED, WELL_AGAIN = "its vehicle has a fault", "its vehicle has recovered"
 
 
 class VehicleFault(Fault):
@@ -41,7 +41,7 @@ class VehicleFault(Fault):
 
     def check(self, vehicles: Vehicles) -> None:
         if vehicles.kind == "none":
-            raise ValueError("needs vehicles that it can befall: `vehicles.kind` is none")
+            raise ValueError("needs vehicles, but `vehicles.kind` is none")
         for vehicle in self.agents:
             if (kind := vehicles.type_of(vehicle)) not in self.of_types:
                 raise ValueError(f"befalls a {' or a '.join(self.of_types)}, and vehicle {vehicle} is a {kind}")

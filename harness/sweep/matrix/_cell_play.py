@@ -25,7 +25,7 @@ Judge = Callable[[Scenario, int], tuple[RunOutcome, Result]]
 
 
 class RunFailedError(HarnessError):
-    """A run did not come to its end, or an agent crashed or hung in it."""
+    """A run did not end normally, or an agent crashed or hung in it."""
 
     exit_status = VIOLATED
 

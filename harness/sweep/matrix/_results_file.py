@@ -84,7 +84,7 @@ def _begun(line: bytes, matrix: Matrix, directory: Path) -> str:
     except (ValueError, RecursionError):
         header = None
     if not isinstance(header, dict) or header.get("schema") != SCHEMA:
-        raise RunDirectoryError(f"{directory} is not empty: choose another --out, nothing is overwritten")
+        raise RunDirectoryError(f"{directory} is not empty: choose another --out; existing files are not overwritten")
     if header.get("matrix") != matrix.model_dump(mode="json"):
         raise RunDirectoryError(f"{directory} holds the results of another matrix file: choose another --out")
     return str(header.get("started_at"))

@@ -80,7 +80,7 @@ def opened(directory: Path) -> Path:
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RunDirectoryError(f"{directory} cannot be made: {error.strerror}; choose another --nights") from None
+        raise RunDirectoryError(f"{directory} cannot be created: {error.strerror}; choose another --nights") from None
     return directory
 
 

@@ -109,7 +109,7 @@ def logged(directory: Path) -> set[str]:
 
 
 def compared(directory: Path) -> set[str]:
-    ended = "the run has not recorded its end"
+    ended = "the end of the run is not recorded"
     return {error for error in told_by(lambda: compare(directory, directory).errors) if ended not in error}
 
 
@@ -169,9 +169,7 @@ def test_what_skimming_leaves_out_is_told_all_the_same(whole: Path, tmp_path: Pa
         patch.setattr(archive_module, "LARGE_BYTES", 0)
         skimmed, read = RunArchive(directory, skim=True), RunArchive(directory)
         assert (
-            skimmed.problems
-            == read.problems
-            == [f"{trace}: line {taken_in + 1} is damaged; what is before that is read"]
+            skimmed.problems == read.problems == [f"{trace}: line {taken_in + 1} is damaged; the part before is read"]
         )
         assert len(skimmed.traces[1].runs) < len(read.traces[1].runs)
 

@@ -157,7 +157,7 @@ def test_a_damaged_line_is_left_out_and_said(tmp_path: Path, damaged: str) -> No
     (tmp_path / NETWORK_FILE).write_text("\n".join([start, damaged, json.dumps(partition(2.0, [1]))]))
     found = read_connectivity(tmp_path / NETWORK_FILE, [1, 2])
     assert told(found) == [(0.0, "start", "1 2"), (2.0, "partition", "1 | 2")]
-    assert found.problems == ["network.jsonl: 1 line is left out, damaged or of no meaning"]
+    assert found.problems == ["network.jsonl: 1 damaged or unknown line is left out"]
 
 
 def test_a_record_that_does_not_begin_with_conditions_says_nothing(tmp_path: Path) -> None:

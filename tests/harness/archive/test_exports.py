@@ -71,7 +71,7 @@ def test_an_export_of_another_mission_is_left_out(paths: list[Path], tmp_path: P
     exports = read_exports([stranger, *paths])
     assert list(exports.by_agent) == [1, 2, 3]
     (error,) = exports.errors
-    assert "agent 4 flew another mission" in error
+    assert "agent 4 belongs to another mission" in error
 
 
 def test_the_same_export_twice_counts_once(paths: list[Path], tmp_path: Path) -> None:

@@ -315,7 +315,7 @@ def test_captures_of_another_run_are_left_out(tmp_path: Path) -> None:
     other = tmp_path / "2.pcapng"
     other.write_bytes((run / "capture" / "2.pcapng").read_bytes().replace(b'"speedup": 20.0', b'"speedup": 10.0'))
     captures = read(run / "capture" / "1.pcapng", other)
-    assert captures.errors == [f"{other}: of another run than the captures before it; look at each run by itself"]
+    assert captures.errors == [f"{other}: of another run than the captures before it; print each run separately"]
     assert [one.received for one in join(captures)] == [()]
 
 
@@ -358,7 +358,7 @@ def test_an_agent_that_was_not_captured_from_its_start_on_has_no_ordinals(tmp_pa
     digits = BLOCK.block_hash.hex()[:8]
     assert names.block(BLOCK.block_hash) == digits
     assert names.chain(CHAIN) == f"{CHAIN.hex()[:8]} ({digits})"
-    with pytest.raises(CaptureError, match=r"--follow 1\.1: no message is known to be about that block"):
+    with pytest.raises(CaptureError, match=r"--follow 1\.1: no known message is about that block"):
         names.find("1.1")
 
 
@@ -374,7 +374,7 @@ def test_a_selection_is_by_sender_receiver_message_and_time(run_dir: Path) -> No
     assert selected
     assert [one.lost_by for one in selected] == [(3,) if 3 in one.lost_by else () for one in whole]
     assert all(one.reached in ([], [3]) for one in selected)
-    with pytest.raises(CaptureError, match="there is no such message; there are Block Add Request, "):
+    with pytest.raises(CaptureError, match="no such message; use one of Block Add Request, "):
         Selection(message="Hello")
     with pytest.raises(CaptureError, match="the first second is not before the last"):
         Selection(between_s=(2, 1))

@@ -96,10 +96,10 @@ def test_what_is_wrong_in_many_places_is_one_sentence_for_each_key(whole: Path, 
 def test_what_is_mostly_wrong_is_refused_in_one_sentence(whole: Path, tmp_path: Path) -> None:
     path = tmp_path / "run.json"
     file = edited(whole, tmp_path, lambda record: record.update(faults=[7] * 30_000))
-    assert file.problems == [f"{path}: 30000 things are wrong with it; it was edited or damaged"]
+    assert file.problems == [f"{path}: 30000 errors in it; it was edited or damaged"]
     path.write_text(f'{{"faults": [{"7," * MAX_VALUES}7, 7]}}')
     file = read_record(path)
-    assert file.problems == [f"{path}: more than 2000000 values, which no run's record has"]
+    assert file.problems == [f"{path}: more than 2000000 values, which is too many for the record of a run"]
     assert isinstance(file.error, DamagedRecordError)
     assert file.judged is None
 

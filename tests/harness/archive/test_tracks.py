@@ -74,7 +74,7 @@ def test_a_damaged_line_is_left_out_and_said(tmp_path: Path, damaged: str) -> No
     path.write_text(text, encoding="utf-8", errors="surrogatepass")
     tracks = read_tracks(path, [1, 2])
     assert [fix.at_s for fix in tracks.by_vehicle[1]] == [1.0, 2.0]
-    assert tracks.problems == ["tracks.jsonl: 1 line is left out, damaged or of no meaning"]
+    assert tracks.problems == ["tracks.jsonl: 1 damaged or unknown line is left out"]
 
 
 def test_reading_ends_at_its_bounds_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,18 +82,18 @@ def test_reading_ends_at_its_bounds_and_says_so(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(bounded_file, "MAX_LINE_BYTES", 1024 * 1024)
     tracks = read_tracks(tracks_file(tmp_path, GOOD, "x" * 1024 * 1024, GOOD), [1, 2])
     assert len(tracks.by_vehicle[1]) == 1
-    assert tracks.problems == ["tracks.jsonl: what follows 1 MiB without a line's end is left out"]
+    assert tracks.problems == ["tracks.jsonl: the part after 1 MiB without a line end is left out"]
     tracks = read_tracks(tracks_file(tmp_path, *["x" * 1000 * 1000] * 3, GOOD, "x" * 1000 * 1000, GOOD), [1, 2])
     assert len(tracks.by_vehicle[1]) == 1
     assert tracks.problems == [
-        "tracks.jsonl: 3 lines are left out, damaged or of no meaning",
-        "tracks.jsonl: what is beyond 50000 lines or 3 MiB is left out",
+        "tracks.jsonl: 3 damaged or unknown lines are left out",
+        "tracks.jsonl: only the first 50000 lines or 3 MiB are read",
     ]
     monkeypatch.setattr(bounded_file, "MAX_LINES", 2)
     assert len(read_tracks(tracks_file(tmp_path, GOOD, GOOD), [1, 2]).by_vehicle[1]) == 2
     tracks = read_tracks(tracks_file(tmp_path, GOOD, GOOD, GOOD), [1, 2])
     assert len(tracks.by_vehicle[1]) == 2
-    assert tracks.problems == ["tracks.jsonl: what is beyond 2 lines or 3 MiB is left out"]
+    assert tracks.problems == ["tracks.jsonl: only the first 2 lines or 3 MiB are read"]
 
 
 def test_a_directory_in_place_of_the_file_holds_no_tracks(tmp_path: Path) -> None:

@@ -170,7 +170,7 @@ def test_a_known_handler_with_another_s_number_is_a_contradiction_in_the_evidenc
     result = check(told_by(honest, misnumber, {1}))
     assert result.bad == ("records",)
     (finding,) = result.beside["records"].evidence
-    assert finding.detail == "its trace has receive_commit_block as Algorithm 7, and that is Algorithm 6"
+    assert finding.detail == "its trace has receive_commit_block as Algorithm 7, but it is Algorithm 6"
 
 
 def test_a_mistake_is_found_though_timers_and_branches_have_other_names(honest: Evidence) -> None:
@@ -196,7 +196,7 @@ def test_what_was_lost_is_not_known_where_nobody_knows_what_was_completed(honest
     told = told_by(honest, operation_renamed("complete"), {2})
     survived = survival(told)
     assert (survived.completed, survived.gone, survived.losses[0].completed) == (None, None, None)
-    assert "nobody knows how many completed blocks are gone" in " ".join(in_words(survived))
+    assert "the number of lost completed blocks is unknown" in " ".join(in_words(survived))
     assert check(told).figures["blocks"] is None
 
 
@@ -219,9 +219,9 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_report_says_that_it_does_not_show_all(directory: Path) -> None:
     page = write_report(RunArchive(directory)).read_text()
-    assert "not all that agent 1 did is shown: unknown timer name &#39;vote&#39; in its trace" in page
+    assert "some steps of agent 1 are not shown: unknown timer name &#39;vote&#39; in its trace" in page
     assert "and such words in 2 more" in page
-    assert "There may be more, in words that are not known" in page
+    assert "The traces contain unknown words, so there may be more" in page
 
 
 @pytest.mark.parametrize(("agent", "because"), [(1, "unknown timer name 'vote'"), (3, "unknown branch 'builds' of")])
@@ -238,7 +238,7 @@ def test_a_reconstruction_plays_an_agent_up_to_the_first_line_that_nobody_unders
 ) -> None:
     ended = harness("reconstruct", directory, "--out", tmp_path / "again.yaml")
     said = ended.stdout + ended.stderr
-    assert "agent 4 cannot be played to the end of its trace: line" in said
+    assert "agent 4 can be played only in part: line" in said
     assert "unknown operation 'done'" in said
     assert "agent 1" not in said, "which timer ended, its handler tells"
-    assert "does not do what the protocol says" not in said
+    assert "deviates from the protocol" not in said

@@ -88,7 +88,9 @@ def test_a_difference_that_no_vote_could_find_does_not_apply(tmp_path: Path, rec
         r"chain of agent [13] changed last, and proposed no block since",
         reason(result, "6"),
     )
-    assert reason(result, "5").startswith("agent 2 lacks 1 copy of completed blocks, 3.1 the first; agent 2 completed")
+    assert reason(result, "5").startswith(
+        "agent 2 lacks 1 copy of completed blocks, the first of block 3.1; agent 2 completed"
+    )
 
 
 def test_a_difference_that_outlives_a_reconcile_violates_5_and_6(tmp_path: Path) -> None:
@@ -108,7 +110,7 @@ def test_exports_alone_that_differ_do_not_tell_whether_the_system_was_connected(
     paths = write_exports(missed_last_block(), tmp_path, traces=False)
     result = check(gather(RunArchive(*paths)))
     assert verdicts(result)[4:] == "nn"
-    assert "exports alone" in reason(result, "6")
+    assert "exports do not show whether" in reason(result, "6")
 
 
 def test_an_agent_that_never_became_idle_is_not_judged(tmp_path: Path) -> None:
@@ -123,7 +125,7 @@ def test_an_agent_whose_export_is_missing_is_never_taken_for_agreeing(run_dir: P
     (run_dir / "agents" / "4.chain.json").unlink()
     result = check(gather(RunArchive(run_dir)))
     assert verdicts(result) == "hnnhnn"
-    assert "no export of agent 4" in reason(result, "6")
+    assert "the export of agent 4 is missing" in reason(result, "6")
 
 
 def test_an_idle_agent_with_an_uncommitted_block_violates_2(run_dir: Path) -> None:
@@ -173,7 +175,7 @@ def test_an_edited_block_violates_4(run_dir: Path) -> None:
     edit(run_dir / "agents" / "1.chain.json", lambda export: export["chain"][2].update(timestamp_us=1))
     result = check(gather(RunArchive(run_dir)))
     assert result.characteristics["4"].verdict == "violated"
-    assert "does not hash to its block hash" in result.characteristics["4"].evidence[0].detail
+    assert "does not match its block hash" in result.characteristics["4"].evidence[0].detail
 
 
 def test_a_reordered_chain_violates_4(run_dir: Path) -> None:
@@ -212,9 +214,9 @@ def test_blocks_of_an_agent_that_left_nothing_are_not_taken_for_genuine(perfect:
     ("trigger", "detail"),
     [
         ({"message": "Commit Block", "from": 1, "seq": 99999}, "never sent"),
-        ({"message": "Block Response", "from": 1, "seq": 0}, "another handler's"),
-        ({"timer": "voting"}, "another handler's"),
-        ({"local": "reconcile_finalize"}, "had not run"),
+        ({"message": "Block Response", "from": 1, "seq": 0}, "which triggers another handler"),
+        ({"timer": "voting"}, "which triggers another handler"),
+        ({"local": "reconcile_finalize"}, "which did not run before"),
         ({}, "no trigger"),
         ({"boot": 3}, "was triggered by a boot, which only ends a reconcile"),
     ],
@@ -259,7 +261,7 @@ def test_a_missing_or_damaged_trace_is_never_taken_for_a_good_one(run_dir: Path)
     trace.unlink()
     result = check(gather(RunArchive(run_dir)))
     assert result.characteristics["1"].verdict == "not applicable"
-    assert "no trace of agent 2" in reason(result, "1")
+    assert "the trace of agent 2 is missing" in reason(result, "1")
 
 
 def test_half_a_last_line_is_that_of_a_killed_agent_and_no_damage(run_dir: Path) -> None:

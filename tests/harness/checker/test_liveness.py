@@ -56,7 +56,11 @@ def test_a_swarm_in_step_never_finishes_and_violates_5_and_6(tracing: bool) -> N
         assert said in liveness(run).reason
     for number in ("5", "6"):
         reason = run.result.characteristics[number].reason
-        assert re.fullmatch(r"fully connected, and yet agents 1, 2, 3, 4 and 5 go round in circles since \d+ s", reason)
+        assert re.fullmatch(
+            r"the system is fully connected, but agents 1, 2, 3, 4 and 5 have repeated the same cycle since "
+            r"\d+ s",
+            reason,
+        )
     assert {"5", "6", "liveness"} == set(run.result.bad)
     (finding,) = liveness(run).evidence
     assert finding.agent_id == 1
@@ -71,7 +75,7 @@ def test_traces_tell_which_handlers_follow_each_other_and_since_when() -> None:
     assert liveness(run).evidence[0].detail == (
         "as agents 2, 3, 4 and 5, runs vote_timer_expiration (not approved), reconcile_begin (begun), reconcile_phase_1"
         " (asked), 5 s later reconcile_phase_1_timer_expiration (no response), reconcile_finalize (done),"
-        " process_next_deque_block (proposed); 10 s later it begins anew"
+        " process_next_deque_block (proposed); 10 s later it starts again"
     )
 
 
@@ -110,8 +114,8 @@ def test_a_few_times_in_a_row_may_be_a_coincidence(monkeypatch: pytest.MonkeyPat
     without_looking(monkeypatch)
     run = simulate(in_step(settle={"limit_s": 10}), seed=1, tracing=True)
     assert liveness(run).verdict == "not finished"
-    assert "5 blocks waited to be committed, and none was" in liveness(run).reason
-    assert "nothing tells whether" in liveness(run).reason
+    assert "5 blocks waited for their commit, and none was" in liveness(run).reason
+    assert "it is unknown whether" in liveness(run).reason
     assert run.result.characteristics["5"].verdict == "not applicable"
 
 
@@ -127,7 +131,7 @@ def test_a_backlog_that_drains_is_no_cycle_and_its_rate_tells_how_long_it_needs(
     busy: dict[str, Any] = {"agents": 5, "duration_s": 600, "events": {"source": "random", "mean_s": 4}}
     cut = simulate(scenario(**busy, settle={"limit_s": 400}), seed=1, tracing=True)
     assert liveness(cut).verdict == "not finished"
-    told = re.search(r"at ([\d.]+) a minute: that would have taken (\d+) minutes more", liveness(cut).reason)
+    told = re.search(r"at ([\d.]+) commits a minute this would have taken (\d+) minutes more", liveness(cut).reason)
     assert told, liveness(cut).reason
     finished = simulate(scenario(**busy, settle={"limit_s": 4000}), seed=1)
     assert liveness(finished).verdict == "finished"
@@ -138,7 +142,7 @@ def test_a_backlog_that_drains_is_no_cycle_and_its_rate_tells_how_long_it_needs(
 
 def test_without_traces_nothing_tells_how_fast_a_backlog_drains() -> None:
     busy = scenario(agents=5, duration_s=600, events={"source": "random", "mean_s": 4}, settle={"limit_s": 400})
-    assert "without traces nothing tells how fast" in liveness(simulate(busy, seed=1)).reason
+    assert "without traces the commit rate is unknown" in liveness(simulate(busy, seed=1)).reason
 
 
 def test_an_agent_that_hangs_never_finishes() -> None:
@@ -146,7 +150,7 @@ def test_an_agent_that_hangs_never_finishes() -> None:
     verdicts = [liveness(simulate(hanging, seed)) for seed in range(10)]
     hang = [verdict for verdict in verdicts if verdict.verdict == "never finishes"]
     assert hang
-    assert all("no timer runs that would end that" in verdict.reason for verdict in hang)
+    assert all("no running timer can change this" in verdict.reason for verdict in hang)
 
 
 def test_traces_tell_since_when_an_agent_hangs() -> None:
@@ -169,17 +173,17 @@ def test_where_there_was_no_looking_nothing_is_said() -> None:
         judgement = judged(evidence, outcome=outcome)["liveness"]
         assert (judgement.verdict, judgement.reason) == (
             "not applicable",
-            f"the run did not come to its end ({outcome})",
+            f"the run did not end normally ({outcome})",
         )
     exports_alone = check(Evidence(evidence.exports)).beside["liveness"]
     assert exports_alone.verdict == "not applicable"
     some = Evidence({1: evidence.exports[1]}, record=evidence.record)
-    assert check(some).beside["liveness"].reason == "there is no export of agents 2 and 3"
+    assert check(some).beside["liveness"].reason == "the export of agents 2 and 3 is missing"
 
 
 def test_an_agent_that_stands_still_to_the_end_is_not_judged() -> None:
     run = simulate(scenario(agents=3, duration_s=600, timeline=[{"at_s": 100, "pause": [3]}]), seed=1)
-    assert (liveness(run).verdict, liveness(run).reason) == ("not applicable", "agent 3 stood still to the end")
+    assert (liveness(run).verdict, liveness(run).reason) == ("not applicable", "agent 3 stayed paused to the end")
 
 
 def test_who_asks_one_that_stands_still_had_no_chance_to_agree() -> None:
@@ -199,7 +203,7 @@ def test_who_asks_one_that_stands_still_had_no_chance_to_agree() -> None:
     )
     assert run.result.figures["reconciles"]
     assert run.result.bad == ()
-    assert "and during which nobody stood still" in run.result.characteristics["5"].reason
+    assert "and during which all agents were running" in run.result.characteristics["5"].reason
 
 
 def test_time_until_uniform_is_known_of_every_run_that_ends_with_one_chain() -> None:
@@ -232,7 +236,8 @@ def test_a_process_that_goes_round_is_found_by_its_trace(tmp_path: Path) -> None
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert record["liveness"]["verdict"] == "never finishes"
     assert re.fullmatch(
-        r"agent 1 goes round in circles since \d+ s: the same handler runs follow each other every 2\d[.\d]* s, \d"
+        r"agent 1 has repeated the same cycle since \d+ s: the same handler runs follow each other every 2\d[.\d]* s, "
+        r"\d"
         r" times in a row; agent 2 refuses the blocks of agent 1",
         record["liveness"]["reason"],
     )

@@ -104,14 +104,14 @@ def test_chains_that_are_all_reversed_and_hashed_anew_are_not_those_of_the_trace
         edit(export(directory, agent), reverse)
     result = judged(directory)
     assert contradicted(result) == ["6"]
-    assert "its export is not what its trace has led to by then: top chain hash" in said(result)
+    assert "its export differs from its trace: top chain hash" in said(result)
 
 
 def test_completed_blocks_that_are_left_out_are_missed(directory: Path) -> None:
     edit(export(directory, 1), lambda document: document["completed"].pop())
     result = judged(directory)
     assert contradicted(result) == ["5"]
-    assert "its trace says that it completed block" in said(result)
+    assert "according to its trace, but not according to its export" in said(result)
 
 
 def test_a_trace_that_was_cut_at_a_line_end_has_not_been_looked_at(directory: Path) -> None:
@@ -119,7 +119,7 @@ def test_a_trace_that_was_cut_at_a_line_end_has_not_been_looked_at(directory: Pa
     result = judged(directory)
     assert result.beside["records"].verdict == "contradict"
     assert not [number for number in "123" if result.characteristics[number].verdict == "holds"]
-    assert "it had counted" in said(result)
+    assert "the agent had counted" in said(result)
 
 
 def test_a_trace_that_lost_its_last_line_has_not_been_looked_at(directory: Path) -> None:
@@ -141,7 +141,7 @@ def test_a_top_that_is_not_of_the_blocks_below_it_is_not_genuine(directory: Path
     edit_lines(trace(directory, 2), lambda lines: lines[-1]["state"].update(top="00" * 32))
     result = judged(directory)
     assert {"4", "6"} <= {*contradicted(result)}
-    assert "is not that of the" in said(result)
+    assert "does not match the" in said(result)
 
 
 def test_a_clock_that_jumps_back_is_told(directory: Path) -> None:
@@ -151,7 +151,7 @@ def test_a_clock_that_jumps_back_is_told(directory: Path) -> None:
                 line["t"] -= 100
 
     edit_lines(trace(directory, 1), jump)
-    assert "the clock goes from" in said(judged(directory))
+    assert "the time goes back from" in said(judged(directory))
 
 
 def test_a_life_that_is_left_out_is_missed(directory: Path) -> None:
@@ -161,7 +161,7 @@ def test_a_life_that_is_left_out_is_missed(directory: Path) -> None:
 
     edit_lines(trace(directory, 3), leave_out)
     result = judged(directory)
-    assert "its trace has 1 header, and by run.json it began 2 times" in said(result)
+    assert "its trace has 1 header, but it started 2 times according to run.json" in said(result)
     assert not [number for number in "123" if result.characteristics[number].verdict == "holds"]
 
 
@@ -173,7 +173,7 @@ def test_a_doubled_line_is_one_too_many(directory: Path) -> None:
     edit_lines(trace(directory, 1), double)
     result = judged(directory)
     assert contradicted(result) == ["1"]
-    assert "it had counted" in said(result)
+    assert "the agent had counted" in said(result)
 
 
 def test_a_message_is_not_heard_before_it_is_sent(directory: Path) -> None:
@@ -185,7 +185,7 @@ def test_a_message_is_not_heard_before_it_is_sent(directory: Path) -> None:
     edit_lines(trace(directory, 1), early)
     result = judged(directory)
     assert "1" in contradicted(result)
-    assert "which was sent at" in said(result)
+    assert "before it was sent at" in said(result)
 
 
 def test_settings_are_the_same_for_all(directory: Path) -> None:
@@ -210,17 +210,17 @@ def test_a_message_is_heard_with_the_content_that_it_was_sent_with(directory: Pa
     edit_lines(trace(directory, 1), turn_a_vote)
     result = judged(directory)
     assert contradicted(result) == ["1"]
-    assert "with another content than it was sent with" in said(result)
+    assert "whose content differs from the sent message" in said(result)
 
 
 def test_run_json_and_network_jsonl_tell_the_same(directory: Path) -> None:
     edit(directory / "run.json", lambda record: record["network"][0].update(fully_connected=True))
-    assert "run.json says, and network.jsonl does not: start at 0 s" in said(judged(directory))
+    assert "only run.json has: start at 0 s" in said(judged(directory))
 
 
 def test_a_fault_that_is_left_out_is_missed(directory: Path) -> None:
     edit(directory / "run.json", lambda record: record["faults"].pop(0))
-    assert "network.jsonl says, and run.json does not: reboot at 60 s" in said(judged(directory))
+    assert "only network.jsonl has: reboot at 60 s" in said(judged(directory))
 
 
 def test_traces_of_two_runs_do_not_mix(directory: Path, tmp_path: Path) -> None:
@@ -229,7 +229,7 @@ def test_traces_of_two_runs_do_not_mix(directory: Path, tmp_path: Path) -> None:
     shutil.copy(trace(other, 2), trace(directory, 2))
     result = judged(directory)
     assert "1" in contradicted(result)
-    assert "its trace says that the inception block's data is" in said(result)
+    assert "as the inception block's data, but" in said(result)
 
 
 def test_a_trace_that_goes_on_with_that_of_another_run_is_read_up_to_there(directory: Path, tmp_path: Path) -> None:
@@ -254,7 +254,7 @@ def test_a_trace_of_an_agent_that_is_not_on_the_roster_is_left_out(directory: Pa
     shutil.copy(trace(directory, 2), trace(directory, 9))
     edit_lines(trace(directory, 9), lambda lines: [line.update(agent_id=9) for line in lines if "schema" in line])
     (error,) = judged(directory).errors
-    assert "of an agent that is not of this run" in error
+    assert "its agent is not in this run" in error
 
 
 @pytest.mark.parametrize("name", ["agents/2.trace.jsonl", "agents/2.chain.json", "before_final_reconcile/2.chain.json"])
@@ -280,7 +280,7 @@ def test_captures_show_what_was_sent_and_heard(tmp_path: Path) -> None:
         )
 
     edit_lines(trace(directory, 1), leave_out_a_vote)
-    assert "its vehicle's capture saw a message leave that its trace does not tell of" in said(judged(directory))
+    assert "the capture of its vehicle has a sent message that is missing in its trace" in said(judged(directory))
 
 
 LISTS = st.sampled_from(["take one out", "double one", "swap two"])
@@ -343,16 +343,16 @@ def test_of_a_run_that_was_broken_off_nothing_tells_how_long_its_traces_should_b
     edit(directory / "run.json", break_off)
     result = judged(directory)
     assert {key for key, judgement in result.judgements.items() if judgement.kind == "good"} <= {"4", "5", "6"}
-    assert "the run did not come to its end" in result.beside["records"].reason
-    assert "the run did not come to its end" in result.beside["steps"].reason
+    assert "the run did not end normally" in result.beside["records"].reason
+    assert "the run did not end normally" in result.beside["steps"].reason
 
 
 @pytest.mark.parametrize(
     ("passed", "lost", "sentence"),
     [
         (0, 0, None),
-        (-1000, 1000, "and the kernel let 0 through to its vehicle"),
-        (-20, 0, "and on the way to its vehicle the kernel counted"),
+        (-1000, 1000, "but the kernel counted 0 messages to its vehicle"),
+        (-20, 0, "but the counters of the kernel for its vehicle have"),
     ],
 )
 def test_the_kernel_counted_what_was_sent_and_heard(

@@ -67,7 +67,7 @@ def test_who_has_not_heard_a_copy_is_not_said_to_have(tmp_path: Path) -> None:
     assert (first.messages[0].handled, second.messages[0].handled) == ({"first": 2}, {"second": 1})
     (nobody, _) = told(tmp_path, TWICE, [copy(20, 1), copy(20, 1)], died_before)
     assert (nobody.sent, nobody.messages[0].unhandled, nobody.messages[0].handled) == (2, 2, {})
-    assert in_words(nobody) == "replay at 20 s, the last 1 of every message: 2 sent; 2 handled by nobody"
+    assert in_words(nobody) == "replay at 20 s, the last 1 of every message: 2 sent; 2 handled by no agent"
 
 
 def test_what_is_forged_is_known_by_its_sequence_number_without_a_line(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_counted_copies_are_not_told_from_the_others_and_that_is_said(tmp_path: 
     counted = line(20, 1, count=2, messages={"Commit Block": 2}, refused={})
     first, _ = told(tmp_path, TWICE, [counted], trace(2, (20.1, 7, "first")))
     assert (first.sent, first.untraced, first.messages[0].handled, first.messages[0].unhandled) == (2, 2, {}, 0)
-    assert in_words(first).endswith("2 sent; 2 not told from their originals")
+    assert in_words(first).endswith("2 sent; 2 indistinguishable from their originals")
 
 
 def test_what_cannot_be_told_of_one_type_is_nothing_of_another(tmp_path: Path) -> None:

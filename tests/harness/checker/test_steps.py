@@ -112,8 +112,8 @@ def test_what_an_agent_may_choose_or_suffer_is_no_finding(keys: dict[str, Any]) 
         ("hide_commits", "vote_timer_expiration", "it sent nothing; it should have sent Commit Block about block "),
         ("approve_everything", "receive_request_add_block", "saying approve True"),
         ("commit_without_succession", "receive_commit_block", "it should have taken 'does not succeed'"),
-        ("wrong_event", "receive_response_block_for_hash", "it triggered Reconcile Phase 1, and should have triggered"),
-        ("give_up_unfinished", "reconcile_phase_3_timer_expiration", "it triggered nothing, and should have triggered"),
+        ("wrong_event", "receive_response_block_for_hash", "it triggered Reconcile Phase 1; it should have triggered"),
+        ("give_up_unfinished", "reconcile_phase_3_timer_expiration", "it triggered nothing; it should have triggered"),
     ],
 )
 def test_a_wrong_agent_is_named_by_what_it_did_first(quirk: str, handler: str, sentence: str) -> None:
@@ -150,30 +150,30 @@ def test_an_agent_that_goes_on_is_compared_from_its_own_state(honest: Evidence) 
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda runs: runs.remove(proposal(runs)), "it triggered nothing, and should have triggered Process Next"),
-        (lambda runs: runs.remove(expiry(runs)), "it ran without having been triggered"),
-        (lambda runs: without_expiry(runs), "it had not run by then, and the voting timer ended at t="),
+        (lambda runs: runs.remove(proposal(runs)), "it triggered nothing; it should have triggered Process Next"),
+        (lambda runs: runs.remove(expiry(runs)), "it ran without a trigger"),
+        (lambda runs: without_expiry(runs), "it did not run, although the voting timer expired at t="),
         (
             lambda runs: setattr(expiry(runs), "handler", "receive_vote_add_block"),
-            "it ran as Algorithm 4; what came is for Algorithm 5",
+            "it ran as Algorithm 4, but the input is for Algorithm 5",
         ),
-        (lambda runs: setattr(expiry(runs), "t", expiry(runs).t - 3), "s before the voting timer ended"),
+        (lambda runs: setattr(expiry(runs), "t", expiry(runs).t - 3), "s before the voting timer expired"),
         (
             lambda runs: setattr(expiry(runs), "trigger", TimerTrigger("finalize gap")),
-            "the finalize gap timer ended, which was not",
+            "at the expiry of the finalize gap timer, which was not running",
         ),
-        (lambda runs: setattr(expiry(runs), "trigger", UnknownTrigger({})), "it ran without a trigger that there is"),
+        (lambda runs: setattr(expiry(runs), "trigger", UnknownTrigger({})), "it ran without a known trigger"),
         (
             lambda runs: setattr(first_run(runs, "build_data_block"), "trigger", EventTrigger(255)),
-            "said to have logged event 255",
+            "recorded the event 255",
         ),
         (
             lambda runs: setattr(first_run(runs, "build_data_block"), "trigger", LocalTrigger("reconcile_begin")),
-            "it ran without having been triggered",
+            "it ran without a trigger",
         ),
-        (lambda runs: setattr(commit(runs).trigger, "sequence", 77), "it said to have got Commit Block 77 from agent"),
-        (lambda runs: setattr(commit(runs), "input", Recorded("!")), "a datagram that is to be dropped: not base64"),
-        (lambda runs: setattr(commit(runs), "input", None), "a datagram that is to be dropped: truncated"),
+        (lambda runs: setattr(commit(runs).trigger, "sequence", 77), "it recorded Commit Block 77 from agent"),
+        (lambda runs: setattr(commit(runs), "input", Recorded("!")), "a datagram that it must drop: not base64"),
+        (lambda runs: setattr(commit(runs), "input", None), "a datagram that it must drop: truncated"),
         (lambda runs: proposal(runs).sent.clear(), "it sent nothing; it should have sent"),
         (lambda runs: setattr(proposal(runs).sent[0], "seq", 9), "with sequence number 9"),
         (lambda runs: runs.insert(9, HANDLER_RUN.validate_json(runs[9].to_line())), "; it should have "),
@@ -223,7 +223,7 @@ def test_a_datagram_that_was_dropped_and_is_good_is_found(honest: Evidence) -> N
     judgement = steps.check(with_traces(honest, {**honest.traces, 3: dataclasses.replace(trace, asides=asides)}))
     (finding,) = judgement.evidence
     assert "trace line 3" in finding.detail
-    assert "it was not given a Block Add Request of agent" in finding.detail
+    assert "it dropped a Block Add Request of agent" in finding.detail
 
 
 def test_an_agent_need_not_tell_what_it_counts_and_which_timers_it_starts(honest: Evidence) -> None:
@@ -253,7 +253,7 @@ def test_of_a_trace_of_the_first_version_steps_are_not_judged(honest: Evidence) 
     old = dataclasses.replace(honest.traces[2], header=header)
     judgement = steps.check(with_traces(honest, {**honest.traces, 2: old}))
     assert judgement.verdict == "not applicable"
-    assert judgement.reason == "of agent 2 the trace is of ucp-trace/1, which lacks what the agent received"
+    assert judgement.reason == "of agent 2 the trace has the version ucp-trace/1, which lacks received messages"
 
 
 def test_without_a_trace_of_everybody_steps_are_not_as_specified(honest: Evidence) -> None:
@@ -266,7 +266,7 @@ def test_without_a_trace_of_everybody_steps_are_not_as_specified(honest: Evidenc
 def test_a_mission_that_cannot_be_is_told(honest: Evidence) -> None:
     trace = honest.traces[1]
     for part, told in (
-        ({"settings": {"vote_timeout_s": -1}}, "settings that cannot be"),
+        ({"settings": {"vote_timeout_s": -1}}, "the header of its trace has invalid settings"),
         ({"clock": {"speedup": 0}}, "clock"),
     ):
         header = trace.header.model_copy(update=part)
@@ -282,7 +282,7 @@ def test_an_agent_that_holds_what_nobody_can_know_is_followed_no_further(honest:
 
     judgement = steps.check(edited(honest, 1, conjure))
     assert (
-        "after trace line 5 agent 1 cannot be followed: no record has the data of block abababababab"
+        "after trace line 5 agent 1 cannot be followed: the data of block abababababab is not recorded"
         in judgement.reason
     )
 
@@ -369,7 +369,7 @@ def test_handlers_that_there_are_not_are_not_judged_however_many_names_they_have
 
     judgement = steps.check(edited(honest, 3, rename))
     assert judgement.verdict == "not applicable"
-    assert judgement.reason.startswith("of agent 3 the trace is not wholly understood: unknown handler name 'handler_0")
+    assert judgement.reason.startswith("of agent 3 the trace has unknown words: unknown handler name 'handler_0")
     assert len(judgement.reason) < 500
 
 

@@ -97,7 +97,7 @@ def test_without_all_traces_only_the_end_is_known() -> None:
     survived = survival(evidence([PAIRS, {"at_s": 100, "kill": [1, 2]}], tracing=False))
     assert counts(survived.losses[0]) == (None, None, None, None)
     assert survived.gone == 1
-    assert "the traces do not tell what was where" in in_words(survived)[0]
+    assert "the traces do not show which blocks were lost" in in_words(survived)[0]
 
 
 def test_nothing_at_all_is_no_survival() -> None:
@@ -118,7 +118,7 @@ def test_it_is_told_in_words() -> None:
     ]
     assert in_words(survival(evidence([PAIRS]))) == [
         "losing any one vehicle loses no block; "
-        "losing vehicles 1 and 2 would lose block 1.1, and 2 of 2 blocks are on no more vehicles than that"
+        "losing vehicles 1 and 2 would lose block 1.1, and 2 of 2 blocks are on as few vehicles"
     ]
     many = [{"at_s": 20.0 * n, what: [4]} for n in range(1, 15) for what in (("kill", "restart")[(n + 1) % 2],)]
     assert in_words(survival(evidence(many)))[5] == "2 more losses of vehicles are in run.json"

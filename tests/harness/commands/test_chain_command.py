@@ -209,7 +209,7 @@ def test_an_agent_without_an_export_is_one_sentence(run_dir: Path) -> None:
     assert sentences(asked.stderr) == ["agent 2 has no export here (killed); exports here are of agents 1, 3"]
     stranger = harness("chain", run_dir, "--agent", "9")
     assert stranger.returncode == 2
-    assert sentences(stranger.stderr) == ["there is no export of agent 9; exports here are of agents 1, 3"]
+    assert sentences(stranger.stderr) == ["the export of agent 9 is missing; exports here are of agents 1, 3"]
 
 
 def test_a_damaged_export_is_told_with_status_2_and_the_rest_are_shown(run_dir: Path) -> None:
@@ -446,18 +446,18 @@ def test_nothing_is_overwritten(run_dir: Path, tmp_path: Path) -> None:
     for option in ("--geojson", "--kml"):
         done = harness("chain", run_dir, option, file)
         assert done.returncode == 2
-        assert sentences(done.stderr) == [f"{file} exists: choose another file, nothing is overwritten"]
+        assert sentences(done.stderr) == [f"{file} exists: choose another file; existing files are not overwritten"]
         assert file.read_text() == "mine"
     done = harness("chain", run_dir, "--kml", tmp_path / "nowhere" / "map.kml")
     assert done.returncode == 2
-    assert "cannot be made: No such file or directory" in sentences(done.stderr)[0]
+    assert "cannot be created: No such file or directory" in sentences(done.stderr)[0]
 
 
 def test_without_positions_there_is_no_map(tmp_path: Path) -> None:
     run = write_run(fly(agents=2), tmp_path / "run", CONNECTED, **{**FLOWN, "backend": "sim"})
     done = harness("chain", run, "--geojson", tmp_path / "map")
     assert done.returncode == 2
-    assert "the events are not those of vehicles" in sentences(done.stderr)[0]
+    assert "the events are not of vehicles" in sentences(done.stderr)[0]
     assert not (tmp_path / "map").exists()
 
 

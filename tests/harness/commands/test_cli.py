@@ -35,7 +35,7 @@ def test_a_violation_is_status_1_with_its_evidence(run_dir: Path) -> None:
     done = harness("check", run_dir)
     assert done.returncode == 1
     assert "✘ violated" in done.stdout
-    assert "does not hash to its block" in " ".join(done.stdout.split())
+    assert "does not match its block" in " ".join(done.stdout.split())
 
 
 def test_an_unreadable_export_is_status_2_and_the_rest_are_checked(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def test_runs_that_differ_are_status_1_with_keys_first_then_agents(a: Path, tmp_
     assert done.returncode == 1
     lines = done.stdout.splitlines()
     assert lines[:2] == ["seed: 1 in A, 2 in B", "network.loss: 0.2 in A, 0.3 in B"]
-    assert re.fullmatch(r"the runs part first at [\d.]+ s, with agent [123]", lines[2])
+    assert re.fullmatch(r"the runs differ first at [\d.]+ s, at agent [123]", lines[2])
     assert [line for line in lines if line.startswith("agent ")] == ["agent 1:", "agent 2:", "agent 3:"]
     assert re.search(r"^    A  [\d.]+ s \(line \d+\): \w+, .+; .+$", done.stdout, re.MULTILINE)
 
@@ -103,7 +103,9 @@ def test_other_times_and_other_hashes_of_the_same_blocks_are_no_difference(a: Pa
     done = harness("diff", a, b)
     assert done.returncode == 0
     assert re.fullmatch(
-        r"the same: \d+ handler runs of 3 agents, and their chains; what differs is not compared: .*\n", done.stdout
+        r"the same: \d+ handler runs of 3 agents, and their chains; they differ only in .*, which are not "
+        r"compared\n",
+        done.stdout,
     )
 
 
@@ -111,7 +113,8 @@ def test_a_state_that_was_edited_is_not_called_a_time(a: Path, b: Path) -> None:
     trace(b).write_text(trace(b).read_text().replace('"deque":0', '"deque":7', 1))
     done = harness("diff", a, b)
     assert done.returncode == 0
-    assert "what differs is not compared: times, hashes that cover them, tallies or states" in done.stdout
+    differences = "times, in hashes that cover times, in tallies or in states"
+    assert f"; they differ only in {differences}, which are not compared" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -172,13 +175,16 @@ def test_keys_are_told_innermost_and_lists_of_another_length_whole() -> None:
 @pytest.mark.parametrize(
     ("spoil", "sentence"),
     [
-        (lambda b: trace(b).unlink(), "2.trace.jsonl: cannot be read (No such file or directory), and runs are"),
+        (
+            lambda b: trace(b).unlink(),
+            "2.trace.jsonl: cannot be read (No such file or directory), and a comparison needs it",
+        ),
         (lambda b: trace(b).write_text(""), "2.trace.jsonl: it is empty"),
         (lambda b: trace(b).write_text(trace(b).read_text() + "{}\n"), "is damaged, or of another version of traces"),
         (lambda b: edit_lines(trace(b), lambda lines: lines[0].update(schema="ucp-trace/3")), "line 1 is damaged, or"),
         (
             lambda b: edit(b / "run.json", lambda it: it.update(roster=[1, 2])),
-            "A has agents 1\u20133, and B has 1, 2: compare runs of the same agents",
+            "A has agents 1\u20133, but B has 1, 2: compare runs of the same agents",
         ),
         (lambda b: edit(b / "run.json", lambda it: it.update(backend="process")), "compare runs of the same backend"),
         (lambda b: edit(b / "run.json", lambda it: it.pop("roster")), "it names no agents"),
@@ -200,7 +206,7 @@ def test_an_export_that_cannot_be_read_is_told_and_counts_as_no_chain(a: Path, b
     (b / "agents" / "2.chain.json").write_text("{")
     done = harness("diff", a, b)
     assert done.returncode == 1
-    assert re.search(r"^  block 1 of its chain is \d\.1 in A, not there in B$", done.stdout, re.MULTILINE)
+    assert re.search(r"^  block 1 of its chain: \d\.1 in A, not there in B$", done.stdout, re.MULTILINE)
     assert "2.chain.json: truncated or damaged" in sentences(done.stderr)[0]
 
 
@@ -208,7 +214,9 @@ def test_a_run_that_has_not_recorded_its_end_is_compared_and_that_is_said(a: Pat
     edit(b / "run.json", lambda record: record.update(outcome="running"))
     done = harness("diff", a, b)
     assert done.returncode == 0
-    assert sentences(done.stderr) == [f"{b}: the run has not recorded its end, and is compared up to there"]
+    assert sentences(done.stderr) == [
+        f"{b}: the end of the run is not recorded, so the comparison covers the recorded part"
+    ]
 
 
 def test_long_traces_are_never_in_memory_as_a_whole(a: Path, b: Path) -> None:

@@ -167,7 +167,7 @@ def test_what_is_no_file_is_no_scenario(tmp_path: Path) -> None:
     for path in (tmp_path / "scenario.yaml", "/dev/zero", tmp_path):
         refused = harness("run", path)
         assert refused.returncode == 2
-        assert sentences(refused.stderr) == [f"{path}: not a file that holds a scenario"]
+        assert sentences(refused.stderr) == [f"{path}: not a file with a scenario"]
 
 
 def test_a_mission_beyond_reason_is_refused(tmp_path: Path) -> None:

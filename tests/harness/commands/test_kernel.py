@@ -54,7 +54,7 @@ def test_a_shell_reaches_inside_and_an_interrupted_run_is_exported_and_judged(tm
     asked = ("run", str(scenario), "--kernel", "uml", "--vehicles", "none", "--out", str(run))
     with _Started(tmp_path, *COMMAND, *asked) as started:
         started.wait_for("mission;")
-        assert f"{run}: in User Mode Linux\n" in harness("shell").stdout
+        assert f"{run}: inside User Mode Linux\n" in harness("shell").stdout
         inside = harness("shell", run, 2, "--", "sh", "-c", "ip -brief address; exit 7", deadline_s=DEADLINE_S)
         assert (inside.returncode, "10.77.0.2/14" in inside.stdout) == (7, True), inside
         started.process.send_signal(signal.SIGINT)

@@ -42,8 +42,8 @@ def test_of_a_run_that_was_killed_there_is_what_is_left(tmp_path: Path) -> None:
     assert done.returncode == 0
     assert done.stdout == f"{running.out / 'report.html'}\n"
     assert sentences(done.stderr) == [
-        "the run has not recorded its end: it is still going on, or it was killed",
-        f"there is no verdict: `ucp-harness check {running.out}` judges what there is",
+        "the end of the run is not recorded: the run is still active, or it was killed",
+        f"the run has no verdict: `ucp-harness check {running.out}` judges the files that exist",
         "agents 1\u20133: no usable export",
     ]
     assert all((running.out / name).stat().st_size for name in WRITTEN)
@@ -64,7 +64,7 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-40])
 
 
-NO_VERDICT = "there is no verdict: `ucp-harness check {run}` judges what there is"
+NO_VERDICT = "the run has no verdict: `ucp-harness check {run}` judges the files that exist"
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ NO_VERDICT = "there is no verdict: `ucp-harness check {run}` judges what there i
     [
         (
             lambda run: (run / "run.json").unlink(),
-            [NO_VERDICT, "run.json is missing: scenario, verdict and figures are not known"],
+            [NO_VERDICT, "run.json is missing: scenario, verdict and figures are unknown"],
         ),
         (
             lambda run: cut(run / "run.json"),
@@ -80,7 +80,7 @@ NO_VERDICT = "there is no verdict: `ucp-harness check {run}` judges what there i
         ),
         (
             lambda run: cut(run / "agents" / "2.trace.jsonl"),
-            ["agents/2.trace.jsonl: cut off in mid-line; what is before that is read"],
+            ["agents/2.trace.jsonl: truncated in the middle of a line; the part before is read"],
         ),
         (
             lambda run: (run / "agents" / "2.trace.jsonl").unlink(),
@@ -88,7 +88,7 @@ NO_VERDICT = "there is no verdict: `ucp-harness check {run}` judges what there i
         ),
         (
             lambda run: [path.unlink() for path in (run / "agents").glob("*.trace.jsonl")],
-            ["no agent has left a trace: there is no timeline"],
+            ["no agent has a trace: there is no timeline"],
         ),
         (
             lambda run: (run / "agents" / "2.chain.json").unlink(),
@@ -96,15 +96,15 @@ NO_VERDICT = "there is no verdict: `ucp-harness check {run}` judges what there i
         ),
         (
             lambda run: (run / "network.jsonl").unlink(),
-            ["network.jsonl is missing: who could reach whom is not known"],
+            ["network.jsonl is missing: the network conditions are unknown"],
         ),
         (
             lambda run: cut(run / "network.jsonl"),
-            ["network.jsonl: 1 line is left out, damaged or of no meaning"],
+            ["network.jsonl: 1 damaged or unknown line is left out"],
         ),
         (
             lambda run: edit(run / "run.json", lambda record: record.update(vehicles={"1": {"kind": "embedded"}})),
-            ["tracks.jsonl is missing: where the vehicles were is not known"],
+            ["tracks.jsonl is missing: the positions of the vehicles are unknown"],
         ),
     ],
 )

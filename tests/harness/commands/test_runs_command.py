@@ -43,7 +43,7 @@ def test_a_report_is_opened_or_it_is_said_how_it_comes_about(runs: Path, tmp_pat
     missing = harness("runs", runs, "--open", "2")
     assert missing.returncode == 2
     assert sentences(missing.stderr) == [
-        f"{runs / 'older' / 'report.html'} is not there: `ucp-harness report {runs / 'older'}` writes it"
+        f"{runs / 'older' / 'report.html'} does not exist: `ucp-harness report {runs / 'older'}` writes it"
     ]
     (runs / "older" / "report.html").write_text("<html>")
     browser = tmp_path / "browser"
@@ -51,10 +51,10 @@ def test_a_report_is_opened_or_it_is_said_how_it_comes_about(runs: Path, tmp_pat
     browser.chmod(0o755)
     assert harness("runs", runs, "--open", "2", env={**os.environ, "BROWSER": str(browser)}).returncode == 0
     assert (tmp_path / "opened").read_text() == f"{(runs / 'older' / 'report.html').as_uri()}\n"
-    assert "there are 2 runs" in harness("runs", runs, "--open", "3").stderr
+    assert "has 2 runs, and no run 3" in harness("runs", runs, "--open", "3").stderr
 
 
 def test_no_folder_is_one_sentence(tmp_path: Path) -> None:
     refused = harness("runs", tmp_path / "none")
     assert refused.returncode == 2
-    assert "`ucp-harness run` makes it" in refused.stderr
+    assert "`ucp-harness run` creates it" in refused.stderr

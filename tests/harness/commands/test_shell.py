@@ -42,7 +42,7 @@ def test_a_command_is_run_in_the_network_of_a_vehicle(kind: str, tmp_path: Path)
         nobody = harness("shell", out, 9)
         assert (nobody.returncode, sentences(nobody.stderr)) == (
             2,
-            [f"nobody is in vehicle 9 of {out}: there are 1, 2, 3"],
+            [f"vehicle 9 of {out} has no running process: choose one of 1, 2, 3"],
         )
         (out / "agents/9").mkdir()
         with subprocess.Popen(["sleep", "60"], cwd=out / "agents/9") as visitor:  # looks into a directory, from outside
@@ -53,4 +53,4 @@ def test_a_command_is_run_in_the_network_of_a_vehicle(kind: str, tmp_path: Path)
 def test_a_run_that_does_not_go_on_is_one_sentence(tmp_path: Path) -> None:
     done = harness("shell", tmp_path)
     assert done.returncode == 2
-    assert f"nobody of {tmp_path} is to be seen here: its run is over, or has not begun;" in sentences(done.stderr)[0]
+    assert f"{tmp_path} has no running vehicles: the run has ended, or has not begun;" in sentences(done.stderr)[0]

@@ -132,7 +132,7 @@ def test_ctrl_c_is_status_130_and_what_came_is_kept(
         process.send_signal(signal.SIGINT)
         _, stderr = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 130
-    assert sentences(stderr) == ["interrupted; the same command goes on where it stopped"]
+    assert sentences(stderr) == ["interrupted; repeat the command to continue"]
     assert 0 < kept[0].stat().st_size <= len(BINARY) // 2
     server.change(f"{RELEASE}arducopter", silent_after=None)
     assert harness("sitl", "install", env=environ).returncode == 0

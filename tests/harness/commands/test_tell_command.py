@@ -25,9 +25,9 @@ def test_virtual_time_stands_still_until_it_is_told_to_go_on(tmp_path: Path) -> 
     for sentence, answer in told:
         assert harness("tell", out, *sentence.split()).stdout.startswith(answer)
     for sentence, refusal in (
-        ("kill 9", "kill names vehicle 9, which does not exist: there are 1, 2, 3"),
-        ("{lose: 0.5}", "`lose` is unknown: there are "),
-        ("1 log", "'1 log' is nothing that a run can be told: there are `partition 1 2 | 3`"),
+        ("kill 9", "kill names vehicle 9, which is not on the roster: use one of 1, 2, 3"),
+        ("{lose: 0.5}", "`lose` is unknown: use one of "),
+        ("1 log", "'1 log' is not a command: use `partition 1 2 | 3`"),
     ):
         done = harness("tell", out, *sentence.split())
         assert done.returncode == 2
@@ -50,7 +50,7 @@ def test_processes_are_told_and_do_not_stand_still(tmp_path: Path) -> None:
     going.wait_for(lambda: harness("tell", out, "partition", "1", "|", "2", "3").returncode == 0, "the mission")
     assert harness("tell", out, "reboot", "3").returncode == 2
     assert harness("tell", out, "{reboot: [3], down_s: 20, disk: kept}").returncode == 0
-    assert "real processes cannot stand still" in harness("tell", out, "pause").stderr
+    assert "the time of real processes cannot be paused" in harness("tell", out, "pause").stderr
     assert harness("tell", out, "heal").returncode == 0
     going.wait_for(lambda: '"what":"boot"' in (out / "network.jsonl").read_text(), "the end of the reboot")
     going.process.send_signal(signal.SIGINT)
@@ -66,4 +66,4 @@ def test_processes_are_told_and_do_not_stand_still(tmp_path: Path) -> None:
 def test_a_run_that_nobody_can_tell_anything_is_one_sentence(tmp_path: Path) -> None:
     done = harness("tell", tmp_path, "heal")
     assert done.returncode == 2
-    assert sentences(done.stderr)[0].startswith(f"{tmp_path}: no run goes on there that can be told anything: start")
+    assert sentences(done.stderr)[0].startswith(f"{tmp_path}: no active run here takes commands: start")

@@ -31,8 +31,8 @@ def phase_one() -> list[Vectors]:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ([], "which agent?"),
-        (["--only", "21", "--", "true"], "there are Algorithms 1 to 20"),
+        ([], "the command of the agent is missing"),
+        (["--only", "21", "--", "true"], "no such Algorithm; give a number from 1 to 20"),
         (["--", "./no such agent"], "no such agent"),
     ],
 )
@@ -60,7 +60,7 @@ def test_what_was_not_tried_has_not_passed(phase_one: list[Vectors], tmp_path: P
 @pytest.mark.parametrize(
     ("quirk", "algorithm", "says"),
     [
-        ("hasty_phase1", 8, "its next timer ends at"),
+        ("hasty_phase1", 8, "its next timer expires at"),
         ("never_ask_phase2", 12, "it did not send Chain Hash Successor Query"),
         ("skip_phase2", 11, "it did not send Chain Hash Successor Query"),
         ("lose_popped_block", 11, "its status says stack 0, not 1"),
@@ -128,7 +128,7 @@ def test_a_program_that_closes_its_standard_output_and_goes_on_is_told(
     async def ask() -> None:
         program = await Program.start(("sh", "-c", "exec >&-; sleep 1000"), tmp_path / "errors.log")
         try:
-            with pytest.raises(AgentEndedError, match="closed its standard output, and goes on"):
+            with pytest.raises(AgentEndedError, match="closed its standard output and still runs"):
                 await program.ask({"t": 0.0})
         finally:
             await program.close()

@@ -74,4 +74,4 @@ def test_an_adapter_that_fails_keeps_what_it_had(swarmlog: Path, tmp_path: Path)
     record = bring_in([tmp_path / "flight.log"], [load_adapter(f"{swarmlog}:SwarmLog")], out)
     assert record.flights[0].agents[7].capture
     (left_out,) = record.left_out
-    assert "reading it broke off after line 4: ValueError: not enough values to unpack" in left_out.sentence
+    assert "reading failed after line 4: ValueError: not enough values to unpack" in left_out.sentence

@@ -75,7 +75,7 @@ def test_what_follows_a_damaged_line_is_used_and_the_gap_is_known(home: Path) ->
     assert trace.gaps == [Gap(4, 2, len(lines[5]) + len(lines[6]))]
     assert [line for line, _ in next(trace.lives())] == [2, 3, 4, 5, *range(8, len(lines) + 1)]
     (left_out,) = homecoming.left_out
-    assert left_out.sentence == f"{path}, line 6: it is damaged, and so is what follows up to line 7"
+    assert left_out.sentence == f"{path}, line 6: it is damaged, and so is the rest up to line 7"
 
 
 def test_half_a_line_with_another_after_it_costs_only_the_half(home: Path) -> None:
@@ -86,7 +86,7 @@ def test_half_a_line_with_another_after_it_costs_only_the_half(home: Path) -> No
     homecoming = sort_out([home])
     trace = homecoming.largest().traces[2]
     assert len(trace.runs) == len(lines) - 2 and trace.gaps == [Gap(4, 1, 60)]
-    assert "line 6: it is damaged; what can be read at its end is used" in why(homecoming)
+    assert "line 6: it is damaged; its readable end is used" in why(homecoming)
 
 
 def test_a_loss_of_power_leaves_nul_at_the_end_or_before_the_next_life(home: Path, whole: Path) -> None:
@@ -110,7 +110,9 @@ def test_a_damaged_header_is_lent_by_another_agent_of_the_flight(home: Path) -> 
     homecoming = sort_out([home])
     trace = homecoming.largest().traces[1]
     assert trace.header.agent_id == 1 and len(trace.runs) == len(lines) - 1 and not trace.gaps
-    assert "its header is lost; as agent 1's it is read with that of the trace of agent 2" in why(homecoming)
+    assert "its header is lost; it is read as a trace of agent 1, with the header of the trace of agent 2" in why(
+        homecoming
+    )
 
 
 def test_a_trace_without_its_beginning_begins_with_a_gap(home: Path) -> None:
@@ -132,7 +134,7 @@ def test_two_flights_are_told_apart(home: Path, another: Path, in_one_file: bool
     assert first and second
     assert homecoming.flights[0].traces[1].runs == first.runs
     assert homecoming.flights[1].traces[1].runs == second.runs
-    assert "of another flight than the largest" in why(homecoming)
+    assert "belong to another flight than the largest one" in why(homecoming)
 
 
 def test_the_same_mission_flown_twice_is_two_flights(home: Path) -> None:
@@ -156,7 +158,7 @@ def test_the_same_file_twice_is_used_once(home: Path) -> None:
     trace = homecoming.largest().traces[1]
     assert len(homecoming.flights) == 1 and len(trace.runs) == len(lines) - 1 and not trace.starts
     told = why(homecoming)
-    assert "it is the same as" in told and told.count("on; what stands there is used") == 2
+    assert "its content equals" in told and told.count("on; the lines there are used") == 2
 
 
 def test_what_is_lost_of_one_copy_is_taken_from_another(home: Path) -> None:
@@ -169,8 +171,8 @@ def test_what_is_lost_of_one_copy_is_taken_from_another(home: Path) -> None:
     homecoming = sort_out([path, home / "copy", home / "end"])
     trace = homecoming.largest().traces[1]
     assert trace.runs == [*whole.runs[:49], *whole.runs[50:]] and trace.gaps == [Gap(49, 1, 2)] and not trace.cut_off
-    assert "3 handler runs that are lost there are taken from here" in why(homecoming)
-    assert "9 handler runs that are lost there are taken from here" in why(homecoming)
+    assert "3 handler runs that are lost there are read from here" in why(homecoming)
+    assert "9 handler runs that are lost there are read from here" in why(homecoming)
 
 
 def test_a_trace_that_was_begun_in_another_file_goes_on_in_this_one(home: Path) -> None:
@@ -207,7 +209,7 @@ def test_what_could_be_used_if_it_were_otherwise_is_told_the_way_out(home: Path)
     (home / "home.zip").write_bytes(b"PK\x03\x04" + bytes(100))
     (home / "flight.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
     told = why(sort_out([home]))
-    assert "iconv" in told and "unpack it first" in told and "`ucp-harness import` reads it" in told
+    assert "iconv" in told and "unpack it first" in told and "read it with `ucp-harness import`" in told
 
 
 def test_windows_line_ends_and_a_byte_order_mark_are_nothing(home: Path) -> None:
@@ -247,7 +249,7 @@ def test_an_agent_that_is_not_of_the_mission_is_named(home: Path, tmp_path: Path
     (tmp_path / "9.trace.jsonl").write_text(trace_of(home, 1).read_text().replace('"agent_id":1', '"agent_id":9', 1))
     told = why(sort_out([home, tmp_path / "9.chain.json", tmp_path / "9.trace.jsonl"]))
     assert "9.chain.json: agent 9 is not on the roster of its mission" in told
-    assert "9.trace.jsonl, line 1: agent 9 is not on the roster that its own trace names" in told
+    assert "9.trace.jsonl, line 1: agent 9 is not on the roster in its own trace" in told
 
 
 def test_an_earlier_export_gives_way_to_a_later(home: Path) -> None:
@@ -267,7 +269,7 @@ def test_a_bomb_is_read_up_to_a_bound(tmp_path: Path, monkeypatch: pytest.Monkey
     (tmp_path / "bomb").write_bytes(gzip.compress(bytes(50 << 20)))
     homecoming = sort_out([tmp_path])
     assert not homecoming.flights
-    assert why(homecoming) == f"{tmp_path / 'bomb'}: it is no whole file: what is beyond 1 MiB is not read"
+    assert why(homecoming) == f"{tmp_path / 'bomb'}: it is incomplete: only the first 1 MiB are read"
 
 
 def test_packed_files_that_break_off_are_used_as_far_as_they_go(home: Path) -> None:
@@ -276,12 +278,12 @@ def test_packed_files_that_break_off_are_used_as_far_as_they_go(home: Path) -> N
     path.write_bytes(packed[: len(packed) // 2])
     homecoming = sort_out([home])
     assert len(homecoming.largest().traces[1].runs) > 10
-    assert "what gzip packed breaks off" in why(homecoming)
+    assert "the gzip data ends early" in why(homecoming)
 
 
 def test_nothing_usable_is_an_error_that_says_why(tmp_path: Path) -> None:
     (tmp_path / "1.trace.jsonl").write_text("hello")
-    with pytest.raises(FieldError, match=r"nothing of this is a usable .* text that says nothing of UCP here"):
+    with pytest.raises(FieldError, match=r"none of these files is a usable .* text without UCP records"):
         sort_out([tmp_path]).largest()
     with pytest.raises(FieldError, match="does not exist"):
         sort_out([tmp_path / "nowhere"])

@@ -113,7 +113,7 @@ def test_of_a_wrong_agent_the_first_wrong_step_is_named_or_its_mistake(tmp_path:
     ignoring = {"ignore_commit": {"agents": [2], "value": 0.5}}
     parted = again(home(tmp_path / "home2", flown(tmp_path / "run2", quirks=ignoring)))
     assert parted.problems == []
-    assert any("agent 2 did nothing with" in remark and "receive_commit_block" in remark for remark in parted.remarks)
+    assert any("agent 2 did not react to" in remark and "receive_commit_block" in remark for remark in parted.remarks)
 
 
 def test_an_agent_that_is_wrong_in_no_known_way_is_played_up_to_its_first_wrong_step(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_an_agent_that_is_wrong_in_no_known_way_is_played_up_to_its_first_wrong_
     trace.write_text("".join(json.dumps(line) + "\n" for line in lines))
     reconstruction = again(directory)
     assert reconstruction.reproduced == [1, 3]
-    assert "agent 2 does not do what the protocol says, and is played up to trace line" in reconstruction.problems[0]
+    assert "agent 2 deviates from the protocol, and is played up to trace line" in reconstruction.problems[0]
     assert "build_data_block" in reconstruction.problems[0]
     assert {datagram["source"] for datagram in reconstruction.document["datagrams"]} == {2}
 
@@ -145,7 +145,7 @@ def test_a_record_without_the_parts_that_may_be_missing_will_do(tmp_path: Path) 
 
 def test_nothing_to_fly_by_is_a_mistake_of_the_request(tmp_path: Path) -> None:
     directory = home(tmp_path / "home", flown(tmp_path / "run"), *(f"{agent}.trace.jsonl" for agent in (1, 2, 3)))
-    with pytest.raises(FieldError, match="bring traces"):
+    with pytest.raises(FieldError, match="add traces"):
         again(directory)
 
 
@@ -158,7 +158,7 @@ def test_the_command_says_what_it_reproduces(tmp_path: Path) -> None:
     assert out.read_text().startswith("# Made by `ucp-harness reconstruct`")
     refused = harness("reconstruct", run, "-o", out)
     assert refused.returncode == 2
-    assert sentences(refused.stderr) == [f"{out} exists: choose another --out, nothing is overwritten"]
+    assert sentences(refused.stderr) == [f"{out} exists: choose another --out; existing files are not overwritten"]
     trace = trace_of(run, 2)
     trace.write_bytes(trace.read_bytes()[:20_000])
     cut = harness("reconstruct", run, "-o", tmp_path / "cut.yaml")

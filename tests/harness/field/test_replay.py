@@ -159,7 +159,7 @@ def test_places_are_lines_handlers_algorithms_and_blocks(right: Path) -> None:
 
 @pytest.mark.parametrize("words", ["vote_timer_expired", "A21", "", "0.0.0", "nothing at all"])
 def test_what_is_no_place_is_said_to_be_none(words: str, right: Path) -> None:
-    with pytest.raises(FieldError, match="is no place to stop at"):
+    with pytest.raises(FieldError, match="is not a breakpoint: use a line number"):
         place(words, Names(open_record(right, 1)))
 
 
@@ -167,8 +167,8 @@ def test_what_is_no_place_is_said_to_be_none(words: str, right: Path) -> None:
     ("name", "content", "sentence"),
     [
         ("a.trace.jsonl", "", "it is empty"),
-        ("a.trace.jsonl", "no trace\n", "nothing of it is a trace"),
-        ("a.chain.json", "{}", "nothing of it is a trace"),
+        ("a.trace.jsonl", "no trace\n", "no trace here can be played"),
+        ("a.chain.json", "{}", "no trace here can be played"),
         ("a.trace.jsonl", None, "does not exist"),
     ],
 )
@@ -198,6 +198,6 @@ def test_all_records_of_a_directory_are_played_and_to_step_through_one_it_has_to
     ended = harness("replay", right, "--step", input="")
     assert (ended.returncode, sentences(ended.stderr)) == (
         2,
-        [f"{right}: whose record is to be played? Choose with --agent: 1, 2, 3"],
+        [f"{right}: several records: choose one with --agent: 1, 2, 3"],
     )
     assert harness("replay", right, "--agent", 9).returncode == 2

@@ -114,7 +114,7 @@ def test_a_record_cut_off_is_played_up_to_there(home: Path) -> None:
     ended = harness("replay", path)
     assert ended.returncode == 0
     (said,) = sentences(ended.stderr)
-    assert "cut off" in said
+    assert "truncated" in said
 
 
 def test_nothing_usable_is_status_2(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_of_the_old_version_nothing_can_be_played(home: Path) -> None:
     change(home / "2.trace.jsonl", lambda lines: lines.__setitem__(0, lines[0].replace("ucp-trace/2", "ucp-trace/1")))
     ended = harness("replay", home / "2.trace.jsonl")
     assert ended.returncode == 2
-    assert "lacks what the agent received" in sentences(ended.stderr)[-1]
+    assert "lacks received messages" in sentences(ended.stderr)[-1]
 
 
 def test_one_that_cannot_be_played_keeps_nobody_from_the_others(home: Path) -> None:
@@ -137,7 +137,7 @@ def test_one_that_cannot_be_played_keeps_nobody_from_the_others(home: Path) -> N
     ended = harness("replay", home)
     assert ended.returncode == 0
     assert ended.stdout.count("✔ no difference") == 3
-    assert any("lacks what the agent received" in said for said in sentences(ended.stderr))
+    assert any("lacks received messages" in said for said in sentences(ended.stderr))
 
 
 @pytest.mark.parametrize("by_s", [30.0, -30.0, 5000.0])

@@ -86,9 +86,7 @@ def test_what_a_step_failed_to_trigger_is_shown_with_that_step(tmp_path: Path) -
     wrong = flown(tmp_path / "run", quirks={"give_up_unfinished": True}, duration_s=900, network={"loss": 0.4})
     line = first_difference(wrong)
     shown = told(wrong, "q", options=("--break", str(line)))[""]
-    assert any(
-        row.startswith("  ✘ it triggered nothing, and should have triggered Reconcile Finalize") for row in shown
-    )
+    assert any(row.startswith("  ✘ it triggered nothing; it should have triggered Reconcile Finalize") for row in shown)
     went_on = told(wrong, "c", "rc", "next difference", "q")
     assert went_on["c"] == went_on["next difference"]
     assert went_on["rc"][0].startswith("before line 1")
@@ -129,11 +127,11 @@ def test_what_makes_no_sense_together_is_refused(options: tuple[str, ...], wrong
 
 def test_what_cannot_be_done_is_said(wrong: Path) -> None:
     said = told(wrong, "b", "fly", "goto x", "n nobody", "clear 7", "quit")
-    assert said["b"] == ["this is the start"]
-    assert said["fly"][0].startswith("there is no command 'fly'")
-    assert said["goto x"][0].startswith("goto wants a line")
-    assert "is no place to stop at" in said["n nobody"][0]
-    assert said["clear 7"] == ["there is no break at '7'"]
+    assert said["b"] == ["start of the record"]
+    assert said["fly"][0].startswith("no command 'fly'")
+    assert said["goto x"][0].startswith("goto needs a line")
+    assert "is not a breakpoint: use a line number" in said["n nobody"][0]
+    assert said["clear 7"] == ["no breakpoint at '7'"]
 
 
 def test_when_the_commands_end_the_rest_is_played(wrong: Path) -> None:

@@ -56,7 +56,7 @@ def test_a_table_says_what_was_asked_and_what_was_measured(monkeypatch: pytest.M
     assert done.exit_code == 0
     (row,) = [line.split() for line in done.stdout.splitlines() if "loss 0.15" in line]
     assert row == ["✔", "loss", "0.15", "lost", "15", "%", "15", "13.86", "to", "16.21", "10000"]
-    assert "by itself took 0.1 ms" in done.stdout
+    assert "packets took 0.1 ms" in done.stdout
     assert "nftables: 10000 packets for 1 question" in done.stderr
 
 

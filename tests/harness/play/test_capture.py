@@ -161,7 +161,7 @@ def test_a_capture_that_crashes_ends_the_run_with_one_sentence_and_status_3(tmp_
     status, _, err = running.end()
     assert status == 3
     assert sentences(err) == [
-        "The capture of packets failed: SIGKILL; what there was has been exported and checked",
+        "The capture of packets failed: SIGKILL; the chains and traces written before that are exported and checked",
     ]
     said = running.record()
     assert said["outcome"] == "failed"
@@ -173,7 +173,7 @@ def test_a_capture_that_crashes_ends_the_run_with_one_sentence_and_status_3(tmp_
 def test_a_run_whose_captures_have_gaps_says_so(tmp_path: Path) -> None:
     counts = {"1": {"received": 10, "dropped": 0}, "7": {"received": 20, "dropped": 4}}
     frames = {vehicle: CapturedFrames.model_validate(counted) for vehicle, counted in counts.items()}
-    assert gaps(frames) == ("the capture lacks 4 of 30 frames, of vehicle 7: this machine was too slow to keep up")
+    assert gaps(frames) == ("the capture lacks 4 of 30 frames, of vehicle 7, because this machine was too slow")
     assert gaps({"1": frames["1"]}) is None
     finished = run(scenario(**RUN, capture=True), 5, tmp_path / "run", Silent(), "sim")
     path = tmp_path / "run" / "run.json"

@@ -40,7 +40,10 @@ def test_there_is_no_engine(tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path)
     for host, word in (
         (f"unix://{tmp_path}/nowhere.sock", "there is no Docker engine: .* install it"),
-        ("tcp://192.0.2.1:2375", "DOCKER_HOST is tcp://192.0.2.1:2375: only containers on this machine"),
+        (
+            "tcp://192.0.2.1:2375",
+            "DOCKER_HOST is tcp://192.0.2.1:2375: the harness connects only containers on this machine",
+        ),
     ):
         asked = ("run", scenario, "--backend", "docker", "--out", tmp_path / "run")
         done = harness(*asked, env={**os.environ, "DOCKER_HOST": host})
@@ -54,7 +57,7 @@ def test_an_engine_that_is_not_running(tmp_path: Path, monkeypatch: pytest.Monke
     path = tmp_path / "docker.sock"
     listening(path).close()
     monkeypatch.setenv("DOCKER_HOST", f"unix://{path}")
-    with pytest.raises(docker_engine.DockerError, match="is not running: nobody listens"):
+    with pytest.raises(docker_engine.DockerError, match="is not running: no process listens"):
         docker_engine.Engine.connect()
 
 
@@ -72,7 +75,7 @@ except docker_engine.DockerError as error: print(error)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     server.close()
     path.unlink()
-    assert done.stdout == f"{path} may not be used by this user: run it with sudo\n", done.stderr
+    assert done.stdout == f"{path} is not accessible to this user: use sudo\n", done.stderr
 
 
 def test_an_engine_that_never_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,7 +127,7 @@ def test_an_image_that_cannot_be_built_is_one_sentence() -> None:
     said: list[str] = []
     api = SimpleNamespace(close=lambda: None, inspect_image=inspect, build=lambda **_: iter(steps))
     one = docker_engine.Engine(api)  # type: ignore[arg-type]
-    with pytest.raises(docker_engine.DockerError, match=r"could not be built \(no such host\): .*--image-from-host"):
+    with pytest.raises(docker_engine.DockerError, match=r"cannot be built \(no such host\): .*--image-from-host"):
         _images.project(one, said.append)
     assert said[1:] == ["building the image: Step 1/9 : ARG BASE"] * 2
     one.close()
@@ -146,7 +149,7 @@ def test_a_debugger_has_to_be_in_the_image(tmp_path: Path, monkeypatch: pytest.M
         with (
             nullcontext()
             if shared
-            else pytest.raises(docker_engine.DockerError, match="in no directory that containers")
+            else pytest.raises(docker_engine.DockerError, match="in a directory that containers do not share")
         ):
             _container_preflight.refuse_debuggers_that_are_not_in_the_image(from_host)
 
@@ -253,7 +256,7 @@ def test_a_compose_file_has_everybody_at_their_addresses(tmp_path: Path) -> None
     assert (tmp_path / "compose/image/ucp/node.py").exists()
     again = harness("run", tmp_path / "scenario.yaml", "--emit-compose", tmp_path / "compose.yaml")
     assert again.returncode == 2
-    assert "is there already" in sentences(again.stderr)[0]
+    assert "compose.yaml exists: choose another name" in sentences(again.stderr)[0]
 
 
 def test_a_compose_file_shows_each_agent_its_own_bundle_and_holds_no_secret(tmp_path: Path) -> None:

@@ -144,12 +144,12 @@ def test_ctrl_c_while_containers_start_leaves_nothing(tmp_path: Path) -> None:
     run.wait_for(lambda: containers(run.out), "the first container")
     run.process.send_signal(signal.SIGINT)
     status, _, err = run.end()
-    assert (status, sentences(err)) == (130, ["the run was interrupted before it began"])
+    assert (status, sentences(err)) == (130, ["the run was interrupted before its start"])
     assert containers(run.out) == []
 
 
 @pytest.mark.parametrize(
-    ("hurt", "sentence"), [(Way.silent, "stopped answering"), (Way.cut, "the Docker engine has ended")]
+    ("hurt", "sentence"), [(Way.silent, "stopped answering"), (Way.cut, "the Docker engine has stopped")]
 )
 def test_an_engine_that_is_gone_ends_the_run(hurt: Any, sentence: str, tmp_path: Path) -> None:
     way = Way(tmp_path / "way.sock")
@@ -177,8 +177,8 @@ def test_a_name_that_is_taken(tmp_path: Path) -> None:
         done = on_docker(tmp_path, **NO_VEHICLES)
     assert done.returncode == 3
     assert sentences(done.stderr) == [
-        f"there is a container {name} already, of a run in the same directory: if that is over, `ucp-harness clean` "
-        f"removes it, else docker rm -f {name}"
+        f"the container {name} of another run in the same directory exists: if that run has ended, remove the "
+        f"container with `ucp-harness clean`, otherwise with docker rm -f {name}"
     ]
     assert json.loads((tmp_path / "run/run.json").read_text())["outcome"] == "failed"
     assert containers(tmp_path / "run") == []
@@ -187,11 +187,11 @@ def test_a_name_that_is_taken(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("keys", "status", "sentence"),
     [
-        ({"docker": {"image": "no/such:image"}}, 3, "there is no image no/such:image on this machine: docker pull"),
+        ({"docker": {"image": "no/such:image"}}, 3, "this machine has no image no/such:image: docker pull"),
         (
             {"docker": {"image": "ucp-harness-host:empty"}, "agent_command": ["/usr/bin/env", "python3"]},
             1,
-            "agent 1 ended by itself with status 127: there is no such program in its image ([FATAL tini",
+            "agent 1 ended by itself with status 127: its image does not hold this program ([FATAL tini",
         ),
         ({"agent_command": ["/bin/false"]}, 1, "agent 1 ended by itself with status 1; its log is agents/1.log"),
         (

@@ -96,17 +96,17 @@ def test_a_run_without_a_click_is_as_ever(tmp_path: Path) -> None:
 
 
 REFUSED: list[tuple[dict[str, Any], str]] = [
-    ({"kill": [2]}, "kill: agent 2 is killed then, not running or paused"),
-    ({"kill": [9]}, "kill names vehicle 9, which does not exist: there are 1, 2, 3, 4, 5"),
+    ({"kill": [2]}, "kill: agent 2 is killed at that time, not running or paused"),
+    ({"kill": [9]}, "kill names vehicle 9, which is not on the roster: use one of 1, 2, 3, 4, 5"),
     ({"loss": 1.5}, "`loss` is 1.5: it should be less than or equal to 1"),
     ({"partition": [[1, 2], [2, 3]]}, "vehicle 2 is in an earlier group too"),
-    ({"lose": 0.5}, "`lose` is unknown: there are"),
+    ({"lose": 0.5}, "`lose` is unknown: use one of"),
     ({}, "needs exactly one of `loss`"),
-    ({"at_s": 5, "loss": 0.5}, "`at_s` is now: leave it out"),
+    ({"at_s": 5, "loss": 0.5}, "a command acts now: leave out `at_s`"),
     ({"reboot": [1]}, "a reboot needs `down_s`"),
     ({"reboot": [1], "down_s": 1e6, "disk": "lost"}, "after the mission's end at 300 s"),
-    ({"kill": [3]}, "the timeline's entry at 200 s, kill: agent 3 is killed then, not running or paused"),
-    ({"loss": 0.5}, "this changes loss for good, and the timeline's entry at 90 s until 150 s: which holds when?"),
+    ({"kill": [3]}, "the timeline's entry at 200 s, kill: agent 3 is killed at that time, not running or paused"),
+    ({"loss": 0.5}, "this changes loss for good, but the timeline's entry at 90 s changes it until 150 s: let this"),
 ]
 
 
@@ -126,9 +126,9 @@ def test_what_cannot_be_is_a_sentence_and_changes_nothing(tmp_path: Path) -> Non
                 wrong.append(str(refusal.value))
         assert hand.scenario is before
         for seconds in (0, -1, float("nan"), float("inf")):
-            with pytest.raises(ScenarioError, match="is no step"):
+            with pytest.raises(ScenarioError, match="is not a step"):
                 hand.step(seconds).result(TIMEOUT_S)
-        with pytest.raises(ScenarioError, match="is not how fast time can go"):
+        with pytest.raises(ScenarioError, match="is not a speed: use a number above 0"):
             hand.set_factor(0).result(TIMEOUT_S)
 
     played(asked, tmp_path / "run", click)
@@ -206,7 +206,7 @@ def test_who_is_refused_at_once_and_asks_again_is_answered(tmp_path: Path) -> No
 def test_after_the_end_nothing_happens_and_every_answer_comes(tmp_path: Path) -> None:
     asked = scenario(duration_s=100)
     hand = Interventions(asked, virtual_time=True)
-    with pytest.raises(ScenarioError, match="the mission has not begun"):
+    with pytest.raises(ScenarioError, match="the mission has not started"):
         hand.ask({"loss": 0.5}).result(0)
     run(asked, 7, tmp_path / "run", Silent(), "sim", interventions=hand)
     with pytest.raises(ScenarioError, match="the run has ended"):
@@ -217,7 +217,7 @@ def test_after_the_end_nothing_happens_and_every_answer_comes(tmp_path: Path) ->
 
 def test_no_more_waits_than_there_is_room_for(tmp_path: Path) -> None:
     hand = Interventions(scenario(), virtual_time=False)
-    with pytest.raises(ScenarioError, match="real processes cannot stand still"):
+    with pytest.raises(ScenarioError, match="the time of real processes cannot be paused"):
         hand.pause().result(0)
     assert issubclass(ScenarioError, HarnessError)
 
@@ -244,9 +244,9 @@ def test_another_process_asks_by_the_socket_in_the_runs_directory(tmp_path: Path
     assert answers[LINES[3]]["by_hand"] == [{"at_s": 10.0, "kill": [2]}, {"at_s": 10.001, "loss": 0.5}]
     assert answers[LINES[3]]["paused"] and answers[LINES[3]]["closed"] is None
     assert [*wrong] == [*LINES[4:]]
-    assert wrong[LINES[4]].startswith("kill: agent 2 is killed then")
+    assert wrong[LINES[4]].startswith("kill: agent 2 is killed at that time")
     assert not (out / SOCKET).exists()
-    assert wrong[LINES[-1]] == "a line of more than 65536 bytes asks too much"
+    assert wrong[LINES[-1]] == "the request has more than 65536 bytes"
 
 
 LINES = (

@@ -107,7 +107,7 @@ def test_subswarms_that_fly_apart_split_the_network_and_reconcile_when_they_rejo
         ({"hard_range": {}, "log_distance": {}}, "needs one of"),
         ({"hard_range": {"range_m": 0}}, r"radio\.range_m: 0\.0 is not above 0"),
         ({"log_distance": {"exponent": "steep"}}, r"network\.radio\.log_distance\.exponent"),
-        ({"log_distance": {"range_m": 5}}, r"network\.radio\.log_distance\.range_m. is unknown: there are exponent"),
+        ({"log_distance": {"range_m": 5}}, r"network\.radio\.log_distance\.range_m. is unknown: use one of exponent"),
         ({"hard_range": {}, "update_s": 0}, r"network\.radio\.update_s"),
     ],
 )
@@ -121,5 +121,5 @@ def test_a_radio_that_means_nothing_is_answered_in_one_sentence(
 
 
 def test_a_radio_needs_vehicles() -> None:
-    with pytest.raises(ValueError, match=r"`network.radio` needs vehicles, and `vehicles.kind` is none"):
+    with pytest.raises(ValueError, match=r"`network.radio` needs vehicles, but `vehicles.kind` is none"):
         scenario(vehicles={"kind": "none"})

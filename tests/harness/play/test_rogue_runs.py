@@ -242,7 +242,10 @@ def test_dead_and_paused_agents_hear_the_rogue_as_they_hear_anybody(tmp_path: Pa
             {"replay": {"message": "Commit"}},
             "`timeline.0.replay.message` is 'Commit': it should be 'Block Add Request'",
         ),
-        ({"replay": {"sender": 9}}, "timeline.0.replay.sender names vehicle 9, which does not exist: there are 1, 2"),
+        (
+            {"replay": {"sender": 9}},
+            "timeline.0.replay.sender names vehicle 9, which is not on the roster: use one of 1, 2",
+        ),
         ({"replay": {}, "heal": True}, "needs exactly one of `loss`"),
         ({"duplicate": {}}, "`timeline.0.duplicate.for_s` is missing"),
         (
@@ -254,15 +257,15 @@ def test_dead_and_paused_agents_hear_the_rogue_as_they_hear_anybody(tmp_path: Pa
         ({"forge": {"message": "Request for Block", "sender": 1}}, "it should be 'Commit Block', 'Block Add Response'"),
         (
             {"forge": {"message": "Block Add Response", "sender": 1}},
-            "`for_s` belongs to a forged answer, and each needs",
+            "`for_s` is needed by forged answers",
         ),
-        ({"forge": {"message": "Commit Block", "sender": 1, "approve": True}}, "a Commit Block says neither"),
-        ({"flood": {"for_s": 100, "per_s": 5000}}, "500000 messages are too many: a flood has 100000 at most"),
+        ({"forge": {"message": "Commit Block", "sender": 1, "approve": True}}, "a Commit Block has no vote"),
+        ({"flood": {"for_s": 100, "per_s": 5000}}, "500000 messages are too many: a flood has at most 100000"),
         ({"lie": {"message": "Commit Block", "sender": 1, "block": "1.1"}}, "a Commit Block says `block` and `chain`"),
         ({"lie": {"message": "Request for Block", "sender": 1, "block": 2.1}}, "`timeline.0.lie.block` is 2.1"),
         (
             {"lie": {"message": "Chain Contain Query", "sender": 1, "chain": [], "receivers": [9]}},
-            "timeline.0.lie.receivers names vehicle 9, which does not exist",
+            "timeline.0.lie.receivers names vehicle 9, which is not on the roster",
         ),
     ],
 )

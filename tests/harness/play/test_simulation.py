@@ -288,8 +288,11 @@ def test_every_scenario_that_runs_as_processes_runs_in_virtual_time(path: Path) 
     [
         ({"vehicles": {"kind": "ardupilot"}}, "`vehicles.kind: ardupilot` needs real processes"),
         ({"vehicles": {"binary": "/bin/x"}}, "`vehicles.binary` needs real processes"),
-        ({"agent_command": ["./nowhere"]}, "`agent_command`: ./nowhere is no program"),
-        ({"agent_command": {2: ["cat"]}, "lateness": {2: "3+0.25"}}, "nobody sees the single timers of an agent that"),
+        ({"agent_command": ["./nowhere"]}, "`agent_command`: ./nowhere is not a program"),
+        (
+            {"agent_command": {2: ["cat"]}, "lateness": {2: "3+0.25"}},
+            "the harness controls the timers of its own agents",
+        ),
     ],
 )
 def test_what_virtual_time_cannot_give_is_refused_by_its_keys(keys: dict[str, Any], sentence: str) -> None:

@@ -82,5 +82,5 @@ def test_played_as_scenarios_ways_lead_to_as_many_chains() -> None:
 
 
 def test_where_messages_take_as_long_as_they_like_they_cross() -> None:
-    with pytest.raises(BoundsError, match=r"--no-crossing is not for --network any"):
+    with pytest.raises(BoundsError, match=r"--no-crossing does not apply to --network any"):
         Bounds(2, 2, "any", crossing=False)

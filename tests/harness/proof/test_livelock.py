@@ -30,18 +30,18 @@ def test_each_form_becomes_a_scenario_that_goes_round(tmp_path: Path, blocks: in
     assert livelock.cycle.period_s == pytest.approx(15.0)
     assert livelock.cycle.agents == [1, 2]
     assert {"vote_timer_expiration", "reconcile_finalize"} <= {step.handler for step in livelock.cycle.steps}
-    assert any("two moments are the same by chance" in line for line in in_words(proof))
+    assert any("two instants are equal by chance" in line for line in in_words(proof))
 
 
 @pytest.mark.parametrize(
     ("coincidences", "losses", "goes_round", "contradictory", "expected"),
     [
-        (0, 0, True, False, "which takes no coincidence"),
-        (0, 1, True, False, "which takes no coincidence; 1 loss leads there"),
-        (0, 3, False, False, "is heard in the same order in every round; 3 losses lead there"),
-        (2, 0, True, False, "2 times two moments are the same by chance"),
+        (0, 0, True, False, "which needs no coincidence"),
+        (0, 1, True, False, "which needs no coincidence; 1 loss leads there"),
+        (0, 3, False, False, "arrive in the same order in every round; 3 losses lead there"),
+        (2, 0, True, False, "2 times two instants are equal by chance"),
         (0, 0, False, True, "as no clocks make them go"),
-        (None, 0, False, False, "if timers can end like that"),
+        (None, 0, False, False, "if timers can expire in this order"),
     ],
 )
 def test_what_it_takes_is_said(

@@ -101,9 +101,9 @@ def test_what_playing_does_not_show_is_said(tmp_path: Path) -> None:
     bounds = Bounds(2, 2, "lossy", quirks={"forget_stack": True}, reduced=False)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
     assert proof.example is not None
-    assert not any("not shown by playing" in line for line in in_words(proof))
+    assert not any("not confirmed: the simulation" in line for line in in_words(proof))
     proof.example = replace(proof.example, judged={})
-    assert any("not shown by playing" in line for line in in_words(proof))
+    assert any("not confirmed: the simulation" in line for line in in_words(proof))
 
 
 @pytest.mark.parametrize("stagger", [{}, {"phase1_timeout_s": 0.5}])
@@ -125,7 +125,9 @@ def test_what_was_not_looked_at_never_holds(tmp_path: Path) -> None:
     proof = prove(Bounds(3, 3, "lossy"), Limits(most_s=0.0), tmp_path / "none.yaml")
     assert proof.exit_status == INCOMPLETE
     assert not any("✔" in line for line in in_words(proof))
-    assert "the same with --losses 1 or --coincidences 0 or --no-crossing or --clocks any" in [*in_words(proof)][2]
+    assert (
+        "the same bounds with --losses 1 or --coincidences 0 or --no-crossing or --clocks any" in [*in_words(proof)][2]
+    )
     least = Bounds(4, 4, "lossy", losses=2, coincidences=0, clocks_any=True, crossing=False)
     proof = prove(least, Limits(most_s=0.0), tmp_path / "least.yaml")
     assert proof.ended == "time"
@@ -226,7 +228,7 @@ def test_what_the_whole_graph_is_asked_is_told(tmp_path: Path, monkeypatch: pyte
     asked = dict.fromkeys(progress.asked for progress in told if progress.asked is not None)
     forks = proof.liveness.forks
     assert forks
-    assert [*asked][:3] == ["who is at rest", "ways round", "ways to one chain"]
+    assert [*asked][:3] == ["idle states", "cycles", "paths to one chain"]
     assert [*asked][3:] == [f"what votes lead to ({known} of {forks} forks)" for known in range(forks)]
     assert {(progress.states, progress.looked_at) for progress in told if progress.asked is not None} == {
         (proof.figures.states, proof.figures.states)

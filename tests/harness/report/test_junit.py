@@ -95,9 +95,12 @@ def test_expected_figures_are_a_test_case() -> None:
     ("keys", "said"),
     [
         ({"outcome": "interrupted", "outcome_detail": "at second 7"}, "did not complete: interrupted: at second 7"),
-        ({"outcome": "running"}, "This run has not recorded its end"),
-        ({"characteristics": {}}, "There is no verdict."),
-        ({"unmatched_fates": ["the first fate never matched"]}, "the first fate never matched, so this run does not"),
+        ({"outcome": "running"}, "The end of this run is not recorded"),
+        ({"characteristics": {}}, "No verdict."),
+        (
+            {"unmatched_fates": ["the first fate never matched"]},
+            "the first fate never matched, so this run differs from its script",
+        ),
     ],
 )
 def test_a_run_that_did_not_complete_fails_a_test_case_of_its_own(keys: dict[str, Any], said: str) -> None:

@@ -63,13 +63,13 @@ def state(at_s: float, *components: set[int]) -> Topology:
 
 def test_a_split_and_a_rejoin_are_on_the_map_in_their_parts(tmp_path: Path) -> None:
     section = drawn(tmp_path)
-    assert [which for _, which in section.legend] == ["in one part with all", "part A", "part B", "start", "end"]
+    assert [which for _, which in section.legend] == ["connected to all others", "part A", "part B", "start", "end"]
     ways = paths(section)
     assert sum(which == "part0" for which, _, _ in ways) == 3
     assert sum(which == "part1" for which, _, _ in ways) == 2
     (second,) = [tip for which, tip, _ in ways if which == "part0" and tip.startswith("vehicle 2")]
     assert second.endswith("part A, with 1, 3")
-    assert all("in one part with all" in tip for which, tip, _ in ways if which == "whole")
+    assert all("connected to all others" in tip for which, tip, _ in ways if which == "whole")
 
 
 def test_the_moments_are_begin_changes_and_end_with_the_live_links(tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_parts_keep_their_letters_while_most_of_them_stay() -> None:
         "alone 1\u20137",
         "A 2, 3; B 4\u20137; alone 1",
         "A 2, 3; B 1, 6; C 4, 5; alone 7",
-        "nobody left",
+        "no vehicle left",
     ]
     assert [letter(number) for number in (0, 25, 26, 53)] == ["A", "Z", "A2", "B3"]
 
@@ -255,7 +255,7 @@ def test_tracks_without_a_record_of_the_network_are_drawn_and_it_is_said(tmp_pat
     section = section_of(tmp_path, ink)
     assert section is not None
     assert [which for which, _, _ in paths(section)] == ["unknown"]
-    assert section.notes == ["network.jsonl: who could reach whom is not on record"]
+    assert section.notes == ["network.jsonl: the network conditions are not recorded"]
     assert "link" not in section.moments[0].picture
 
 
@@ -263,7 +263,7 @@ def test_damaged_tracks_leave_a_sentence_on_the_page(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", {1: "1.1", 2: "1.1"})
     (run_dir / TRACKS_FILE).write_text('{\n{"at_s": 1, "places": {"<script>": [0, 0, 0]}}\n')
     page = Reader(write_report(RunArchive(run_dir)).read_text(encoding="utf-8"))
-    assert "tracks.jsonl: 2 lines are left out, damaged or of no meaning." in page.text
+    assert "tracks.jsonl: 2 damaged or unknown lines are left out." in page.text
     assert "map" not in {attributes.get("class") for tag, attributes in page.elements if tag == "svg"}
 
 

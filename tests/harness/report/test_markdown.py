@@ -44,7 +44,7 @@ def test_a_run_that_was_killed_says_so_and_what_is_missing(tmp_path: Path) -> No
     agents = {str(agent): {"outcome": "running"} for agent in (1, 2, 3)}
     lines = lines_of(tmp_path, {"outcome": "running", "characteristics": {}, "figures": {}, "agents": agents})
     assert lines[2] == "**not judged**"
-    assert "**This run has not recorded its end** It is still going on, or it was killed." in lines
+    assert "**The end of this run is not recorded** The run is still active, or it was killed." in lines
     assert "- agent 3: no usable export (running)" in lines
     assert not [line for line in lines if line.startswith("| 1 ")]
 

@@ -98,11 +98,14 @@ def test_what_was_asked_for_by_hand_stands_among_what_was_scheduled() -> None:
     )
     rows = [[cell.replace("\u00a0", " ") for cell in row] for row in happened(record)]
     assert rows == [
-        ["60 s", "kill", "agent 2; asked for by hand"],
+        ["60 s", "kill", "agent 2; caused by hand"],
         ["125.5 s", "operator", "vehicles 1 3: MAV_CMD_DO_SET_MODE; param1 1, param2 6; 3 times until 130 s"],
         ["300 s", "heal", "loss 0 %; fully connected: yes"],
-        ["later", "operator", "4 more commands, which nobody has kept"],
+        ["later", "operator", "4 more commands, which are not recorded"],
     ]
-    told = "Ground station at 127.0.0.1:14550: 12\u202f345 datagrams went there, 9 came from it, and 2 were dropped."
+    told = (
+        "Ground station at 127.0.0.1:14550: 12\u202f345 datagrams were sent to it, 9 datagrams came from it, and 2 "
+        "were dropped."
+    )
     assert ground_station(record) == told
     assert ground_station(RunRecord()) is None

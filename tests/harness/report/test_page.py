@@ -88,8 +88,8 @@ def test_the_page_says_what_the_losses_of_vehicles_took(tmp_path: Path) -> None:
         "at 300 s vehicle 3 was lost (crash), and with it 1 of 12 completed blocks",
         "at the end 2 of 41 completed blocks are gone",
         "300 s 3 crash 12 11 1 2",
-        "300 s: who held which blocks",
-        "3.1 nobody 1, 2",
+        "300 s: holders of blocks",
+        "3.1 none 1, 2",
     ):
         assert said in page.text
     for survival in (None, 7, {"losses": "none"}):
@@ -182,8 +182,8 @@ def test_a_run_file_with_nothing_but_its_schema_is_shown(tmp_path: Path) -> None
     run_dir = write_run(tmp_path / "run", CHAINS)
     (run_dir / "run.json").write_text('{"schema": "ucp-run/1"}')
     page = Reader(write_report(RunArchive(run_dir)).read_text(encoding="utf-8"))
-    assert "This run has not recorded its end" in page.text
-    assert "Not judged" in page.text
+    assert "The end of this run is not recorded" in page.text
+    assert "No verdict: the run ended" in page.text
     assert "inception block" in page.text
 
 
@@ -203,15 +203,15 @@ def test_it_says_why_more_blocks_were_completed_than_are_in_chains() -> None:
     assert counts(exports({1: "1.1 2.1", 2: "1.1 2.1"}), RunRecord()) is None
     lost = RunRecord(agents={"3": AgentRecord(outcome="killed", completed_before=["a", "b"])})
     assert counts(exports({1: "1.2 2.1"}), lost) == (
-        "Of 4 completed blocks 1 is in a chain; 3 are held by nobody whose export is here; "
-        "beside them 1 is held whose makers do not say here what they completed."
+        "Of 4 completed blocks 1 is in a chain; 3 are in no available export; "
+        "beside these 1 is held without a record of completion."
     )
 
 
 def test_a_run_without_any_export_is_still_reported(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", {}, {"scenario": {"name": "all lost", "agents": 2}})
     page = Reader(write_report(RunArchive(run_dir)).read_text(encoding="utf-8"))
-    assert "No chain to draw" in page.text
+    assert "No chains: no agent" in page.text
     assert "agents 1, 2: no usable export" in page.text
 
 
@@ -270,7 +270,7 @@ def test_what_the_mission_left_is_drawn_beside_what_the_final_reconcile_made_of_
     run_dir = write_run(tmp_path, {1: ["1.1", "2.1"], 2: ["1.1", "2.1"]}, result_of([1, 2]))
     write_exports(run_dir / BEFORE_FINAL_RECONCILE, {1: ["1.1", "2.1"], 2: ["1.1"]})
     page = write_report(RunArchive(run_dir)).read_text()
-    assert "As the mission left them" in page
+    assert "At the end of the mission" in page
     assert "After the final reconcile" in page
     identifiers = re.findall(r' id="([^"]+)"', page)
     assert len(identifiers) == len(set(identifiers))

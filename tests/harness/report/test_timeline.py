@@ -84,7 +84,7 @@ def test_every_kind_of_thing_is_drawn_with_a_title_and_explained(troubled: Path)
     ):
         assert re.search(f"<title>{pattern}", html), pattern
     text = Reader(html).text
-    for meaning in ("vote approved", "reconcile, phase 3", "lost", "paused", "reboots", "network parted"):
+    for meaning in ("vote approved", "reconcile, phase 3", "lost", "paused", "reboots", "network partitioned"):
         assert meaning in text
 
 
@@ -139,7 +139,7 @@ def test_a_long_restless_run_is_thinned_and_says_so() -> None:
     assert picture.notes == [
         "Of 10000 votes the 6000 longest are drawn",
         "Of 10000 reconciles the 6000 longest are drawn",
-        "Reconciles are drawn as one bar each: there are too many phases",
+        "Each reconcile is drawn as one bar, because there are too many phases",
     ]
     assert [meaning for _, meaning in picture.legend] == ["vote approved", "commit", "reconcile", "tie"]
     voters = {agent for agent in range(1, 51) if f"agent {agent}: vote" in picture.drawing}
@@ -171,7 +171,7 @@ def test_messages_above_a_limit_are_left_out_and_that_is_said(
     monkeypatch.setattr(module, limit, 10)
     html = html_of(troubled)
     assert 'data-messages="null"' in html
-    assert "Messages are left out" in html
+    assert "Messages are not drawn" in html
     assert said in html
 
 
@@ -228,7 +228,7 @@ def test_a_swarm_that_goes_round_in_circles_has_a_bracket_for_each_round(tmp_pat
     )
     assert "every 15 s since 11 s" in page
     assert "agent 1, as agents 2, 3, 4 and 5, runs vote_timer_expiration (not approved)" in page
-    assert "goes round" in page
+    assert "repeats a cycle" in page
 
 
 def test_a_swarm_that_finishes_has_no_brackets(troubled: Path) -> None:

@@ -117,7 +117,8 @@ def test_an_agent_that_crashes_ends_the_run_and_is_named_and_the_others_export(t
     status, _, err = run.end()
     assert status == 1
     assert sentences(err)[0] == (
-        "agent 2 ended by itself with SIGKILL; its log is agents/2.log; what there was has been exported and checked"
+        "agent 2 ended by itself with SIGKILL; its log is agents/2.log; the chains and traces written before that are "
+        "exported and checked"
     )
     record = run.record()
     assert record["agents"]["2"]["outcome"] == "crashed"
@@ -134,7 +135,7 @@ def test_an_agent_that_hangs_ends_the_run_and_is_named(tmp_path: Path, monkeypat
     run.signal_agent(3, signal.SIGSTOP)
     status, _, err = run.end()
     assert status == 1
-    assert re.match("agent 3 stopped answering: no answer to status for", sentences(err)[0])
+    assert re.match("agent 3 stopped answering: no answer to status within", sentences(err)[0])
     assert run.record()["agents"]["3"]["outcome"] == "hung"
     assert not processes(run.out)
 
@@ -300,20 +301,20 @@ sys.exit(ucp.node.main(sys.argv[1:], Mine))
 @pytest.mark.parametrize(
     ("command", "sentence"),
     [
-        (["./nowhere"], "`agent_command`: ./nowhere is no program: give a path from {here}, or a name on PATH"),
+        (["./nowhere"], "`agent_command`: ./nowhere is not a program: give a path from {here}, or a name on PATH"),
         (
             {3: ["./nowhere"]},
-            "`agent_command` of agent 3: ./nowhere is no program: give a path from {here}, or a name on PATH",
+            "`agent_command` of agent 3: ./nowhere is not a program: give a path from {here}, or a name on PATH",
         ),
         (
             {3: ["{notes}"]},
-            "`agent_command` of agent 3: {notes} is a file that may not be executed: chmod +x, or name ",
+            "`agent_command` of agent 3: {notes} is not executable: make it executable (chmod +x), or put ",
         ),
         (
             {3: ["{script}"]},
-            "`agent_command` of agent 3: the first line of {script} names /no/such, and ",
+            "`agent_command` of agent 3: the first line of {script} names /no/such, which does not exist",
         ),
-        ({3: ["/usr"]}, "`agent_command` of agent 3: /usr is no program: give a path, or a name on PATH"),
+        ({3: ["/usr"]}, "`agent_command` of agent 3: /usr is not a program: give a path, or a name on PATH"),
     ],
 )
 @pytest.mark.whoever
@@ -336,7 +337,7 @@ def test_a_file_that_is_no_program_after_all_is_the_scenarios_mistake(tmp_path: 
         "run", write_scenario(tmp_path, agent_command={3: [str(agent), "[/bold]"]}), "--out", tmp_path / "run"
     )
     assert done.returncode == 2
-    assert "`agent_command` of agent 3: The agent could not be started: [Errno 8] Exec format error" in done.stderr
+    assert "`agent_command` of agent 3: The agent cannot be started: [Errno 8] Exec format error" in done.stderr
     assert "agent 3 ran" in done.stdout and "[/bold]" in done.stdout
 
 
@@ -358,12 +359,12 @@ def test_an_agent_that_ends_with_127_at_its_start_is_not_judged(tmp_path: Path, 
     done = harness("run", scenario, "--out", tmp_path / "run")
     assert done.returncode == 3
     why = f"not supported by agent 2 ({shlex.quote(str(agent))} --x): {words or 'it does not say why'}"
-    assert sentences(done.stderr) == [f"{why}; nothing is judged"]
+    assert sentences(done.stderr) == [f"{why}; the run has no verdict"]
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (record["outcome"], record["outcome_detail"]) == ("not supported", why)
     assert set(verdicts(record).values()) == {"not applicable"}
     assert record["agents"]["2"]["outcome"] == "not supported"
-    assert "This run is not judged" in (tmp_path / "run" / "report.html").read_text()
+    assert "This run has no verdict" in (tmp_path / "run" / "report.html").read_text()
     assert 'failures="0"' in (tmp_path / "run" / "junit.xml").read_text()
     assert harness("check", tmp_path / "run").returncode == 3
 
@@ -375,7 +376,7 @@ def test_what_is_not_supported_half_way_leaves_no_verdict_either(tmp_path: Path)
     done = harness("run", write_scenario(tmp_path, agent_command={2: command}, **keys), "--out", tmp_path / "run")
     assert done.returncode == 3
     asked = f"not supported by agent 2 ({shlex.join(command)}): asked to stop_events, it says: mine has no stop_events"
-    assert sentences(done.stderr) == [f"{asked}; nothing is judged"]
+    assert sentences(done.stderr) == [f"{asked}; the run has no verdict"]
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert set(verdicts(record).values()) == {"not applicable"}
     assert 60 <= record["mission_s"] < 200

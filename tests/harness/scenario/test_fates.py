@@ -64,7 +64,7 @@ def test_the_field_tests_crash_on_a_tie_is_found_out() -> None:
     simulated = simulate(one, 1, tracing=True)
     distributed = simulated.result.characteristics["1"]
     assert distributed.verdict == "violated"
-    assert "a reconcile did not go on" in distributed.evidence[0].detail
+    assert "a reconcile did not continue" in distributed.evidence[0].detail
     assert (distributed.evidence[0].agent_id, simulated.played.settled) == (1, False)
 
 
@@ -153,8 +153,8 @@ def test_a_fate_that_never_matched_is_reported_and_the_run_is_no_proof(tmp_path:
     assert finished.exit_status == WRONG_REQUEST
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert record["unmatched_fates"] == [
-        "fates.0 (drop Commit Block of block 3.7 to 2) never matched a message",
-        "fates.1 (name 'never' Block Response) never matched a message",
+        "fates.0 (drop Commit Block of block 3.7 to 2) matched no message",
+        "fates.1 (name 'never' Block Response) matched no message",
         "fates.2 (deliver after 'never' Commit Block): the message that 'never' is about never arrived",
     ]
 
@@ -167,9 +167,9 @@ def test_a_fate_that_never_matched_is_reported_and_the_run_is_no_proof(tmp_path:
         ({"message": "Commit", "drop": True}, "'Block Add Request', 'Block Add Response'"),
         ({"block": 4.1, "drop": True}, "should be quoted, as in"),
         ({"block": "4", "drop": True}, "the number of its block"),
-        ({"sender": 9, "drop": True}, "fates.0.sender names vehicle 9, which does not exist: there are 1, 2, 3"),
+        ({"sender": 9, "drop": True}, "fates.0.sender names vehicle 9, which is not on the roster: use one of 1, 2, 3"),
         ({"block": "9.1", "drop": True}, "fates.0.block names vehicle 9"),
-        ({"after": "x"}, "fates.0.after 'x' is the name of no fate"),
+        ({"after": "x"}, "fates.0.after 'x' is not the name of a fate"),
         ({"from_s": 5, "until_s": 5, "drop": True}, "from_s 5 is not before until_s 5"),
         ({"count": 0, "drop": True}, "greater than or equal to 1"),
     ],

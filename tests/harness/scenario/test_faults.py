@@ -43,7 +43,7 @@ def test_a_killed_agent_is_gone_with_all_that_it_held() -> None:
     assert max(run.t for run in simulated.evidence.traces[2].runs) <= 300
     assert verdicts(simulated) == {"holds"}
     blocks, left = simulated.result.figures["blocks"], len(simulated.evidence.exports[1].chain)
-    gone = f"; {blocks - left} more were gone with the agents that were killed" if blocks != left else ""  # type: ignore[operator]
+    gone = f"; {blocks - left} more were lost with agents that were killed" if blocks != left else ""  # type: ignore[operator]
     assert simulated.result.characteristics["5"].reason == f"all {left} completed blocks are in every chain{gone}"
 
 
@@ -52,7 +52,7 @@ def test_blocks_that_only_a_killed_agent_held_are_told_and_no_violation() -> Non
     simulated = played(alone, agents=3, final_reconcile=True)
     everywhere = simulated.result.characteristics["5"]
     assert everywhere.verdict == "holds"
-    assert "more were gone with the agents that were killed" in everywhere.reason
+    assert "more were lost with agents that were killed" in everywhere.reason
     assert simulated.result.figures["copies_min"] == 0
 
 
@@ -227,21 +227,27 @@ def test_agents_agree_whatever_their_clocks_show(offset_s: float, drift: float) 
 @pytest.mark.parametrize(
     ("timeline", "sentence"),
     [
-        ([{"at_s": 1, "restart": [1]}], "timeline.0.restart: agent 1 is running then, not killed"),
-        ([{"at_s": 1, "kill": [1]}, {"at_s": 2, "pause": [1]}], "timeline.1.pause: agent 1 is killed then"),
-        ([{"at_s": 2, "resume": [1]}], "timeline.0.resume: agent 1 is running then, not paused"),
-        ([{"at_s": 2, "kill": [1, 1]}], "agent 1 is killed then"),
-        ([{"at_s": 2, "kill": [9]}], "timeline.0.kill names vehicle 9, which does not exist"),
+        ([{"at_s": 1, "restart": [1]}], "timeline.0.restart: agent 1 is running at that time, not killed"),
+        ([{"at_s": 1, "kill": [1]}, {"at_s": 2, "pause": [1]}], "timeline.1.pause: agent 1 is killed at that time"),
+        ([{"at_s": 2, "resume": [1]}], "timeline.0.resume: agent 1 is running at that time, not paused"),
+        ([{"at_s": 2, "kill": [1, 1]}], "agent 1 is killed at that time"),
+        ([{"at_s": 2, "kill": [9]}], "timeline.0.kill names vehicle 9, which is not on the roster"),
         ([{"at_s": 2, "kill": []}], "at least 1 item"),
         ([{"at_s": 2, "kill": [1], "heal": True}], "needs exactly one of"),
-        ([{"at_s": 2, "crash": [9]}], "timeline.0.crash names vehicle 9, which does not exist"),
-        ([{"at_s": 1, "kill": [1]}, REBOOT], "timeline.1.reboot: agent 1 is killed then, not running or paused"),
-        ([REBOOT, {"at_s": 25, "kill": [1]}], "timeline.1.kill: agent 1 is rebooting then, not running or paused"),
+        ([{"at_s": 2, "crash": [9]}], "timeline.0.crash names vehicle 9, which is not on the roster"),
+        (
+            [{"at_s": 1, "kill": [1]}, REBOOT],
+            "timeline.1.reboot: agent 1 is killed at that time, not running or paused",
+        ),
+        (
+            [REBOOT, {"at_s": 25, "kill": [1]}],
+            "timeline.1.kill: agent 1 is rebooting at that time, not running or paused",
+        ),
         ([{**REBOOT, "down_s": 1191}], "its agents would be back at 1201 s, after the mission's end at 1200 s"),
         ([{"at_s": 10, "reboot": [1], "disk": "kept"}], "a reboot needs `down_s`"),
         ([{"at_s": 10, "reboot": [1], "down_s": 20}], "a reboot needs .* `disk: kept` or `disk: lost`"),
         ([{"at_s": 10, "kill": [1], "disk": "lost"}], "`down_s` and `disk` belong to `reboot`"),
-        ([{"at_s": 10, "kill": [1, 2, 3]}, {"at_s": 20, "crash": [4, 5]}], "the timeline leaves nobody"),
+        ([{"at_s": 10, "kill": [1, 2, 3]}, {"at_s": 20, "crash": [4, 5]}], "the timeline kills all agents"),
     ],
 )
 def test_faults_that_cannot_be_played_are_refused(timeline: list[dict[str, Any]], sentence: str) -> None:
@@ -295,7 +301,7 @@ def test_what_only_a_switched_off_agent_holds_is_at_home_with_it_and_no_violatio
     alone = [{"at_s": 0, "partition": [[1], [2, 3]]}, {"at_s": 400, "switch_off": [1]}, {"at_s": 401, "heal": True}]
     simulated = played(alone, agents=3, final_reconcile=True)
     assert not simulated.result.bad
-    assert "8 more were gone with the agents that were killed or switched off" in (
+    assert "8 more were lost with agents that were killed or switched off" in (
         simulated.result.characteristics["5"].reason
     )
 
@@ -311,5 +317,5 @@ def test_nobody_has_to_finish_who_is_switched_off() -> None:
 
 
 def test_who_is_switched_off_stays_off() -> None:
-    with pytest.raises(ValidationError, match="agent 2 is switched off then, not killed"):
+    with pytest.raises(ValidationError, match="agent 2 is switched off at that time, not killed"):
         faulty([{"at_s": 300, "switch_off": [2]}, {"at_s": 400, "restart": [2]}])

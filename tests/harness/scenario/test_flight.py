@@ -43,13 +43,16 @@ def test_a_plan_is_read_as_written(tmp_path: Path) -> None:
         ({"plan": [UP] * 101}, "at most 100 items"),
         ({"plan": [{**UP, **DOWN}]}, "`flight.0.plan.0`.* needs exactly one of `take_off`, `go_to`, `loiter_s`"),
         ({"plan": [{"take_off": 20, "speed_ms": 5}]}, "`altitude_m` and `speed_ms` belong to a `go_to`"),
-        ({"plan": [UP, {"goto": [1, 2]}]}, "`flight.0.plan.1.goto` is unknown: there are take_off, go_to"),
+        ({"plan": [UP, {"goto": [1, 2]}]}, "`flight.0.plan.1.goto` is unknown: use one of take_off, go_to"),
         ({"plan": [THERE]}, r"flight.0.plan, for vehicle 1: the plan of a copter begins with take_off"),
         ({"plan": [UP, {"go_to": [100_000, 100]}]}, "farther than 100 km from home"),
         ({"plan": [UP, {"go_to": [0, float("nan")]}]}, "farther than 100 km from home"),
         ({"plan": [UP], "vehicles": [118]}, "for vehicle 118: leg 1 .* a rover neither takes off nor lands"),
-        ({"plan": [UP], "vehicles": [1, 2, 1]}, "`flight` names vehicle 1 twice: a vehicle flies one plan"),
-        ({"plan": [UP], "vehicles": [7]}, "flight.0.vehicles names vehicle 7, which does not exist: there are 1, 2"),
+        ({"plan": [UP], "vehicles": [1, 2, 1]}, "`flight` names vehicle 1 twice: a vehicle has one plan"),
+        (
+            {"plan": [UP], "vehicles": [7]},
+            "flight.0.vehicles names vehicle 7, which is not on the roster: use one of 1, 2",
+        ),
         ({"plan": [UP], "vehicles": []}, r"`flight.0.vehicles` is \[\]"),
         ({"plan": [UP], "by": "stick"}, "`flight.0.by` is 'stick': it should be 'mission' or 'guided'"),
     ],
@@ -63,14 +66,14 @@ def test_a_plan_that_cannot_be_flown_is_one_sentence(keys: dict[str, Any], sente
 @pytest.mark.parametrize(
     ("vehicles", "sentence"),
     [
-        ({"kind": "none"}, "`flight` needs vehicles, and `vehicles.kind` is none"),
+        ({"kind": "none"}, "`flight` needs vehicles, but `vehicles.kind` is none"),
         (
             {"types": {2: "plane"}, "binary": "/bin/x"},
-            "`vehicles.binary` is one program, and there are copter and plane",
+            "`vehicles.binary` is one program, but the vehicles are of types copter and plane",
         ),
-        ({"types": {7: "plane"}}, "vehicles.types names vehicle 7, which does not exist"),
+        ({"types": {7: "plane"}}, "vehicles.types names vehicle 7, which is not on the roster"),
         ({"types": {2: "boat"}}, "`vehicles.types.2` is 'boat': it should be 'copter', 'plane' or 'rover'"),
-        ({"home": [0, 0, 10, 0]}, "`vehicles.home` is .* ArduPilot's word for no position"),
+        ({"home": [0, 0, 10, 0]}, "`vehicles.home` is .* reads latitude and longitude 0 as no position"),
         ({"spacing_m": 0}, "`vehicles.spacing_m` is 0: it should be greater than 0"),
     ],
 )

@@ -33,13 +33,13 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("name: x\nspeedpu: 3", "`speedpu` is unknown: there are name, about, agents"),
-        ("name: x\nscenario: {name: y}", "this is a matrix, which `ucp-harness matrix "),
+        ("name: x\nspeedpu: 3", "`speedpu` is unknown: use one of name, about, agents"),
+        ("name: x\nscenario: {name: y}", "this is a matrix: play it with `ucp-harness matrix "),
         ("name: x\nspeedpu: 3", "; did you mean `speedup`?"),
         ("name: x\ntimeline: [{at_s: 1, kill: 2}]", "`timeline.0.kill` is 2: it should be a valid list, as [2]"),
         (
             "name: x\nnetwork: {lost: 1}",
-            "`network.lost` is unknown: there are loss, delay, duplicate, reorder, corrupt, rate, limit, "
+            "`network.lost` is unknown: use one of loss, delay, duplicate, reorder, corrupt, rate, limit, "
             "receivers, links",
         ),
         ("name: x\ntimeline: [{at_s: 1, heel: true}]", "`timeline.0.heel` is unknown"),
@@ -49,7 +49,7 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
         ("name: x\nnetwork: {loss: much}", "`network.loss` is 'much': it should be a valid number"),
         ("name: x\nnetwork: {loss: {p: 2, r: 1}}", "`network.loss.p` is 2: it should be less than or equal to 1"),
         ("name: x\nnetwork: {loss: {p: 1}}", "`network.loss.r` is missing"),
-        ("name: x\nnetwork: {loss: {p: 1, r: 1, h: 1}}", "`network.loss.h` is unknown: there are p, r, loss_bad"),
+        ("name: x\nnetwork: {loss: {p: 1, r: 1, h: 1}}", "`network.loss.h` is unknown: use one of p, r, loss_bad"),
         ("name: x\nnetwork: {delay: -1}", "`network.delay` is -1: it should be greater than or equal to 0"),
         ("name: x\nnetwork: {delay: 61}", "`network.delay` is 61: it should be less than or equal to 60"),
         (
@@ -70,7 +70,10 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
         ("name: x\nnetwork: {rate: 1000, limit: 1.5}", "`network.limit` is 1.5: it should be a valid integer"),
         ("name: x\nnetwork: {limit: 10}", "limit: 10 needs a delay or a rate to wait for"),
         ("name: x\nnetwork: {rate: 9, limit: 9, receivers: {3: {rate: none}}}", "receivers.3: limit: 9 needs a delay"),
-        ("name: x\nnetwork: {receivers: {3: {los: 0}}}", "`network.receivers.3.los` is unknown: there are loss, delay"),
+        (
+            "name: x\nnetwork: {receivers: {3: {los: 0}}}",
+            "`network.receivers.3.los` is unknown: use one of loss, delay",
+        ),
         ("name: x\nnetwork: {links: [{from: 1}]}", "`network.links.0.to` is missing"),
         ("name: x\nnetwork: {links: [{from: 1, to: []}]}", "`network.links.0.to` is []: List should have at least 1"),
         (
@@ -82,11 +85,20 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
         ("name: x\nnetwork: {links: [{from: [1, 2], to: [2, 1]}]}", "links.0: a link from vehicle 1 to itself"),
         (
             "name: x\nnetwork: {links: [{from: 1, to: 2, both: true}, {from: 2, to: 1}]}",
-            "links.1: from 2 to 1 is named twice: which one counts?",
+            "links.1: from 2 to 1 is named twice: leave out one of them",
         ),
-        ("name: x\nnetwork: {links: [{from: 1, to: 9}]}", "network.links.0.to names vehicle 9, which does not exist"),
-        ("name: x\nnetwork: {links: [{from: 9, to: 1}]}", "network.links.0.from names vehicle 9, which does not exist"),
-        ("name: x\nnetwork: {receivers: {9: {loss: 0.1}}}", "vehicle 9, which does not exist: there are 1, 2, 3, 4, 5"),
+        (
+            "name: x\nnetwork: {links: [{from: 1, to: 9}]}",
+            "network.links.0.to names vehicle 9, which is not on the roster",
+        ),
+        (
+            "name: x\nnetwork: {links: [{from: 9, to: 1}]}",
+            "network.links.0.from names vehicle 9, which is not on the roster",
+        ),
+        (
+            "name: x\nnetwork: {receivers: {9: {loss: 0.1}}}",
+            "vehicle 9, which is not on the roster: use one of 1, 2, 3, 4, 5",
+        ),
         ("name: x\ntimeline: [{at_s: 1, partition: [[1], [9]]}]", "unknown vehicle 9"),
         ("name: x\ntimeline: [{at_s: 1, partition: [[1], [1, 2]]}]", "vehicle 1 is in an earlier group too"),
         ("name: x\ntimeline: [{at_s: 1, heal: true}, {at_s: 1, loss: 0}]", "two entries"),
@@ -96,7 +108,7 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
         ("name: x\nagents: [1, 1]", "names 1 twice"),
         ("name: x\nagents: [1, 70000]", "70000 is not an agent ID"),
         ("name: x\nspeedup: 0", "`speedup` is 0: it should be greater than 0"),
-        ("name: x\nsettings: {vote: 1}", "vote is unknown: there are vote_timeout_s"),
+        ("name: x\nsettings: {vote: 1}", "vote is unknown: use one of vote_timeout_s"),
         ("name: x\nsettings: {vote_timeout_s: -1}", "vote_timeout_s must be more than 0"),
         ("name: x\nquirks: {ignore_commit: 2}", "probability 0..1"),
         ("name: x\nquirks: {hide_commits: 1}", "hide_commits is true or false, not 1"),
@@ -104,43 +116,43 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
         ("name: x\nquirks: {5: true}", "unknown quirk '5'"),
         (
             "name: x\nquirks: {crash_on_tie: {agents: [9]}}",
-            "quirks.crash_on_tie.agents names vehicle 9, which does not",
+            "quirks.crash_on_tie.agents names vehicle 9, which is not on the roster",
         ),
         ("name: x\nquirks: {crash_on_tie: {agents: []}}", "at least 1 item"),
         ("name: x\nquirks: {crash_on_tie: {agents: [1], value: 1}}", "crash_on_tie is true or false, not 1"),
         ("name: x\nquirks: {ignore_commit: {agents: [1]}}", "ignore_commit is a probability 0..1, not True"),
         (
             "name: x\nquirks: {crash_on_tie: {agents: [1], valu: false}}",
-            "`quirks.crash_on_tie.valu` is unknown: there are agents, value",
+            "`quirks.crash_on_tie.valu` is unknown: use one of agents, value",
         ),
         (
             "name: x\nagent_command: ./mine",
-            "`agent_command` is './mine': it should be a program and its arguments, as a",
+            "`agent_command` is './mine': it must be a program and its arguments, as a",
         ),
         ("name: x\nagent_command: []", "or a mapping of agent IDs to such lists"),
-        ("name: x\nagent_command: {2: ./mine}", "agent 2 needs a program and its arguments, as a list"),
-        ("name: x\nagent_command: {two: [./mine]}", "'two' is not an agent ID: it should be 1..65535"),
+        ("name: x\nagent_command: {2: ./mine}", "agent 2 needs a list of a program and its arguments"),
+        ("name: x\nagent_command: {two: [./mine]}", "'two' is not an agent ID: use 1..65535"),
         (
             "name: x\nagent_command: {9: [./mine]}",
-            "agent_command names vehicle 9, which does not exist: there are 1, 2",
+            "agent_command names vehicle 9, which is not on the roster: use one of 1, 2",
         ),
         ('name: x\nagent_command: ["./mine\\0"]', "a program and its arguments, as a list"),
         ("name: x\nvehicles: {kind: boat}", "it should be 'ardupilot', 'embedded' or 'none'"),
         ("name: x\nvehicles: {home: [100, 0, 0, 0]}", "latitude -90..90"),
         ("name: [x", "not YAML at line 1"),
-        ("name: x\ntimeline: [{at: 3, kill: [2]}]", "`timeline.0.at` is unknown: there are"),
+        ("name: x\ntimeline: [{at: 3, kill: [2]}]", "`timeline.0.at` is unknown: use one of"),
         ('name: x\nlateness: {1: "0+1;2+3"}', 'it should be numbers and seconds, as in "3+0.25 8+1"'),
         (
             'name: x\nfates: [{block: "1-1", drop: true}]',
-            'should be an agent and the number of its block, as in "4.11"',
+            'must be an agent and the number of its block, such as "4.11"',
         ),
         ("name: x\nduration_s: 0x" + "f" * 5000, "is a number of thousands of digits: it should"),
         ('name: x\n"foo\\nbar": 1', r"`'foo\nbar'` is unknown"),
         (
             "name: x\nnetwork: {loss: 0.1}\nagents: 3\nnetwork: {loss: 0.2}",
-            "not YAML at line 4: network is there twice",
+            "not YAML at line 4: network is repeated",
         ),
-        ("name: x\nnetwork: {loss: 0.1, loss: 0.2}", "not YAML at line 2: loss is there twice"),
+        ("name: x\nnetwork: {loss: 0.1, loss: 0.2}", "not YAML at line 2: loss is repeated"),
         ("- 1", "a YAML mapping"),
         ("!!python/object/apply:os.system ['true']", "not YAML"),
     ],
@@ -164,7 +176,7 @@ def test_an_alias_bomb_is_refused_at_once(tmp_path: Path) -> None:
 
 
 def test_a_missing_or_oversized_file_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match="there is no such file or scenario; `ucp-harness scenarios` lists"):
+    with pytest.raises(ScenarioError, match="no such file or scenario; `ucp-harness scenarios` lists"):
         load_scenario(tmp_path / "none.yaml")
     with pytest.raises(ScenarioError, match="larger than"):
         load_scenario(write(tmp_path, "#" * 9_000_000))

@@ -247,7 +247,10 @@ def rogue(run: Simulated, seed: int) -> None:
     assert {finding.agent_id for finding in violated["4"].evidence} == {1, 2, 3, 4, 5}
     (forged,) = {finding.block for finding in violated["4"].evidence}
     assert forged not in map(run.evidence.name, run.evidence.completed_blocks())
-    at_600_s = f"holds block {forged}, which agent 2 never completed; it came at t=600.026 s, by receive_commit_block"
+    at_600_s = (
+        f"holds block {forged}, which agent 2 never completed; the block arrived at t=600.026 s, in "
+        "receive_commit_block"
+    )
     assert [finding.detail for finding in violated["4"].evidence if finding.agent_id != 2] == [at_600_s] * 4
     assert all("Commit Block" in finding.detail for finding in violated["1"].evidence)
     assert all("which agent 2 never sent" in finding.detail for finding in violated["1"].evidence)
@@ -284,7 +287,10 @@ def captured(run: Simulated, seed: int) -> None:
     violated = {number: one for number, one in run.result.characteristics.items() if one.verdict == "violated"}
     assert set(violated) == {"1", "4"}
     assert {finding.agent_id for finding in violated["4"].evidence} == {1, 2, 4, 5}
-    never_made = "holds block 3.1, which agent 3 never completed, signed with its key, which others must have"
+    never_made = (
+        "holds block 3.1, which agent 3 never completed, although the block is signed with its key, so its "
+        "key is known to others"
+    )
     assert all(finding.detail.startswith(never_made) for finding in violated["4"].evidence)
     unsigned = {"not signed by its sender": 1}
     dropped = {agent_id for agent_id, agent in run.played.agents.items() if agent["dropped"] == unsigned}

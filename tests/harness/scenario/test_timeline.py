@@ -84,12 +84,12 @@ def test_within_a_change_another_may_pass_and_then_the_outer_one_holds_again() -
     [
         (
             [{"at_s": 10, "loss": 0.5, "for_s": 20}, {"at_s": 20, "loss": 0.1, "for_s": 20}],
-            r"timeline.1 changes loss until 40 s, and timeline.0 until 30 s: which holds when\? "
-            r"Have timeline.1 begin then, or be over by then",
+            r"timeline.1 changes loss until 40 s, but timeline.0 changes it until 30 s: "
+            r"let timeline.1 begin at that time, or end before it",
         ),
         (
             [{"at_s": 20, "loss": 0.1}, {"at_s": 10, "network": {"loss": 0.5}, "for_s": 20}],
-            r"timeline.0 changes loss for good, and timeline.1 until 30 s",
+            r"timeline.0 changes loss for good, but timeline.1 changes it until 30 s",
         ),
         (
             [
@@ -100,7 +100,7 @@ def test_within_a_change_another_may_pass_and_then_the_outer_one_holds_again() -
         ),
         (
             [{"at_s": 10, "partition": [[1]], "for_s": 20}, {"at_s": 20, "heal": True}],
-            r"timeline.1 changes the partition for good, and timeline.0 until 30 s",
+            r"timeline.1 changes the partition for good, but timeline.0 changes it until 30 s",
         ),
         ([{"at_s": 10, "heal": True, "for_s": 20}], "`for_s` belongs to `loss`, `partition` and `network`"),
         ([{"at_s": 10, "kill": [1], "for_s": 20}], "`for_s` belongs to `loss`, `partition` and `network`"),
@@ -110,11 +110,11 @@ def test_within_a_change_another_may_pass_and_then_the_outer_one_holds_again() -
             "timeline.0.network would last until 1210 s, after the mission's end at 1200 s",
         ),
         ([{"at_s": 10, "network": {}}], "needs at least one of `loss`, `delay`, .*`links`"),
-        ([{"at_s": 10, "network": {"loss": 0.1}, "loss": 0.1}], "are the same thing: leave one of them out"),
+        ([{"at_s": 10, "network": {"loss": 0.1}, "loss": 0.1}], "are the same setting: leave out one of them"),
         ([{"at_s": 10, "network": {"delay": 0.1}, "loss": 0.1}], "needs exactly one of `loss`, `partition`"),
         (
             [{"at_s": 10, "network": {"links": [{"from": 1, "to": 9}]}}],
-            r"timeline.0.network.links.0.to names vehicle 9, which does not exist",
+            r"timeline.0.network.links.0.to names vehicle 9, which is not on the roster",
         ),
         (
             [{"at_s": 10, "network": {"links": [{"from": 1, "to": 2}, {"from": 1, "to": 2}]}}],
@@ -135,10 +135,13 @@ def test_what_means_nothing_or_two_things_is_refused(timeline: list[dict[str, An
 @pytest.mark.parametrize(
     ("entry", "sentence"),
     [
-        ("{at_s: 1, network: {lost: 1}}", "`timeline.0.network.lost` is unknown: there are loss, delay, duplicate"),
-        ("{at_s: 1, network: {radio: {log_distance: {}}}}", "`timeline.0.network.radio` is unknown: there are loss"),
+        ("{at_s: 1, network: {lost: 1}}", "`timeline.0.network.lost` is unknown: use one of loss, delay, duplicate"),
+        ("{at_s: 1, network: {radio: {log_distance: {}}}}", "`timeline.0.network.radio` is unknown: use one of loss"),
         ("{at_s: 1, network: {delay: -1}}", "`timeline.0.network.delay` is -1: it should be greater than or equal"),
-        ("{at_s: 1, delay: 0.5}", "`timeline.0.delay` is 0.5: it is what a rogue node does; `network: {delay: 0.5}`"),
+        (
+            "{at_s: 1, delay: 0.5}",
+            "`timeline.0.delay` is 0.5: it is an action of a rogue node; `network: {delay: 0.5}`",
+        ),
     ],
 )
 def test_a_mistake_names_the_key_and_what_is_allowed(tmp_path: Path, entry: str, sentence: str) -> None:
@@ -176,13 +179,13 @@ def test_schedules_speak_the_language_of_the_timeline() -> None:
 @pytest.mark.parametrize(
     ("schedule", "sentence"),
     [
-        ({"ramp": {"network": [{"loss": 0}, {"delay": 1}]}}, "is in one `network` of the two: from what, or to what"),
-        ({"ramp": {"network": [{"rate": "none"}, {"rate": 9}]}}, "rate is 'none': a ramp goes from one number"),
-        ({"ramp": {"network": [{"loss": 0}, {"loss": 1}], "loss": [0, 1]}}, "are the same thing"),
+        ({"ramp": {"network": [{"loss": 0}, {"delay": 1}]}}, "is in one `network` of the ramp only: give it in both"),
+        ({"ramp": {"network": [{"rate": "none"}, {"rate": 9}]}}, "rate is 'none': a ramp needs two numbers"),
+        ({"ramp": {"network": [{"loss": 0}, {"loss": 1}], "loss": [0, 1]}}, "are the same setting"),
         ({"ramp": {"network": [ONE_WAY, {"links": [{"from": 1, "to": 9, "loss": 1}]}]}}, "loss from 1 to . is in one"),
         (
             {"repeat": {"network": {"receivers": {9: {"loss": 1}}}}, "every_s": 9, "for_s": 1},
-            "schedule.0.repeat.network.receivers names vehicle 9, which does not exist",
+            "schedule.0.repeat.network.receivers names vehicle 9, which is not on the roster",
         ),
         ({"repeat": {"network": {"limit": 9}}, "every_s": 9, "for_s": 1}, "schedule.0, at 0 s: limit: 9 needs a delay"),
     ],

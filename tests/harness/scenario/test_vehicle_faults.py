@@ -49,11 +49,11 @@ def test_all_of_them_are_there_and_their_records_are_known() -> None:
 @pytest.mark.parametrize(
     ("entry", "vehicles", "sentence"),
     [
-        ({"lose_gps": [1]}, {"kind": "none"}, "timeline.0.lose_gps needs vehicles that it can befall"),
+        ({"lose_gps": [1]}, {"kind": "none"}, "timeline.0.lose_gps needs vehicles, but `vehicles.kind` is none"),
         ({"stop_motor": [2]}, {"type": "plane"}, "timeline.0.stop_motor befalls a copter, and vehicle 2 is a plane"),
         ({"battery": [1]}, {}, "a battery needs `volts`, for example 10.4"),
         ({"wind": [1], "wind_ms": 5, "from_deg": 400}, {}, "timeline.0.from_deg"),
-        ({"lose_gps": [7]}, {}, "names vehicle 7, which does not exist"),
+        ({"lose_gps": [7]}, {}, "names vehicle 7, which is not on the roster"),
     ],
 )
 def test_what_cannot_be_is_one_sentence(entry: dict[str, Any], vehicles: dict[str, Any], sentence: str) -> None:
@@ -66,7 +66,7 @@ def test_virtual_time_refuses_it(tmp_path: Path) -> None:
     (tmp_path / "trouble.yaml").write_text(yaml.safe_dump(scenario(TROUBLE)))
     run = harness("run", tmp_path / "trouble.yaml", "--backend", "sim", "--out", tmp_path / "run")
     assert run.returncode == 2
-    assert "`lose_gps`, `battery`, `lose_compass`, `regain_gps` need vehicles that fly" in run.stderr
+    assert "`lose_gps`, `battery`, `lose_compass`, `regain_gps` need flying vehicles" in run.stderr
 
 
 @pytest.mark.lab
@@ -94,7 +94,7 @@ def test_a_run_in_which_vehicles_are_in_trouble_goes_on_and_says_what_they_canno
     assert modes == {"1": MODES["copter"]["LAND"], "2": MODES["copter"]["RTL"]}
     assert [fault["what"] for fault in record["faults"]] == ["lose_gps", "battery", "lose_compass", "regain_gps"]
     report = (out / "report.html").read_text()
-    assert "its vehicle is in trouble" in report
+    assert "its vehicle has a fault" in report
     assert "cannot simulate the loss of its compasses" in report
     assert re.search(r"battery at 25\S* s, lose_compass at 30\S* s: not simulated", report)
     assert record["scenario"]["timeline"][2]["volts"] == 10.4

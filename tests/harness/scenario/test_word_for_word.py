@@ -38,8 +38,8 @@ def test_an_event_and_the_inception_block_are_those_of_the_flight() -> None:
     expect = Expect.model_validate({"chains": {1: top, 2: "0" * 64, 3: top}})
     tops = {agent: export.top_chain_hash for agent, export in simulated.evidence.exports.items()}
     assert [*expect.other_chains(tops)] == [
-        f"agent 2 ends with the chain hash {top[:12]} on top, and should with 000000000000",
-        f"agent 3 has left no chain, and should end with {top[:12]} on top",
+        f"agent 2 ends with the chain hash {top[:12]} on top, but must end with 000000000000",
+        f"agent 3 has no chain, but must end with {top[:12]} on top",
     ]
 
 
@@ -93,13 +93,13 @@ def test_seconds_by_number_are_written_as_they_are_read() -> None:
     ("keys", "sentence"),
     [
         ({"fates": [{"sender": 1, "receiver": 2, "arrivals": "0@1 x"}]}, "fates.0.arrivals"),
-        ({"fates": [{"sender": 1, "arrivals": "0@1"}]}, "`arrivals` are from a `sender` to a `receiver`"),
-        ({"fates": [{"sender": 1, "receiver": 2, "count": 3, "arrivals": "0@1"}]}, "need no other key"),
-        ({"lateness": {9: "0+1"}}, "lateness names vehicle 9, which does not exist"),
+        ({"fates": [{"sender": 1, "arrivals": "0@1"}]}, "`arrivals` need `sender` and `receiver`"),
+        ({"fates": [{"sender": 1, "receiver": 2, "count": 3, "arrivals": "0@1"}]}, "exclude all other keys"),
+        ({"lateness": {9: "0+1"}}, "lateness names vehicle 9, which is not on the roster"),
         ({"lateness": {1: "0@1"}}, "lateness"),
-        ({"datagrams": [{"source": 9, "datagram": "!", "reaches": {1: 1}}]}, "it should be base64"),
+        ({"datagrams": [{"source": 9, "datagram": "!", "reaches": {1: 1}}]}, "it must be base64"),
         ({"datagrams": [{"source": 9, "datagram": "AA==", "reaches": {7: 1}}]}, "datagrams.0.reaches names vehicle 7"),
-        ({"initial_data": "?"}, "it should be base64"),
+        ({"initial_data": "?"}, "it must be base64"),
         ({"expect": {"chains": {1: "abc"}}}, "expect.chains.1"),
     ],
 )

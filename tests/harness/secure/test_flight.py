@@ -55,7 +55,7 @@ def keys(home: Home) -> list[str]:
     return ["--bundle", str(home.directory.parent / "bundles/1.bundle.json"), "--depot-key", str(home.directory)]
 
 
-FORGED = "which agent 3 never completed, signed with its key, which others must have"
+FORGED = "which agent 3 never completed, although the block is signed with its key, so its key is known to others"
 SEALED = "sealed to the depot"
 COMMANDS: list[tuple[Sequence[str], int, str]] = [
     (("check", "RUN"), 1, FORGED),
@@ -70,7 +70,7 @@ COMMANDS: list[tuple[Sequence[str], int, str]] = [
     (("packets", "RUN", "--bundle", "BUNDLE"), 0, "not signed by its sender"),
     (("packets", "RUN", "--follow", "1.1"), 2, "--bundle shows what is sealed"),
     (("packets", "RUN", "--follow", "1.1", "--bundle", "BUNDLE"), 0, "approve block 1.1"),
-    (("export", "RUN", "--mcap", "OUT"), 0, "event data is sealed to the depot: positions are not known"),
+    (("export", "RUN", "--mcap", "OUT"), 0, "event data is sealed to the depot: positions need --depot-key"),
     (("export", "RUN", "--perfetto", "OUT", "--depot-key", "HOME"), 0, "events"),
     (("import", "RUN", "--out", "OUT"), 0, "3 trace(s)"),
     (("bisect", "--once", "RUN"), 0, "characteristic 4 violated"),

@@ -105,7 +105,10 @@ def test_a_captured_vehicles_keys_forge_its_blocks_and_no_others(home: Home, tmp
     record = json.loads(dict(left)[str(tmp_path / "run/run.json")])
     genuine = record["characteristics"]["4"]
     assert genuine["verdict"] == "violated"
-    assert all("agent 3 never completed, signed with its key" in finding["detail"] for finding in genuine["evidence"])
+    assert all(
+        "agent 3 never completed, although the block is signed with its key" in finding["detail"]
+        for finding in genuine["evidence"]
+    )
     dropped = [reason for agent in record["agents"].values() for reason in agent["dropped"]]
     assert "not signed by its sender" in dropped
     assert told(secrets(home, EPOCHS), left) == []

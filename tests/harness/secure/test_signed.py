@@ -78,7 +78,7 @@ def test_signatures_that_were_not_checked_are_not_passed_over(run: Path, tmp_pat
     assert "signatures were not checked" in judgement["reason"]
     done = harness("check", whole)
     assert done.returncode == 2
-    assert "public.json is missing, which a secured run leaves" in done.stderr
+    assert "public.json is missing, although the run was secured" in done.stderr
     assert "signatures were not checked" not in genuine(run)["reason"]
 
 
@@ -90,10 +90,10 @@ def test_public_keys_that_are_damaged_are_told(home: Path) -> None:
 
 EDITS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
     (lambda block: block.pop("signature"), "without a signature"),
-    (lambda block: block.update(signature=base64.b64encode(bytes(64)).decode()), "is not agent 3's of this block"),
-    (lambda block: block.update(timestamp_us=block["timestamp_us"] + 1), "is not agent 3's of this block"),
-    (lambda block: block.update(event_data="AAAA"), "is not agent 3's of this block"),
-    (lambda block: block.update(agent_id=2), "is not agent 2's of this block"),
+    (lambda block: block.update(signature=base64.b64encode(bytes(64)).decode()), "does not match the key of agent 3"),
+    (lambda block: block.update(timestamp_us=block["timestamp_us"] + 1), "does not match the key of agent 3"),
+    (lambda block: block.update(event_data="AAAA"), "does not match the key of agent 3"),
+    (lambda block: block.update(agent_id=2), "does not match the key of agent 2"),
     (lambda block: block.update(agent_id=9), "has no key in this mission"),
 ]
 
@@ -118,7 +118,7 @@ def test_an_import_takes_the_public_keys_of_its_flight_along(home: Path, tmp_pat
     (home / "broken.json").write_text(json.dumps({**others, "mission": "no"}))
     done = harness("import", home, "--out", tmp_path / "brought in")
     assert done.returncode == 0, done.stderr
-    assert "others.json: public keys that no block here is signed with" in done.stderr
+    assert "others.json: public keys of another mission, which sign no block here" in done.stderr
     assert "broken.json: public keys, but `mission` must be" in done.stderr
     assert "left out" not in done.stdout
     judgement = genuine(tmp_path / "brought in")

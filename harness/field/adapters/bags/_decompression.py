@@ -68,7 +68,7 @@ class Topics:
             else:
                 unknown += 1
         if unknown:
-            yield Broken(f"{unknown} messages are left out whose topic stands nowhere")
+            yield Broken(f"{unknown} messages are left out because their topic is not declared")
 
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -83,18 +83,18 @@ def unpacked(compression: str, data: bytes, most_bytes: int = MAX_CHUNK_BYTES) -
         return data, ""
     unpacker = _unpacker(compression)
     if unpacker is None:
-        return b"", f"a part of it is packed by {compression[:20]!r}, which no bag is"
+        return b"", f"a part of it has the unknown compression {compression[:20]!r}"
     content = bytearray()
     for start in range(0, len(data), _STEP_BYTES):
         try:
             content += unpacker.decompress(data[start : start + _STEP_BYTES], max(most_bytes - len(content), 0))
         except Exception as error:  # each of the three has errors of its own
-            return bytes(content), f"what {compression} packed is damaged: {str(error)[:100]}"
+            return bytes(content), f"the {compression} data is damaged: {str(error)[:100]}"
         if unpacker.eof:
             return bytes(content), ""
         if len(content) >= most_bytes:
-            return bytes(content), f"what is beyond {most_bytes // 1024 // 1024} MiB of a part of it is not read"
-    return bytes(content), f"what {compression} packed breaks off"
+            return bytes(content), f"only the first {most_bytes // 1024 // 1024} MiB of a part are read"
+    return bytes(content), f"the {compression} data ends early"
 
 
 def message_data(data: bytes) -> bytes:
@@ -119,8 +119,8 @@ def unpacked_file(path: Path, copy: Path) -> str:
             try:
                 written += unpacked_copy.write(unpacker.decompress(part, _AT_ONCE))
             except Exception as error:  # its own, and not everywhere of one class
-                return f"what zstd packed is damaged: {str(error)[:100]}"
-    return "" if unpacker.eof else f"what is beyond {MAX_FILE_BYTES // 1024 // 1024} MiB is not read"
+                return f"the zstd data is damaged: {str(error)[:100]}"
+    return "" if unpacker.eof else f"only the first {MAX_FILE_BYTES // 1024 // 1024} MiB are read"
 
 
 def _unpacker(compression: str) -> Any:

@@ -31,9 +31,9 @@ def items(bag: Buffer) -> Iterator[Item]:
     reader = _Reader(topics)
     yield from reader.items(bag, len(MAGIC), 0)
     if next(reader.records, None) is None:
-        yield Broken(f"what is beyond {MAX_RECORDS} records is not read")
+        yield Broken(f"only the first {MAX_RECORDS} records are read")
     elif not reader.closed:
-        yield Broken("it was not closed, and breaks off")
+        yield Broken("it was not closed, and ends early")
     yield from topics.rest()
 
 
@@ -57,9 +57,9 @@ class _Reader:
                 following = self._next(buffer, position + 1)
                 if following is None:
                     if whole and depth:
-                        yield Broken("it breaks off, or is damaged")
+                        yield Broken("it ends early, or is damaged")
                     return
-                yield Broken("it is damaged, and goes on behind")
+                yield Broken("it is damaged in the middle; the data after the damage is read")
                 position = following
                 continue
             record = buffer[begins : min(ends, begins + MAX_CHUNK_BYTES)]

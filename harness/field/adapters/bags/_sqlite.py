@@ -51,7 +51,7 @@ def _rows(database: sqlite3.Connection) -> Iterator[Item]:
     database.text_factory = lambda text: text.decode("utf-8", "replace")
     tables = database.execute("SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN (?, ?)", _TABLES)
     if tables.fetchone() != (len(_TABLES),):
-        yield Broken("it is no ROS bag, but a database without the tables messages and topics")
+        yield Broken("it is not a ROS bag: the database has no tables messages and topics")
         return
     topics = {number: (str(name), str(kind)) for number, name, kind in database.execute(_TOPICS)}
     last = _FIRST

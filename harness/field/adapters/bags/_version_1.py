@@ -34,7 +34,7 @@ def items(bag: Buffer) -> Iterator[Item]:
     reader = _Reader(topics)
     yield from reader.items(bag, len(MAGIC), 0)
     if next(reader.records, None) is None:
-        yield Broken(f"what is beyond {MAX_RECORDS} records is not read")
+        yield Broken(f"only the first {MAX_RECORDS} records are read")
     yield from topics.rest()
 
 
@@ -52,9 +52,9 @@ class _Reader:
                 following = self._next(buffer, position + 1)
                 if following is None:
                     if whole:
-                        yield Broken("it breaks off, or is damaged")
+                        yield Broken("it ends early, or is damaged")
                     return
-                yield Broken("it is damaged, and goes on behind")
+                yield Broken("it is damaged in the middle; the data after the damage is read")
                 position = following
                 continue
             fields, data, position = record
@@ -64,7 +64,7 @@ class _Reader:
                 sound = not trouble and len(data) == _claimed(buffer, position, data)
                 yield from self.items(content, 0, depth + 1, sound)
                 if trouble or not sound:
-                    yield Broken(trouble or "it breaks off")
+                    yield Broken(trouble or "it ends early")
             elif operation == _CONNECTION:
                 self._connection(fields, data)
             elif operation == _MESSAGE and len(fields.get("time", b"")) == _TIME.size:

@@ -46,7 +46,7 @@ def draw(record: Consolidation, reconciliation: Reconciliation | None = None) ->
         summary=_summary(record, when),
         sentences=list(in_words(record)),
         findings=[
-            ("Something is wrong with these exports. What is whole of them is used.", header.problems),
+            ("These exports have errors. Their undamaged parts are used.", header.problems),
             ("Not all files are used.", header.left_out),
         ],
         remarks=header.remarks,
@@ -88,8 +88,8 @@ def _headline(record: Consolidation) -> tuple[str, str]:
     if gone:
         return f"{' and '.join(gone)} lost", "violated"
     if record.header.problems or record.header.left_out:
-        return "something is wrong with the files", "violated"
-    return "nothing is known to be lost", "holds"
+        return "the files have errors", "violated"
+    return "no known losses", "holds"
 
 
 def _summary(record: Consolidation, when: _time_chart.Span | None) -> list[str]:
@@ -105,13 +105,13 @@ def _figures(record: Consolidation, rare: list[str]) -> list[tuple[str, str]]:
     header = record.header
     building = sum(block.line.events for block in record.unfinished)
     figures: list[tuple[str, int | str]] = [
-        ("vehicles home", f"{len(record.home.latest)} of {len(header.roster)}"),
+        ("vehicles with an export", f"{len(record.home.latest)} of {len(header.roster)}"),
         ("events", header.events),
         ("blocks", header.blocks - len(record.unfinished)),
         ("blocks in the mutual chain", header.mutual_chain),
         ("distinct chains", header.distinct_chains),
         ("blocks with one vehicle only", len(rare) - len(record.unfinished)),
-        ("events in blocks being built", building),
+        ("events in current blocks", building),
         ("blocks lost", header.lost_blocks),
     ]
     return [(label, words.value(value)) for label, value in figures]
@@ -124,7 +124,7 @@ def _trees(
     exports = record.home.exports
     if len(record.blocks) > MAX_TREE_BLOCKS:
         return None
-    drawn = [("As they came home" if reconciliation else "", _tree(exports, record, ink, "home"))]
+    drawn = [("As exported" if reconciliation else "", _tree(exports, record, ink, "home"))]
     if reconciliation is not None:
         drawn.append(("After the final reconcile", _tree(reconciliation.exports, record, ink, "reconciled")))
     return drawn

@@ -24,14 +24,14 @@ GROUPS = {
     "chain": "in some chains",
     "aside": "in no chain",
     "edited": "edited",
-    "building": "being built",
+    "building": "current block",
     "lost": "lost",
 }
 PLACES = {
     "chain": "in its chain",
     "deque": "to be committed",
     "stack": "on its reconcile stack",
-    "current block": "being built",
+    "current block": "current block",
     "earlier export": "only in an earlier export",
 }
 

@@ -56,7 +56,7 @@ def draw(
     drawing = Markup(
         '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
         ' aria-labelledby="map-title map-desc" font-family="{font}" font-size="12">'
-        '<title id="map-title">Map of what was logged</title><desc id="map-desc">{desc}</desc>\n'
+        '<title id="map-title">Map of logged events</title><desc id="map-desc">{desc}</desc>\n'
         "{frame}\n{ways}\n{marks}\n{ends}</svg>\n"
     ).format(
         w=n(_LEFT + to_px.width + _RIGHT),
@@ -72,7 +72,7 @@ def draw(
         ),
         ends=_ends(ways, to_px, ink),
     )
-    notes = [] if len(shown) == len(logged) else [f"Of {len(logged)} events the map has {len(shown)}."]
+    notes = [] if len(shown) == len(logged) else [f"The map shows {len(shown)} of {len(logged)} events."]
     if far:
         notes.append(f"{far} positions more than {FARTHEST_M / 1000:.0f} km away are at the edge.")
     return Map(drawing, notes)
@@ -110,7 +110,7 @@ def _ways(
     drawn = []
     for (track, gap, _), line in zip(pieces, lines, strict=True):
         path = "M" + "L".join(f"{n(x)} {n(y)}" for x, y in line)
-        tip = f"vehicle {track.agent_id}" + (": here blocks of it were lost" if gap else "")
+        tip = f"vehicle {track.agent_id}" + (": blocks lost here" if gap else "")
         colours = ink[track.agent_id]
         drawn.append(
             Markup(
@@ -152,7 +152,7 @@ def _mark(place: Point, entry: Entry, rare: bool, ink: Ink) -> Markup:
     tip = [
         describe(entry.event.event_id, entry.event.data),
         text.moment(entry.event.timestamp_us),
-        f"block {entry.block}" + (", with one vehicle only" if rare else ""),
+        f"block {entry.block}" + (", held by one vehicle" if rare else ""),
     ]
     return Markup('<circle class="{}" cx="{}" cy="{}" r="{}" fill="{}"><title>{}</title></circle>').format(
         "logged rare" if rare else "logged", n(place[0]), n(place[1]), 3 if rare else 2.5, ink.fill, "\n".join(tip)

@@ -146,7 +146,11 @@ def _boxes(blocks: Sequence[BlockOnRecord], record: Consolidation, when: Span, a
             merged.append((last[0], max(last[1], end), looks, [*last[3], block.line.name]))
         else:
             merged.append((begin, max(end, begin + 1.5), looks, [block.line.name]))
-    means = {"building": "being built", "copies0": "with one vehicle only", f"copies{SHADES - 1}": "with all vehicles"}
+    means = {
+        "building": "current block",
+        "copies0": "with one vehicle only",
+        f"copies{SHADES - 1}": "with all vehicles",
+    }
     return Markup("").join(
         Markup('<rect class="{}" x="{}" y="{}" width="{}" height="{}"><title>{}</title></rect>').format(
             looks, n(begin), n(top), n(end - begin), BOXES, f"{_named(names)}: {means.get(looks, 'with some vehicles')}"
@@ -179,7 +183,7 @@ def _losses(
         yield _hatched(begin, end, top, f"{_named(names)}: lost")
     if any(missing.agent_id == agent_id for missing in record.missing):
         begin = max((end for _, end in reach.values()), default=across.start)
-        yield _hatched(begin, max(across.end, begin + 3), top, "what came after did not come home")
+        yield _hatched(begin, max(across.end, begin + 3), top, "later records are missing")
 
 
 def _hatched(begin: float, end: float, top: float, tip: str) -> Markup:

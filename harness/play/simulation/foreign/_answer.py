@@ -48,9 +48,9 @@ def read_answer(line: bytes, *, tracing: bool) -> Answer:
     try:
         said = from_json(line, allow_inf_nan=False)
     except ValueError as error:
-        raise AnswerError(f"with what is not JSON ({error}): {shown(line)}") from None
+        raise AnswerError(f"with a line that is not JSON ({error}): {shown(line)}") from None
     if not isinstance(said, dict):
-        raise AnswerError(f"with what is not a JSON object: {shown(line)}")
+        raise AnswerError(f"with a line that is not a JSON object: {shown(line)}")
     if "error" in said:
         kind = LacksError if said.get("unsupported") is True else RefusedError
         raise kind(str(said["error"])[:500])
@@ -58,7 +58,7 @@ def read_answer(line: bytes, *, tracing: bool) -> Answer:
     if not isinstance(sent, list):
         raise AnswerError(f"without a list `sent`: {shown(line)}")
     if len(sent) > MAX_SENT:
-        raise AnswerError(f"with {len(sent)} datagrams at once, and more than {MAX_SENT} are none that an input makes")
+        raise AnswerError(f"with {len(sent)} datagrams at once: at most {MAX_SENT} are allowed for an input")
     timer = said.get("timer", math.nan)
     if timer is not None and (type(timer) not in (int, float) or not -LATEST_S <= timer <= LATEST_S):
         what = f"with the timer {shown(timer)}, not" if "timer" in said else "without"
@@ -67,7 +67,7 @@ def read_answer(line: bytes, *, tracing: bool) -> Answer:
     if tracing:
         trace = said.get("trace")
         if not isinstance(trace, list):
-            raise AnswerError("without a list `trace`, which its mission asked for")
+            raise AnswerError("without the list `trace`, which its mission requires")
         answer.trace = list(_entries(trace))
     return answer
 
@@ -99,9 +99,9 @@ def _entries(trace: list[Any]) -> Iterable[Entry]:
             problem = error.errors()[0]
             where = ".".join(str(part) for part in problem["loc"])
             wrong = f": {where}: {problem['msg'].lower()}" if kind is HANDLER_RUN else ""
-            raise AnswerError(f"with `trace.{number}`, which is no line of a trace{wrong}: {shown(line)}") from None
+            raise AnswerError(f"with `trace.{number}`, which is not a line of a trace{wrong}: {shown(line)}") from None
         if isinstance(entry, HandlerRun) and entry.started and not all(map(math.isfinite, entry.started.values())):
-            raise AnswerError(f"with `trace.{number}`, in which a timer runs for ever: {shown(line)}")
+            raise AnswerError(f"with `trace.{number}`, in which a timer never expires: {shown(line)}")
         yield entry
 
 

@@ -140,8 +140,8 @@ class ForeignAgent:
 
     def handle_timer(self, now: float) -> None:
         if self._timers_ended.add(1, now) > MAX_TIMERS_PER_S:
-            raise self._failure("hung", f"has a timer that ends again and again at {now:g} s")
-        self._give(f'{{"t":{self._at(now)},"timer":true}}', "the end of its timer", now)
+            raise self._failure("hung", f"has a timer that expires again and again at {now:g} s")
+        self._give(f'{{"t":{self._at(now)},"timer":true}}', "the expiry of its timer", now)
 
     def begin_reconcile(self, now: float) -> None:
         told = self._give(f'{{"t":{self._at(now)},"command":"reconcile"}}', "the command reconcile", now).told
@@ -233,7 +233,7 @@ class ForeignAgent:
         timer = self._timer
         answer = self._exchange(f'{{"t":{self._at(now)},"command":"{command}"}}', f"the command {command}", now)
         if answer.sent or answer.timer != timer or any(isinstance(entry, HandlerRun) for entry in answer.trace):
-            raise self._failure("crashed", f"did more than answer when it was given the command {command}")
+            raise self._failure("crashed", f"did not only answer the command {command}")
         return self._accepted(command, answer.told)
 
     def _accepted(self, command: str, told: Any) -> dict[str, Any]:
@@ -242,7 +242,7 @@ class ForeignAgent:
         if told.get("ok") is False:
             error = str(told.get("error", "no reason given"))
             if told.get("unsupported") is True:
-                raise self._lacks(f"asked to {command}, it says: {last_words(error)}")
+                raise self._lacks(f"refused the command {command}: {last_words(error)}")
             raise self._failure("crashed", f"refused to {command}: {last_words(error)}")
         return told
 

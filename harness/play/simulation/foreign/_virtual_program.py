@@ -92,7 +92,7 @@ class Program:
     def tell(self, line: bytes) -> None:
         """Write a line. Raises ProgramFailedError."""
         if self._said:
-            raise ProgramFailedError("crashed", f"wrote what nobody asked for: {_shown(self._said)}")
+            raise ProgramFailedError("crashed", f"wrote an unexpected line: {_shown(self._said)}")
         self.owes_an_answer = True
         try:
             written = os.write(self._in, line)
@@ -146,12 +146,12 @@ class Program:
             left_s = deadline - time.monotonic()
             events = dict(ready.poll(max(0.0, left_s) * 1000))
             if not events:
-                raise ProgramFailedError("hung", f"did not read what it was given within {ANSWER_LIMIT_S:g} s")
+                raise ProgramFailedError("hung", f"did not read its input within {ANSWER_LIMIT_S:g} s")
             if self._out in events:
                 heard = os.read(self._out, CHUNK_BYTES)
                 self._said += heard
                 if not heard or len(self._said) > MAX_ANSWER_BYTES:
-                    raise self._ended() if not heard else ProgramFailedError("crashed", "writes without an end")
+                    raise self._ended() if not heard else ProgramFailedError("crashed", "writes without end")
             if self._in in events:
                 with suppress(BlockingIOError):
                     try:
@@ -173,7 +173,7 @@ class Program:
         if self.log is not None:
             return f"; its log is {self.log}"
         words = self.last_words()
-        return f"; it said: {words}" if words else ""
+        return f"; its last output: {words}" if words else ""
 
     def last_words(self) -> str:
         """What it said last on standard error; empty if nothing."""

@@ -16,10 +16,8 @@ from harness.play.simulation.foreign._answer import shown
 from harness.play.simulation.foreign._foreign_agent import LifeRecord
 from harness.play.simulation.foreign._virtual_program import Program, ProgramFailedError
 
-OF_ITSELF = (
-    "it reads a clock, draws random numbers, or has something else of its own, such as the order of a hash table"
-)
-OF_BEFORE = "it keeps something from an earlier life that it played in the same process"
+OF_ITSELF = "it may read a clock, draw random numbers, or depend on the order of a hash table"
+OF_BEFORE = "it may keep state of an earlier incarnation in the same process"
 
 
 class NotTheSameError(HarnessError):
@@ -63,7 +61,7 @@ class Again:
 
 def _explained(record: LifeRecord, difference: str, *, used: bool) -> str:
     """Whether what came before in a process makes the difference: two that are new say so."""
-    sentence = f"is not the same twice: {difference}"
+    sentence = f"is not deterministic: {difference}"
     if not used and not record.after_another:
         return f"{sentence}; {OF_ITSELF}"
     differences = []
@@ -93,7 +91,7 @@ def _input(line: bytes) -> str:
         "mission": "its mission",
         "datagram": "a datagram",
         "event_id": "an event",
-        "timer": "the end of its timer",
+        "timer": "the expiry of its timer",
     }
     what = next((words for key, words in kinds.items() if key in given), f"the command {given.get('command')}")
     return f"{what} at {given['t']:g} s"
@@ -106,7 +104,7 @@ def _difference(before: bytes, now: bytes) -> str:
     except (ValueError, RecursionError):
         parted = ((), before, now)
     if parted is None:
-        return "the same in another order or spelling, and it should be the same to the byte"
+        return "the same in another order or notation; each byte must be equal"
     path, was, is_now = parted
     where = f"`{'.'.join(path)}` " if path else ""
     return f"with {where}{shown(is_now)}, and {shown(was)} before"

@@ -21,8 +21,8 @@ export class Hand {
 
   build() {
     const swarm = group(this.root, "Swarm");
-    this.button(swarm, "Part", "The chosen vehicles and the others do not hear each other", true, () => ({ partition: this.parts() }), () => this.others().length > 0 || "somebody has to be left");
-    this.button(swarm, "Heal", "No partition any more", false, () => ({ heal: true }));
+    this.button(swarm, "Part", "Separate the chosen vehicles from the others", true, () => ({ partition: this.parts() }), () => this.others().length > 0 || "leave at least one vehicle unchosen");
+    this.button(swarm, "Heal", "End the partition", false, () => ({ heal: true }));
     this.loss = labelled(document.createElement("select"), "Loss");
     for (const share of [0, 0.05, 0.1, 0.15, 0.25, 0.5, 0.75, 1]) {
       const option = element("option", `loss ${100 * share} %`);
@@ -31,18 +31,18 @@ export class Hand {
       this.loss.append(option);
     }
     swarm.append(this.loss);
-    this.button(swarm, "Set", "Every receiver loses so many messages", false, () => ({ loss: +this.loss.value }));
+    this.button(swarm, "Set", "Set the loss rate of all links", false, () => ({ loss: +this.loss.value }));
     const vehicles = group(this.root, "Vehicles");
-    this.button(vehicles, "Kill", "The chosen vehicles are lost, and their data with them", true, () => ({ kill: this.ids() }));
-    this.button(vehicles, "Reboot", "The chosen vehicles' computers are back after 30 s, with their disks", true, () => ({ reboot: this.ids(), down_s: 30, disk: "kept" }));
-    this.button(vehicles, "Replace", "Others, with nothing, take the place of chosen ones that were lost", true, () => ({ restart: this.ids() }));
-    this.button(vehicles, "Reconcile", "The chosen agents begin to reconcile", true, () => ({ reconcile: this.ids() }));
+    this.button(vehicles, "Kill", "Kill the chosen vehicles; their data is lost", true, () => ({ kill: this.ids() }));
+    this.button(vehicles, "Reboot", "Reboot the computers of the chosen vehicles for 30 s; their disks are kept", true, () => ({ reboot: this.ids(), down_s: 30, disk: "kept" }));
+    this.button(vehicles, "Replace", "Start new vehicles without data in place of chosen vehicles that were lost", true, () => ({ restart: this.ids() }));
+    this.button(vehicles, "Reconcile", "Start a reconcile of the chosen agents", true, () => ({ reconcile: this.ids() }));
     this.trouble = group(this.root, "Trouble");
     const time = group(this.root, "Time");
-    this.hold = this.command(time, "Hold", "Virtual time stands still", () => ({ do: this.state.paused ? "go on" : "pause" }));
-    this.command(time, "+1 s", "Hold, but go on for a second", () => ({ do: "step", seconds: 1 }));
-    this.command(time, "+10 s", "Hold, but go on for ten seconds", () => ({ do: "step", seconds: 10 }));
-    this.command(time, "Next step", "Hold, but go on until an agent has run a handler", () => ({ do: "next run" }));
+    this.hold = this.command(time, "Hold", "Pause virtual time", () => ({ do: this.state.paused ? "go on" : "pause" }));
+    this.command(time, "+1 s", "Pause after one second", () => ({ do: "step", seconds: 1 }));
+    this.command(time, "+10 s", "Pause after ten seconds", () => ({ do: "step", seconds: 10 }));
+    this.command(time, "Next step", "Pause after the next handler run of an agent", () => ({ do: "next run" }));
     this.speed = labelled(document.createElement("select"), "Speed of the run");
     for (const factor of [1, 2, 5, 10, 20, 50, 100, 500, null]) {
       const option = element("option", factor === null ? "fastest" : `${factor}×`);
@@ -59,7 +59,7 @@ export class Hand {
   // What can befall vehicles, each with its further keys and what these are unless somebody says otherwise.
   befall({ flown, troubles }) {
     const words = (name) => name.replaceAll("_", " ");
-    const what = labelled(document.createElement("select"), "What befalls vehicles");
+    const what = labelled(document.createElement("select"), "Vehicle fault");
     for (const [name] of troubles) what.append(Object.assign(element("option", words(name)), { value: name }));
     const further = element("span");
     const ask = () => further.replaceChildren(...Object.entries(troubles.find(([name]) => name === what.value)[1]).flatMap(([key, value]) => {
@@ -72,7 +72,7 @@ export class Hand {
     this.trouble.append(what, further);
     const keys = () => Object.fromEntries([...further.querySelectorAll("input")].map((input) => [input.name, input.valueAsNumber]));
     const may = () => flown || "needs vehicles that fly: use --backend process, and `vehicles.kind` embedded or ardupilot";
-    this.button(this.trouble, "Befall", "It befalls the chosen vehicles", true, () => ({ [what.value]: this.ids(), ...keys() }), may);
+    this.button(this.trouble, "Befall", "Apply the fault to the chosen vehicles", true, () => ({ [what.value]: this.ids(), ...keys() }), may);
     this.refresh();
   }
 
@@ -101,7 +101,7 @@ export class Hand {
     return button;
   }
 
-  noTime() { return this.state.virtual ? null : "real processes cannot stand still: use --backend sim, where time is virtual"; }
+  noTime() { return this.state.virtual ? null : "the time of real processes cannot be paused: use --backend sim, where time is virtual"; }
 
   ids() { return [...this.chosen].sort((a, b) => a - b); }
 
@@ -151,7 +151,7 @@ export class Hand {
       button.title = reason ?? title;
     }
     this.speed.disabled = this.noTime() !== null;
-    this.speed.title = this.noTime() ?? "Mission seconds in a second";
+    this.speed.title = this.noTime() ?? "Mission seconds per second";
   }
 }
 

@@ -54,7 +54,7 @@ export class Events {
   }
 }
 
-const PHASES = { "phase 1": "looks for the chain that most have", "phase 2": "asks for the next block", "phase 3": "fetches a block", finalize: "puts back what it had" };
+const PHASES = { "phase 1": "searches for the most common chain", "phase 2": "asks for the next block", "phase 3": "fetches a missing block", finalize: "restores its own blocks" };
 
 function inWords(change, swarm) {
   const [kind, , ...rest] = change;
@@ -80,13 +80,13 @@ function inWords(change, swarm) {
     if (parts) return ["network", parts.length > 1 ? `in ${parts.length} parts: ${parts.map((part) => part.join(" ")).join(" | ")}` : "all are connected"];
     return null;
   }
-  if (kind === "z") return ["loss", `${rest[0]} begins a new life`];
+  if (kind === "z") return ["loss", `${rest[0]} restarts`];
   if (kind === "x") return ["loss", `${rest[0]} ${AGAINST[rest[1]](swarm.name(rest[2]))}`];
   return null;
 }
 
 const AGAINST = {
-  2: (block) => `is idle, and ${block}, which it completed, is not in its chain`,
+  2: (block) => `is idle, but ${block}, which it completed, is not in its chain`,
   3: (block) => `holds ${block} twice`,
 };
 const NAMES = ["distributed", "idle implies committed", "single copy", "genuine", "all committed everywhere", "one uniform chain"];
@@ -129,7 +129,7 @@ function soFar(swarm) {
   for (const key of swarm.blocks.keys()) if ((swarm.inChains.get(key) ?? 0) >= chains) everywhere += 1;
   const against = (number) => {
     const first = swarm.against.find((each) => each.number === number);
-    return first ? [`at ${clock(first.t)} ${first.agent} ${AGAINST[number](swarm.name(first.key))}`, ["✘", "bad"]] : ["nothing against it yet", ["·", "open"]];
+    return first ? [`at ${clock(first.t)} ${first.agent} ${AGAINST[number](swarm.name(first.key))}`, ["✘", "bad"]] : ["no violation so far", ["·", "open"]];
   };
   const later = ["judged at the end", ["·", "open"]];
   const says = [

@@ -202,7 +202,7 @@ function showStatus() {
   $("hand").hidden = true;
   const bad = end.judgements.filter(([, , , , kind]) => kind === "bad");
   const open = end.judgements.filter(([, , , , kind]) => kind === "unknown");
-  if (!end.judgements.length) status.textContent = end.outcome === "running" ? "did not come to its end" : end.outcome;
+  if (!end.judgements.length) status.textContent = end.outcome === "running" ? "did not end normally" : end.outcome;
   else if (bad.length) { status.textContent = bad.map(([, name, verdict]) => `${name}: ${verdict}`).join(", "); status.classList.add("bad"); }
   else if (open.length) status.textContent = `not judged: ${open.map(([, name]) => name).join(", ")}`;
   else { status.textContent = "all good"; status.classList.add("good"); }
@@ -299,7 +299,7 @@ function connect() {
     if (story.notes.length && !story.end) complain(story.notes);
   });
   socket.addEventListener("close", () => {
-    if (!story.end) complain(["The server has ended: what came before is shown."]);
+    if (!story.end) complain(["The server has ended. The page shows the records received before."]);
     changed = true;
   });
 }

@@ -97,7 +97,7 @@ def test_what_cannot_be_tried_is_skipped_and_what_is_alike_is_no_finding(reposit
     assert "cannot be tried: it does not start: SyntaxError" in sentences(broken.stderr)[0]
     unknown = harness("bisect", records, "--good", "last-week", *arguments)
     assert unknown.returncode == 2
-    assert "there is no commit 'last-week'; `git log` lists them" in sentences(unknown.stderr)[0]
+    assert "no commit 'last-week'; `git log` lists the commits" in sentences(unknown.stderr)[0]
 
 
 def test_core_that_crashes_on_a_record_has_a_changed_outcome(repository: Path, records: Path, tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_exit_statuses_are_those_that_git_bisect_run_takes(repository: Path, sce
     nothing = harness("bisect", "--once", scenario, "--repository", tmp_path)
     assert (
         nothing.returncode == 125
-        and "cannot be tried: there is no ucp/ in it; --repository names another directory" in nothing.stderr
+        and "cannot be tried: it has no directory ucp/; name the repository with --repository" in nothing.stderr
     )
     for mistake in (["--sed", 3], ["--expect", scenario], ["--expect", tmp_path / "none.json"], ["--agent", 1]):
         assert harness("bisect", "--once", scenario, "--repository", repository, *mistake).returncode == 128
@@ -163,7 +163,7 @@ def test_interrupted_it_leaves_nothing_behind(repository: Path, scenario: Path, 
     process.send_signal(signal.SIGTERM)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert sentences(stderr) == ["interrupted; nothing is left behind"]
+    assert sentences(stderr) == ["interrupted; all temporary files are removed"]
     assert list((tmp_path / "scratch").iterdir()) == []
 
 
@@ -172,9 +172,9 @@ def test_outcomes_differ_in_words() -> None:
     now = Outcome(subject="x", agents={1: OfAgent(chain=["1.1"], top="a", deviates="")}, verdicts={"6": "violated"})
     assert differences(was, was) == []
     assert differences(was, now) == [
-        "characteristic 6: violated, and was holds",
-        "agent 1: it deviates first in no known handler, and did nowhere",
-        "agent 1: its chain has 1 blocks, and had 2; block 2 is not there, and was 2.1",
+        "characteristic 6: violated, was holds",
+        "agent 1: its first deviation is in no known handler, was nowhere",
+        "agent 1: its chain has 1 blocks, was 2; block 2 is not there, was 2.1",
     ]
     crashed = Outcome(subject="x", crashed="KeyError (ucp/core.py:7, send)")
     assert differences(was, crashed) == ["it crashes: KeyError (ucp/core.py:7, send)"]

@@ -67,7 +67,7 @@ def test_what_an_agent_asked_itself_is_answered_when_it_asks(records: Path) -> N
 
 def test_a_record_in_words_that_nobody_knows_is_not_played(records: Path, tmp_path: Path) -> None:
     (tmp_path / "2.trace.jsonl").write_text((records / "2.trace.jsonl").read_text().replace("vote_timer_", "poll_"))
-    with pytest.raises(FieldError, match=r"unknown handler name 'poll_expiration', so nobody knows what is to be"):
+    with pytest.raises(FieldError, match=r"unknown handler name 'poll_expiration', so it cannot be played; give"):
         play_live(open_record(tmp_path, 2), ["no-such-agent"], tmp_path, speedup=1.0)
 
 

@@ -172,7 +172,7 @@ def test_a_wrong_hash_of_a_good_block_is_told_and_its_events_are_there_once(tmp_
     edited["chain"][1]["block_hash"] = "0" * 64
     record = brought(tmp_path, document(1, "1.1 2.1"), edited)
     assert record.header.events == 4
-    assert "does not hash to" in record.header.problems[0]
+    assert "does not match its hash" in record.header.problems[0]
     assert names(record) == ["1.1", "2.1"]
     assert [block.line.claimed_hash for block in record.blocks] == [None, None]
     assert len(reconcile(record).line.chain) == 2

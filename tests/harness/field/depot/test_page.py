@@ -46,13 +46,22 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Consolidation:
 
 def test_the_page_says_what_the_record_says(flown: Consolidation) -> None:
     page = Reader(draw(flown, reconcile(flown)))
-    headings = ("What came home", "Where", "When", "Who holds what", "Lost", "Chains", "Final reconcile", "Vehicles")
+    headings = (
+        "Collected exports",
+        "Positions",
+        "Events over time",
+        "Holders of blocks",
+        "Lost",
+        "Chains",
+        "Final reconcile",
+        "Vehicles",
+    )
     at = [page.text.rindex(heading) for heading in headings[:4]]
     assert at == sorted(at)
     assert all(heading in page.text for heading in headings)
     assert "1 vehicle and 2 blocks lost" in page.text
-    assert "vehicles home 3 of 4" in page.text
-    assert "no export of vehicle 4 came home" in page.text
+    assert "vehicles with an export 3 of 4" in page.text
+    assert "vehicle 4 has no export" in page.text
     for lost in flown.lost_blocks:
         assert f"block {lost.block}" in page.text
     classes = [attributes.get("class") for tag, attributes in page.elements if tag in ("rect", "g")]

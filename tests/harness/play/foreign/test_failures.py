@@ -42,27 +42,31 @@ def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
             "hung",
             "did not answer within 1 s (with a whole line, flushed) when it was given an event",
         ),
-        (EVENT + "print('ready')", "crashed", "answered an event at 12.5 s with what is not JSON"),
-        (EVENT + "said = [1]", "crashed", "answered an event at 12.5 s with what is not a JSON object: '[1]'"),
+        (EVENT + "print('ready')", "crashed", "answered an event at 12.5 s with a line that is not JSON"),
+        (EVENT + "said = [1]", "crashed", "answered an event at 12.5 s with a line that is not a JSON object: '[1]'"),
         (EVENT + "said = {}", "crashed", "answered an event at 12.5 s without a list `sent`: '{}'"),
         (EVENT + "print('x' * (2 << 20), end='')", "crashed", "answers with a line of more than 1 MiB"),
         (EVENT + "del said['timer']", "crashed", "without a number of mission seconds, or null, as `timer`"),
-        (EVENT + "said['timer'] = float('nan')", "crashed", "with what is not JSON (expected value"),
+        (EVENT + "said['timer'] = float('nan')", "crashed", "with a line that is not JSON (expected value"),
         (EVENT + "said['timer'] = 10 ** 400", "crashed", "not a number of mission seconds, or null, as `timer`"),
         (EVENT + "said['timer'] = '1'", "crashed", "with the timer '1', not a number of mission seconds"),
-        ("said['timer'] = given['t'] + 1e-9 * ('timer' in given or not number)", "hung", "a timer that ends again and"),
-        ("said['timer'] = 1", "hung", "has a timer that ends again and again at 1 s"),
+        (
+            "said['timer'] = given['t'] + 1e-9 * ('timer' in given or not number)",
+            "hung",
+            "a timer that expires again and",
+        ),
+        ("said['timer'] = 1", "hung", "has a timer that expires again and again at 1 s"),
         (EVENT + "said['sent'] = ['?']", "crashed", "with a datagram that is not base64: '?'"),
         (EVENT + "said['sent'] = ['AA=='] * 2000", "crashed", "with 2000 datagrams at once"),
         (EVENT + "said['sent'] = ['A' * 100000]", "crashed", "with a datagram of 75000 bytes, more than UDP carries"),
-        (EVENT + "del said['trace']", "crashed", "without a list `trace`, which its mission asked for"),
-        (EVENT + "said['trace'] = [{'t': 1}]", "crashed", "with `trace.0`, which is no line of a trace"),
+        (EVENT + "del said['trace']", "crashed", "without the list `trace`, which its mission requires"),
+        (EVENT + "said['trace'] = [{'t': 1}]", "crashed", "with `trace.0`, which is not a line of a trace"),
         (
             EVENT + "said['trace'] = [{'t': 1, 'dropped': 'x', 'datagram': ''}]",
             "crashed",
             "wrote t=1.0 into its trace of an input at 12.5 s",
         ),
-        (EVENT + "print(json.dumps(said))", "crashed", "wrote what nobody asked for"),
+        (EVENT + "print(json.dumps(said))", "crashed", "wrote an unexpected line"),
         (EVENT + "said = {'error': 'no, not I'}", "crashed", "refused an event at 12.5 s: no, not I"),
         ("if given.get('command') == 'status': said['answer'] = {'ok': True}", "crashed", "without a proper `started`"),
         (
@@ -85,7 +89,7 @@ def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
             "crashed",
             "answered to the command export with the chain of another mission",
         ),
-        ("if given.get('command') == 'export': said['sent'] = ['AA==']", "crashed", "did more than answer when it was"),
+        ("if given.get('command') == 'export': said['sent'] = ['AA==']", "crashed", "did not only answer the command"),
         (EVENT + "said = {'error': 'no such event', 'unsupported': True}", "not supported", "no such event"),
     ],
 )
@@ -149,8 +153,8 @@ def test_an_agent_that_does_not_end_by_itself_is_ended(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("code", "why"),
     [
-        ("import time; said['now'] = int(time.time())", "it reads a clock, draws random numbers"),
-        ("import os; said['pid'] = os.getpid()", "it reads a clock, draws random numbers"),
+        ("import time; said['now'] = int(time.time())", "it may read a clock, draw random numbers"),
+        ("import os; said['pid'] = os.getpid()", "it may read a clock, draw random numbers"),
         ("given.setdefault('seen', globals().setdefault('seen', number)); said['n'] = number", "from an earlier life"),
     ],
 )
@@ -158,7 +162,7 @@ def test_an_agent_that_is_not_the_same_twice_is_named(tmp_path: Path, code: str,
     finished = run_with(tmp_path, EXPORT + code)
     detail = str(finished.played.outcome_detail)
     assert finished.exit_status == 1
-    assert "agent 2 is not the same twice: given" in detail and why in detail, detail
+    assert "agent 2 is not deterministic: given" in detail and why in detail, detail
 
 
 def test_what_virtual_time_lacks_is_not_supported(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def test_an_agent_that_is_not_the_same_twice_is_named_before_its_seeds_are_playe
     done = harness("explore", asked, "--out", tmp_path / "shrunk.yaml")
     assert done.returncode == 1
     (said,) = sentences(done.stderr)
-    assert "agent 1 is not the same twice: given its mission at 0 s again, it answers with `now`" in said
+    assert "agent 1 is not deterministic: given its mission at 0 s again, it answers with `now`" in said
 
 
 def test_a_matrix_looks_at_the_first_seed_of_each_cell(tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_a_matrix_looks_at_the_first_seed_of_each_cell(tmp_path: Path) -> None:
     matrix = Matrix.model_validate({**asked, "backend": ["sim"]})
     player = Player(matrix, tmp_path)
     first, *_ = matrix.tasks
-    with pytest.raises(HarnessError, match="is not the same twice"):
+    with pytest.raises(HarnessError, match="is not deterministic"):
         player(first)
 
 

@@ -101,7 +101,7 @@ def test_the_command_says_it(tmp_path: Path) -> None:
     assert document["tlc"]["states"] == document["prove"]["states"]
     done = harness("prove", "--faults", "death", "--second-opinion")
     assert done.returncode == 2
-    assert sentences(done.stderr) == ["the specification has no faults: leave --faults out"]
+    assert sentences(done.stderr) == ["the specification has no faults: leave out --faults"]
 
 
 def test_sigterm_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

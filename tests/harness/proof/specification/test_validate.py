@@ -80,12 +80,12 @@ def test_what_is_not_all_looked_at_does_not_hold() -> None:
 
 def test_an_interrupt_leaves_what_came_before() -> None:
     def runs() -> Iterator[Recorded]:
-        yield Recorded("first", [], problems=["there are no traces"])
+        yield Recorded("first", [], problems=["no traces found"])
         raise KeyboardInterrupt
 
     validation = validate(runs())
     assert validation.interrupted
-    assert validation.unread == ["first: there are no traces"]
+    assert validation.unread == ["first: no traces found"]
     assert validation.exit_status == 130
 
 
@@ -102,7 +102,7 @@ def test_agents_that_are_processes_do_what_is_specified(tmp_path: Path) -> None:
 def test_what_is_no_run_is_one_sentence(tmp_path: Path) -> None:
     done = harness("validate")
     assert done.returncode == 2
-    assert "name runs, or a --scenario to play" in done.stderr
+    assert "validate needs recorded runs, or a --scenario to play" in done.stderr
     done = harness("validate", tmp_path / "nowhere")
     assert done.returncode == 2
     [sentence] = sentences(done.stderr)

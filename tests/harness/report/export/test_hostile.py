@@ -49,8 +49,8 @@ def test_a_run_that_broke_off_is_exported_up_to_there(copy: Path, tmp_path: Path
     exported = harness("export", copy, "--perfetto", tmp_path / "p")
     assert exported.returncode == 0
     assert sentences(exported.stderr) == [
-        "agents/1.trace.jsonl: cut off in mid-line; what is before that is read",
-        "the run has not recorded its end: it is still going on, or it was killed",
+        "agents/1.trace.jsonl: truncated in the middle of a line; the part before is read",
+        "the end of the run is not recorded: the run is still active, or it was killed",
     ]
 
 
@@ -72,7 +72,7 @@ def test_a_roster_beyond_reason_is_refused(copy: Path, tmp_path: Path) -> None:
     edit(copy / "run.json", lambda record: record.update(roster=list(range(1, 5000))))
     refused = harness("export", copy, "--mcap", tmp_path / "m")
     assert refused.returncode == 2
-    assert "4999 agents are named in it, and a run has at most 1000" in sentences(refused.stderr)[-1]
+    assert "4999 agents are named in it, but a run has at most 1000" in sentences(refused.stderr)[-1]
     assert not (tmp_path / "m").exists()
 
 

@@ -193,9 +193,9 @@ def test_what_cannot_be_is_one_sentence(copy: Path, tmp_path: Path) -> None:
     there.write_text("mine")
     (empty := tmp_path / "empty").mkdir()
     for arguments, words in (
-        ((copy,), "say what to write: --mcap FILE,"),
-        ((copy, "--mcap", there), "exists: choose another file, nothing is overwritten"),
-        ((copy, "--mcap", tmp_path / "no" / "where.mcap"), "its directory is not there"),
+        ((copy,), "no output is named: add --mcap FILE,"),
+        ((copy, "--mcap", there), "exists: choose another file; existing files are not overwritten"),
+        ((copy, "--mcap", tmp_path / "no" / "where.mcap"), "its directory does not exist"),
         ((empty, "--mcap", tmp_path / "new.mcap"), "neither a run directory nor"),
         ((tmp_path / "nothing", "--mcap", tmp_path / "new.mcap"), "is not a directory"),
     ):

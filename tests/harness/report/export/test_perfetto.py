@@ -86,7 +86,7 @@ def test_votes_and_reconciles_are_slices_that_nest(run: Path, trace: Read) -> No
 def test_counters_are_of_chains_and_losses(run: Path, trace: Read) -> None:
     chain = [event.double_counter_value for _, event in trace.on("agent 3", "chain (blocks)")]
     assert chain[-1] == len(RunArchive(run).exports.by_agent[3].chain)
-    assert max(event.double_counter_value for _, event in trace.on("swarm", "groups that hear each other")) == 2
-    assert (50 * 10**9) in [at_ns for at_ns, _ in trace.on("swarm", "groups that hear each other")]
+    assert max(event.double_counter_value for _, event in trace.on("swarm", "connected groups")) == 2
+    assert (50 * 10**9) in [at_ns for at_ns, _ in trace.on("swarm", "connected groups")]
     assert trace.on("swarm", "worst loss (%)")
     assert max(event.double_counter_value for _, event in trace.on("agent 1", "altitude (m)")) > 15

@@ -30,7 +30,7 @@ def test_one_that_says_much_and_dies_is_told_of_after_the_run(server: Path, tmp_
     with beside(tmp_path, 0, HAND) as page:
         assert page.address == "http://here/"
         assert not page.run_is_over()
-        assert page.problem == "the page's server ended by itself with SIGKILL (no more memory), and the run went on"
+        assert page.problem == "the server of the page ended by itself with SIGKILL (no more memory); the run continued"
 
 
 def test_one_that_hangs_ends_with_the_run(server: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,7 +41,7 @@ def test_one_that_hangs_ends_with_the_run(server: Path, tmp_path: Path, monkeypa
         for _ in range(module.MOST_WAITING):  # more than a pipe holds
             page._say(["t", 100.0])
         assert not page.run_is_over()
-        assert page.problem == "the page hung: 0.1 s after the run its server had not answered"
+        assert page.problem == "the page hung: its server did not answer within 0.1 s after the run"
 
 
 def test_one_that_cannot_begin_says_why(server: Path, tmp_path: Path) -> None:

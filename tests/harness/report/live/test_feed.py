@@ -141,8 +141,8 @@ def test_damage_is_said_once_and_the_rest_is_shown(run: Path, tmp_path: Path) ->
     told = film(damaged)
     assert sorted(note for _, note in of_kind("note", told)) == [
         "network.jsonl has damaged lines, which are left out",
-        "network.jsonl has lines that mean nothing, which are left out",
-        "the trace of agent 2 is damaged, and read up to there",
+        "network.jsonl has unknown lines, which are left out",
+        "the trace of agent 2 is damaged, and is read up to the damage",
     ]
     assert len(chains_of(told)) == 4
 

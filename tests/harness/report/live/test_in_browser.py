@@ -76,5 +76,5 @@ def test_a_film_of_a_run_that_was_killed_says_so(browser: Browser, run: Path, tm
     with page_of("watch", killed) as (_, address):
         browser.show(address, width=1000, scheme="light")
         until(browser, "watch.story.end")
-        assert browser.evaluate("document.getElementById('status').textContent") == "did not come to its end"
+        assert browser.evaluate("document.getElementById('status').textContent") == "did not end normally"
     assert of_kind("end", film(killed))[0][1]["outcome"] == "running"

@@ -39,9 +39,7 @@ def test_only_the_address_with_the_token_opens_the_page(tmp_path: Path) -> None:
                 url = path if path.startswith("http") else f"http://127.0.0.1:{port}{path}"
                 async with client.get(url) as refused:
                     assert refused.status == 403
-                    assert (
-                        await refused.text() == "This page is for whoever has the address that ucp-harness printed.\n"
-                    )
+                    assert await refused.text() == "This page needs the full address that ucp-harness printed.\n"
             for headers in (
                 {"Host": f"evil.example:{port}"},
                 {"Origin": "http://evil.example"},
@@ -164,7 +162,7 @@ def test_a_port_that_is_in_use_is_said_in_a_sentence(tmp_path: Path) -> None:
         async with served(tmp_path) as (_, address):
             port = urlsplit(address).port
             assert port is not None
-            with pytest.raises(MachineError, match=f"port {port} of 127.0.0.1 cannot be had: .*use"):
+            with pytest.raises(MachineError, match=f"port {port} of 127.0.0.1 is not available: .*use"):
                 async with Server(Story(), tmp_path, live=False).open(port):
                     pass
 

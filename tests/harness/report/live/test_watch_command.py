@@ -24,7 +24,7 @@ def test_a_port_that_is_in_use_is_said_before_the_run_begins(tmp_path: Path) -> 
         told = harness("run", "perfect", "--backend", "sim", "--watch", "--watch-port", port, "--out", tmp_path / "run")
     assert told.returncode == 3
     assert sentences(told.stderr) == [
-        f"port {port} of 127.0.0.1 cannot be had: Address already in use; choose another, or leave it to us"
+        f"port {port} of 127.0.0.1 is not available: Address already in use; choose another port, or 0 for a free one"
     ]
     assert not (tmp_path / "run").exists()
 

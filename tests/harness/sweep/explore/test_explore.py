@@ -142,7 +142,7 @@ def test_a_reached_bound_is_said(tmp_path: Path) -> None:
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
     out = tmp_path / "mine.yaml"
     out.write_text("mine")
-    with pytest.raises(RunDirectoryError, match="nothing is overwritten"):
+    with pytest.raises(RunDirectoryError, match="existing files are not overwritten"):
         find(out)
     assert out.read_text() == "mine"
 

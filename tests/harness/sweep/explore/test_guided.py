@@ -313,8 +313,8 @@ def test_ctrl_c_keeps_what_was_found(tmp_path: Path) -> None:
     ("arguments", "said"),
     [
         (["--for", "soon"], "is no time"),
-        (["--runs", "3", "--seeds", "5"], "needs no --seeds"),
-        (["--corpus", "there"], "are for a hunt"),
+        (["--runs", "3", "--seeds", "5"], "--seeds and --out do not apply to a hunt"),
+        (["--corpus", "there"], "--corpus and --json need a hunt"),
     ],
 )
 def test_wrong_options_are_one_sentence(tmp_path: Path, arguments: list[str], said: str) -> None:

@@ -68,7 +68,7 @@ def test_json_is_all_that_standard_output_gets(tmp_path: Path) -> None:
     ("keys", "sentence"),
     [
         ({"loss": [2]}, "`loss.0` is 2: it should be less than or equal to 1"),
-        ({"scenario": {"agent_command": ["./agent"]}}, "`agent_command`: ./agent is no program"),
+        ({"scenario": {"agent_command": ["./agent"]}}, "`agent_command`: ./agent is not a program"),
     ],
 )
 def test_a_wrong_request_is_one_sentence_and_status_2(tmp_path: Path, keys: dict[str, Any], sentence: str) -> None:
@@ -202,7 +202,7 @@ def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(tmp_path: Path) -> 
     assert json.loads(said)["outcome"] == "interrupted"
     assert json.loads((out / "matrix.json").read_text()) == json.loads(said)
     way_on, sentence = sentences(complaint)
-    assert way_on == f"the same command with --out {out} goes on from here"
-    assert sentence.startswith("interrupted; the ")
-    assert sentence.endswith(f" of 20000 runs that had ended are in {out}")
+    assert way_on == f"to continue, repeat the command with --out {out}"
+    assert sentence.startswith("interrupted; results of ")
+    assert sentence.endswith(f" of 20000 runs are in {out}")
     assert not processes(tmp_path)

@@ -136,11 +136,11 @@ def test_what_matrix_json_says_of_it_is_a_matrix_again(tmp_path: Path) -> None:
         ({"seeds": [7, 7]}, "`seeds` is [7, 7]: names 7 twice"),
         (
             {"losses": [0.1]},
-            "`losses` is unknown: there are name, about, scenario, loss, seeds, agents, duration_s, "
+            "`losses` is unknown: use one of name, about, scenario, loss, seeds, agents, duration_s, "
             "backend, keep, traces",
         ),
-        ({"scenario": {"agents": 0}}, "`scenario.agents` is 0: it should be a number of agents 1..1000"),
-        ({"scenario": {"agent": 5}}, "`scenario.agent` is unknown: there are name, about, agents,"),
+        ({"scenario": {"agents": 0}}, "`scenario.agents` is 0: use a number of agents 1..1000"),
+        ({"scenario": {"agent": 5}}, "`scenario.agent` is unknown: use one of name, about, agents,"),
         ({"scenario": {"network": {"loss": 0.2}}}, "sets network.loss to 0.2, which the matrix's `loss` is for"),
         ({"agents": [5]}, "`scenario` sets agents to 3, which the matrix's `agents` is for: remove it there"),
         ({"agents": [5, 0], "scenario": {}}, "`agents.1` is 0: it should be greater than or equal to 1"),
@@ -174,10 +174,10 @@ def test_what_matrix_json_says_of_it_is_a_matrix_again(tmp_path: Path) -> None:
         ({"keep": "none"}, "`keep` is 'none': it should be 'violated' or 'all'"),
         (
             {"delay": [0.1]},
-            "`delay` is unknown: there are name, about, scenario, loss, seeds, agents, duration_s, "
+            "`delay` is unknown: use one of name, about, scenario, loss, seeds, agents, duration_s, "
             "backend, keep, traces",
         ),
-        ({"scenario": "nowhere.yaml"}, "nowhere.yaml: there is no such file or scenario"),
+        ({"scenario": "nowhere.yaml"}, "nowhere.yaml: no such file or scenario"),
         ({"name": None}, "is missing"),
         ({"scenario": None, "timeline": []}, "this is a scenario; a matrix names one, `scenario: "),
     ],

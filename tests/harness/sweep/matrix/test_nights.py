@@ -63,7 +63,7 @@ def test_only_the_last_nights_are_read(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_a_place_that_cannot_be_a_directory_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(RunDirectoryError, match=r"cannot be made: .*; choose another --nights"):
+    with pytest.raises(RunDirectoryError, match=r"cannot be created: .*; choose another --nights"):
         nights.opened(tmp_path / "file")
 
 
