@@ -26,13 +26,13 @@ PAGE = Path(ucp.__path__[0]) / "contract" / "BRANCHES.md"
 INTRODUCTION = """\
 # Branches of the event handlers
 
-Each run of an event handler ends in one *branch*, a named case such as "approved". The handler declares its branches,
-and a trace records the handler and the branch of each run. [The agent contract](CONTRACT.md#the-20-algorithms) has the
-algorithms. [HANDLERS.md](HANDLERS.md) shows which handler runs when.
+Each run of an event handler ends in one *branch*, a named case such as "approved". The handler declares its branches.
+For each run, a trace records the handler and the branch. [The agent contract](CONTRACT.md#the-20-algorithms) contains
+the algorithms, and [HANDLERS.md](HANDLERS.md) shows the cause of each handler.
 
 This table lists each branch of Algorithms 1-20 with its condition. The last column lists the tests in
-[tests/ucp](../../tests/ucp) that take the branch and check its effect. A test fails if it does not take its branches.
-`make test` fails if a branch has no test.
+[tests/ucp](../../tests/ucp) in which an agent takes the branch, and which check the effect. A test fails if no agent
+takes the branches that the test declares. `make test` fails if a branch has no test.
 
 `python -m tests.ucp.branches` generates this page.
 
@@ -46,8 +46,8 @@ TABLE = """\
 WRONG_AGENTS = """
 ## Branches of wrong agents
 
-A [quirk](../quirks) is a deliberate mistake of an agent. An agent with quirks has wrong handlers in place of some of
-the handlers above. They have two additional branches:
+A [quirk](../quirks) is a deliberate mistake of an agent. A quirk replaces handlers of the agent with wrong
+handlers. A wrong handler can take two additional branches:
 
 | branch | condition |
 |---|---|
@@ -58,7 +58,7 @@ the handlers above. They have two additional branches:
 WHEN: dict[str, dict[str, str]] = {
     "build_data_block": {
         "building": "another event of the largest size still fits the current block",
-        "full": "another event of the largest size might not fit",
+        "full": "another event of the largest size might not fit the current block",
     },
     "process_next_deque_block": {
         "reconcile in progress": "the agent reconciles",
@@ -72,24 +72,24 @@ WHEN: dict[str, dict[str, str]] = {
         "disapprove": "the proposer's top chain hash differs from the agent's own",
     },
     "receive_vote_add_block": {
-        "no vote running": "the agent has no vote running",
+        "no vote running": "the agent's voting timer does not run",
         "another block": "the vote is not for the agent's candidate",
-        "another round": "with `vote_names_chain`: the vote is for the candidate on top of another chain",
-        "counted already": "the responder has voted in this round",
+        "another round": "only with `vote_names_chain`: the vote names another chain than the agent's proposal",
+        "counted already": "the responder has already voted in this round",
         "yes": "the responder approves",
         "no": "the responder disapproves",
     },
     "vote_timer_expiration": {
         "reconcile in progress": "the agent started a reconcile after its proposal",
-        "chain changed": "the chain changed, and more approve than disapprove (`changed_before_tally`: any result)",
-        "approved": "more approve than disapprove, and the chain did not change",
+        "chain changed": "the chain changed, and more agents approve than not (`changed_before_tally`: any result)",
+        "approved": "more agents approve than not, and the chain did not change",
         "not approved": "any other case",
     },
     "receive_commit_block": {
         "reconcile in progress": "the agent reconciles",
-        "does not succeed": "the block does not go on top of the agent's chain",
-        "held already": "the block goes on top of the agent's chain, but the agent holds it already",
-        "committed": "the block goes on top of the agent's chain",
+        "does not succeed": "the block's chain hash does not fit on top of the agent's chain",
+        "held already": "the chain hash fits, but the agent already holds the block",
+        "committed": "the chain hash fits, and the agent does not hold the block",
     },
     "reconcile_begin": {
         "already in progress": "the agent reconciles",
@@ -99,14 +99,14 @@ WHEN: dict[str, dict[str, str]] = {
     "receive_request_chain_contain": {
         "reconcile in progress": "the agent reconciles",
         "yes": "the agent's chain contains the chain hash",
-        "no": "the agent's chain does not contain it",
+        "no": "the agent's chain does not contain the chain hash",
     },
     "receive_phase_1_response": {
         "not in phase 1": "the phase 1 timer does not run",
         "another chain": "the response is not about the agent's top chain hash",
         "counted already": "the responder has answered this query",
         "yes": "the responder's chain contains the chain hash",
-        "no": "the responder's chain does not contain it",
+        "no": "the responder's chain does not contain the chain hash",
     },
     "reconcile_phase_1_timer_expiration": {
         "no response": "no agent answered",
@@ -125,15 +125,15 @@ WHEN: dict[str, dict[str, str]] = {
         "not in phase 2": "the phase 2 timer does not run",
         "another chain": "the response is not about the agent's top chain hash",
         "counted already": "the responder has answered this query",
-        "new candidate": "the answer is the first of its kind",
-        "counted": "another responder gave the same answer",
+        "new candidate": "no other responder has given this answer",
+        "counted": "another responder has given the same answer",
     },
     "reconcile_phase_2_timer_expiration": {
         "no response": "no agent answered",
-        "top of chain": "most answers are Is Top Of Chain (`top_needs_majority`: and a vote would be approved)",
-        "block": "most answers name the same block",
-        "tie: top of chain": "a tie, and the answer with the oldest timestamp is Is Top Of Chain",
-        "tie: block": "a tie, and the answer with the oldest timestamp names a block (`phase2_tie: block`: any tie)",
+        "top of chain": "most frequent answer: Is Top Of Chain (`top_needs_majority`: and a vote would be approved)",
+        "block": "most frequent answer: a block",
+        "tie: top of chain": "a tie; the tied answer with the oldest timestamp is Is Top Of Chain",
+        "tie: block": "a tie; the tied answer with the oldest timestamp is a block (`phase2_tie: block`: any tie)",
     },
     "reconcile_phase_3": {
         "from the stack": "the block is on the reconcile stack",
