@@ -27,20 +27,20 @@ Algorithms 1-20. They are in [commit.py](../commit.py) and [reconcile.py](../rec
 their branches with the conditions. [How UCP works](../../docs/explanation/protocol.md) explains the protocol.
 
 Each handler declares the messages that it sends, the timers that it starts, and the local events that it triggers.
-[core.py](../core.py) rejects any other action of the handler. The tables in [agent.py](../agent.py) define which
-handler runs when a message arrives, a timer expires, or a local event occurs. `python -m docs.generate.handlers`
-generates this page from these declarations and tables.
+[core.py](../core.py) rejects any message, timer or local event that the handler does not declare. The tables in
+[agent.py](../agent.py) define which handler runs when a message arrives, a timer expires, or a local event occurs.
+`python -m docs.generate.handlers` generates this page from these declarations and tables.
 
-The diagram has three kinds of arrows:
+The diagram has three kinds of arrows. Each arrow leads from a handler to a handler that it causes:
 
-| arrow | cause | the next handler runs |
+| arrow | cause | where and when the second handler runs |
 |---|---|---|
 | thick | local event | in the same agent, directly after the current handlers |
 | thin | timer | in the same agent, when the timer expires |
 | dotted | message | in each agent that receives the message |
 
-Two causes are not in the diagram. The operator can trigger Reconcile Begin. An agent that boots from its store starts
-with Reconcile Finalize.
+Two causes are not in the diagram. The operator can trigger Reconcile Begin with a command. An agent that continues
+from its store starts with Reconcile Finalize.
 
 """
 
