@@ -1,8 +1,8 @@
-"""Pages that stand beside what they are about, in the source tree, as pages of the site.
+"""Add pages of the source tree outside `docs/` to the site.
 
-The README is its start. What a page links to comes along, under the path that it has in the repository; of a folder
-that is its README, and a folder without one is named, not linked. The JSON Schemas are no files of the repository: this
-hook generates them at the paths that the pages link to.
+The README is the start page of the site. Each file that a page links to becomes part of the site, under its path in the
+repository. A link to a folder leads to the README of the folder. If the folder has no README, the link becomes plain
+text. The repository does not contain the JSON Schemas: this hook generates them at the paths that the pages link to.
 """
 
 import os
@@ -29,7 +29,7 @@ _IMAGE = re.compile(r'(?P<before><img src=")(?P<target>[^":]+)')
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add what the pages link to, and what that links to."""
+    """Add the files that pages link to, directly or through other added pages."""
     waiting = [ROOT / "README.md", *(Path(file.abs_src_path or "") for file in files.documentation_pages())]
     there = {*waiting}
     while waiting:
@@ -48,7 +48,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links as they are between pages of the site."""
+    """Return the page with links that are valid between pages of the site."""
     source = ROOT / "README.md" if page.file.src_uri == HOME else _source(page.file.src_uri)
     here = posixpath.dirname(page.file.src_uri) or "."
 
@@ -83,7 +83,10 @@ def _targets(page: Path) -> list[Path]:
 
 
 def _resolved(page: Path, target: str) -> Path | None:
-    """The file that is meant; None for a folder without a README. Raises PluginError if there is neither."""
+    """Return the target file of a link, or None for a folder without a README.
+
+    Raises PluginError if the target does not exist.
+    """
     path = Path(os.path.normpath(page.parent / target))
     if path in SCHEMAS:
         return path

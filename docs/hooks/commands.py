@@ -1,6 +1,6 @@
-"""Generate the sections on commands of `docs/reference/commands.md` from the command line itself.
+"""Generate the sections on commands of `docs/reference/commands.md` from the help of the commands.
 
-The page has each command with its help, usage, arguments and options. It cannot differ from `--help`.
+The page shows the description, usage, arguments and options of each command, so it cannot differ from `--help`.
 """
 
 import re
@@ -23,7 +23,7 @@ GROUPS = {
     "prove": "Prove properties and test agents",
     "this machine": "Set up the machine",
 }
-"""Panel of the help -> heading on the page."""
+"""Name of a panel of `ucp-harness --help` -> heading on the page."""
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -77,26 +77,26 @@ def _place(argument: Any) -> str:
 
 
 def _names(option: Any, context: Any) -> str:
-    """Return the names of the option, and the kind of its value."""
+    """Return the names of the option, and the type of its value."""
     names, _ = option.get_help_record(context)
     return str(names)
 
 
 def _described(option: Any, context: Any) -> str:
-    """Return the help with default and range. An option of a panel of its own has its name in front."""
+    """Return the help with default and range. If the name of its panel starts with "With", this name comes first."""
     _, text = option.get_help_record(context)
     panel = option.rich_help_panel
     return f"{panel}: {text}" if panel and panel.startswith("With") else str(text)
 
 
 def _row(names: str, text: str) -> str:
-    """Return a row of a table. The first cell is code, in which a table allows no bare pipe."""
+    """Return a row of a table. Pipes are escaped, because they separate cells."""
     code, words = (" ".join(cell.replace("|", "\\|").split()) for cell in (names, text or ""))
     return f"| `{code}` | {_text(words)} |"
 
 
 def _text(text: str) -> str:
-    """Return the help as Markdown: names of options outside of code become code, and exit statuses a paragraph."""
+    """Return the help as Markdown: option names become code, and the words "Exit status" become bold."""
     text = text.replace("<", "&lt;")
     text = re.sub(r"(?<![`\w-])(--[a-z][a-z-]*)(?![^`]*`(?:[^`]*`[^`]*`)*[^`]*$)", r"`\1`", text)
     return re.sub(r"Exit status 0:", "**Exit status** 0:", text)

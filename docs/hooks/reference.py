@@ -20,14 +20,14 @@ from ucp.settings import DECLARED, Number
 
 MARK = "<!-- keys -->"
 ABOUT = {
-    "Offset": "A place relative to the first home: metres east, north and up, and a heading in degrees.",
+    "Offset": "A position relative to the first home: metres east, north and up, and a heading in degrees.",
     "Settings": "Settings of all agents. Durations are mission seconds, sizes are bytes.",
 }
-"""Model -> introduction, for models whose schema has no description."""
+"""Name of a model -> introduction of its table, for models whose schema has no description."""
 QUIRKS_SECTION = "Quirks"
-ABOUT_QUIRKS = """A quirk is a mistake that an agent makes on purpose. `crash_on_tie: true` is for all agents, and
-`crash_on_tie: {agents: [2, 3]}` for two agents. `ignore_commit: 0.2` sets the probability of the mistake, and
-`ignore_commit: {agents: [2], value: 0.2}` sets it for one agent. An unknown quirk is an error."""
+ABOUT_QUIRKS = """A quirk is a mistake that an agent makes on purpose. `crash_on_tie: true` applies to all agents, and
+`crash_on_tie: {agents: [2, 3]}` to agents 2 and 3. `ignore_commit: 0.2` sets the probability of the mistake for all
+agents, and `ignore_commit: {agents: [2], value: 0.2}` for agent 2. An unknown name of a quirk is an error."""
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -35,7 +35,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def reference() -> str:
-    """Return a table of the scenario, and a table of each model that it contains."""
+    """Return a table of the keys of a scenario, and a table for each model that a scenario contains."""
     schema = generate("scenario")
     models = _models(Scenario)
     parts = [_table("Scenario", schema, models)]
@@ -112,7 +112,7 @@ def _type(schema: dict[str, Any]) -> str:
 
 
 def _models(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
-    """Return the model and the models that it contains, by name."""
+    """Return the model and all models that it contains, by name."""
     found: dict[str, type[BaseModel]] = {}
 
     def visit(annotation: Any) -> None:

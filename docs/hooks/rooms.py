@@ -1,4 +1,4 @@
-"""Which room of the harness uses which, drawn from the imports: `docs/explanation/architecture.md`."""
+"""Draw a picture of the imports between the rooms of the harness for `docs/explanation/architecture.md`."""
 
 import ast
 import re
@@ -25,7 +25,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def uses(rooms: list[str]) -> Counter[tuple[str, str]]:
-    """(room, another that it uses) -> how many of its files import from there."""
+    """Return (room, imported room) -> number of files of the room with such an import."""
     counted: Counter[tuple[str, str]] = Counter()
     for room in rooms:
         for path in (ROOT / "harness" / room).rglob("*.py"):
@@ -34,14 +34,14 @@ def uses(rooms: list[str]) -> Counter[tuple[str, str]]:
 
 
 def _imported(path: Path) -> Iterator[str]:
-    """The rooms that a file imports from."""
+    """Yield the rooms that a file imports from."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("harness."):
             yield node.module.split(".")[1]
 
 
 def picture(rooms: list[str], counted: Counter[tuple[str, str]]) -> str:
-    """A row for each room: in which others its files look, the more the darker."""
+    """Return an SVG with a row for each room. The more files import a room, the darker is its mark."""
     size = len(rooms) * CELL
     most = max(counted.values())
     parts = []
@@ -58,5 +58,5 @@ def picture(rooms: list[str], counted: Counter[tuple[str, str]]) -> str:
                 place = f'x="{LEFT + other * CELL}" y="{y}" width="{BOX}" height="{BOX}"'
                 parts.append(f'<rect {place} class="uses" fill-opacity="{shade:.2f}"><title>{title}</title></rect>')
     frame = f'viewBox="0 0 {LEFT + size + 60} {TOP + size}" style="max-width: {LEFT + size + 60}px"'
-    label = f"Of {len(rooms)} rooms each uses some of those before it, and none after it"
+    label = f"Imports between {len(rooms)} rooms: each room imports only rooms before it"
     return f'<svg class="rooms" role="img" aria-label="{label}" {frame}>{"".join(parts)}</svg>'

@@ -1,4 +1,4 @@
-"""Order the results of the search: guides first, then explanations, then generated lists and measurements."""
+"""Rank search results: guides first, then explanations, then generated lists and measurements."""
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import Files
@@ -13,7 +13,7 @@ BOOSTS = {
     "reference/scenario-keys.md": 0.25,
     "CHANGELOG.md": 0.25,
 }
-"""Start of a page's path -> factor of its score. Other pages have 1."""
+"""Start of the path of a page -> factor of its score in a search. All other pages have the factor 1."""
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
