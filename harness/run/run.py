@@ -1,9 +1,7 @@
 """One run from scenario to verdict: play, check, write the record, the report and the file that replays it."""
 
 import asyncio
-import platform
 import signal
-import sys
 import threading
 import time
 from collections.abc import Collection, Coroutine
@@ -11,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +25,13 @@ from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, 
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
-from harness.play.core_version import core_version
 from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
 from harness.play.progress import Progress, Silent
 from harness.play.request_socket import listening
+from harness.run.provenance import versions
 from harness.scenario import Scenario
 from harness.scenario.scenario_file import to_yaml
-from netem import uml
 from ucp.agent_files import write_atomically
 
 REPLAY_FILE = "replay.yaml"
@@ -55,9 +51,6 @@ def replay_of(scenario: Scenario, by_hand_s: Collection[float], seed: int | None
         f"    ucp-harness run {REPLAY_FILE} --backend {backend} --seed {seed}",
     ]
     return to_yaml(document, comment, remark)
-
-
-PACKAGES = ("ucp-harness", "pymavlink")
 
 
 @dataclass(frozen=True)
@@ -271,14 +264,3 @@ async def _until_interrupted(
         for number, handler in before.items():
             loop.remove_signal_handler(number)
             signal.signal(number, handler)
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of the software and the system, so that a user can repeat the run."""
-    return {
-        "core": core_version(),
-        **{package: version(package) for package in PACKAGES},
-        "python": platform.python_version(),
-        "kernel": f"{platform.release()} (User Mode Linux)" if uml.inside() else platform.release(),
-        "platform": sys.platform,
-    }

@@ -11,7 +11,7 @@ from pathlib import Path
 from harness.archive.directory import default_path
 from harness.errors import InterruptedRunError, ScenarioError
 from harness.run.parallel import Failed, cores, sweep
-from harness.run.run import versions
+from harness.run.provenance import versions
 from harness.scenario import Scenario
 from harness.sweep.matrix._cell import Run, sum_up
 from harness.sweep.matrix._cell_play import Judge, Player, simulated

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import harness
 from harness.cli import app
 from harness.play import core_version
-from harness.run.run import versions
+from harness.run.provenance import versions
 from harness.run.simulate import simulate
 from tests.harness.play.test_simulation import digest
 from tests.harness.virtual import scenario

@@ -17,7 +17,7 @@ from harness.proof import Bounds
 from harness.proof.coverage import Existing, existing
 from harness.proof.coverage import to_json as coverage_to_json
 from harness.run.parallel import sweep
-from harness.run.run import versions
+from harness.run.provenance import versions
 from harness.run.simulate import evidence_lines, same_twice, simulated
 from harness.scenario import Scenario
 from harness.sweep.explore._exploring import smallest_of

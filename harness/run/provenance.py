@@ -1,0 +1,60 @@
+"""The software that played and judged a run: the key `versions` of run.json, matrix.json and findings.json."""
+
+import hashlib
+import platform
+import subprocess
+import sys
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+from harness.checker import reference
+from harness.play.core_version import core_version
+from netem import uml
+
+PACKAGES = ("ucp-harness", "pymavlink")
+ROOT = Path(__file__).parents[2]
+GIT_LIMIT_S = 5.0
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of agent core, reference, packages, Python, kernel and platform.
+
+    `commit` is there if the harness runs from a clone. "-dirty" at its end means that files were modified.
+    """
+    commit = _commit()
+    return {
+        **{package: version(package) for package in PACKAGES},
+        **({"commit": commit} if commit else {}),
+        "core": core_version(),
+        "reference": _reference_version(),
+        "python": platform.python_version(),
+        "kernel": f"{platform.release()} (User Mode Linux)" if uml.inside() else platform.release(),
+        "platform": sys.platform,
+    }
+
+
+@cache
+def _reference_version() -> str:
+    """The digest of the reference that judges steps."""
+    files = sorted(Path(reference.__file__).parent.glob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+
+
+@cache
+def _commit() -> str | None:
+    """The commit of the clone from which the harness runs; None if it runs from an installed package."""
+    if not (ROOT / ".git").exists():
+        return None
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=GIT_LIMIT_S,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return described.stdout.strip() or None
