@@ -66,7 +66,12 @@ def _digests() -> dict[str, str]:
     return {f"ucp/{name}.py": hashlib.sha256((directory / f"{name}.py").read_bytes()).hexdigest() for name in FILES}
 
 
+def record() -> None:
+    """Record the core in use as the released one."""
+    RELEASED.write_text("".join(f"{digest}  {name}\n" for name, digest in _digests().items()), "ascii")
+
+
 if __name__ == "__main__":
     if sys.argv[1:] != ["--record"]:
         raise SystemExit("usage: python -m harness.play.core_version --record")
-    RELEASED.write_text("".join(f"{digest}  {name}\n" for name, digest in _digests().items()), "ascii")
+    record()

@@ -42,34 +42,42 @@ def test_core_is_all_that_an_agent_imports() -> None:
 
 
 @pytest.fixture
-def edited_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Record another digest of `ucp/commit.py`, as if the file had been edited."""
-    released = core_version.RELEASED.read_text("ascii")
-    line = next(line for line in released.splitlines() if line.endswith("ucp/commit.py"))
+def released_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Record the digests of the core in use, whether or not it is the released one."""
     recorded = tmp_path / "released_core.sha256"
-    recorded.write_text(released.replace(line, f"{'0' * 64}  ucp/commit.py"), "ascii")
     monkeypatch.setattr(core_version, "RELEASED", recorded)
+    core_version.record()
     core_version.edited_files.cache_clear()
-    yield
+    yield recorded
     core_version.edited_files.cache_clear()
 
 
-def test_run_record_names_an_edited_core(edited_core: None) -> None:
+def edit(recorded: Path) -> None:
+    """Record another digest of `ucp/commit.py`, as if the file had been edited."""
+    lines = recorded.read_text("ascii").splitlines()
+    edited = [f"{'0' * 64}  ucp/commit.py" if line.endswith(" ucp/commit.py") else line for line in lines]
+    recorded.write_text("\n".join(edited), "ascii")
+    core_version.edited_files.cache_clear()
+
+
+def test_run_record_names_an_edited_core(released_core: Path) -> None:
+    assert versions()["core"].startswith("released ")
+    edit(released_core)
     assert core_version.edited_files() == ("ucp/commit.py",)
     assert versions()["core"].startswith("edited ")
     assert versions()["core"].endswith("(ucp/commit.py)")
 
 
-def test_virtual_time_withholds_nothing_from_an_edited_core(edited_core: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_virtual_time_withholds_nothing_from_an_edited_core(released_core: Path) -> None:
     lossy = scenario(network={"loss": 0.2}, duration_s=200.0)
-    edited = digest(simulate(lossy, 1, tracing=True))
-    core_version.edited_files.cache_clear()
-    monkeypatch.undo()
-    assert edited == digest(simulate(lossy, 1, tracing=True, deliver_all=True))
-    assert edited != digest(simulate(lossy, 1, tracing=True))
+    withheld = digest(simulate(lossy, 1, tracing=True))
+    delivered = digest(simulate(lossy, 1, tracing=True, deliver_all=True))
+    edit(released_core)
+    assert (digest(simulate(lossy, 1, tracing=True)) == delivered) and (delivered != withheld)
 
 
-def test_proof_of_an_edited_core_does_not_reduce_states(edited_core: None) -> None:
+def test_proof_of_an_edited_core_does_not_reduce_states(released_core: Path) -> None:
+    edit(released_core)
     proved = CliRunner().invoke(app, ["prove", "--agents", "2", "--blocks", "1", "--json"])
     assert "state reduction is disabled" in proved.stderr and "ucp/commit.py was edited" in proved.stderr
     assert json.loads(proved.stdout)["reduced"] is False
