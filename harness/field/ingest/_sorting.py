@@ -140,8 +140,8 @@ def _what_else(data: bytes) -> str:
     if data.startswith(_ARCHIVES):
         return "it is an archive, or compressed with another program than gzip: unpack it first"
     printable = sum(byte >= 32 or byte in b"\t\r\n" for byte in data[:4096])
-    text = "text" if printable > 0.9 * len(data[:4096]) else "neither text nor a capture"
-    return f"it is not a trace, chain export or capture: {text} without UCP records"
+    content = "text" if printable > 0.9 * len(data[:4096]) else "binary data"
+    return f"it is not a trace, chain export or capture: {content} without UCP records"
 
 
 def _summed_up(left_out: list[LeftOut]) -> Iterator[LeftOut]:
