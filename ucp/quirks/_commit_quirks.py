@@ -14,7 +14,7 @@ from ucp.timers import Timer
 
 @quirk(1, helper=Core.complete)
 def oldest_event_timestamp(good: Helper, core: Core, block: Block) -> None:
-    """A block has the timestamp of its oldest event, not of its newest."""
+    """A block has the timestamp of its oldest event, not of its newest event."""
     oldest_us = int.from_bytes(block.event_data[:8], "big")
     good(core, Block(block.agent_id, max(oldest_us, core.newest_block_timestamp_us + 1), block.event_data))
 
@@ -26,7 +26,7 @@ def lose_completed_block(good: Helper, core: Core, block: Block) -> None:
 
 @quirk(1, helper=Core.trigger)
 def complete_and_wait(good: Helper, core: Core, event: LocalEvent) -> None:
-    """A completed block triggers no proposal. It waits until another event processes the deque."""
+    """A completed block triggers no proposal. The block waits until another event processes the deque."""
 
 
 @quirk(2)
@@ -57,7 +57,7 @@ def propose_back_of_deque(good: Handler, core: Core) -> str:
 
 @quirk(2, helper=Core.send)
 def propose_earlier_top(good: Helper, core: Core, message: BlockAddRequest) -> None:
-    """A proposal names the top chain hash of one block earlier."""
+    """A proposal names the chain hash of the block below the top block."""
     chain_hashes = [core.chain.inception.chain_hash, *(chain_hash for _, chain_hash in core.chain.with_chain_hashes())]
     good(core, replace(message, chain_hash=chain_hashes[-2:][0]))
 
@@ -107,7 +107,7 @@ def vote_while_reconciling(good: Handler, core: Core, sender: int, message: Bloc
 
 @quirk(4)
 def count_votes_twice(good: Handler, core: Core, sender: int, message: BlockAddResponse) -> str:
-    """Each copy of a vote counts."""
+    """If a vote arrives twice, both copies count."""
     core.voters.discard(sender)
     return good(core, sender, message)
 
@@ -150,7 +150,7 @@ def commit_onto_changed_chain(good: Handler, core: Core) -> str:
 
 @quirk(5)
 def change_without_new_vote(good: Handler, core: Core) -> str:
-    """If the chain changes during a vote, the agent holds no new vote (the pseudo-code as printed)."""
+    """If the chain changes during a vote, the agent starts no new vote, as in the printed pseudo-code."""
     branch = good(core)
     if branch == "chain changed":
         core.triggered.pop()
@@ -171,7 +171,7 @@ def hide_commits(good: Helper, core: Core, message: CommitBlock) -> None:
 
 @quirk(5)
 def lose_disapproved_block(good: Handler, core: Core) -> str:
-    """A block that is not approved leaves the deque."""
+    """A block that is not approved is removed from the deque."""
     branch = good(core)
     if branch == "not approved":
         core.take_from_deque()
@@ -180,7 +180,7 @@ def lose_disapproved_block(good: Handler, core: Core) -> str:
 
 @quirk(5, helper=Core.take_from_deque)
 def take_two_blocks(good: Callable[..., Block], core: Core) -> Block:
-    """A commit removes two blocks from the deque, and commits one."""
+    """A commit removes two blocks from the deque, and commits one of them."""
     block = good(core)
     if core.blocks_to_be_committed:
         good(core)
@@ -201,13 +201,13 @@ def break_off_commit(good: Helper, core: Core, block: Block) -> None:
 
 @quirk(5, helper=Core.send)
 def break_off_broadcast(good: Helper, core: Core, message: CommitBlock) -> None:
-    """A wrong file path ends the commit. The block is in the chain and not broadcast. The next one is not proposed."""
+    """A wrong file path ends the commit. The block is in the chain but not sent. The next block is not proposed."""
     raise FileNotFoundError
 
 
 @quirk(6, branches=("ignored by quirk",), chance=True)
 def ignore_commit(good: Handler, core: Core, sender: int, message: CommitBlock, strikes: Callable[[], bool]) -> str:
-    """The agent ignores each Commit Block with this probability."""
+    """The agent ignores each Commit Block with the probability that is the quirk's value."""
     if not core.reconcile_in_progress and strikes():
         return "ignored by quirk"
     return good(core, sender, message)

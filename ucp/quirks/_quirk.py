@@ -2,7 +2,7 @@
 
     @quirk(4)
     def count_votes_twice(good: Handler, core: Core, sender: int, message: BlockAddResponse) -> str:
-        '''Each copy of a vote counts.'''
+        '''If a vote arrives twice, both copies count.'''
         core.voters.discard(sender)
         return good(core, sender, message)
 

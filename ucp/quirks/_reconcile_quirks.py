@@ -29,7 +29,7 @@ def never_reconcile(good: Handler, core: Core) -> str:
 
 @quirk(7)
 def reconcile_unflagged(good: Handler, core: Core) -> str:
-    """A reconcile does not set `reconcile_in_progress`. The agent still votes, answers and starts reconciles."""
+    """A reconcile does not set `reconcile_in_progress`. The agent still votes, sends answers and starts reconciles."""
     branch = good(core)
     core.reconcile_in_progress = False
     return branch
@@ -70,14 +70,14 @@ def count_phase1_of_others(good: Handler, core: Core, sender: int, message: Chai
 
 @quirk(10)
 def count_phase1_twice(good: Handler, core: Core, sender: int, message: ChainContainResponse) -> str:
-    """Each copy of a phase 1 answer counts."""
+    """If a phase 1 answer arrives twice, both copies count."""
     core.reconcile_responders.discard(sender)
     return good(core, sender, message)
 
 
 @quirk(11)
 def other_phase1_tie(good: Handler, core: Core) -> str:
-    """A tie in phase 1 is resolved against the setting `phase1_tie`."""
+    """The agent resolves a tie in phase 1 contrary to the setting `phase1_tie`."""
     if core.reconcile_vote_count["yes"] == core.reconcile_vote_count["no"] > 0:
         core.reconcile_vote_count["no" if core.settings.phase1_tie == "phase2" else "yes"] += 1
     return good(core)
@@ -147,7 +147,7 @@ def diverged_and_unmoved(good: Helper, core: Core, event: LocalEvent) -> None:
 
 @quirk(14)
 def count_phase2_twice(good: Handler, core: Core, sender: int, message: NextInSequenceResponse) -> str:
-    """Each copy of a phase 2 answer counts."""
+    """If a phase 2 answer arrives twice, both copies count."""
     core.reconcile_responders.discard(sender)
     return good(core, sender, message)
 
@@ -208,7 +208,7 @@ def lose_block_from_stack(good: Helper, core: Core, block: Block) -> None:
 
 @quirk(16, helper=Core.trigger)
 def stop_after_stack(good: Helper, core: Core, event: LocalEvent) -> None:
-    """Phase 3 stops after it takes a block from the reconcile stack (the pseudo-code as printed)."""
+    """Phase 3 stops after it takes a block from the reconcile stack, as in the printed pseudo-code."""
 
 
 @quirk(17)
