@@ -220,6 +220,13 @@ class Told(GrowingTimeline):
         self._set(final_reconcile=reconcile_finally or self.scenario.final_reconcile)
         await mission.settle(swarm, self.scenario)
 
+    async def break_off(self, swarm: mission.Swarm) -> None:
+        """End the mission here, so that the recorded scenario ends at the moment at which the test failed."""
+        if not swarm.played.settled and swarm.played.final_reconcile is None:
+            await self.release(swarm)
+            settle = self.scenario.settle.model_copy(update={"limit_s": INSTANT_S})
+            self._set(duration_s=max(swarm.now(), INSTANT_S), settle=settle, final_reconcile=False)
+
     def _set(self, **keys: Any) -> None:
         self.scenario = self.scenario.model_copy(update=keys)
 

@@ -316,10 +316,12 @@ class Swarm:
             self._loop.call_soon_threadsafe(callback, *arguments)
 
     def finish(self, settle: bool) -> Run:
-        """End the run, once the agents have settled if `settle`, and judge it. Raises MachineError."""
-        if settle:
-            with suppress(RunEndedError):  # the record says why
+        """End the run and judge it: after the agents have settled if `settle`, or at once. Raises MachineError."""
+        with suppress(RunEndedError):  # the record says why
+            if settle:
                 self._hear(lambda swarm: self._told.end(swarm, reconcile_finally=False))
+            else:
+                self._hear(self._told.break_off)
         self._in_loop(self._told.stop)
         return self._judge()
 

@@ -9,7 +9,7 @@ import pytest
 from harness.archive.playable import scenario_of
 from harness.errors import HarnessError
 from tests.harness.command import harness
-from tests.pytest_plugin.inner import run
+from tests.pytest_plugin.inner import run, run_directories
 
 pytest_plugins = "pytester"
 
@@ -46,3 +46,20 @@ def test_a_record_without_a_scenario_is_one_sentence(tmp_path: Path, record: str
     (tmp_path / "run.json").write_text(record)
     with pytest.raises(HarnessError, match=sentence):
         scenario_of(tmp_path)
+
+
+def test_rerun_of_a_failed_test_ends_where_the_test_failed(pytester: pytest.Pytester, tmp_path: Path) -> None:
+    pytester.makepyfile("""
+        import pytest
+
+        @pytest.mark.swarm(backend="sim", duration_s=1200)
+        def test_blocks(swarm):
+            swarm.run_for(400)
+            assert swarm.figures["blocks"] > 1000
+    """)
+    failed = run(pytester, "--ucp-keep", "kept")
+    failed.assert_outcomes(failed=1)
+    (kept,) = run_directories(pytester)
+    harness("run", kept, "--backend", "sim", "--out", tmp_path / "again")
+    same = harness("diff", kept, tmp_path / "again")
+    assert "identical to the last byte" in same.stdout
