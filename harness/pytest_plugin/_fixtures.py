@@ -16,7 +16,7 @@ from harness.pytest_plugin.findings import Findings
 from harness.pytest_plugin.swarm_in_test import Swarm
 from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.load import parse
+from harness.scenario.load import find, parse
 
 DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1}
 
@@ -73,7 +73,9 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
             "the fixture `scenario` needs a marker with a scenario, and optionally a backend and a seed: "
             '@pytest.mark.scenario("loss_15.yaml", backend="sim", seed=3)'
         )
-    return node.path.parent / marker.args[0], {**DEFAULTS, **marker.kwargs}
+    path = node.path.parent / marker.args[0]
+    included = find(Path(marker.args[0]))
+    return path if path.exists() or not included.is_absolute() else included, {**DEFAULTS, **marker.kwargs}
 
 
 def _backend_and_seed(backend: Any, seed: Any, options: Options) -> tuple[BackendName, int]:

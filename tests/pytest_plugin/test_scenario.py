@@ -88,3 +88,14 @@ def test_a_backend_that_this_machine_cannot_is_skipped_with_the_way_out(
     result.assert_outcomes(skipped=3)
     result.stdout.fnmatch_lines(["SKIPPED *is not installed*apt install*"] * 1)
     no_internals(result)
+
+
+def test_marker_names_an_included_scenario(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+        import pytest
+
+        @pytest.mark.scenario("perfect", backend="sim", seed=1)
+        def test_perfect(scenario):
+            assert scenario.figures["distinct_chains"] == 1
+    """)
+    run(pytester).assert_outcomes(passed=1)
