@@ -225,7 +225,7 @@ def test_a_connection_to_nobody_times_out_and_stalls_nobody(tmp_path: Path) -> N
 
 def test_who_is_not_in_the_lab_is_refused_by_name(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
-        with pytest.raises(LabError, match="no 9 in the lab; allowed is any of 1, 2"):
+        with pytest.raises(LabError, match="vehicle: the lab has no vehicle 9; use one of 1, 2"):
             await start(lab, tmp_path, 9, "/bin/true")
         with pytest.raises(LabError, match="numeric"):
             await lab.connect(1, PORT, host="localhost", timeout_s=1)

@@ -89,7 +89,7 @@ def test_named_locations_are_looked_for_beside_the_scenario_then_where_the_user_
     assert start_places.named("AVC", tmp_path, environ).lat_deg == 1
     with pytest.raises(VehicleError, match=r"no such location in .*: did you mean AVC\?"):
         start_places.named("AVD", tmp_path, environ)
-    with pytest.raises(VehicleError, match="no file of named locations: looked for"):
+    with pytest.raises(VehicleError, match="no file of named locations found: searched"):
         start_places.named("AVC", tmp_path / "none", {"HOME": "/nowhere"})
     tree = tmp_path / "ardupilot"
     written(tree / "Tools" / "autotest" / "locations.txt", "CMAC=-35.3,149.1,584,353\n")

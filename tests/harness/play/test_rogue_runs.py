@@ -121,7 +121,7 @@ def check_forgery(finished: Run) -> None:
     assert violated(finished) == {"1", "4"}
     for finding in finished.result.characteristics["4"].evidence:
         assert (finding.block or "").startswith("2.")
-        assert f"holds block {finding.block}, which agent 2 never completed; it came at t=2" in finding.detail
+        assert f"holds block {finding.block}, which agent 2 never completed; the block arrived at t=2" in finding.detail
 
 
 def test_a_forged_commit_is_noticed_and_the_report_says_what_became_of_it(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_a_rogue_node_that_dies_ends_the_run_as_a_failure_of_the_harness(tmp_pat
     os.kill(pid, signal.SIGKILL)
     status, _, err = running.end()
     assert status == 3
-    assert sentences(err)[0].startswith("the rogue node ended by itself with SIGKILL; its log is rogue.log; what there")
+    assert sentences(err)[0].startswith("the rogue node ended by itself with SIGKILL; its log is rogue.log; the chains")
     assert not processes(tmp_path / "run")
 
 
@@ -261,7 +261,7 @@ def test_dead_and_paused_agents_hear_the_rogue_as_they_hear_anybody(tmp_path: Pa
         ),
         ({"forge": {"message": "Commit Block", "sender": 1, "approve": True}}, "a Commit Block has no vote"),
         ({"flood": {"for_s": 100, "per_s": 5000}}, "500000 messages are too many: a flood has at most 100000"),
-        ({"lie": {"message": "Commit Block", "sender": 1, "block": "1.1"}}, "a Commit Block says `block` and `chain`"),
+        ({"lie": {"message": "Commit Block", "sender": 1, "block": "1.1"}}, "a Commit Block needs `block` and `chain`"),
         ({"lie": {"message": "Request for Block", "sender": 1, "block": 2.1}}, "`timeline.0.lie.block` is 2.1"),
         (
             {"lie": {"message": "Chain Contain Query", "sender": 1, "chain": [], "receivers": [9]}},

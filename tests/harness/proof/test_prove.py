@@ -134,7 +134,7 @@ def test_what_was_not_looked_at_never_holds(tmp_path: Path) -> None:
     assert not any("sooner" in line for line in in_words(proof))
     bounds = Bounds(3, 3, "lossless", stagger={"phase1_timeout_s": 0.5})
     staggered = prove(bounds, Limits(most_s=0.0), tmp_path / "staggered.yaml")
-    assert [*in_words(staggered)][2].endswith("the same with --coincidences 0 or --no-crossing or --clocks any")
+    assert [*in_words(staggered)][2].endswith("the same bounds with --coincidences 0 or --no-crossing or --clocks any")
 
 
 @pytest.mark.parametrize(

@@ -177,7 +177,7 @@ def test_a_vehicle_that_exits_at_once_ends_the_run_with_its_last_words(tmp_path:
     done = harness("run", scenario, "--out", tmp_path / "run")
     assert done.returncode == 2
     said = sentences(done.stderr)[0]
-    assert re.search(r"vehicle \d \(ardupilot\) ended by itself with status 1; its last words .*: bind failed", said)
+    assert re.search(r"vehicle \d \(ardupilot\) ended by itself with status 1; its last output .*: bind failed", said)
     assert not processes(tmp_path / "run")
 
 
@@ -375,8 +375,8 @@ def test_what_is_not_supported_half_way_leaves_no_verdict_either(tmp_path: Path)
     keys = {"vehicles": {"kind": "none"}, "timeline": [{"at_s": 60, "stop_events": [2]}]}
     done = harness("run", write_scenario(tmp_path, agent_command={2: command}, **keys), "--out", tmp_path / "run")
     assert done.returncode == 3
-    asked = f"not supported by agent 2 ({shlex.join(command)}): asked to stop_events, it says: mine has no stop_events"
-    assert sentences(done.stderr) == [f"{asked}; the run has no verdict"]
+    refused = "refused the command stop_events: mine has no stop_events; the run has no verdict"
+    assert sentences(done.stderr) == [f"not supported by agent 2 ({shlex.join(command)}): {refused}"]
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert set(verdicts(record).values()) == {"not applicable"}
     assert 60 <= record["mission_s"] < 200

@@ -155,7 +155,10 @@ def test_an_agent_that_does_not_end_by_itself_is_ended(tmp_path: Path) -> None:
     [
         ("import time; said['now'] = int(time.time())", "it may read a clock, draw random numbers"),
         ("import os; said['pid'] = os.getpid()", "it may read a clock, draw random numbers"),
-        ("given.setdefault('seen', globals().setdefault('seen', number)); said['n'] = number", "from an earlier life"),
+        (
+            "given.setdefault('seen', globals().setdefault('seen', number)); said['n'] = number",
+            "an earlier incarnation",
+        ),
     ],
 )
 def test_an_agent_that_is_not_the_same_twice_is_named(tmp_path: Path, code: str, why: str) -> None:

@@ -46,7 +46,7 @@ def test_a_crash_is_found_and_shrunk_to_what_it_takes(tmp_path: Path) -> None:
     done = harness("explore", asked, "--seeds", 1, "--jobs", 2, "--out", tmp_path / "shrunk.yaml", deadline_s=240)
     assert done.returncode == 1
     assert "agent 2: crashed: it ended by itself with status 1 when it was given an event at " in done.stdout
-    assert "it said: the third event was too much" in done.stdout
+    assert "its last output: the third event was too much" in done.stdout
     shrunk = yaml.safe_load((tmp_path / "shrunk.yaml").read_text())
     assert shrunk["agent_command"] == command and len(shrunk["events"]["script"]) == 3
     assert nobody_is_left(tmp_path)
