@@ -221,9 +221,14 @@ class Told(GrowingTimeline):
         await mission.settle(swarm, self.scenario)
 
     async def break_off(self, swarm: mission.Swarm) -> None:
-        """End the mission here, so that the recorded scenario ends at the moment at which the test failed."""
-        if not swarm.played.settled and swarm.played.final_reconcile is None:
-            await self.release(swarm)
+        """End the mission here, so that the recorded scenario ends at the moment at which the test failed.
+
+        A scenario lasts at least as long as its timeline. If a change lasts longer, the recorded duration stays.
+        """
+        await self.release(swarm)
+        lasts_s = max([0.0, *(entry.ends_at_s for entry in self.scenario.timeline)])
+        ended = swarm.played.settled or swarm.played.final_reconcile is not None
+        if not ended and not self.scenario.schedule and lasts_s <= swarm.now():
             settle = self.scenario.settle.model_copy(update={"limit_s": INSTANT_S})
             self._set(duration_s=max(swarm.now(), INSTANT_S), settle=settle, final_reconcile=False)
 
