@@ -43,7 +43,7 @@ def check(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.uml
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_threads_children_and_signals_leave_registers_alone(
     guest: None, check: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -55,7 +55,7 @@ def test_threads_children_and_signals_leave_registers_alone(
 
 
 @pytest.mark.uml
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_hashes_copies_and_floats_come_out_as_on_the_host(guest: None, capfd: pytest.CaptureFixture[str]) -> None:
     argv = [sys.executable, str(PROGRAMS / "work.py")]
     here = subprocess.run(argv, capture_output=True, text=True, check=True).stdout
@@ -64,7 +64,7 @@ def test_hashes_copies_and_floats_come_out_as_on_the_host(guest: None, capfd: py
 
 
 @pytest.mark.uml
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_registers_that_are_lost_are_noticed(
     check: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -116,7 +116,7 @@ def test_a_compiler_that_fails_is_an_error_with_its_word(tmp_path: Path, monkeyp
 
 
 @pytest.mark.uml
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_temporary_directory_may_have_any_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, guest: None, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -54,7 +54,7 @@ def test_the_same_tests_end_the_same_with_any_number_of_workers(
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_eight_labs_at_once_do_not_meet(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
     import json, pathlib, pytest, time

@@ -29,7 +29,7 @@ FIRST_AND_LAST = """
 
 
 @pytest.mark.uml
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_session_is_played_in_user_mode_linux(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
     pytester.makepyfile(FIRST_AND_LAST)
     monkeypatch.setenv("TMPDIR", str(pytester.mkdir("temporary")))

@@ -266,7 +266,7 @@ def test_with_keys_it_is_ours_to_the_byte(secured: Path) -> None:
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_with_keys_over_udp_with_ours_among_them(secured: Path, tmp_path: Path) -> None:
     commands = {1: [str(secured)], 3: [str(secured)]}
     keys = {"agents": 4, "agent_command": commands, "security": {"seal": True, "captured": 4}}
@@ -280,7 +280,7 @@ def test_with_keys_over_udp_with_ours_among_them(secured: Path, tmp_path: Path) 
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_mission_over_udp_with_ours_among_them(checked: Path, agent: Path, tmp_path: Path) -> None:
     commands = {1: [str(agent)], 3: [str(checked)]}
     path = write_scenario(tmp_path, vehicles={"kind": "none"}, duration_s=150, agent_command=commands, **HARD_RUN)

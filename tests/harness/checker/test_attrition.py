@@ -88,7 +88,7 @@ def _the_vehicle_fell(vehicle: dict[str, Any]) -> None:
     assert vehicle["altitude_m"] < 1
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_an_agent_that_stays_paused_is_woken_for_its_export_and_the_run_is_not_settled(tmp_path: Path) -> None:
     keys = {"vehicles": {"kind": "none"}, "final_reconcile": True, "settle": {"limit_s": 200}}
     scenario = write_scenario(tmp_path, **keys, timeline=[{"at_s": 100, "pause": [3]}])
@@ -100,7 +100,7 @@ def test_an_agent_that_stays_paused_is_woken_for_its_export_and_the_run_is_not_s
     assert {agent["outcome"] for agent in record["agents"].values()} == {"exported"}
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_an_agent_that_dies_unasked_in_its_second_life_fails_the_run(tmp_path: Path) -> None:
     timeline = [{"at_s": 20, "kill": [2]}, {"at_s": 40, "restart": [2]}]
     scenario = write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}, timeline=timeline)
@@ -114,7 +114,7 @@ def test_an_agent_that_dies_unasked_in_its_second_life_fails_the_run(tmp_path: P
     assert run.record()["agents"]["2"]["outcome"] == "crashed"
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_run_that_is_interrupted_while_an_agent_is_down_says_so(tmp_path: Path) -> None:
     timeline = [{"at_s": 20, "reboot": [2], "down_s": 90_000, "disk": "kept"}]
     scenario = write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}, timeline=timeline)

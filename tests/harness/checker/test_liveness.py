@@ -218,7 +218,7 @@ def test_time_until_uniform_is_known_of_every_run_that_ends_with_one_chain() -> 
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_process_that_goes_round_is_found_by_its_trace(tmp_path: Path) -> None:
     """Nobody approves of anything, so that each vote of the one agent with a block ends in a reconcile, and so on."""
     refusing = write_scenario(

@@ -68,7 +68,7 @@ def test_a_shell_reaches_inside_and_an_interrupted_run_is_exported_and_judged(tm
 
 
 @pytest.mark.uml
-@pytest.mark.whoever
+@pytest.mark.any_user
 @pytest.mark.parametrize("before", ["", LATE_BEAT], ids=["beating", "output-before-first-beat"])
 def test_sigterm_reaches_the_command_as_ctrl_c(tmp_path: Path, before: str) -> None:
     with _Started(tmp_path, sys.executable, "-c", before + WAITING) as started:
@@ -80,7 +80,7 @@ def test_sigterm_reaches_the_command_as_ctrl_c(tmp_path: Path, before: str) -> N
 
 
 @pytest.mark.uml
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_whoever_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
     with _Started(tmp_path, sys.executable, "-c", WAITING) as started:
         started.wait_for("here")
@@ -91,7 +91,7 @@ def test_whoever_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 @pytest.mark.uml
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_the_exit_status_and_both_outputs_come_out_whole(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     lines = 20000
     assert _run(f"seq {lines}; echo complaint >&2; exit 7") == 7
@@ -101,14 +101,14 @@ def test_the_exit_status_and_both_outputs_come_out_whole(tmp_path: Path, capfd: 
 
 
 @pytest.mark.uml
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_kernel_that_panics_is_an_error_not_a_status(tmp_path: Path) -> None:
     with pytest.raises(UmlError, match="panic"):
         _run("echo c >/proc/sysrq-trigger; sleep 60")
 
 
 @pytest.mark.uml
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_kernel_that_falls_silent_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uml, "SILENCE_LIMIT_S", 3.0)
     monkeypatch.setattr(uml, "BEAT_S", 60)
@@ -117,7 +117,7 @@ def test_a_kernel_that_falls_silent_is_an_error(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.uml
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_kernel_that_does_not_boot_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uml, "MEMORY", "nonsense")
     with pytest.raises(UmlError, match="it did not boot"):

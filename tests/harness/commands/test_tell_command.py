@@ -9,7 +9,7 @@ from harness.play.request_socket import SOCKET
 from tests.harness.command import Running, harness, sentences, write_scenario
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_virtual_time_stands_still_until_it_is_told_to_go_on(tmp_path: Path) -> None:
     out = tmp_path / "run"
     going = Running(write_scenario(tmp_path), out, "--backend", "sim", "--by-hand", "--seed", "3")
@@ -62,7 +62,7 @@ def test_processes_are_told_and_do_not_stand_still(tmp_path: Path) -> None:
     assert "by hand" in (out / "replay.yaml").read_text()
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_run_that_nobody_can_tell_anything_is_one_sentence(tmp_path: Path) -> None:
     done = harness("tell", tmp_path, "heal")
     assert done.returncode == 2

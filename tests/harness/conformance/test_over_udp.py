@@ -49,7 +49,7 @@ def test_a_right_agent_passes_all(idle: list[Vectors], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("quirk", "algorithm"), [("complete_and_wait", 1), ("commit_without_succession", 6), ("diverged_and_unmoved", 13)]
 )
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_of_a_wrong_agent_the_algorithm_is_named(
     quirk: str, algorithm: int, idle: list[Vectors], tmp_path: Path
 ) -> None:
@@ -64,7 +64,7 @@ def test_of_a_wrong_agent_the_algorithm_is_named(
     assert to_junit(results).count("<failure") == len(results.failures)
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_an_agent_that_lacks_what_the_settings_need_is_not_applicable(tmp_path: Path, idle: list[Vectors]) -> None:
     variant = dataclasses.replace(VARIANTS["default"], features=("a feature that nobody has",))
     results = results_of([dataclasses.replace(idle[0], variant=variant)], tmp_path / "lab", *OURS)

@@ -151,7 +151,7 @@ def test_of_a_run_that_is_killed_the_captures_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_capture_that_crashes_ends_the_run_with_one_sentence_and_status_3(tmp_path: Path) -> None:
     going_on = {**RUN, "timeline": [], "duration_s": 100_000}
     running = Running(write_scenario(tmp_path, **going_on), tmp_path / "run", "--capture")

@@ -98,7 +98,7 @@ def test_an_operator_flies_a_real_copter_under_a_debugger(backend: tuple[str, ..
     assert min(vehicle["real_time_factor"] for vehicle in record["vehicles"].values()) > 0.95
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_tracks_in_virtual_time_are_seen_and_refuse_commands(tmp_path: Path) -> None:
     ground = GroundStation()
     ground.start()
@@ -153,7 +153,7 @@ def test_a_ground_station_that_cannot_be_is_one_sentence(arguments: list[str], s
     assert sentence in " ".join(done.stderr.split())
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_ground_station_to_which_there_is_no_way_is_one_sentence(tmp_path: Path) -> None:
     options = ["--out", tmp_path / "run", "--backend", "sim", "--gcs", "255.255.255.255:1"]
     done = harness("run", write_scenario(tmp_path), *options)

@@ -22,7 +22,7 @@ from tests.harness.virtual import scenario
 
 TIMEOUT_S = 60.0
 
-pytestmark = pytest.mark.whoever
+pytestmark = pytest.mark.any_user
 
 
 def played(asked: Scenario, out: Path, do: Callable[[Interventions], None]) -> Run:

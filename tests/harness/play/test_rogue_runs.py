@@ -189,7 +189,7 @@ def finished_traces(directory: Path) -> dict[int, list[dict[str, Any]]]:
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_rogue_node_that_dies_ends_the_run_as_a_failure_of_the_harness(tmp_path: Path) -> None:
     keys = {"duration_s": 2000, "speedup": 20, "vehicles": {"kind": "none"}, "timeline": [FORGE]}
     running = Running(write_scenario(tmp_path, **keys), tmp_path / "run", "--seed", 1)

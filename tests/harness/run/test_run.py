@@ -62,7 +62,7 @@ def test_a_run_with_vehicles_leaves_everything_that_it_promises(tmp_path: Path) 
     assert json.loads(again.stdout)["figures"] == record["figures"]
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_partition_without_heal_keeps_chains_apart_and_5_and_6_do_not_apply(tmp_path: Path) -> None:
     scenario = write_scenario(
         tmp_path,
@@ -83,7 +83,7 @@ def test_a_partition_without_heal_keeps_chains_apart_and_5_and_6_do_not_apply(tm
     assert {block["agent_id"] for block in other["chain"]} == {300, 65535}
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_the_options_of_the_command_line_come_before_the_scenario_s(tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path, speedup=1)
     done = harness("run", scenario, "--speedup", 200, "--vehicles", "none", "--seed", 0, "--out", tmp_path / "run")
@@ -128,7 +128,7 @@ def test_an_agent_that_crashes_ends_the_run_and_is_named_and_the_others_export(t
     assert "agent 2" in record["characteristics"]["6"]["reason"]
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_an_agent_that_hangs_ends_the_run_and_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = Running(write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}), tmp_path / "run")
     run.wait_for_mission(1, 2, 3)
@@ -146,7 +146,7 @@ def executable(path: Path, text: str, mode: int = 0o755) -> Path:
     return path
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_vehicle_binary_that_will_not_do_is_one_sentence_before_anything_starts(tmp_path: Path) -> None:
     not_executable = executable(tmp_path / "arducopter", "#!/bin/sh\n", 0o644)
     for binary, sentence in ((tmp_path / "nowhere", "does not exist"), (not_executable, "is not executable")):
@@ -159,7 +159,7 @@ def test_a_vehicle_binary_that_will_not_do_is_one_sentence_before_anything_start
     assert not list(tmp_path.glob("run-*"))
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_asking_for_ardupilot_without_having_it_says_how_to_get_it(tmp_path: Path) -> None:
     environment = {**os.environ, "PATH": "/usr/bin:/bin"}
     environment.pop("ARDUPILOT_SITL", None)
@@ -170,7 +170,7 @@ def test_asking_for_ardupilot_without_having_it_says_how_to_get_it(tmp_path: Pat
     assert "no ArduPilot" in sentences(done.stderr)[0]
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_vehicle_that_exits_at_once_ends_the_run_with_its_last_words(tmp_path: Path) -> None:
     binary = executable(tmp_path / "arducopter", "#!/bin/sh\necho bind failed >&2\nexit 1\n")
     scenario = write_scenario(tmp_path, vehicles={"kind": "ardupilot", "binary": str(binary)})
@@ -181,7 +181,7 @@ def test_a_vehicle_that_exits_at_once_ends_the_run_with_its_last_words(tmp_path:
     assert not processes(tmp_path / "run")
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_run_directory_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "precious").write_text("data")
@@ -254,7 +254,7 @@ def test_where_user_namespaces_are_forbidden_a_run_and_doctor_say_so_with_status
     assert json.loads((tmp_path / "run" / "run.json").read_text())["outcome"] == "failed"
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_any_program_that_follows_the_contract_can_be_put_under_test(tmp_path: Path) -> None:
     agent = executable(
         tmp_path / "my-agent",
@@ -266,7 +266,7 @@ def test_any_program_that_follows_the_contract_can_be_put_under_test(tmp_path: P
     assert (tmp_path / "started").read_text() == "--mine\n" * 3
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_some_agents_run_another_program_and_the_others_ours(tmp_path: Path) -> None:
     agent = tmp_path / "my agent.py"
     agent.write_text(
@@ -317,7 +317,7 @@ sys.exit(ucp.node.main(sys.argv[1:], Mine))
         ({3: ["/usr"]}, "`agent_command` of agent 3: /usr is not a program: give a path, or a name on PATH"),
     ],
 )
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_an_agent_command_that_is_no_program_is_one_sentence_before_anything_starts(
     tmp_path: Path, command: Any, sentence: str
 ) -> None:
@@ -341,7 +341,7 @@ def test_a_file_that_is_no_program_after_all_is_the_scenarios_mistake(tmp_path: 
     assert "agent 3 ran" in done.stdout and "[/bold]" in done.stdout
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_an_agent_that_ends_at_once_is_named_with_its_status(tmp_path: Path) -> None:
     agent = executable(tmp_path / "my-agent", "#!/bin/sh\necho no licence >&2\nexit 4\n")
     scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command=[str(agent)])
@@ -352,7 +352,7 @@ def test_an_agent_that_ends_at_once_is_named_with_its_status(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("words", ["mine has no telemetry", ""])
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_an_agent_that_ends_with_127_at_its_start_is_not_judged(tmp_path: Path, words: str) -> None:
     agent = refusing_to_start(tmp_path / "my-agent", words)
     scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command={2: [str(agent), "--x"]})
@@ -369,7 +369,7 @@ def test_an_agent_that_ends_with_127_at_its_start_is_not_judged(tmp_path: Path, 
     assert harness("check", tmp_path / "run").returncode == 3
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_what_is_not_supported_half_way_leaves_no_verdict_either(tmp_path: Path) -> None:
     command = lacking(tmp_path / "my_agent.py", "stop_events")
     keys = {"vehicles": {"kind": "none"}, "timeline": [{"at_s": 60, "stop_events": [2]}]}
@@ -383,7 +383,7 @@ def test_what_is_not_supported_half_way_leaves_no_verdict_either(tmp_path: Path)
     assert record["agents"]["1"]["outcome"] == "exported"
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_shell_that_does_not_find_the_agent_is_a_failure_and_no_agent_that_lacks_something(tmp_path: Path) -> None:
     agent = executable(tmp_path / "my-agent", '#!/bin/sh\nno_such_program "$1"\n')
     scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command={2: [str(agent)]})
@@ -405,7 +405,7 @@ def test_a_lab_that_dies_is_blamed_and_not_the_agents_that_die_with_it(tmp_path:
     assert not processes(run.out)
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_an_agent_that_does_not_follow_the_contract_is_told_so(tmp_path: Path) -> None:
     program = """
 import os, socket, sys

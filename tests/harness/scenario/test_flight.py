@@ -148,7 +148,7 @@ while True:
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_vehicle_that_is_given_up_is_named_and_killed(tmp_path: Path) -> None:
     binary = tmp_path / "arducopter"
     (tmp_path / "stranger.py").write_text(STRANGER)

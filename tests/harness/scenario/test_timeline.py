@@ -250,7 +250,7 @@ def test_exploring_cuts_a_network_s_changes_to_pieces() -> None:
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_link_loses_for_a_while_as_processes(tmp_path: Path) -> None:
     path = write_scenario(
         tmp_path,

@@ -62,7 +62,7 @@ def test_what_a_run_leaves_has_no_secret(home: Home, tmp_path: Path) -> None:
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_what_a_run_of_processes_that_fails_leaves_has_no_secret(home: Home, tmp_path: Path) -> None:
     """Agent 2 is a program that tells all that it is given, and dies."""
     tells = ["sh", "-c", "cat *.mission.json; printenv; exit 3"]
@@ -94,7 +94,7 @@ def test_an_agent_in_virtual_time_that_tells_all_tells_no_secret(home: Home, tmp
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_captured_vehicles_keys_forge_its_blocks_and_no_others(home: Home, tmp_path: Path) -> None:
     """As processes: what is in the run's directory has no secret either."""
     forged = [{"at_s": 60, "forge": {"message": "Commit Block", "sender": sender}} for sender in (3,)]

@@ -60,7 +60,7 @@ def in_short(outcomes: list[str]) -> str:
     return outcomes[0] if len({*outcomes}) == 1 else ", ".join(outcomes)
 
 
-@pytest.mark.whoever
+@pytest.mark.any_user
 @pytest.mark.parametrize(("cure", "cells"), rows(), ids=[cure.replace("`", "") for cure, _ in rows()])
 def test_a_cure_ends_what_the_page_says(cure: str, cells: list[str]) -> None:
     played = [

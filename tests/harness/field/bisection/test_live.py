@@ -41,7 +41,7 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_right_agent_says_what_is_in_the_record_and_a_wrong_one_does_not(records: Path, tmp_path: Path) -> None:
     options = ["--agent", 2, "--speedup", 10, "--agent-command"]
     right = harness("bisect", "--once", records, *options, RIGHT)

@@ -133,7 +133,7 @@ def test_processes_fly_a_matrix_and_leave_what_the_file_asks_for(tmp_path: Path,
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_a_run_whose_agent_crashes_is_a_result_and_is_kept(tmp_path: Path) -> None:
     agent = tmp_path / "agent"
     agent.write_text("#!/bin/sh\nexit 7\n")
@@ -151,7 +151,7 @@ def test_a_run_whose_agent_crashes_is_a_result_and_is_kept(tmp_path: Path) -> No
 
 
 @pytest.mark.lab
-@pytest.mark.whoever
+@pytest.mark.any_user
 def test_what_an_agent_does_not_support_is_neither_failed_nor_violated(tmp_path: Path) -> None:
     agent = refusing_to_start(tmp_path / "agent")
     scenario = {"agents": 2, "duration_s": 60, "vehicles": {"kind": "none"}, "agent_command": {1: [str(agent)]}}
