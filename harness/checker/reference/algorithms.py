@@ -2,7 +2,7 @@
 
 Recorded runs of other implementations are judged by this module, so it favours the order and the words of the
 pseudo-code over short code. Its author worked from the thesis and the readings of the thesis, and did not see `ucp`.
-"Reading 4" in a docstring is a numbered reading, for a place where the thesis contradicts itself or is silent.
+"Reading 4" in a docstring means number 4 of docs/reference/readings.md.
 
 Each algorithm is one function. It reads and changes a `State` and returns the name of the branch that it took. An input
 is a message, an expired timer, a logged event or a command. A handler is atomic: it runs to its end, then the local

@@ -1,7 +1,7 @@
 """The memory of an agent in the reference: settings, timers, the chain, and the variables of the pseudo-code.
 
-`algorithms` has the 20 handlers that read and change it. "Reading 4" in a docstring refers to the project's list of
-readings of the thesis, for places where the thesis contradicts itself or is silent.
+`algorithms` has the 20 handlers that read and change it. "Reading 4" in a docstring means number 4 of
+docs/reference/readings.md.
 """
 
 from collections import deque
