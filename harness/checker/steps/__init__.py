@@ -19,7 +19,7 @@ from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
 from harness.checker.steps.recorded_inputs import Blocks, decoded
-from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
+from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, UnknownSettingError, checked
 from ucp.messages import MalformedDatagramError
 from ucp.trace import Commanded, Dropped
 
@@ -37,6 +37,9 @@ def check(evidence: Evidence) -> Judgement:
             continue
         try:
             header = checked(trace.header)
+        except UnknownSettingError as error:
+            unjudged[agent_id] = str(error)
+            continue
         except ImpossibleHeaderError as error:
             deviations.append(Deviation(agent_id, 1, 0.0, None, str(error)))
             continue

@@ -7,6 +7,7 @@ from typing import Any
 
 from harness.archive.traces import Header
 from harness.checker._waiting import SLACK_WALL_S
+from harness.checker.reference.state import Settings as ReferenceSettings
 from ucp.block import MAX_AGENT_ID
 from ucp.core import Seal
 from ucp.settings import Settings
@@ -21,6 +22,10 @@ _SETTINGS = {setting.name for setting in fields(Settings)}
 
 class ImpossibleHeaderError(Exception):
     """No agent can have these settings, or this clock: a sentence."""
+
+
+class UnknownSettingError(ImpossibleHeaderError):
+    """The agent uses a setting that the reference does not implement, so its steps cannot be judged."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,8 @@ def checked(header: Header) -> CheckedHeader:
         settings = Settings(**{name: value for name, value in header.settings.items() if name in _SETTINGS})
     except (ValueError, TypeError) as error:
         raise ImpossibleHeaderError(f"the header of its trace has invalid settings: {str(error)[:200]}") from None
+    if unknown := _unknown_to_reference(settings):
+        raise UnknownSettingError(f"the settings include {', '.join(unknown)}, which the reference lacks")
     if not 1 <= header.agent_id <= MAX_AGENT_ID:
         raise ImpossibleHeaderError(f"the header of its trace has an invalid agent ID: {str(header.agent_id)[:20]}")
     speedup, drift = _clock(header, "speedup", 1.0), _clock(header, "drift", 0.0)
@@ -67,6 +74,13 @@ def checked(header: Header) -> CheckedHeader:
         SLACK_WALL_S * speedup,
         bool(header.secured),
     )
+
+
+def _unknown_to_reference(settings: Settings) -> list[str]:
+    """Return the settings that differ from their defaults and that the reference lacks."""
+    lacking = _SETTINGS - {setting.name for setting in fields(ReferenceSettings)}
+    usual = Settings()
+    return sorted(name for name in lacking if getattr(settings, name) != getattr(usual, name))
 
 
 def _clock(header: Header, key: str, default: float) -> float:

@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from harness.archive.traces import HANDLER_RUN, Header, Trace
 from harness.checker import Evidence, steps
 from harness.checker.judgement import Judgement
+from harness.checker.reference.state import Settings
+from harness.checker.steps import trace_header
 from harness.run.simulate import simulate
 from tests.harness.virtual import scenario
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, Agent
@@ -254,6 +256,15 @@ def test_of_a_trace_of_the_first_version_steps_are_not_judged(honest: Evidence) 
     judgement = steps.check(with_traces(honest, {**honest.traces, 2: old}))
     assert judgement.verdict == "not applicable"
     assert judgement.reason == "of agent 2 the trace has the version ucp-trace/1, which lacks received messages"
+
+
+def test_agent_with_a_setting_that_the_reference_lacks_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = [(name, object) for name in vars(Settings()) if name != "phase1_tie"]
+    monkeypatch.setattr(trace_header, "ReferenceSettings", dataclasses.make_dataclass("Settings", known))
+    assert judged(settings={"phase1_tie": "phase2"}).verdict == "as specified"
+    judgement = judged(settings={"phase1_tie": "pop"})
+    assert judgement.verdict == "not applicable"
+    assert "the settings include phase1_tie, which the reference lacks" in judgement.reason
 
 
 def test_without_a_trace_of_everybody_steps_are_not_as_specified(honest: Evidence) -> None:

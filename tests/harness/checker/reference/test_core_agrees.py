@@ -88,6 +88,11 @@ def settings_for(rng: Random) -> Settings:
     return replace(Settings(max_block_bytes=300), **changed)
 
 
+def test_reference_has_each_setting_of_the_core_with_its_default() -> None:
+    settings = Settings()
+    assert vars(ReferenceSettings()) == {name: getattr(settings, name) for name in settings.__match_args__}
+
+
 def runs_of(agent: Agent | ReferenceAgent) -> list[HandlerRun]:
     """Return the handler runs since the last call without the inputs, which only the core records."""
     return [replace(entry, input=None) for entry in agent.trace() if isinstance(entry, HandlerRun)]
