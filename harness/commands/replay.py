@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from harness.checker.steps.core_in_use import IN_USE
+from harness.checker.steps.implementation import REFERENCE
 from harness.commands.terminal import complain, print_json
 from harness.errors import VIOLATED, WRONG_REQUEST, InterruptedRunError
 from harness.field.replay import Found, Player, Record, open_record, open_records
@@ -40,7 +41,7 @@ def replay_command(
 ) -> None:
     """Feed an agent's trace to the reference, and compare.
 
-    Exit status 0: the agent did the same as the core. 1: it did not. 2: no step could be replayed.
+    Exit status 0: the agent did the same as the reference. 1: it did not. 2: no step could be replayed.
     """
     if until is not None and not until >= 0:
         raise typer.BadParameter(f"--until {until:g} is not a mission second: use a number from 0 on")
@@ -82,7 +83,8 @@ def _ask(
 ) -> NoReturn:
     """Step through a record as the user says; when no more is said, play the rest."""
     _complain_of(record)
-    player, names = Player(record, until, IN_USE), Names(record)
+    names = Names(record)
+    player = Player(record, until, IN_USE if debug else REFERENCE)
     if debug:
         places = [place(words, names) for words in breaks]
         while not player.at_end:
@@ -96,7 +98,7 @@ def _ask(
         if prompt.quit:
             raise typer.Exit(VIOLATED if player.found.deviations else 0)
     found = Player(record, until).to_end()
-    _show(console, [*summary(record, found, names), *_in_use(player.to_end(), found)])
+    _show(console, [*summary(record, found, names), *_in_use(Player(record, until, IN_USE).to_end(), found)])
     raise typer.Exit(VIOLATED if found.deviations else 0 if found.steps else WRONG_REQUEST)
 
 

@@ -4,9 +4,11 @@ import cmd
 import sys
 from bdb import BdbQuit
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from rich.console import Console, RenderableType
 
+from harness.checker.steps.core_in_use import IN_USE
 from harness.errors import FieldError
 from harness.field.replay._agent_record import Entry
 from harness.field.replay._other_agents import Others
@@ -163,12 +165,10 @@ class Prompt(cmd.Cmd):
         player = self._player
         if not player.position:
             raise FieldError("nothing is played yet: enter next, then debug")
-        position = player.position
-        player.to(position - 1)
-        try:
-            player.forward(into_debugger=True)
-        except BdbQuit:
-            player.to(position, anew=True)
+        in_use = Player(player.record, implementation=IN_USE)
+        in_use.to(player.position - 1)
+        with suppress(BdbQuit):
+            in_use.forward(into_debugger=True)
         self._show()
 
     # Looking

@@ -119,7 +119,7 @@ def summary(record: Record, found: Found, names: Names) -> Iterator[Text]:
     steps = f"{found.steps:,} handler run{'s' if found.steps != 1 else ''}"
     match verdict(found):
         case "as specified":
-            words = "all" if not found.unjudged else "all that could be played"
+            words = "all" if not found.unjudged else "the steps that could be played"
             yield shown(f"✔ no difference: {steps}, {words} follow Algorithms 1 to 20", style="green")
         case "not judged":
             yield shown("- nothing could be judged", style="yellow")
