@@ -7,7 +7,7 @@ vehicles/7/         the vehicle's own files, its output, telemetry.tlog; of its 
 capture/7.pcapng    every frame that vehicle 7 sent and every one that reached it, if asked for (netem.capture)
 network.jsonl       every change of conditions as the kernel applied it, and its counters at the end
 tracks.jsonl        where the vehicles were, in metres north, east and up from the middle of the field
-replay.yaml         the scenario with what was caused by hand, if anything was (harness.play.interventions)
+replay.yaml         the scenario with the changes that the user made by hand (harness.play.interventions)
 rogue.jsonl         what the rogue node has sent, if the timeline injects; rogue.log has what it had to say
 lab.log             what the lab itself had to say
 report.html  report.md  junit.xml  chains.svg

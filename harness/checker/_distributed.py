@@ -10,7 +10,7 @@ from harness.archive.vocabulary import MESSAGES, TIMERS, names_another_kind
 from harness.checker._waiting import waited_too_long
 from harness.checker.evidence import Evidence, Sendings
 from harness.checker.judgement import Finding, Judgement, agents, violated
-from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
+from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
 from ucp.trace import HandlerRun
 from ucp.trigger import (
     BootTrigger,

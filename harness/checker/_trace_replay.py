@@ -10,7 +10,7 @@ from itertools import islice, pairwise
 from harness.archive.history import LATEST_S
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import OPERATIONS
-from ucp.agent import HANDLERS
+from harness.checker.reference.algorithms import HANDLERS
 from ucp.block import HASH_BYTES, next_chain_hash
 from ucp.trace import HandlerRun, StateSummary
 

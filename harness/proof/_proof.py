@@ -33,7 +33,7 @@ CLAIMS = {
     "4": "every block is genuine",
     "hang": "no agent reconciles without a timer that ends the reconcile",
     "crash": "no handler ends by an error",
-    "steps": "every step is that of a right agent",
+    "steps": "every step is that of the reference",
 }
 """Properties that the proof checks in every state. "steps" is optional."""
 OF_CAPTORS = {

@@ -47,7 +47,7 @@ def replay_of(scenario: Scenario, by_hand_s: Collection[float], seed: int | None
         return "by hand" if entry.get("at_s") in by_hand_s else None
 
     comment = [
-        "What a run has come to, with what was caused by hand while it went on. To play it again:",
+        "A run with the changes that the user made by hand. To play it again:",
         f"    ucp-harness run {REPLAY_FILE} --backend {backend} --seed {seed}",
     ]
     return to_yaml(document, comment, remark)

@@ -8,7 +8,7 @@ from typing import Any
 
 from harness.checker.evidence import Evidence
 from harness.checker.records.contradiction import Contradiction, of_agent
-from ucp.agent import HANDLERS
+from harness.checker.reference.algorithms import HANDLERS
 
 WORDS = {"epoch_us": "mission second 0", "initial_data": "the inception block's data"}
 MAX_VALUE = 40

@@ -16,12 +16,12 @@ CORE, HARNESS = Path(ucp.__file__).parent, Path(harness.__file__).parent
 MAX_WORDS = 200
 
 
-def crash_of(life: Incarnation | None, error: Exception) -> Exception:
-    """Return an AgentFailedError if the exception came out of the agent's core, otherwise the exception itself."""
+def crash_of(life: Incarnation | None, error: Exception) -> AgentFailedError | None:
+    """Return the failure of the agent if the exception came out of its core, otherwise None."""
     frames = [(Path(frame.filename), frame.lineno) for frame in extract_tb(error.__traceback__)]
     ours = [(path, line) for path, line in frames if path.is_relative_to(CORE) or path.is_relative_to(HARNESS)]
     if life is None or life.state is None or not ours or not ours[-1][0].is_relative_to(CORE):
-        return error
+        return None
     path, line = ours[-1]
     handler = vars(life.state)["running"]
     detail = (

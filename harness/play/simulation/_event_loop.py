@@ -178,7 +178,9 @@ class Clockwork:
                 if self._found is not None:
                     return
         except Exception as error:
-            raise crash_of(life, error) from error
+            if (crash := crash_of(life, error)) is None:
+                raise
+            raise crash from error
 
     def _arrive(self, number: int, life: Incarnation, flight: InFlight) -> None:
         """A message reaches the agent."""

@@ -295,7 +295,9 @@ class Simulation(Clockwork):
             try:
                 life.agent.begin_reconcile(life.local_s(self._now))
             except Exception as error:
-                raise crash_of(life, error) from error
+                if (crash := crash_of(life, error)) is None:
+                    raise
+                raise crash from error
             self._after(number, life)
 
     async def top_chain_hashes(self) -> dict[int, str]:

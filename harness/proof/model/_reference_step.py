@@ -8,6 +8,7 @@ bounds.
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from harness.checker.reference.algorithms import HANDLERS
 from harness.checker.reference.reference_agent import ReferenceAgent
 from harness.checker.reference.state import Settings, State
 from harness.checker.steps.deviation import differences
@@ -15,7 +16,7 @@ from harness.proof.bounds import Bounds
 from harness.proof.model._known_states import FIRST
 from harness.proof.model._real_agents import INITIAL_DATA
 from harness.proof.model._snapshot import NOW_S, Snapshot, put_back
-from ucp.agent import HANDLERS, Agent
+from ucp.agent import Agent
 from ucp.state import AgentState
 from ucp.trace import HandlerRun
 
@@ -56,9 +57,11 @@ class Reference:
         """
         reference = self._reference(agent_id, before)
         error = _error_of(reference, to_reference)
-        alike = (error is None) == (crashed is None)
+        if error is not None and crashed is not None:
+            return None  # no handler is written for this state, and the proof reports the crash itself
         outbox = [said[1] for said in vars(agent.state)["outbox"]]
-        if alike and _state(reference.state) == _state(agent.state) and _said(reference) == outbox:
+        alike = _state(reference.state) == _state(agent.state) and _said(reference) == outbox
+        if alike and error is None and crashed is None:
             return None
         left: list[tuple[Any, ...]] = []
         traced = self._make(agent_id, lambda: left.append(_state(traced.state)))

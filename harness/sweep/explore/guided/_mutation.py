@@ -27,7 +27,7 @@ TIMERS_S = tuple(
     getattr(Settings(), name) for name in ("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s")
 )
 NEAR_S = 0.03
-"""So near to each other two instants are when a message from the one arrives after the other."""
+"""Maximum distance between two moments at which a message of the first can arrive after the second."""
 DELAYS_S = (0.0, 0.06, 0.2, 1.0, 4.99, 5.02, 9.99, 10.02, 15.0, 20.0)
 """Of single messages: later than the next one, than a timer, than a round."""
 LATE_S = (0.001, 0.01, 0.03, 0.06, 0.2, 0.5)
