@@ -160,17 +160,7 @@ class Store:
             raise StoreError(f"{self._path} cannot be written: the directory {self._path.parent} does not exist")
         if self._path.exists() and not self._path.is_file():
             raise StoreError(f"{self._path} is no file: name another as `store`")
-        try:
-            return self._replayed(_entries(self._path))
-        except (ValueError, TypeError, LookupError, RecursionError):
-            raise StoreError(
-                f"{self._path} has an entry whose checksum is right and that no agent wrote: move it away or name "
-                "another file as `store`"
-            ) from None
-
-    def _replayed(self, entries: Iterator[Any]) -> StoredState | None:
-        """Raises some error for entries that have no meaning, or make a state that no agent is in."""
-        header = next(entries, None)
+        header, stored = read_store(self._path)
         if not isinstance(header, dict):
             if self._path.exists() and self._path.stat().st_size:
                 raise StoreError(
@@ -182,10 +172,6 @@ class Store:
                 f"{self._path} is the store of agent {shown(header.get('agent_id'))} in another mission, or of "
                 "another version: name another file as `store`"
             )
-        stored, known = StoredState(), dict[str, Block]()
-        for entry in entries:
-            stored.replay(entry, known)
-        stored.check()
         return stored
 
     def write(self, changes: list[Change], secured: SecuredState | None = None) -> None:
@@ -241,6 +227,26 @@ class Store:
     def close(self) -> None:
         if self._file is not None:
             self._file.close()
+
+
+def read_store(path: Path) -> tuple[Any, StoredState]:
+    """Return the header of a store, and the state that its whole entries lead to. The header is None without any entry.
+
+    Raises OSError, or StoreError for an entry with the right checksum that no agent wrote.
+    """
+    entries = _entries(path)
+    stored, known = StoredState(), dict[str, Block]()
+    try:
+        header = next(entries, None)
+        for entry in entries:
+            stored.replay(entry, known)
+        stored.check()
+    except (ValueError, TypeError, LookupError, RecursionError):
+        raise StoreError(
+            f"{path} has an entry whose checksum is right and that no agent wrote: move it away or name another file "
+            "as `store`"
+        ) from None
+    return header, stored
 
 
 def block_on_disk(agent_id: int, timestamp_us: int, event_data: bytes) -> Block:

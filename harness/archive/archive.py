@@ -7,6 +7,7 @@ missing file that a complete run would have.
 
 import os
 import re
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
@@ -264,6 +265,19 @@ class RunArchive:
             return load_public(path), []
         except KeyFileError as error:
             return None, [f"{error}; signatures of blocks are not checked"]
+
+    @property
+    def stores(self) -> dict[int, Path]:
+        """The store of the last incarnation of each agent that has one, by agent ID."""
+        if self.directory is None:
+            return {}
+        agents = agents_directory(self.directory)
+        by_incarnation: dict[int, dict[int, Path]] = defaultdict(dict)
+        for path in (*agents.glob("*.store"), *agents.glob("*-*/*.store")):
+            agent, _, incarnation = path.parent.name.partition("-") if path.parent != agents else (path.stem, "", "1")
+            if agent == path.stem and _AGENT_ID.fullmatch(agent) and _AGENT_ID.fullmatch(incarnation):
+                by_incarnation[int(agent)][int(incarnation)] = path
+        return {agent_id: paths[max(paths)] for agent_id, paths in by_incarnation.items()}
 
     # Network, vehicles and the rogue node
 

@@ -62,6 +62,8 @@ class NetworkState(_Model):
     what: str
     detail: str
     fully_connected: bool
+    planned_s: float | None = None
+    """Mission second of the change in the scenario, if the change was made later."""
 
 
 class FaultRecord(_Model):
@@ -76,6 +78,8 @@ class FaultRecord(_Model):
     """State of the disk after a reboot."""
     by_hand: bool = False
     """True if a user requested it during the run. The timeline of the recorded scenario contains it."""
+    planned_s: float | None = None
+    """Mission second of the change in the scenario, if the change was made later."""
 
     @property
     def kind(self) -> type[faults.Fault]:

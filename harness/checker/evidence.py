@@ -6,11 +6,13 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
 from harness.archive.archive import RunArchive
+from harness.archive.connectivity import Link
 from harness.archive.exports import Export, name_blocks
 from harness.archive.packets.capture_files import DIRECTORY, Captures, capture_files, read_captures
 from harness.archive.run_record import AgentRecord, Counters, JudgedRecord
@@ -20,6 +22,10 @@ from harness.checker._trace_replay import Life, replay
 from harness.checker.reference.state import State
 from harness.errors import RunDirectoryError
 from harness.play.rogue.rogue_line import OF_NO_INJECTION
+from harness.scenario import Scenario
+from harness.scenario.changes import NO_MORE_FATES
+from netem.conditions import NetworkConditions
+from netem.link import LinkConditions
 from ucp.block import HASH_BYTES
 from ucp.trace import HandlerRun, Sent
 from ucp.trigger import MessageTrigger
@@ -64,6 +70,9 @@ class Condition(BaseModel):
     fully_connected: bool | None = None
     agents: list[int] | None = None
     disk: str | None = None
+    planned_s: float | None = None
+    asked: dict[str, Any] | None = None
+    """The conditions that the scenario asks for, as `NetworkConditions.to_json` writes them."""
     counters: Counters | None = None
     """What the kernel had counted at the end."""
 
@@ -117,6 +126,12 @@ class Evidence:
     """Whether a signature is good, of who knows it better than by verifying it: a swarm played in this process."""
     watch: Watch | None = None
     """Is shown each step that the step judge follows."""
+    scenario: Scenario | None = None
+    """The recorded scenario. None without a record, and for a run in memory, whose scenario nothing can alter."""
+    link_losses: list[tuple[float, dict[Link, float]]] = field(default_factory=list)
+    """Mission seconds with the losses, 0 to 1, that links have from then on: first all links, then changed ones."""
+    stores: dict[int, Path] = field(default_factory=dict)
+    """The store of the last incarnation of each agent that has one."""
     _derived: dict[Callable[["Evidence"], Any], Any] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -209,7 +224,7 @@ class Evidence:
                 continue
             if fault.kind.stands_still:
                 since = fault.at_s
-            elif since is not None:
+            elif since is not None and fault.kind.leads_to is not None:
                 if since <= until_s and fault.at_s >= from_s:
                     return True
                 since = None
@@ -271,6 +286,27 @@ class Evidence:
         """The conditions at the end of the run, in words; None if not on record."""
         return self.record.network[-1].detail if self.record and self.record.network else None
 
+    @cached_property
+    def links_asked(self) -> set[LinkConditions] | None:
+        """All conditions that the scenario asked for any link. None if they are not on record, or not readable."""
+        if self.conditions is None:
+            return None
+        links: set[LinkConditions] = set()
+        for condition in self.conditions:
+            if condition.asked is None:
+                continue
+            try:
+                asked = NetworkConditions.from_json(condition.asked)
+            except (ValueError, TypeError, AttributeError, KeyError):
+                return None
+            links |= {asked.default, *asked.receivers.values(), *asked.links.values()}
+        return links
+
+    @property
+    def has_fates(self) -> bool:
+        """True if a scenario script decided about the delivery of messages, in place of the network."""
+        return self.record is not None and any(state.what == NO_MORE_FATES for state in self.record.network)
+
     def not_told_completed(self) -> set[int]:
         """Agents of which nothing tells all that they completed, for their traces have operations that nobody knows."""
         unknown = {agent_id for agent_id, words in self.unknown.items() if "operation" in words}
@@ -306,6 +342,9 @@ def gather(archive: RunArchive) -> Evidence:
         archive.conditions(Condition),
         _captures(archive),
         archive.public_keys,
+        scenario=archive.record.scenario,
+        link_losses=[*archive.link_losses(archive.roster)],
+        stores=archive.stores,
     )
 
 

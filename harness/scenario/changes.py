@@ -11,11 +11,14 @@ from typing import Any
 
 from harness.scenario import Scenario
 from harness.scenario.faults import Fault
+from harness.scenario.faults.fault import planned
 from harness.scenario.injection import Injection, InjectionName
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 
 RANGE = "range"
 """Name of a network change caused by the flight of vehicles, not by the scenario."""
+FINAL_RECONCILE = "final reconcile"
+"""Name of the network change before the final reconcile."""
 NO_MORE_FATES = "no more fates"
 """Name of the record at the end of the scripted fates. No change happens then."""
 
@@ -44,6 +47,7 @@ class NetworkChange:
             "detail": self.detail,
             "fully_connected": self.conditions.fully_connected,
             **({"losses": dict(self.losses)} if self.losses else {}),
+            **({} if self.what in (RANGE, FINAL_RECONCILE) else planned(self.at_s, at_s)),
             **_hand(self.by_hand),
         }
 
@@ -64,7 +68,8 @@ class Injected:
 
     def to_json(self, at_s: float) -> dict[str, Any]:
         """Return the record of this injection with a start at mission second `at_s`."""
-        return {"at_s": at_s, "what": self.what, "detail": self.detail, **_hand(self.by_hand)}
+        record = {"at_s": at_s, "what": self.what, "detail": self.detail}
+        return {**record, **planned(self.at_s, at_s), **_hand(self.by_hand)}
 
 
 def _hand(by_hand: bool) -> dict[str, Any]:
@@ -116,7 +121,7 @@ def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[
 
 def final_reconcile(at_s: float) -> NetworkChange:
     """Return the change that clears all conditions, so that all vehicles receive all messages."""
-    return replace(_change(at_s, "final reconcile", NetworkConditions()), clears_all=True)
+    return replace(_change(at_s, FINAL_RECONCILE, NetworkConditions()), clears_all=True)
 
 
 def _change(at_s: float, what: str, conditions: NetworkConditions) -> NetworkChange:

@@ -1,8 +1,7 @@
-"""Cross-examination: what two records tell about the same thing must agree.
+"""Compare records of the same facts. Two records that contradict each other are a finding.
 
-A comparison is a file here: a function from `Evidence` to the `Contradiction`s that it finds. An honest run has none,
-whatever became of its agents: what is killed, restarted, rebooted, paused, disturbed by a rogue node, or ends as its
-disk is full, is on record as such.
+Each comparison is a file in this folder: a function from `Evidence` to the `Contradiction`s that it finds. An unaltered
+run has no contradiction. The records contain each kill, restart, reboot, pause, rogue node and full disk.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,9 +13,14 @@ from harness.checker.records import (
     _captures_vs_traces,
     _conditions_vs_network,
     _counters,
+    _export_vs_store,
     _export_vs_trace,
+    _handled_vs_faults,
     _headers,
     _heard_vs_sent,
+    _losses,
+    _scenario_vs_record,
+    _times,
 )
 from harness.checker.records.contradiction import Contradiction
 
@@ -30,7 +34,12 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
     _export_vs_trace.compare_export,
     _counters.compare_completed_blocks,
     _heard_vs_sent.compare,
+    _handled_vs_faults.compare,
     _conditions_vs_network.compare,
+    _scenario_vs_record.compare,
+    _times.compare,
+    _export_vs_store.compare,
+    _losses.compare,
     _captures_vs_traces.compare_counters,
     _captures_vs_traces.compare_captures,
 )

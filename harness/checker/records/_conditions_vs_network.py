@@ -12,7 +12,7 @@ from harness.checker.evidence import Condition, Evidence
 from harness.checker.records.contradiction import Contradiction, of_agent
 from harness.scenario.changes import NO_MORE_FATES, RANGE
 
-Change = tuple[float, str, str | None, bool | None, tuple[int, ...], str | None]
+Change = tuple[float, str, str | None, bool | None, tuple[int, ...], str | None, float | None]
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
@@ -52,8 +52,8 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
 def _change(entry: NetworkState | FaultRecord | Condition, fated_until: float) -> Change:
     connected = None if entry.at_s < fated_until else entry.fully_connected
     if isinstance(entry, NetworkState):
-        return entry.at_s, entry.what, entry.detail, connected, (), None
-    return entry.at_s, entry.what, entry.detail, connected, tuple(entry.agents or ()), entry.disk
+        return entry.at_s, entry.what, entry.detail, connected, (), None, entry.planned_s
+    return entry.at_s, entry.what, entry.detail, connected, tuple(entry.agents or ()), entry.disk, entry.planned_s
 
 
 def _in_words(change: Change) -> str:

@@ -1,5 +1,10 @@
-"""What an agent heard against what others sent: nothing is heard before it is sent, and a block comes as it went."""
+"""Compare the messages that agents handled with the messages that others sent.
 
+An agent handles a message after its sender sent it, with the content that was sent. It handles the message once, unless
+the network duplicates messages.
+"""
+
+from collections import Counter
 from collections.abc import Iterator
 
 from harness.checker._trace_replay import Sight
@@ -17,7 +22,9 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     """What was heard of a message is what its sender sent, and after it was sent."""
     slack = max(map(slack_s, evidence.traces.values()), default=0.0)
     sendings = evidence.sendings
+    once = not _may_duplicate(evidence)
     for agent_id, lives in evidence.lives.items():
+        handled: Counter[tuple[int, str, int]] = Counter()
         for life in lives:
             for line, run in life.numbered():
                 trigger = run.trigger
@@ -26,6 +33,12 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                 sent = sendings.get(trigger.sender, {}).get(trigger.message, {}).get(trigger.sequence)
                 if sent is None:
                     continue  # what nobody sent is characteristic 1's to say
+                if once:
+                    key = trigger.sender, trigger.message, trigger.sequence
+                    handled[key] += 1
+                    if handled[key] > len(sent) and not evidence.injected.may_be(trigger):
+                        what = f"handled {_named(trigger)} again, although nothing duplicates messages"
+                        yield Contradiction(finding(evidence, agent_id, Sight(line, run, what)), "1")
                 first_s, message = sent[0]
                 told = message.datagram
                 as_it_went = told is not None and (run.input is told or run.input == told)
@@ -34,6 +47,12 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                 if not evidence.injected.may_be(trigger):
                     for sight, touches in _unlike(line, run, trigger, sent, first_s - slack):
                         yield Contradiction(finding(evidence, agent_id, sight), touches)
+
+
+def _may_duplicate(evidence: Evidence) -> bool:
+    """Return true if the network or a script can deliver a message twice, or if the network is not on record."""
+    links = evidence.links_asked
+    return links is None or evidence.has_fates or any(link.duplicate > 0 for link in links)
 
 
 def _unlike(

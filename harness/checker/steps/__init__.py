@@ -13,12 +13,12 @@ from harness.archive.traces import Trace
 from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, unknown_words
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
+from harness.checker.recorded_inputs import Blocks, decoded
 from harness.checker.records import cross_examine
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
-from harness.checker.steps.recorded_inputs import Blocks, decoded
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, UnknownSettingError, checked
 from ucp.messages import MalformedDatagramError
 from ucp.trace import Commanded, Dropped

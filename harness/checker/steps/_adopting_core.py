@@ -8,8 +8,8 @@ debugger and for `bisect` (`harness.checker.steps.core_in_use`).
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from harness.checker.recorded_inputs import Blocks, NotOnRecordError, decoded
 from harness.checker.reference.state import State, Timer
-from harness.checker.steps.recorded_inputs import Blocks, NotOnRecordError, decoded
 from ucp.block import HASH_BYTES, Block
 from ucp.messages import (
     BlockAddRequest,

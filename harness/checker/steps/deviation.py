@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+from harness.checker.recorded_inputs import decoded
 from harness.checker.reference.algorithms import HANDLERS
-from harness.checker.steps.recorded_inputs import decoded
 from ucp.messages import MalformedDatagramError
 from ucp.trace import HandlerRun, Sent, Tally
 

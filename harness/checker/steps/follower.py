@@ -7,13 +7,7 @@ from typing import Any, NamedTuple
 
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import branch_is_known, tally_is_known, timer_that_ended, timers_are_known
-from harness.checker.reference import why_not_handled
-from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_TIMER
-from harness.checker.reference.state import Handler, State
-from harness.checker.steps._adopting_core import Before
-from harness.checker.steps.deviation import Deviation
-from harness.checker.steps.implementation import REFERENCE, Implementation
-from harness.checker.steps.recorded_inputs import (
+from harness.checker.recorded_inputs import (
     Blocks,
     NotOnRecordError,
     decoded,
@@ -21,6 +15,12 @@ from harness.checker.steps.recorded_inputs import (
     sealed_of,
     stored_blocks,
 )
+from harness.checker.reference import why_not_handled
+from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_TIMER
+from harness.checker.reference.state import Handler, State
+from harness.checker.steps._adopting_core import Before
+from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.implementation import REFERENCE, Implementation
 from harness.checker.steps.trace_header import CheckedHeader
 from ucp.block import Block
 from ucp.events import MalformedEventsError

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.vocabulary import first_of, unknown_words
-from harness.checker.steps.recorded_inputs import decoded
+from harness.checker.recorded_inputs import decoded
 from harness.errors import FieldError, HarnessError, MachineError
 from harness.field.bisection.outcome import Difference
 from harness.field.replay import Record

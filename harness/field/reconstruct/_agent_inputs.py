@@ -8,7 +8,7 @@ from typing import Protocol
 
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, timer_that_ended, unknown_words
-from harness.checker.steps.recorded_inputs import event_of
+from harness.checker.recorded_inputs import event_of
 from harness.checker.steps.trace_header import CheckedHeader
 from ucp.events import LoggableEvent, MalformedEventsError
 from ucp.messages import decode

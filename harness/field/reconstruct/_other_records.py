@@ -14,7 +14,7 @@ from harness.archive.packets.datagram import NotUcpError, unwrap
 from harness.archive.packets.pcap import OUTBOUND, CaptureFile
 from harness.archive.traces import Trace
 from harness.checker.judgement import agents
-from harness.checker.steps.recorded_inputs import decoded, event_of, sealed_of
+from harness.checker.recorded_inputs import decoded, event_of, sealed_of
 from harness.checker.steps.trace_header import CheckedHeader
 from harness.errors import CaptureError
 from harness.field.ingest import Flight

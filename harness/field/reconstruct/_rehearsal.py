@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 from random import Random
 
-from harness.checker.steps.recorded_inputs import decoded
+from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.trace_header import CheckedHeader
 from harness.field.reconstruct._agent_inputs import Asked, Booted, Heard, Input, Logged, TimerEnded
 from harness.play.simulation.fate_script import LateTimers, Running

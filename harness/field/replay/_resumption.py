@@ -14,8 +14,8 @@ from itertools import islice
 from statistics import median
 
 from harness.archive.traces import Trace
+from harness.checker.recorded_inputs import NotOnRecordError, event_of
 from harness.checker.steps.follower import Follower
-from harness.checker.steps.recorded_inputs import NotOnRecordError, event_of
 from harness.field.replay._agent_record import Entry, Record
 from harness.field.replay._peer_messages import Exchanges
 from harness.field.replay.replay_names import RecordedBlocks

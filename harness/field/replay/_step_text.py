@@ -6,8 +6,8 @@ from itertools import zip_longest
 from rich.table import Table
 from rich.text import Text
 
+from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.deviation import Deviation
-from harness.checker.steps.recorded_inputs import decoded
 from harness.field.replay._agent_record import Entry
 from harness.field.replay._player import Player
 from harness.field.replay.breakpoints import source_of

@@ -7,7 +7,7 @@ from functools import cache
 from itertools import takewhile
 from pathlib import Path
 
-from harness.checker.steps.recorded_inputs import decoded
+from harness.checker.recorded_inputs import decoded
 from harness.errors import FieldError
 from harness.field.replay._agent_record import Entry
 from harness.field.replay._player import Player

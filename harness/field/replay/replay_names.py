@@ -6,7 +6,7 @@ from functools import cached_property
 
 from harness.archive.exports import name_blocks
 from harness.archive.traces import Trace
-from harness.checker.steps.recorded_inputs import Blocks, NotOnRecordError, decoded
+from harness.checker.recorded_inputs import Blocks, NotOnRecordError, decoded
 from harness.field.replay._agent_record import Record
 from ucp.block import Block
 from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError

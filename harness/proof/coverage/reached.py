@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from harness.checker.evidence import Evidence, Watch
+from harness.checker.recorded_inputs import decoded
 from harness.checker.reference.state import State
 from harness.checker.steps import check
-from harness.checker.steps.recorded_inputs import decoded
 from harness.play.simulation.simulation import Simulation
 from harness.proof.model._shape import Held, Shape, shape_of
 from harness.run.simulate import InMemory, Simulated, simulate_in_memory

@@ -17,8 +17,8 @@ from harness.archive.vocabulary import (
     timers_are_known,
     unknown_words,
 )
+from harness.checker.recorded_inputs import decoded, event_of, sealed_of, stored_blocks
 from harness.checker.steps.follower import COUNTING, Tells
-from harness.checker.steps.recorded_inputs import decoded, event_of, sealed_of, stored_blocks
 from harness.checker.steps.trace_header import CheckedHeader
 from ucp.agent import HANDLERS, ON_TIMER, why_not_handled
 from ucp.block import LATEST_US, Block, InceptionBlock, next_chain_hash

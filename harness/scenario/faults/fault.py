@@ -154,4 +154,14 @@ class Fault:
         """The record of this fault, made at `at_s`."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
         hand = {"by_hand": True} if self.by_hand else {}
-        return {**record, **({} if self.disk_left is None else {"disk": self.disk_left}), **hand}
+        disk = {} if self.disk_left is None else {"disk": self.disk_left}
+        return {**record, **disk, **planned(self.at_s, at_s), **hand}
+
+
+SAME_TIME_S = 0.001
+"""Records round times to milliseconds."""
+
+
+def planned(planned_s: float, at_s: float) -> dict[str, float]:
+    """Return the key `planned_s` of a record, if the change was made later than planned."""
+    return {} if abs(planned_s - at_s) < SAME_TIME_S else {"planned_s": planned_s}

@@ -11,9 +11,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from harness.archive.traces import HEADER, Held, Trace
+from harness.checker.recorded_inputs import Blocks
 from harness.checker.steps import wrongly_dropped
 from harness.checker.steps.follower import Follower, Tells
-from harness.checker.steps.recorded_inputs import Blocks
 from harness.checker.steps.trace_header import checked
 from tests.fuzz.finding import require
 from ucp.agent import Agent

@@ -1,0 +1,127 @@
+"""Compare the handler runs in traces with the faults that stopped an agent, and with the network that cut links.
+
+An agent that is killed, reboots, is switched off or is paused runs no handler. An agent handles no message that its
+sender sent while the link lost all messages. The time of sending decides, because messages under way arrive.
+
+The harness records a stop after it took effect, and a start before the agent runs again. `CLOCK_SLACK_WALL_S` therefore
+covers the difference of two readings of one machine's clock only. Links are different: between the time of a trace
+line and its datagram, a busy machine may change the conditions. A link therefore counts as cut only if it was cut for
+the slack of processes before and after the time of sending.
+"""
+
+from bisect import bisect_right
+from collections import defaultdict
+from collections.abc import Iterator
+from math import inf
+
+from harness.archive.connectivity import Link
+from harness.archive.traces import Trace
+from harness.checker._trace_replay import Sight
+from harness.checker.evidence import Evidence
+from harness.checker.records._export_vs_trace import finding
+from harness.checker.records.contradiction import ROUNDED_S, Contradiction, in_virtual_time, slack_s
+from harness.scenario.faults.fault import SAME_TIME_S
+from ucp.trace import HandlerRun
+from ucp.trigger import MessageTrigger
+
+CLOCK_SLACK_WALL_S = 0.1
+"""Tolerance, in seconds of wall time, for the clocks of the harness and of an agent on one machine."""
+
+Stop = tuple[float, float, str]
+"""An interval in mission seconds, without its ends, and the fault that began it."""
+
+
+def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """Yield each handler run of a stopped agent, and each handled message of a cut link."""
+    if evidence.record is None:
+        return
+    cuts = _cuts(evidence)
+    for agent_id, trace in evidence.traces.items():
+        stops = stopped(evidence, agent_id, _clock_slack_s(trace))
+        if cuts is None and not stops:
+            continue
+        for life in evidence.lives[agent_id]:
+            for line, run in life.numbered():
+                for what in (_while_stopped(run, stops), _over_a_cut(evidence, agent_id, run, cuts)):
+                    if what is not None:
+                        yield Contradiction(finding(evidence, agent_id, Sight(line, run, what)), "1")
+
+
+def _clock_slack_s(trace: Trace) -> float:
+    speedup = trace.header.clock.get("speedup")
+    if in_virtual_time(trace) or not isinstance(speedup, int | float):
+        return SAME_TIME_S
+    return SAME_TIME_S + CLOCK_SLACK_WALL_S * speedup
+
+
+def stopped(evidence: Evidence, agent_id: int, slack_s: float) -> list[Stop]:
+    """Return the intervals in which the agent was killed, rebooting, switched off or paused, shorter by the slack."""
+    stops: list[Stop] = []
+    since: tuple[float, str] | None = None
+    end_s = inf
+    for fault in evidence.record.faults if evidence.record else ():
+        kind = fault.kind
+        if agent_id not in (fault.agents or ()):
+            continue
+        ends_s = fault.at_s if fault.planned_s is None else min(fault.at_s, fault.planned_s)
+        if since is not None and kind.leads_to is not None:
+            stops.append((since[0] + slack_s, ends_s - slack_s, since[1]))
+            since = None
+        if kind.ends_a_life or kind.stands_still:
+            since = fault.at_s, f"its {kind.what} at {fault.at_s:g} s"
+            # The harness wakes a paused agent at the end of the run, for its export.
+            end_s = (evidence.ended_at_s or 0.0) - slack_s if kind.stands_still else inf
+    if since is not None:
+        stops.append((since[0] + slack_s, end_s, since[1]))
+    return [stop for stop in stops if stop[0] < stop[1]]
+
+
+def _while_stopped(run: HandlerRun, stops: list[Stop]) -> str | None:
+    for from_s, until_s, fault in stops:
+        if from_s < run.t < until_s:
+            return f"ran at {run.t:g} s, although {fault} had stopped the agent"
+    return None
+
+
+class _Cuts:
+    """The intervals in which each link loses all messages."""
+
+    def __init__(self, link_losses: list[tuple[float, dict[Link, float]]], slack_s: float) -> None:
+        self.slack_s = slack_s
+        self._times: dict[Link, list[float]] = defaultdict(list)
+        """Mission seconds at which a link was cut, joined, cut again, and so on."""
+        for at_s, losses in link_losses:
+            for link, loss in losses.items():
+                times = self._times[link]
+                if (loss == 1.0) != (len(times) % 2 == 1):
+                    times.append(at_s)
+
+    def cut_at(self, link: Link, sent_s: float) -> bool:
+        """Return true if the link was cut at this time, and for the slack before and after it."""
+        times = self._times.get(link, [])
+        from_s, until_s = sent_s - self.slack_s, sent_s + self.slack_s
+        number = bisect_right(times, from_s)
+        return number % 2 == 1 and (number == len(times) or until_s < times[number])
+
+
+def _cuts(evidence: Evidence) -> _Cuts | None:
+    """Return the cut links. None if no link was ever cut, or if scripted fates may deliver messages over a cut link."""
+    if evidence.has_fates or not any(loss == 1.0 for _, losses in evidence.link_losses for loss in losses.values()):
+        return None
+    slack = max(map(slack_s, evidence.traces.values()), default=ROUNDED_S)
+    return _Cuts(evidence.link_losses, max(slack, SAME_TIME_S))
+
+
+def _over_a_cut(evidence: Evidence, agent_id: int, run: HandlerRun, cuts: _Cuts | None) -> str | None:
+    trigger = run.trigger
+    if cuts is None or not isinstance(trigger, MessageTrigger) or trigger.sender == agent_id:
+        return None
+    sent = evidence.sendings.get(trigger.sender, {}).get(trigger.message, {}).get(trigger.sequence, ())
+    if not sent or not all(cuts.cut_at((trigger.sender, agent_id), sent_s) for sent_s, _ in sent):
+        return None
+    if evidence.injected.may_be(trigger):
+        return None
+    return (
+        f"handled {trigger.message} number {trigger.sequence}, which agent {trigger.sender} sent at {sent[0][0]:g} s, "
+        "although no message could pass this link then"
+    )

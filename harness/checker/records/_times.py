@@ -1,0 +1,92 @@
+"""Compare the times of exports, events and handler runs with the end of the run.
+
+An agent exports its chain at its own end: when it is switched off, or when the run ends. An event has the timestamp of
+its logging. Virtual time has one clock, so these times are equal. Processes export one after another and on a machine
+that may be busy, so their exports and last handler runs may be later than the end of the run, by `END_WALL_S` at most.
+"""
+
+from collections.abc import Iterator
+
+from harness.archive.exports import Export
+from harness.archive.traces import Trace
+from harness.checker._trace_replay import Sight
+from harness.checker.evidence import Evidence
+from harness.checker.recorded_inputs import event_of
+from harness.checker.records._export_vs_trace import finding
+from harness.checker.records.contradiction import Contradiction, in_virtual_time, mission_s, of_agent, slack_s
+from harness.scenario.faults.fault import SAME_TIME_S
+from ucp.events import MalformedEventsError
+from ucp.trace import HandlerRun
+from ucp.trigger import EventTrigger
+
+END_WALL_S = 60.0
+"""Seconds of wall time in which the harness ends all agents, at most."""
+ROUNDED_END_S = 0.1
+"""run.json has tenths of a second, except in virtual time."""
+
+
+def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """Yield each export, handler run and event whose time contradicts the end of the run or the agent's clock."""
+    as_logged = not _has_recorded_events(evidence)
+    for agent_id, trace in evidence.traces.items():
+        end_s = evidence.end_of(agent_id)
+        if end_s is not None:
+            earliest_s, latest_s = _around_the_end(trace, end_s)
+            yield from _compare_runs(evidence, agent_id, latest_s)
+            export = evidence.exports.get(agent_id)
+            if export is not None:
+                yield from _compare_export(evidence, agent_id, trace, export, earliest_s, latest_s)
+        if as_logged and trace.header.has_inputs:
+            yield from _compare_events(evidence, agent_id, trace)
+
+
+def _around_the_end(trace: Trace, end_s: float) -> tuple[float, float]:
+    """Return the earliest time of the export, and the latest time of an export or a handler run."""
+    speedup = trace.header.clock.get("speedup")
+    if in_virtual_time(trace) or not isinstance(speedup, int | float):
+        return end_s - SAME_TIME_S, end_s + SAME_TIME_S
+    return end_s - ROUNDED_END_S - slack_s(trace), end_s + END_WALL_S * speedup
+
+
+def _compare_runs(evidence: Evidence, agent_id: int, latest_s: float) -> Iterator[Contradiction]:
+    for life in evidence.lives[agent_id]:
+        if life.runs and life.runs[-1].t > latest_s:
+            line, run = next((line, run) for line, run in life.numbered() if run.t > latest_s)
+            what = f"ran at {run.t:g} s, although the agent ended at {evidence.end_of(agent_id):g} s"
+            yield Contradiction(finding(evidence, agent_id, Sight(line, run, what)))
+
+
+def _compare_export(
+    evidence: Evidence, agent_id: int, trace: Trace, export: Export, earliest_s: float, latest_s: float
+) -> Iterator[Contradiction]:
+    recorded = evidence.recorded(agent_id)
+    at_s = mission_s(export.exported_at_us, trace.header)
+    if recorded is None or recorded.outcome != "exported" or at_s is None or not export.exported_at_us:
+        return
+    if not earliest_s <= at_s <= latest_s:
+        detail = f"its export is of {at_s:g} s, but the run ended for it at {evidence.end_of(agent_id):g} s"
+        yield of_agent(agent_id, detail)
+
+
+def _has_recorded_events(evidence: Evidence) -> bool:
+    """Return true if the scenario gives events the timestamps of another run."""
+    return evidence.scenario is None or any(event.timestamp_us is not None for event in evidence.scenario.events.script)
+
+
+def _compare_events(evidence: Evidence, agent_id: int, trace: Trace) -> Iterator[Contradiction]:
+    slack = max(slack_s(trace), SAME_TIME_S)
+    for life in evidence.lives[agent_id]:
+        for line, run in life.numbered():
+            if not isinstance(run.trigger, EventTrigger):
+                continue
+            logged_s = _time_of_event(run, trace)
+            if logged_s is not None and abs(logged_s - run.t) > slack:
+                what = f"logged an event at {run.t:g} s, but the timestamp of the event is {logged_s:g} s"
+                yield Contradiction(finding(evidence, agent_id, Sight(line, run, what)))
+
+
+def _time_of_event(run: HandlerRun, trace: Trace) -> float | None:
+    try:
+        return mission_s(event_of(run.input).timestamp_us, trace.header)
+    except MalformedEventsError:
+        return None

@@ -1,0 +1,202 @@
+"""Records that contradict the scenario, the faults, the network or the end of a run are found."""
+
+import base64
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.archive.archive import RunArchive
+from harness.checker import check, gather
+from harness.play.progress import Silent
+from harness.run.run import run
+from tests.harness.virtual import scenario
+
+Document = dict[str, Any]
+Edit = Callable[[Path], None]
+
+
+@pytest.fixture(scope="module")
+def unaltered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run with a reboot, a partition, a kill, a restart, a pause and a final reconcile."""
+    asked = scenario(
+        agents=4,
+        duration_s=400,
+        network={"loss": 0.2},
+        events={"source": "random", "mean_s": 6},
+        timeline=[
+            {"at_s": 60, "reboot": [2], "down_s": 20, "disk": "kept"},
+            {"at_s": 100, "partition": [[1, 2]], "for_s": 60},
+            {"at_s": 200, "kill": [3]},
+            {"at_s": 240, "restart": [3]},
+            {"at_s": 260, "pause": [4]},
+            {"at_s": 300, "resume": [4]},
+        ],
+        final_reconcile=True,
+    )
+    return run(asked, 3, tmp_path_factory.mktemp("unaltered") / "run", Silent(), backend="sim").directory
+
+
+@pytest.fixture
+def directory(unaltered: Path, tmp_path: Path) -> Path:
+    shutil.copytree(unaltered, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def found(directory: Path) -> str:
+    """Return the findings of the check of the records."""
+    judgement = check(gather(RunArchive(directory))).beside["records"]
+    assert judgement.verdict == "contradict"
+    return "\n".join(finding.detail for finding in judgement.evidence)
+
+
+def edit(path: Path, change: Callable[[Document], Any]) -> None:
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def edit_lines(path: Path, change: Callable[[list[Document]], Any]) -> None:
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    change(lines)
+    path.write_text("".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines))
+
+
+def edit_scenario(change: Callable[[Document], Any]) -> Edit:
+    return lambda directory: edit(directory / "run.json", lambda record: change(record["scenario"]))
+
+
+def without_change(what: str) -> Edit:
+    """Remove a change from run.json and from network.jsonl."""
+
+    def remove(directory: Path) -> None:
+        edit(
+            directory / "run.json",
+            lambda record: record.update(
+                {key: [each for each in record[key] if each["what"] != what] for key in ("faults", "network")}
+            ),
+        )
+        edit_lines(
+            directory / "network.jsonl",
+            lambda lines: lines.__setitem__(slice(None), [line for line in lines if line["what"] != what]),
+        )
+
+    return remove
+
+
+def with_loss(loss: float) -> Edit:
+    """Change the loss consistently in the scenario, run.json and network.jsonl."""
+
+    def change(entry: Document) -> None:
+        entry["detail"] = entry["detail"].replace("loss 20 %", f"loss {loss * 100:g} %")
+        if entry.get("asked", {}).get("default", {}).get("loss") == 0.2:
+            entry["asked"]["default"]["loss"] = loss
+
+    def replace(directory: Path) -> None:
+        def of_record(record: Document) -> None:
+            record["scenario"]["network"]["loss"] = loss
+            for entry in record["network"] + record["faults"]:
+                change(entry)
+
+        edit(directory / "run.json", of_record)
+        edit_lines(directory / "network.jsonl", lambda lines: [change(line) for line in lines])
+
+    return replace
+
+
+def with_message_at(agent_id: int, at_s: float) -> Edit:
+    """Move the last message that the agent handled before this time to this time."""
+
+    def move(lines: list[Document]) -> None:
+        before = [line for line in lines if line.get("handler", "").startswith("receive_") and line["t"] < at_s]
+        before[-1]["t"] = at_s
+
+    return lambda directory: edit_lines(directory / "agents" / f"{agent_id}.trace.jsonl", move)
+
+
+def exported_later(by_s: float) -> Edit:
+    return lambda directory: edit(
+        directory / "agents" / "1.chain.json",
+        lambda export: export.update(exported_at_us=export["exported_at_us"] + round(by_s * 1e6)),
+    )
+
+
+def test_unaltered_run_agrees(unaltered: Path) -> None:
+    result = check(gather(RunArchive(unaltered)))
+    assert result.beside["records"].verdict == "agree"
+    assert not result.bad
+
+
+@pytest.mark.parametrize(
+    ("altered", "expected"),
+    [
+        (without_change("kill"), "the scenario has kill at 200 s, agent 3, but run.json lacks it"),
+        (without_change("pause"), "the scenario has pause at 260 s, agent 4, but run.json lacks it"),
+        (without_change("partition"), "the scenario has partition at 100 s"),
+        (edit_scenario(lambda asked: asked["network"].update(loss=0.3)), "loss 30 %, but run.json lacks it"),
+        (edit_scenario(lambda asked: asked.update(agents=5)), "the roster of run.json differ in agent 5"),
+        (edit_scenario(lambda asked: asked["timeline"][4].update(at_s=261)), "run.json has this change at 260 s"),
+        (edit_scenario(lambda asked: asked["timeline"][1].update(partition=[[1, 3]])), "partition 1 3, but run.json"),
+        (edit_scenario(lambda asked: asked.update(duration_s=9000)), "but its scenario lasts 9000 s"),
+        (edit_scenario(lambda asked: asked.update(final_reconcile=False)), "but its scenario asks for none"),
+        (edit_scenario(lambda asked: asked["settings"].update(vote_timeout_s=15)), "its trace has vote_timeout_s 10"),
+        (lambda run: edit(run / "run.json", lambda record: record.update(mission_s=9000)), "ended for it at 9000 s"),
+        (lambda run: edit(run / "run.json", lambda record: record.update(mission_s=390)), "its scenario lasts 400 s"),
+        (exported_later(100), "its export is of"),
+        (exported_later(-100), "its export is of"),
+        (with_message_at(3, 230.0), "although its kill at 200 s had stopped the agent"),
+        (with_message_at(2, 75.0), "although its reboot at 60 s had stopped the agent"),
+        (with_message_at(4, 290.0), "although its pause at 260 s had stopped the agent"),
+        (with_loss(0.6), "but the recorded loss is"),
+        (with_loss(0.05), "but the recorded loss is"),
+        (with_loss(0.0), "but the recorded loss is"),
+    ],
+)
+def test_altered_record_contradicts_others(directory: Path, altered: Edit, expected: str) -> None:
+    altered(directory)
+    assert expected in found(directory)
+
+
+def test_message_over_partition_is_found(directory: Path) -> None:
+    """Give a message that agent 1 handled during the partition to a sender on the other side."""
+
+    def swap(lines: list[Document]) -> None:
+        theirs = {line["t"]: sent for line in lines for sent in line.get("sent", ()) if 105 < line["t"] < 150}
+        assert theirs
+        at_s, sent = next(iter(theirs.items()))
+        heard.update(at_s=at_s, sent=sent)
+
+    heard: Document = {}
+    edit_lines(directory / "agents" / "3.trace.jsonl", swap)
+
+    def take(lines: list[Document]) -> None:
+        line = next(
+            line for line in lines if line.get("handler", "").startswith("receive_") and line["t"] > heard["at_s"]
+        )
+        line["trigger"] = {"message": heard["sent"]["message"], "from": 3, "seq": heard["sent"]["seq"]}
+
+    edit_lines(directory / "agents" / "1.trace.jsonl", take)
+    assert "although no message could pass this link then" in found(directory)
+
+
+def test_message_handled_twice_is_found(directory: Path) -> None:
+    def repeat(lines: list[Document]) -> None:
+        number = next(number for number, line in enumerate(lines) if line.get("handler", "").startswith("receive_"))
+        lines.insert(number + 1, lines[number])
+
+    edit_lines(directory / "agents" / "1.trace.jsonl", repeat)
+    assert "again, although nothing duplicates messages" in found(directory)
+
+
+def test_event_with_another_timestamp_is_found(directory: Path) -> None:
+    def shift(lines: list[Document]) -> None:
+        line = next(line for line in lines if "event" in line.get("trigger", {}))
+        event = bytearray(base64.b64decode(line["input"]))
+        event[:8] = (int.from_bytes(event[:8], "big") + 5_000_000).to_bytes(8, "big")
+        line["input"] = base64.b64encode(event).decode()
+
+    edit_lines(directory / "agents" / "1.trace.jsonl", shift)
+    assert "but the timestamp of the event is" in found(directory)
