@@ -1,0 +1,95 @@
+"""The rule by which a station chooses when to send: in turns, or as its duty cycle allows.
+
+`netem.channel._contention` has the rule of IEEE 802.11.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Protocol
+
+from netem.channel._frame import Frame
+from netem.channel._parameters import Chirps, Turns, nanoseconds
+
+NEVER = 1 << 62
+"""A time in nanoseconds that no run reaches."""
+
+
+class Access(Protocol):
+    """A rule. Stations are numbered from 0, and times are nanoseconds."""
+
+    next_due: int
+    """When the next station sends, if nothing changes; NEVER without frames."""
+
+    def take_due(self) -> list[int]:
+        """Remove the stations that send at `next_due`, and return them."""
+
+    def wait(self, frame: Frame, now: int, active: Iterable[Frame]) -> None:
+        """Choose when the sender of `frame` sends it. `active` are the frames on the air."""
+
+    def begun(self, frames: list[Frame], now: int) -> None:
+        """React to the beginning of these frames, which `take_due` has named."""
+
+    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Iterable[Frame]) -> None:
+        """React to the end of `frame`. `waiting` is the next frame of its sender."""
+
+    def too_long(self, airtime_ns: int) -> bool:
+        """Return true if a frame with this airtime can never be sent."""
+
+
+class DutyCycle:
+    """Send at once, unless the station has used up its share of the time.
+
+    After a frame of T seconds a station is silent until T / duty after the beginning of this frame (ETSI EN 300 220, as
+    LoRaWAN devices apply it).
+    """
+
+    def __init__(self, count: int, radio: Chirps | Turns) -> None:
+        self.next_due = NEVER
+        self._due: dict[int, int] = {}
+        self._duty = radio.duty
+        self._silent_until = [0] * count
+
+    def take_due(self) -> list[int]:
+        stations = [station for station, due in self._due.items() if due == self.next_due]
+        for station in stations:
+            del self._due[station]
+        self.next_due = min(self._due.values(), default=NEVER)
+        return stations
+
+    def wait(self, frame: Frame, now: int, active: Iterable[Frame]) -> None:
+        due = self._due[frame.sender] = self._chosen(frame, max(now, self._silent_until[frame.sender]))
+        self.next_due = min(self.next_due, due)
+
+    def begun(self, frames: list[Frame], now: int) -> None:
+        for frame in frames:
+            self._silent_until[frame.sender] = now + math.ceil(frame.airtime_ns / self._duty)
+
+    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Iterable[Frame]) -> None:
+        if waiting is not None:
+            self.wait(waiting, now, active)
+
+    def too_long(self, airtime_ns: int) -> bool:
+        return False
+
+    def _chosen(self, frame: Frame, earliest: int) -> int:
+        return earliest
+
+
+class TimeSlots(DutyCycle):
+    """Send in the own time slot only. A frame that does not fit into the rest of the slot waits for the next one."""
+
+    def __init__(self, count: int, radio: Turns) -> None:
+        super().__init__(count, radio)
+        self._turn = nanoseconds(radio.turn_s)
+        self._usable = self._turn - nanoseconds(radio.guard_s)
+        self._round = count * self._turn
+
+    def too_long(self, airtime_ns: int) -> bool:
+        return airtime_ns > self._usable
+
+    def _chosen(self, frame: Frame, earliest: int) -> int:
+        into = (earliest - frame.sender * self._turn) % self._round
+        fits = into + frame.airtime_ns <= self._usable
+        return earliest if fits else earliest - into + self._round

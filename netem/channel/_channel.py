@@ -1,0 +1,181 @@
+"""A radio channel that all vehicles share: airtime, carrier sense, collisions, hidden terminals, capture.
+
+The model does no I/O and reads no clock. It plays events, which are the beginnings and the ends of frames, up to the
+time that the caller gives it. The same calls with the same seed give the same result on every machine: times are
+integers of nanoseconds, powers come from tables, and each station has a random stream of its own for its backoff.
+
+A receiver begins to receive a frame if it does not send and receives no other frame, if the power is at least
+`sensitivity_dbm`, and if the frame is `preamble_db` stronger than noise and all other frames together. The last
+condition must hold during `capture_window_s`. Within this time the receiver changes to a stronger frame, which is the
+capture effect. It receives the frame if the ratio of the power to noise and all other frames never falls below
+`sinr_db`, and if it does not begin to send. Two stations that
+do not hear each other do not wait for each other: they are hidden from each other, and their frames collide at a
+receiver between them.
+
+The model neglects the propagation time, which is 1 us for 300 m and part of the slot time, and draws no bit errors: a
+ratio of signal to interference decides. In a frame of 100 bytes, the step from no errors to certain errors takes about
+2 dB.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from itertools import count
+from operator import add
+from random import Random
+
+from netem.channel._access import NEVER, Access, DutyCycle, TimeSlots
+from netem.channel._contention import CarrierSense
+from netem.channel._frame import Fate, Frame, Transmission
+from netem.channel._links import Links, linear
+from netem.channel._parameters import NANOSECONDS, Chirps, Contention, Radio, Turns, nanoseconds
+from netem.radio import Place
+
+
+class Channel:
+    """The channel between `vehicles`, which are numbered from 0 in this order.
+
+    Times are seconds, and no call may go back in time. All vehicles are at one place until the first call of `move`.
+    """
+
+    def __init__(self, vehicles: Sequence[int], radio: Radio, seed: int) -> None:
+        self._radio = radio
+        self._access = _access(radio, vehicles, seed)
+        energy_dbm = radio.energy_dbm if isinstance(radio, Contention) else radio.sensitivity_dbm
+        self._links = Links(len(vehicles), radio, energy_dbm, Random(f"{seed}/shadowing"))
+        self._queues: list[deque[Frame]] = [deque() for _ in vehicles]
+        self._active: list[Frame] = []
+        self._next_end = NEVER
+        self._sending = 0
+        """Stations that send, as bits."""
+        self._finished: list[Transmission] = []
+        self._numbers = count()
+        self._airtimes: dict[int, int] = {}
+        self._silence = [linear(round(100 * radio.noise_dbm))] * len(vehicles)
+        self._begins = 1 + linear(round(-100 * radio.preamble_db)) / linear(0)
+        self._suffices = 1 + linear(round(-100 * radio.sinr_db)) / linear(0)
+        self._capture_window = nanoseconds(radio.capture_window_s)
+
+    def send(self, sender: int, now: float, data_bytes: int) -> int | Fate:
+        """Queue a message of this length, and return the number of its frame.
+
+        Return Fate.QUEUE or Fate.TOO_LONG if the radio drops the message.
+        """
+        now_ns = nanoseconds(now)
+        self._play(now_ns)
+        airtime = self._airtimes.get(data_bytes)
+        if airtime is None:
+            airtime = self._airtimes[data_bytes] = self._radio.airtime_ns(data_bytes)
+        if data_bytes > self._radio.largest_bytes or self._access.too_long(airtime):
+            return Fate.TOO_LONG
+        queue = self._queues[sender]
+        if len(queue) >= self._radio.queue_frames:
+            return Fate.QUEUE
+        frame = Frame(next(self._numbers), sender, data_bytes, now_ns, airtime)
+        queue.append(frame)
+        if len(queue) == 1 and not self._sending >> sender & 1:
+            self._access.wait(frame, now_ns, self._active)
+        return frame.number
+
+    def next_event(self) -> float | None:
+        """Return when the next frame begins or ends, in seconds; None if all queues are empty."""
+        next_ns = min(self._next_end, self._access.next_due)
+        return None if next_ns == NEVER else next_ns / NANOSECONDS
+
+    def advance(self, now: float) -> list[Transmission]:
+        """Play all events up to `now`, and return the transmissions that have ended since the last call, in order."""
+        self._play(nanoseconds(now))
+        finished, self._finished = self._finished, []
+        return finished
+
+    def move(self, places: Sequence[Place], now: float) -> None:
+        """Put the vehicles at these places. Frames on the air keep the power with which they began."""
+        self._play(nanoseconds(now))
+        self._links.move(places)
+
+    def tune(self, groups: Sequence[int], now: float) -> None:
+        """Give each vehicle the number of a channel. Vehicles on different channels neither hear nor disturb another.
+
+        Frames on the air are still received on the old channel.
+        """
+        self._play(nanoseconds(now))
+        self._links.tune(groups)
+
+    def _play(self, until: int) -> None:
+        access = self._access
+        while True:
+            due, ends = access.next_due, self._next_end
+            if min(due, ends) > until:
+                return
+            if ends <= due:
+                for frame in [frame for frame in self._active if frame.ends_ns == ends]:
+                    self._end(frame, ends)
+            else:
+                self._begin(access.take_due(), due)
+
+    def _begin(self, stations: list[int], now: int) -> None:
+        frames = []
+        for station in stations:
+            frame = self._queues[station].popleft()
+            frame.begins_ns, frame.ends_ns = now, now + frame.airtime_ns
+            frame.reach = self._links.reach(station, now)
+            self._sending |= 1 << station
+            self._next_end = min(self._next_end, frame.ends_ns)
+            frames.append(frame)
+        if len(frames) == 1 and not self._active:
+            frames[0].receiving = frames[0].reach.heard
+        else:
+            self._overlap(frames, now)
+        self._active += frames
+        self._access.begun(frames, now)
+
+    def _overlap(self, frames: list[Frame], now: int) -> None:
+        """Decide which receivers begin to receive these frames, and which frames on the air are disturbed.
+
+        A power p suffices if p >= ratio (total - p), which is p (1 + 1 / ratio) >= total.
+        """
+        for frame in self._active:
+            frame.deaf |= frame.reach.heard & self._sending
+            frame.receiving &= ~self._sending
+        air = self._active + frames
+        totals = self._silence
+        for frame in air:
+            totals = list(map(add, totals, frame.reach.powers))
+        begins, suffices, occupied = self._begins, self._suffices, 0
+        for frame in self._active:
+            if now - frame.begins_ns <= self._capture_window:
+                frame.receiving &= _sufficient(frame, totals, begins)
+            occupied |= frame.receiving
+        able = ~self._sending & ~occupied
+        for frame in frames:
+            frame.deaf = frame.reach.heard & self._sending
+            frame.receiving = frame.reach.heard & able & _sufficient(frame, totals, begins)
+        for frame in air:
+            if frame.receiving:
+                frame.disturbed |= frame.receiving & ~_sufficient(frame, totals, suffices)
+
+    def _end(self, frame: Frame, now: int) -> None:
+        self._active.remove(frame)
+        self._next_end = min([other.ends_ns for other in self._active], default=NEVER)
+        self._sending &= ~(1 << frame.sender)
+        queue = self._queues[frame.sender]
+        self._access.ended(frame, queue[0] if queue else None, now, self._active)
+        self._finished.append(Transmission(frame))
+
+
+def _sufficient(frame: Frame, totals: Sequence[float], ratio: float) -> int:
+    """Return the receivers, as bits, at which the power of the frame times `ratio` is at least the total power."""
+    receivers = 0
+    for number in [number for number, power in enumerate(frame.reach.powers) if power * ratio >= totals[number]]:
+        receivers |= 1 << number
+    return receivers
+
+
+def _access(radio: Radio, vehicles: Sequence[int], seed: int) -> Access:
+    if isinstance(radio, Contention):
+        return CarrierSense(radio, [Random(f"{seed}/backoff/{vehicle}") for vehicle in vehicles])
+    if isinstance(radio, Turns):
+        return TimeSlots(len(vehicles), radio)
+    assert isinstance(radio, Chirps), f"no access rule for {type(radio).__name__}"
+    return DutyCycle(len(vehicles), radio)

@@ -1,0 +1,154 @@
+"""Carrier sense and random backoff of IEEE 802.11 broadcasts: the DCF of IEEE 802.11-2020, 10.3.4.
+
+A station with a frame sends at once if the channel has been idle for DIFS. If the channel is busy, the station draws a
+number of slots from 0 to the contention window. It counts a slot down whenever the channel was idle for its duration,
+begins to count after DIFS, and sends at 0. After a frame it draws again, also if no further frame waits. A broadcast is
+never acknowledged, so the window never grows. After a frame with an error a station waits for EIFS in place of DIFS.
+
+Two stations whose counters end in the same slot both send, because neither can sense the other in time: a frame that
+began less than `sense_s` ago is not sensed yet.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from random import Random
+
+from netem.channel._access import NEVER
+from netem.channel._frame import Frame
+from netem.channel._parameters import Contention, nanoseconds
+
+_WORD_BITS = 32
+
+
+class CarrierSense:
+    """The backoff of all stations. `draws` has a random stream per station."""
+
+    def __init__(self, radio: Contention, draws: Sequence[Random]) -> None:
+        self.next_due = NEVER
+        self._due: dict[int, int] = {}
+        """Station with a frame -> when it will send this frame, if nothing changes."""
+        self._draws = draws
+        self._choices = radio.contention_window + 1
+        self._slot = nanoseconds(radio.slot_s)
+        self._difs = nanoseconds(radio.difs_s)
+        self._eifs = nanoseconds(radio.eifs_s)
+        self._sense = nanoseconds(radio.sense_s)
+        self._left = [0] * len(draws)
+        """Slots to count down, as of `_from`."""
+        self._from = [0] * len(draws)
+        """When the station begins to count, or began."""
+        self._resting: set[int] = set()
+        """Stations that count down after their last frame, without a further one."""
+        self._over: deque[Frame] = deque()
+        """Frames that ended less than EIFS ago."""
+
+    def take_due(self) -> list[int]:
+        stations = [station for station, due in self._due.items() if due == self.next_due]
+        for station in stations:
+            del self._due[station]
+        return stations
+
+    def wait(self, frame: Frame, now: int, active: Iterable[Frame]) -> None:
+        station = frame.sender
+        self._resting.discard(station)
+        left = self._counted(station, now)
+        if busy_until := self._busy_until(station, now, active):
+            if left == 0:
+                self._left[station] = self._drawn(station)
+            self._from[station] = max(self._from[station], busy_until + self._difs)
+        elif left == 0:
+            self._from[station] = self._idle_from(station, now)
+        due = self._due[station] = max(now, self._from[station] + self._left[station] * self._slot)
+        self.next_due = min(self.next_due, due)
+
+    def begun(self, frames: list[Frame], now: int) -> None:
+        """Let the stations that sense these frames wait. Those that are due before they sense them send all the same.
+
+        This runs for each frame and each waiting station, so it counts the slots itself.
+        """
+        all_due, all_from, all_left, slot, notices = self._due, self._from, self._left, self._slot, now + self._sense
+        busy = [(frame.ends_ns + self._difs, frame.sensed) for frame in frames]
+        busy.sort(reverse=True)
+        next_due = NEVER
+        for station, due in all_due.items():
+            if due > notices:
+                for idle_from, sensed in busy:
+                    if sensed >> station & 1:
+                        left, since = all_left[station], all_from[station]
+                        if left and since < now:
+                            left = all_left[station] = left - (now - since) // slot
+                        if left == 0:
+                            left = all_left[station] = self._drawn(station)
+                        if since < idle_from:
+                            since = all_from[station] = idle_from
+                        due = all_due[station] = since + left * slot
+                        break
+            if due < next_due:
+                next_due = due
+        self.next_due = next_due
+        for station in list(self._resting):
+            if self._counted(station, now) == 0:
+                self._resting.remove(station)
+                continue
+            for idle_from, sensed in busy:
+                if sensed >> station & 1:
+                    all_from[station] = max(all_from[station], idle_from)
+                    break
+
+    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Iterable[Frame]) -> None:
+        if failed := frame.receiving & frame.disturbed:
+            self._wait_for_longer(failed, now)
+        station = frame.sender
+        self._left[station] = self._drawn(station)
+        self._from[station] = max(now, self._busy_until(station, now, active)) + self._difs
+        if waiting is None:
+            self._resting.add(station)
+        else:
+            due = self._due[station] = self._from[station] + self._left[station] * self._slot
+            self.next_due = min(self.next_due, due)
+        self._over.append(frame)
+        while self._over[0].ends_ns + self._eifs < now:
+            self._over.popleft()
+
+    def too_long(self, airtime_ns: int) -> bool:
+        return False
+
+    def _wait_for_longer(self, stations: int, now: int) -> None:
+        """Let these stations wait for EIFS from now on in place of DIFS."""
+        early, late = now + self._difs, now + self._eifs
+        for station in (*self._due, *self._resting):
+            if stations >> station & 1 and self._from[station] == early:
+                self._from[station] = late
+                if station in self._due:
+                    self._due[station] = late + self._left[station] * self._slot
+        self.next_due = min(self._due.values(), default=NEVER)
+
+    def _counted(self, station: int, now: int) -> int:
+        """Count down the slots that have passed, and return the number of slots left."""
+        left = self._left[station]
+        if left and now > self._from[station]:
+            passed = (now - self._from[station]) // self._slot
+            left = self._left[station] = max(0, left - passed)
+            self._from[station] += passed * self._slot
+        return left
+
+    def _drawn(self, station: int) -> int:
+        return self._draws[station].getrandbits(_WORD_BITS) * self._choices >> _WORD_BITS
+
+    def _busy_until(self, station: int, now: int, active: Iterable[Frame]) -> int:
+        """Return when the frames end that the station senses now; 0 if there are none."""
+        began_by = now - self._sense
+        return max(
+            (frame.ends_ns for frame in active if frame.sensed >> station & 1 and frame.begins_ns <= began_by),
+            default=0,
+        )
+
+    def _idle_from(self, station: int, now: int) -> int:
+        """Return when the channel has been idle for long enough, after the last frame that the station sensed."""
+        for frame in reversed(self._over):
+            if frame.sensed >> station & 1:
+                failed = frame.receiving & frame.disturbed
+                return frame.ends_ns + (self._eifs if failed >> station & 1 else self._difs)
+        return now

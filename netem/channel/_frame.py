@@ -1,0 +1,129 @@
+"""A frame, from its way into the queue to its end on the air."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from netem.channel._links import Reach
+from netem.channel._parameters import NANOSECONDS
+
+
+class Fate(StrEnum):
+    """The fate of a frame at one receiver. A frame with one of the last two was never sent."""
+
+    RECEIVED = "received"
+    COLLISION = "collision"
+    """The receiver heard other frames at the same time, or it was receiving another one."""
+    HALF_DUPLEX = "half_duplex"
+    """The receiver was sending a frame itself."""
+    FADE = "fade"
+    """The shadowing took too much power."""
+    RANGE = "range"
+    """The receiver is too far away, even without shadowing."""
+    PARTITION = "partition"
+    """The receiver listens to another channel."""
+    QUEUE = "queue"
+    """The queue of the sender was full."""
+    TOO_LONG = "too_long"
+    """The radio cannot send a frame of this length."""
+
+
+@dataclass(slots=True, eq=False)
+class Frame:
+    """A frame. Times are nanoseconds. Sets of receivers are bits, as in `Reach`."""
+
+    number: int
+    sender: int
+    data_bytes: int
+    queued_ns: int
+    airtime_ns: int
+    begins_ns: int = 0
+    ends_ns: int = 0
+    reach: Reach = field(init=False)
+    """Known when the frame begins."""
+    receiving: int = 0
+    """Receivers that receive this frame and no other."""
+    disturbed: int = 0
+    """Receivers at which other frames were too strong."""
+    deaf: int = 0
+    """Receivers in range that sent a frame themselves."""
+
+    @property
+    def sensed(self) -> int:
+        """Stations for which this frame makes the channel busy."""
+        return self.receiving | self.disturbed | self.reach.energetic
+
+    @property
+    def received(self) -> int:
+        return self.receiving & ~self.disturbed
+
+    @property
+    def collided(self) -> int:
+        return self.reach.heard & ~self.received & ~self.deaf
+
+
+class Transmission:
+    """A frame whose transmission has ended, with its fate at each receiver."""
+
+    __slots__ = ("_frame",)
+
+    def __init__(self, frame: Frame) -> None:
+        self._frame = frame
+
+    @property
+    def number(self) -> int:
+        """The number that `Channel.send` returned."""
+        return self._frame.number
+
+    @property
+    def sender(self) -> int:
+        return self._frame.sender
+
+    @property
+    def data_bytes(self) -> int:
+        return self._frame.data_bytes
+
+    @property
+    def queued_at(self) -> float:
+        """When `Channel.send` was called, in seconds."""
+        return self._frame.queued_ns / NANOSECONDS
+
+    @property
+    def began_at(self) -> float:
+        return self._frame.begins_ns / NANOSECONDS
+
+    @property
+    def ended_at(self) -> float:
+        return self._frame.ends_ns / NANOSECONDS
+
+    @property
+    def received(self) -> int:
+        """The receivers that got the frame, as bits: receiver 0 is the lowest bit."""
+        return self._frame.received
+
+    def lost(self) -> dict[Fate, int]:
+        """Return the receivers that lost the frame, as bits, by fate."""
+        frame, reach = self._frame, self._frame.reach
+        lost = {
+            Fate.COLLISION: frame.collided,
+            Fate.HALF_DUPLEX: frame.deaf,
+            Fate.FADE: reach.faded,
+            Fate.RANGE: reach.far,
+            Fate.PARTITION: reach.cut,
+        }
+        return {fate: receivers for fate, receivers in lost.items() if receivers}
+
+    def fate(self, receiver: int) -> Fate:
+        """Return the fate of the frame at this receiver, which is not the sender."""
+        bit = 1 << receiver
+        return next((fate for fate, receivers in self.lost().items() if receivers & bit), Fate.RECEIVED)
+
+
+def numbers(receivers: int) -> Iterator[int]:
+    """Yield the numbers of the receivers in this set of bits, in ascending order."""
+    while receivers:
+        lowest = receivers & -receivers
+        yield lowest.bit_length() - 1
+        receivers ^= lowest

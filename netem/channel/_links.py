@@ -1,0 +1,201 @@
+"""The power with which each vehicle hears each other one: path loss over the distance, and shadowing.
+
+Shadowing is a normal deviation in decibels, equal in both directions of a link. It is correlated: after a vehicle has
+moved, or after some time, a part of the old deviation remains (Gudmundson, Correlation Model for Shadow Fading in
+Mobile Radio Systems, Electronics Letters 27(23), 1991). If both ends of a link move, both distances count (Wang,
+Tameh, Nix, Joint Shadowing Process in Urban Peer-to-Peer Radio Channels, IEEE Transactions on Vehicular Technology
+57(1), 2008). Links are independent of each other, also if two vehicles fly side by side: the model has no map of
+obstacles.
+
+Powers are integers of 0.01 dB, and sums of powers use the entries of a table. Rounded values do not depend on the
+mathematical library of the machine.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from array import array
+from collections.abc import Sequence
+from dataclasses import dataclass
+from random import Random
+
+from netem._distributions import SCALE, table
+from netem.channel._parameters import NANOSECONDS, Radio, nanoseconds
+from netem.radio import MIN_DISTANCE_M, Place
+
+STEP = 0.1
+"""Change of the shadowing after which it is drawn again: its correlation has then fallen to exp(-STEP), about 0.9."""
+
+_TABLE_SIZE = 4096
+_KEPT_STEPS = 1 << 16
+_MANTISSA = [round(10 ** (6 + step / 1000)) for step in range(1000)]
+_LIGHT_M_PER_S = 299_792_458.0
+
+
+def linear(centibels: int) -> float:
+    """Return the power of this level in 0.01 dB, relative to 10^-6 of level 0."""
+    tens, step = divmod(centibels, 1000)
+    return _MANTISSA[step] * 10.0**tens if tens >= 0 else _MANTISSA[step] / 10.0**-tens
+
+
+@dataclass(slots=True)
+class Reach:
+    """How a frame of one sender arrives at each receiver. Sets of receivers are bits: receiver 0 is the lowest bit."""
+
+    powers: list[float]
+    heard: int
+    """Receivers that can receive the frame if nothing disturbs it."""
+    energetic: int
+    """Receivers that sense the carrier by its energy alone."""
+    faded: int
+    """Receivers that the shadowing cuts off."""
+    far: int
+    """Receivers that are out of range even without shadowing."""
+    cut: int
+    """Receivers that listen to another channel."""
+
+
+class Links:
+    """The links between `count` vehicles, which are at one place until the first call of `move`."""
+
+    def __init__(self, count: int, radio: Radio, energy_dbm: float, draws: Random) -> None:
+        self._count = count
+        self._radio = radio
+        self._power = _centibels(radio.power_dbm)
+        self._sensitivity = _centibels(radio.sensitivity_dbm)
+        self._energy = _centibels(energy_dbm)
+        self._deviation = 100 * radio.shadowing_db
+        self._each_frame = radio.shadowing_db > 0 and 0.0 in (radio.shadowing_m, radio.shadowing_s)
+        self._correlated = radio.shadowing_db > 0 and not self._each_frame
+        self._draws = draws
+        self._quantiles = table("normal", _TABLE_SIZE)
+        self._group = [0] * count
+        self._places = [Place(0.0, 0.0, 0.0)] * count
+        self._loss = [[self._path_loss(self._places[0], self._places[0])] * count for _ in range(count)]
+        self._moved_m = [0.0] * count
+        """Metres since the last change of the shadowing."""
+        self._shadow = [[0] * count for _ in range(count)]
+        self._shadowed_at = 0
+        self._ages_at = 0
+        self._reaches: list[Reach | None] = [None] * count
+        if self._correlated:
+            self._ages_at = nanoseconds(STEP * radio.shadowing_s)
+            self._shift(None)
+
+    def move(self, places: Sequence[Place]) -> None:
+        """Put the vehicles at these places."""
+        moved = [number for number, place in enumerate(places) if place != self._places[number]]
+        if not moved:
+            return
+        for number in moved:
+            self._moved_m[number] += places[number].distance_m(self._places[number])
+        if self._correlated and 2 * max(self._moved_m) > STEP * self._radio.shadowing_m:
+            self._ages_at = 0
+        self._places = list(places)
+        for number in moved:
+            row = self._loss[number]
+            for other, place in enumerate(places):
+                if other != number:
+                    row[other] = self._loss[other][number] = self._path_loss(places[number], place)
+        self._reaches = [None] * self._count
+
+    def tune(self, groups: Sequence[int]) -> None:
+        """Let only vehicles with the same number in `groups` hear and disturb each other."""
+        self._group = list(groups)
+        self._reaches = [None] * self._count
+
+    def reach(self, sender: int, now_ns: int) -> Reach:
+        """Return how a frame arrives that `sender` begins to send now."""
+        if self._each_frame:
+            words = self._words(self._count)
+            return self._computed(sender, [self._deviate(word) for word in words])
+        if self._correlated and now_ns >= self._ages_at:
+            self._age(now_ns)
+        found = self._reaches[sender]
+        if found is None:
+            found = self._reaches[sender] = self._computed(sender, self._shadow[sender])
+        return found
+
+    def _computed(self, sender: int, shadow: Sequence[int]) -> Reach:
+        powers = [0.0] * self._count
+        heard = energetic = faded = far = cut = 0
+        group, own = self._group, self._group[sender]
+        for receiver, loss in enumerate(self._loss[sender]):
+            if receiver == sender:
+                continue
+            bit = 1 << receiver
+            if group[receiver] != own:
+                cut |= bit
+                continue
+            mean = self._power - loss
+            level = mean + shadow[receiver]
+            powers[receiver] = linear(level)
+            if level >= self._sensitivity:
+                heard |= bit
+            elif mean < self._sensitivity:
+                far |= bit
+            else:
+                faded |= bit
+            if level >= self._energy:
+                energetic |= bit
+        return Reach(powers, heard, energetic, faded, far, cut)
+
+    def _path_loss(self, one: Place, other: Place) -> int:
+        """Return the path loss: log-distance, or over a flat ground whichever of the two is greater.
+
+        Two rays: Rappaport, Wireless Communications, 2nd ed., eq. 4.52, far from the antennas.
+        """
+        radio = self._radio
+        metres = max(one.distance_m(other), MIN_DISTANCE_M)
+        first_metre_db = 20 * math.log10(4 * math.pi * MIN_DISTANCE_M * radio.frequency_hz / _LIGHT_M_PER_S)
+        loss_db = first_metre_db + 10 * radio.exponent * math.log10(metres)
+        if radio.ground == "two_ray":
+            heights = [max(place.up_m, 0.0) + radio.antenna_m for place in (one, other)]
+            if min(heights) <= 0:
+                return _centibels(1000.0)
+            loss_db = max(loss_db, 40 * math.log10(metres) - 20 * math.log10(heights[0] * heights[1]))
+        return _centibels(loss_db)
+
+    def _age(self, now_ns: int) -> None:
+        """Change the shadowing by the time and the movement since its last change."""
+        elapsed_s = (now_ns - self._shadowed_at) / NANOSECONDS
+        self._shadowed_at = now_ns
+        self._ages_at = now_ns + nanoseconds(STEP * self._radio.shadowing_s)
+        self._shift(elapsed_s / self._radio.shadowing_s)
+
+    def _shift(self, exponent: float | None) -> None:
+        """Draw the shadowing again. Without an exponent, nothing of the old shadowing remains."""
+        count, shadow, moved_m = self._count, self._shadow, self._moved_m
+        known: dict[float, tuple[int, float]] = {}
+        words = self._words(count * (count - 1) // 2)
+        at = 0
+        for one in range(count):
+            row = shadow[one]
+            for other in range(one):
+                moved = moved_m[one] + moved_m[other]
+                if moved not in known:
+                    share = 0.0 if exponent is None else math.exp(-exponent - moved / self._radio.shadowing_m)
+                    kept = round(share * _KEPT_STEPS)
+                    known[moved] = kept, math.sqrt(1 - (kept / _KEPT_STEPS) ** 2)
+                kept, rest = known[moved]
+                row[other] = shadow[other][one] = round(
+                    row[other] * kept / _KEPT_STEPS + rest * self._deviate(words[at])
+                )
+                at += 1
+        self._moved_m = [0.0] * count
+        self._reaches = [None] * count
+
+    def _deviate(self, word: int) -> int:
+        """Return a normal deviation in 0.01 dB from a word of 16 bits."""
+        return round(self._deviation * self._quantiles[word % _TABLE_SIZE] / SCALE)
+
+    def _words(self, count: int) -> array[int]:
+        words = array("H", self._draws.randbytes(2 * count))
+        if sys.byteorder == "big":
+            words.byteswap()
+        return words
+
+
+def _centibels(decibels: float) -> int:
+    return round(100 * decibels)
