@@ -27,6 +27,7 @@ from harness.report.live.server_process import beside
 from harness.run.run import Run, run
 from harness.scenario import Scenario
 from harness.scenario.agent_options import in_words
+from harness.scenario.agent_programs import Programs, command_keys, programs_of
 from harness.scenario.load import explain
 
 
@@ -46,6 +47,14 @@ def run_command(
     ],
     seed: Annotated[int | None, typer.Option(min=0, help="Random seed; that of RUN or a new one if not given.")] = None,
     speedup: Annotated[float | None, typer.Option(help="Mission seconds per second of wall time.")] = None,
+    agents: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--ucp-agent",
+            metavar="[ID=]COMMAND",
+            help="Other agent for all vehicles or, with ID=, for one; repeatable.",
+        ),
+    ] = None,
     vehicles: Annotated[Vehicles | None, typer.Option(help="Kind of vehicles, instead of the scenario's.")] = None,
     backend: Annotated[
         BackendName, typer.Option(help="Processes in private networks, containers, or virtual time.")
@@ -60,7 +69,8 @@ def run_command(
         bool, typer.Option("--capture", help="Record each vehicle's frames in capture/ID.pcapng.")
     ] = False,
     secured: Annotated[
-        bool, typer.Option("--secured", help="Secure the mission with fresh keys if it has none.")
+        bool,
+        typer.Option("--secured", rich_help_panel=RARE, help="Secure the mission with fresh keys if it has none."),
     ] = False,
     image_from_host: Annotated[
         bool,
@@ -94,7 +104,7 @@ def run_command(
     """
     console = Console()
     asked, own_seed = scenario_of(scenario)
-    request = _with_options(asked, speedup, vehicles, gcs, capture, image_from_host)
+    request = _with_options(asked, speedup, vehicles, gcs, capture, image_from_host, programs_of(agents or ()))
     if secured:
         request = request.secured()
     directory = (out or default_path(request.name)).absolute()
@@ -126,6 +136,7 @@ def run_command(
         given += [f"{OUT}{directory.resolve()}"]
         given += ["--capture"] if capture else []
         given += ["--secured"] if secured else []
+        given += [f"--ucp-agent={agent}" for agent in agents or ()]
         console.print("Booting User Mode Linux.", style="dim")
         raise typer.Exit(run_inside(["run", *given, "--", str(scenario)]))
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
@@ -182,9 +193,10 @@ def _with_options(
     gcs: str | None,
     capture: bool,
     image_from_host: bool,
+    programs: Programs,
 ) -> Scenario:
     """The scenario as resolved: the command line's word comes before the file's."""
-    document: dict[str, Any] = scenario.model_dump()
+    document: dict[str, Any] = scenario.model_dump() | command_keys(scenario, programs)
     if speedup is not None:
         if not 0 < speedup <= 1000:
             raise typer.BadParameter(f"{speedup:g} is not a speedup: use a number above 0 and at most 1000")

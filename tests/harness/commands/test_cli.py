@@ -1,11 +1,12 @@
 """The command line without a lab: `check`, wrong requests, exit statuses."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
-from tests.harness.command import harness, sentences
+from tests.harness.command import harness, sentences, write_scenario
 from tests.harness.mission import CONNECTED, edit, fly, write_exports, write_run
 
 PERFECT = Path(__file__).parents[3] / "scenarios" / "perfect.yaml"
@@ -109,4 +110,30 @@ def test_virtual_time_has_no_ardupilot(tmp_path: Path) -> None:
     done = harness(*asked)
     assert done.returncode == 2
     assert "`vehicles.kind: ardupilot` needs real processes" in " ".join(sentences(done.stderr))
+    assert not (tmp_path / "run").exists()
+
+
+def test_option_ucp_agent_replaces_the_agents_of_a_scenario(tmp_path: Path) -> None:
+    scenario = write_scenario(tmp_path, agent_command={"3": ["./missing"]}, vehicles={"kind": "none"})
+    ours = [sys.executable, "-P", "-m", "ucp.node"]
+    agents = ("--ucp-agent", " ".join(ours), "--ucp-agent", f"2={' '.join(ours)}")
+    done = harness("run", scenario, *agents, "--backend", "sim", "--seed", "1", "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert record["scenario"]["agent_command"] == {"1": ours, "2": ours, "3": ours}
+
+
+@pytest.mark.parametrize(
+    ("agents", "sentence"),
+    [
+        (["9=mine"], "agent_command names vehicle 9, which is not on the roster"),
+        (["mine", "yours"], "--ucp-agent names two programs for all"),
+        (["2="], "--ucp-agent is empty: name a program"),
+    ],
+)
+def test_impossible_option_ucp_agent_is_one_sentence(agents: list[str], sentence: str, tmp_path: Path) -> None:
+    options = [word for agent in agents for word in ("--ucp-agent", agent)]
+    done = harness("run", write_scenario(tmp_path), *options, "--out", tmp_path / "run")
+    assert done.returncode == 2
+    assert sentence in " ".join(sentences(done.stderr))
     assert not (tmp_path / "run").exists()

@@ -1,0 +1,48 @@
+"""The option `--ucp-agent [ID=]COMMAND` of `run` and of pytest: other programs as the agents of a scenario."""
+
+import re
+import shlex
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from harness.errors import ScenarioError
+from harness.scenario.scenario import Scenario
+
+_OF_ONE = re.compile(r"(?P<agent>[0-9]{1,5})=")
+
+Programs = Mapping[int | None, list[str]]
+"""Agent ID -> command. The key None has the command of all agents without a command of their own here."""
+
+
+def programs_of(options: Iterable[str]) -> Programs:
+    """Return the programs that the options name. Raises ScenarioError."""
+    programs: dict[int | None, list[str]] = {}
+    for option in options:
+        of_one = _OF_ONE.match(option)
+        agent_id = int(of_one["agent"]) if of_one else None
+        if agent_id in programs:
+            raise ScenarioError(f"--ucp-agent names two programs for {of_one['agent'] if of_one else 'all'}")
+        programs[agent_id] = _words(option[of_one.end() :] if of_one else option)
+    return programs
+
+
+def command_keys(scenario: Scenario, programs: Programs) -> dict[str, Any]:
+    """Return the keys that replace the agents of the scenario. Without programs there are none."""
+    if not programs:
+        return {}
+    others = programs.get(None)
+    asked = {agent_id: others or scenario.command_of(agent_id) for agent_id in scenario.roster}
+    named = {agent_id: words for agent_id, words in programs.items() if agent_id is not None}
+    return {
+        "agent_command": {agent_id: words for agent_id, words in (asked | named).items() if words is not None},
+    }
+
+
+def _words(command: str) -> list[str]:
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise ScenarioError(f"--ucp-agent is {command!r}: {str(error).lower()}") from None
+    if not words:
+        raise ScenarioError("--ucp-agent is empty: name a program")
+    return words
