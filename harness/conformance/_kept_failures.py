@@ -5,7 +5,9 @@ vector.jsonl      the inputs and answers that lead there, as `COMMAND --virtual`
 scenario.yaml     the same as a scenario, for `ucp-harness run --backend sim`
 air.pcapng        what crossed the air, for Wireshark and `ucp-harness packets`
 
-It can be played in virtual time, and then has all that a run has: its report, its trace, each step judged.
+The scenario can be played in virtual time. The run has a report and a trace, and the checker judges each step. If a
+timer expired late in the test, the inputs may be impossible in virtual time. In that case failure.txt reports this, and
+there are no vector and no scenario.
 """
 
 import base64
@@ -19,7 +21,7 @@ from harness.conformance._observation import Exchange
 from harness.conformance._reference_model import AGENT, INITIAL_DATA, PEERS, ROSTER
 from harness.conformance._state_space import VARIANTS, Variant
 from harness.conformance._udp_lab import AGENTS, PEERS_ON
-from harness.conformance._virtual_lines import Writer
+from harness.conformance._virtual_lines import NotPlayableError, Writer
 from harness.conformance.results import Case
 from harness.conformance.results_table import lines_of
 from harness.errors import MachineError
@@ -79,25 +81,29 @@ def keep(case: Case, command: Sequence[str], directory: Path) -> None:
     """Raises MachineError if the disk refuses."""
     try:
         directory.mkdir(parents=True)
-        (directory / "failure.txt").write_text("\n".join(lines_of(case)) + "\n", encoding="utf-8")
+        lines = list(lines_of(case))
         if case.settings in VARIANTS:
-            _write_vector(case, directory / "vector.jsonl")
-            scenario = scenario_of(case.name, command, VARIANTS[case.settings], case.inputs)
-            (directory / "scenario.yaml").write_text(scenario, encoding="utf-8")
+            try:
+                vector = _vector(case)
+                scenario = scenario_of(case.name, command, VARIANTS[case.settings], case.inputs)
+            except NotPlayableError as error:
+                lines.append(f"  these inputs have no scenario, because {error} is impossible in virtual time")
+            else:
+                (directory / "vector.jsonl").write_text(vector, encoding="utf-8")
+                (directory / "scenario.yaml").write_text(scenario, encoding="utf-8")
+        (directory / "failure.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
         if case.exchanges:
             _write_capture(case.exchanges, directory)
     except OSError as error:
         raise MachineError(f"{directory} cannot be written: {error.strerror}") from None
 
 
-def _write_vector(case: Case, path: Path) -> None:
+def _vector(case: Case) -> str:
     writer = Writer(VARIANTS[case.settings])
-    with path.open("w", encoding="utf-8") as file:
-        file.write(json.dumps({"in": writer.first(), "out": {"sent": [], "timer": None}}) + "\n")
-        for line in writer.lines(case.inputs):
-            file.write(
-                json.dumps({"in": line.given, "out": line.answer, "says": line.says, "sends": line.sends}) + "\n"
-            )
+    steps: list[dict[str, Any]] = [{"in": writer.first(), "out": {"sent": [], "timer": None}}]
+    for line in writer.lines(case.inputs):
+        steps.append({"in": line.given, "out": line.answer, "says": line.says, "sends": line.sends})
+    return "".join(json.dumps(step) + "\n" for step in steps)
 
 
 def _write_capture(exchanges: Sequence[Exchange], directory: Path) -> None:

@@ -99,6 +99,8 @@ class Seen:
     """The timer that ended, or would end, at another time than it should."""
     started: str | None = None
     """The timer that runs as it should, where that can be seen."""
+    ended: str | None = None
+    """How the agent ended by itself, or that it hangs."""
     hidden: Run | None = None
     """What should have changed nothing, just before; or should have stopped a timer."""
 

@@ -52,6 +52,8 @@ class Failure:
     """What crossed the air."""
     of_an_earlier_round: bool = False
     """It fails only after what was long over."""
+    unexplained_end: str | None = None
+    """How the agent ended, if no short way to its last input ends it."""
 
 
 @dataclass
@@ -105,6 +107,7 @@ class Suite:
         self._enough = enough
         self._room = float(side_by_side)
         self._starting = asyncio.Semaphore(STARTS_AT_ONCE)
+        self._unexplained_ends: set[str] = set()
 
     async def run(self, until: float) -> None:
         """All vectors, until that second of the monotonic clock, the last of them alone; then what is suspected.
@@ -234,12 +237,18 @@ class Suite:
 
     async def _try_again(self, waiting: Iterator[tuple[Tally, Suspicion]]) -> None:
         for tally, suspicion in waiting:
+            tally.passed.discard(suspicion.seen.pair)
+            if suspicion.seen.ended is not None and _kind_of_end(suspicion.seen.ended) in self._unexplained_ends:
+                continue
             outcomes = [outcome async for outcome in self._alone(tally, suspicion)]
             failures = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
-            tally.passed.discard(suspicion.seen.pair)
             if failures:
                 tally.failures.append(failures[0])
                 tally.passed.discard(failures[0].seen.pair)
+            elif (ended := suspicion.seen.ended) is not None:
+                if _kind_of_end(ended) not in self._unexplained_ends:
+                    self._unexplained_ends.add(_kind_of_end(ended))
+                    tally.failures.append(_unexplained(tally.vectors.variant, suspicion, ended))
             elif all(outcome is RIGHT for outcome in outcomes):
                 tally.passed.add(suspicion.seen.pair)  # it was the machine
 
@@ -262,6 +271,8 @@ class Suite:
                     if isinstance(outcome, Failure):
                         yield replace(outcome, seen=replace(outcome.seen, hidden=run))
                         return
+        if suspicion.seen.ended is not None:  # all its inputs may have ended it, not the last ones
+            return
         for way in _tails(variant, suspicion.way):
             outcome = await self._repeated(variant, way)
             if isinstance(outcome, Failure):
@@ -311,6 +322,15 @@ class Suite:
         finally:
             await subject.close()
         return RIGHT
+
+
+def _kind_of_end(ended: str) -> str:
+    """Return "it hangs", or "it ended with status 1"."""
+    return ended.partition(":")[0]
+
+
+def _unexplained(variant: Variant, suspicion: Suspicion, ended: str) -> Failure:
+    return Failure(variant.name, suspicion.way, suspicion.seen, suspicion.exchanges, unexplained_end=ended)
 
 
 def _run_without_effect(variant: Variant, way: tuple[str, ...], name: str) -> Run | None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 
 from harness.conformance._alphabet import INPUTS, TIMER
-from harness.conformance._observation import Seen
+from harness.conformance._observation import Exchange, Seen
 from harness.conformance._reference_model import Model
 from harness.conformance._state_space import Pair, State, Step, Variant, pair_of, state_of
 from harness.conformance._subject import Subject
@@ -37,6 +37,8 @@ class Suspicion:
 
     way: tuple[str, ...]
     seen: Seen
+    exchanges: tuple[Exchange, ...]
+    """All datagrams since the start of the agent."""
 
 
 class Map:
@@ -198,7 +200,7 @@ class Tour:
                     return None
                 continue
             if seen.wrong:
-                return Suspicion(tuple(self._way), seen)
+                return Suspicion(tuple(self._way), seen, self._subject.exchanges())
             if taken:
                 self._passed(pair)
             if self._map.leads_to(state, name) not in (None, state_of(self._subject.model)):

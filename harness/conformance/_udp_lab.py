@@ -32,6 +32,11 @@ FIRST_PORT = 14600
 MAX_READ_BYTES = 65536
 START_LIMIT_S, ANSWER_LIMIT_S, GRACE_S = 30.0, 10.0, 5.0
 LOOK_AGAIN_S = 0.01
+LAST_CHANCES, CHANCE_S = 10, 1.0
+"""Number of further requests to an agent that did not answer one within ANSWER_LIMIT_S, and their time limit. An agent
+that answers none of them hangs. A pause of the harness uses up one of them only."""
+MOMENT_S = 0.5
+"""Maximum wall time between the end of a process and the report of that end."""
 MAX_OUTPUT_BYTES = 16 * 1024 * 1024
 """Of an agent that is not yet ready."""
 _SO_TIMESTAMPNS = 35
@@ -46,6 +51,14 @@ class NoAgentError(HarnessError):
 
 class AgentEndedError(Exception):
     """The agent ended by itself, or does not answer: how."""
+
+
+class AgentExitedError(AgentEndedError):
+    """The process of the agent ended."""
+
+
+class AgentHangsError(AgentEndedError):
+    """The agent runs, but answers no request, however often it is asked."""
 
 
 class Air:
@@ -251,16 +264,36 @@ class Process:
         """Raises what its end means."""
         if self.process.returncode == UNSUPPORTED:
             raise UnsupportedError(last_line(self.output))
-        raise AgentEndedError(f"it ended with {self.process.end}: {last_line(self.output)}")
+        raise self._exited()
+
+    def _exited(self) -> AgentExitedError:
+        return AgentExitedError(f"it ended with {self.process.end}: {last_line(self.output)}")
 
     async def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
         """Raises AgentEndedError if it does not answer, AgentRefusedError if it refuses."""
         try:
             return await self.control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
         except AgentSilentError as error:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self.process.wait(), MOMENT_S)
             if self.process.returncode is not None:
-                self.raise_end()
+                raise self._exited() from None
+            await self.check_answers()
             raise AgentEndedError(str(error)) from None
+
+    async def check_answers(self) -> None:
+        """Raises AgentHangsError if the agent runs and answers none of several requests."""
+        for _ in range(LAST_CHANCES):
+            next_chance = time.monotonic() + CHANCE_S
+            try:
+                await self.control.ask("status", timeout_s=CHANCE_S)
+                return
+            except AgentRefusedError:
+                return
+            except AgentSilentError:
+                await asyncio.sleep(next_chance - time.monotonic())
+        if self.process.returncode is None:
+            raise AgentHangsError(f"it hangs: it did not answer {LAST_CHANCES} requests in a row")
 
     async def export(self) -> dict[str, Any]:
         """Its chain export, made now. Raises AgentEndedError, AgentRefusedError."""

@@ -32,7 +32,7 @@ from harness.conformance._reference_model import (
 )
 from harness.conformance._state_space import Variant, ends_next, state_of
 from harness.conformance._subject import Start, Subject
-from harness.conformance._udp_lab import AgentEndedError, Air, Ear, Process
+from harness.conformance._udp_lab import AgentEndedError, AgentExitedError, AgentHangsError, Air, Ear, Process
 from harness.play.agent_control import AgentRefusedError
 from ucp.clock import MICROSECONDS
 from ucp.events import MalformedEventsError, decode_events
@@ -148,7 +148,7 @@ class OverUdp(Subject):
         began, ends = self.now(), self._wall(deadline or 0.0) if isinstance(action, Expire) else 0.0
         waiting: list[Any] = []
         status: dict[str, Any] = {}
-        mistimed = None
+        mistimed = ended = None
         try:
             if isinstance(action, Expire):
                 too_early = await self._wait_for_timer(ends, str(expired))
@@ -159,6 +159,7 @@ class OverUdp(Subject):
                 waiting = await self._give(action)
         except (AgentEndedError, AgentRefusedError) as error:
             wrong.append(str(error))
+            ended = _end(error)
         if isinstance(action, Log):
             outcome, made = log_as(model, action, began, waiting)
             wrong += made
@@ -167,18 +168,20 @@ class OverUdp(Subject):
         ends_then = model.agent.next_timer()
         chances, gave_up = 0, False
         try:
-            status, chances, gave_up = await self._settle(len(outcome.sent), max(time.time(), ends), ends_then)
+            if ended is None:
+                status, chances, gave_up = await self._settle(len(outcome.sent), max(time.time(), ends), ends_then)
         except (AgentEndedError, AgentRefusedError) as error:
             wrong.append(str(error))
+            ended = _end(error)
         heard = self.ear.take()
         timestamp_us = model.state.newest_block_timestamp_us
         seen = compare(model, given, before, outcome, _data(heard), status, wrong)
-        late = chances < CHANCES and self._ended(ends_then)
+        late = ended is None and chances < CHANCES and self._ended(ends_then)
         if seen.wrong and late:
             given_now = [(action, began, timestamp_us)]
             self.in_step = bool(status) and self._explained(moment, given_now, heard, status)
             late = self.in_step or not gave_up
-        return dataclasses.replace(seen, late=late, mistimed=mistimed or seen.mistimed)
+        return dataclasses.replace(seen, late=late, mistimed=mistimed or seen.mistimed, ended=ended)
 
     def _explained(
         self,
@@ -283,6 +286,11 @@ class OverUdp(Subject):
             if time.time() - calm_since > pace.calm_s:
                 return status, chances, False
             await self.ear.arrival(time.time() + 0.004)
+
+
+def _end(error: Exception) -> str | None:
+    """The end of the agent that the error reports. None if the machine may be late instead."""
+    return str(error) if isinstance(error, AgentHangsError | AgentExitedError) else None
 
 
 def _data(heard: Sequence[tuple[float, bytes]]) -> list[bytes]:

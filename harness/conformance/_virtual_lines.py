@@ -31,6 +31,10 @@ class Line:
     outcome: Outcome
 
 
+class NotPlayableError(Exception):
+    """An input is impossible in virtual time, because over UDP a timer expired late."""
+
+
 class Writer:
     """The reference in virtual time, whose inputs and answers are written down."""
 
@@ -44,7 +48,7 @@ class Writer:
         return {"t": 0.0, "mission": virtual_mission(self._variant), "trace": False}
 
     def lines(self, way: Sequence[str]) -> Iterator[Line]:
-        """Of a way that there is."""
+        """Yield the lines of these inputs. Raises NotPlayableError."""
         for name in way:
             given = INPUTS[name]
             if given.first is not None:
@@ -55,7 +59,8 @@ class Writer:
 
     def line(self, given: Input) -> Line:
         action = given.make(self.model)
-        assert action is not None, f"{given.name} was there when the path was found"
+        if action is None:
+            raise NotPlayableError(given.name)
         deadline = self.model.agent.next_timer()
         self.now = deadline if isinstance(action, Expire) and deadline is not None else self.now + STEP_S
         timestamp_us = round(self.now * MICROSECONDS)

@@ -27,6 +27,8 @@ from harness.conformance._udp_lab import (
     LOOK_AGAIN_S,
     START_LIMIT_S,
     AgentEndedError,
+    AgentExitedError,
+    AgentHangsError,
     NoAgentError,
     last_line,
 )
@@ -54,6 +56,7 @@ class Program:
         self._reading = reading
         self._answers = answers
         self._errors = errors
+        self._lines = 0
         self.broken = False
 
     @classmethod
@@ -92,22 +95,27 @@ class Program:
 
     async def ask(self, line: dict[str, Any], limit_s: float = ANSWER_LIMIT_S) -> dict[str, Any]:
         """Its answer. Raises AgentEndedError, UnsupportedError."""
+        self._lines += 1
         try:
             async with asyncio.timeout(limit_s):
                 self._given.write(json.dumps(line).encode("ascii") + b"\n")
                 await self._given.drain()
                 text = await self._answers.readline()
                 answer = json.loads(text) if text else None
-        except (TimeoutError, OSError, ValueError, RecursionError) as error:
+        except TimeoutError:
             self.broken = True
-            raise AgentEndedError(f"no readable answer: {str(error) or 'it is silent'}") from None
+            line_number = f"line {self._lines} of its process"
+            raise AgentHangsError(f"it hangs: it did not answer {line_number} within {limit_s:g} s") from None
+        except (OSError, ValueError, RecursionError) as error:
+            self.broken = True
+            raise AgentEndedError(f"no readable answer: {error}") from None
         if answer is None:
             self.broken = True
             with suppress(TimeoutError):
                 await asyncio.wait_for(_ended(self._process), GRACE_S)
             if self._process.returncode is None:
                 raise AgentEndedError("it closed its standard output and still runs")
-            raise AgentEndedError(f"it ended with status {self._process.returncode}: {last_line(self._errors)}")
+            raise AgentExitedError(f"it ended with status {self._process.returncode}: {last_line(self._errors)}")
         if not isinstance(answer, dict):
             self.broken = True
             raise AgentEndedError("its answer is not a JSON object")
@@ -139,9 +147,9 @@ async def _ended(process: subprocess.Popen[bytes]) -> None:
 
 
 class InVirtualTime(Subject):
-    """One life in a process, which is given back at its end."""
+    """One incarnation in a process, which the next one uses if `idle` is a list."""
 
-    def __init__(self, variant: Variant, program: Program, idle: list[Program]) -> None:
+    def __init__(self, variant: Variant, program: Program, idle: list[Program] | None) -> None:
         super().__init__(variant)
         self._program = program
         self._idle = idle
@@ -151,7 +159,7 @@ class InVirtualTime(Subject):
         """When timers would have ended, and what stopped them."""
 
     @classmethod
-    async def start(cls, variant: Variant, program: Program, idle: list[Program]) -> "InVirtualTime":
+    async def start(cls, variant: Variant, program: Program, idle: list[Program] | None) -> "InVirtualTime":
         subject = cls(variant, program, idle)
         try:
             await program.ask({"t": 0.0, "mission": virtual_mission(variant), "trace": False}, START_LIMIT_S)
@@ -169,7 +177,7 @@ class InVirtualTime(Subject):
         return tuple(self._record)
 
     async def close(self) -> None:
-        if self._program.broken:
+        if self._program.broken or self._idle is None:
             await self._program.close()
         else:
             self._idle.append(self._program)
@@ -188,6 +196,7 @@ class InVirtualTime(Subject):
             self._stopped |= dict.fromkeys(running - _deadlines(model), outcome.runs[0]) if outcome.runs else {}
         line = given_line(action, self._now, timestamp_us)
         wrong, sent, status = list[str](), list[bytes](), dict[str, Any]()
+        ended = None
         ends, should = model.agent.next_timer(), model.agent.next_timer()
         names = Names(model)
         try:
@@ -198,6 +207,7 @@ class InVirtualTime(Subject):
             status = told if isinstance(told, dict) else {}
         except (AgentEndedError, UnsupportedError) as error:
             wrong.append(str(error))
+            ended = str(error) if isinstance(error, AgentHangsError | AgentExitedError) else None
         except (KeyError, TypeError, ValueError):
             wrong.append("its answer has no `sent`, a list of datagrams in base64")
         if "datagram" in line:
@@ -205,7 +215,7 @@ class InVirtualTime(Subject):
             self._record.append(Exchange(self._now, False, data, told_datagram(data, names)))
         self._record += [Exchange(self._now, True, data, told_datagram(data, names)) for data in sent]
         timer = ends_next(model)
-        seen = compare(model, given, before, outcome, sent, status, wrong)
+        seen = replace(compare(model, given, before, outcome, sent, status, wrong), ended=ended)
         if _same_instant(ends, should):
             return replace(seen, started=timer)
         sentence = f"according to its answer its next timer expires at {ends} s, not at {should} s"
@@ -233,6 +243,8 @@ def starting(command: Sequence[str], errors: Path) -> tuple[Start, list[Program]
     idle: list[Program] = []
 
     async def start(variant: Variant, alone: bool) -> Subject:
+        if alone:  # an earlier incarnation of the process may be the cause of a failure
+            return await InVirtualTime.start(variant, await Program.start(command, errors), None)
         program = idle.pop() if idle else await Program.start(command, errors)
         return await InVirtualTime.start(variant, program, idle)
 

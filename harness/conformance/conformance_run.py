@@ -22,8 +22,9 @@ from harness.conformance._suite import (
     Tally,
 )
 from harness.conformance._udp_lab import Air
-from harness.conformance.results import Case, Results, Row
+from harness.conformance.results import BESIDE, Case, Results, Row
 from harness.conformance.vectors import Vectors, generate
+from harness.errors import MachineError
 
 IN_VIRTUAL_TIME = 2
 """Processes of the agent there."""
@@ -59,7 +60,7 @@ def conform(
         asyncio.run(_run(asked, place, chosen, lambda count: told(count, total), results))
     except KeyboardInterrupt:
         results.interrupted = True
-    results.cases = _kept(results.cases, asked)
+    _keep_failures(results, asked)
     results.wall_s = time.monotonic() - began
     return results
 
@@ -116,8 +117,21 @@ def _conclude(tallies: Sequence[Tally], asked: Asked, results: Results) -> None:
 
 
 def _case(failure: Failure, evidence: Evidence) -> Case:
-    blamed = evidence.blame(failure)
     seen = failure.seen
+    if failure.unexplained_end is not None:
+        return Case(
+            f"{failure.unexplained_end}; its incarnation had {len(failure.way)} inputs",
+            BESIDE,
+            "failed",
+            reason=failure.unexplained_end,
+            settings=failure.variant,
+            inputs=failure.way,
+            expected=seen.expected,
+            came=seen.came,
+            wrong=(failure.unexplained_end, "no short sequence that ends with the same input has this effect"),
+            exchanges=failure.exchanges,
+        )
+    blamed = evidence.blame(failure)
     return Case(
         f"{seen.before.text}; {seen.given}",
         blamed.algorithm,
@@ -134,16 +148,18 @@ def _case(failure: Failure, evidence: Evidence) -> Case:
     )
 
 
-def _kept(cases: Sequence[Case], asked: Asked) -> list[Case]:
-    """Each failure with its directory, if any is asked for."""
+def _keep_failures(results: Results, asked: Asked) -> None:
+    """Write the files of each failure. If the disk refuses one, a note reports this, and the results stay."""
     if asked.keep is None:
-        return list(cases)
-    numbered = []
-    for number, case in enumerate(cases, 1):
-        if case.verdict == "failed":
-            place = asked.keep / f"{number:02d}-{case.handler or 'program'}"
-            keep(case, asked.command, place)
-            numbered.append(replace(case, directory=str(place)))
-        else:
-            numbered.append(case)
-    return numbered
+        return
+    kept = []
+    try:
+        for number, case in enumerate(results.cases, 1):
+            if case.verdict == "failed":
+                place = asked.keep / f"{number:02d}-{case.handler or 'program'}"
+                keep(case, asked.command, place)
+                case = replace(case, directory=str(place))
+            kept.append(case)
+    except MachineError as error:
+        results.notes.append(str(error))
+    results.cases[: len(kept)] = kept

@@ -77,8 +77,9 @@ def lines_of(case: Case) -> Iterator[str]:
     if case.inputs:
         yield f"  after {'; '.join(case.inputs[:-1])}" if case.inputs[:-1] else "  from its start"
         yield f"  given {case.inputs[-1]}"
-    yield f"  expected {'; '.join(case.expected) or 'nothing'}"
-    yield f"  came     {'; '.join(case.came) or 'nothing'}"
+    if case.inputs or case.expected or case.came:
+        yield f"  expected {'; '.join(case.expected) or 'nothing'}"
+        yield f"  came     {'; '.join(case.came) or 'nothing'}"
     for sentence in case.wrong[:WRONG_SHOWN]:
         yield f"  {sentence}"
     for exchange in case.exchanges[-EXCHANGES_SHOWN:]:

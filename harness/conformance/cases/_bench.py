@@ -142,7 +142,12 @@ class Bench:
             await alone.process.ready()
             if started:
                 await alone.begin()
-            yield alone
+            try:
+                yield alone
+            except WrongError:
+                if alone.process.process.returncode is None:
+                    await alone.process.check_answers()
+                raise
 
     @asynccontextmanager
     async def program(
