@@ -1,7 +1,7 @@
 """Cases written by hand, for behaviour that no state explains.
 
 A case starts agents of its own and plays their peers (`_bench`). The modules of this package cover hostile datagrams,
-blocks and votes, start and end of the program, the disk, and missions with keys.
+blocks and votes, start and end of the program, the disk, records, and missions with keys.
 """
 
 from harness.conformance.cases import (  # noqa: F401  (each module adds its cases to ALL)
@@ -9,6 +9,7 @@ from harness.conformance.cases import (  # noqa: F401  (each module adds its cas
     _datagram_cases,
     _disk_cases,
     _program_cases,
+    _record_cases,
     _secured_cases,
 )
 from harness.conformance.cases._bench import ALL, Bench, ByHand

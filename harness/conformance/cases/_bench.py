@@ -80,6 +80,9 @@ class Alone:
         self.epoch_s = time.time() + ahead_s
         await self.process.ask("start", epoch_us=round(self.epoch_s * MICROSECONDS))
 
+    def mission_s(self) -> float:
+        return (time.time() - self.epoch_s) * SPEEDUP
+
     def say(self, sender: int, message: Message) -> None:
         self._sequence += 1
         self.ear.say(encode(sender, self._sequence, message))

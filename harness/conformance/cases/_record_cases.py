@@ -1,0 +1,173 @@
+"""The records of an agent: its trace, its chain export and its status agree with each other and with the test."""
+
+import base64
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from harness.archive.exports import Export, read_export
+from harness.archive.traces import SUFFIX, Trace, read_trace
+from harness.checker import records, steps
+from harness.checker.evidence import Evidence
+from harness.checker.judgement import Judgement
+from harness.conformance._reference_model import INITIAL_DATA, PEERS, ROSTER, STRANGER
+from harness.conformance._state_space import VARIANTS
+from harness.conformance.cases._bench import INCEPTION, SPEEDUP, Bench, CannotTellError, WrongError, case, must
+from harness.errors import ExportError
+from ucp.block import Block, next_chain_hash
+from ucp.clock import MICROSECONDS
+from ucp.messages import (
+    BlockAddRequest,
+    BlockAddResponse,
+    ChainContainQuery,
+    ChainContainResponse,
+    CommitBlock,
+    RequestForBlock,
+)
+from ucp.trace import Dropped, Recorded
+
+SETTINGS = {**VARIANTS["default"].settings.told(), "max_block_bytes": 1024, "max_event_bytes": 267}
+LARGEST_EVENT = bytes(256)
+EVENTS_OF_A_BLOCK = 3
+MOMENT_S = 1.0
+"""Mission seconds by which the clocks of the harness and of the agent may differ."""
+
+
+@dataclass(frozen=True)
+class _Records:
+    trace: Trace
+    export: Export
+    status: dict[str, Any]
+    said: Sequence[tuple[float, bytes]]
+    """Mission second and content of each datagram to the agent."""
+    sent: Sequence[bytes]
+    export_s: tuple[float, float]
+    """Mission seconds before and after the command `export`."""
+    epoch_us: int
+
+    def judged_by(self, judgement: Judgement, bad: str, expected: str) -> None:
+        found = judgement.evidence[0].detail if judgement.evidence else judgement.reason
+        must(judgement.verdict != bad, expected, found)
+
+    def evidence(self) -> Evidence:
+        agent_id = self.export.agent_id
+        return Evidence({agent_id: self.export}, {agent_id: self.trace})
+
+
+async def _played(bench: Bench) -> _Records:
+    """Return the records of an agent that commits, votes, reconciles, drops datagrams, and is then killed."""
+    async with bench.agent({"settings": SETTINGS}) as agent:
+        first, second, *_ = PEERS
+        block = Block(first, 1, b"block")
+        top = next_chain_hash(INCEPTION, block.block_hash)
+        agent.say(first, CommitBlock(block, top))
+        agent.ear.say(b"UC")
+        agent.say(STRANGER, ChainContainQuery(top))
+        agent.say(second, RequestForBlock(block.block_hash))
+        await agent.hear(1, "a Block Response")
+        for _ in range(EVENTS_OF_A_BLOCK):
+            await agent.log(LARGEST_EVENT)
+        (proposed,) = await agent.hear(1, "a Block Add Request")
+        assert isinstance(proposed, BlockAddRequest)
+        agent.say(first, BlockAddResponse(proposed.block_hash, True))
+        (committed,) = await agent.hear(1, "a Commit Block after an approved vote")
+        must(isinstance(committed, CommitBlock), "a Commit Block after an approved vote", committed.NAME)
+        await agent.process.ask("reconcile")
+        (asked,) = await agent.hear(1, "a Chain Contain Query")
+        assert isinstance(asked, ChainContainQuery)
+        agent.say(first, ChainContainResponse(asked.chain_hash, False))
+        await agent.hear(1, "a Chain Contain Query about the chain below")
+        (back,) = await agent.hear(1, "a Commit Block of the popped block")
+        must(back.NAME == "Commit Block", "a Commit Block of the popped block", back.NAME)
+        await agent.log(b"event of the next block")
+        await agent.process.ask("stop_events")
+        before_s = agent.mission_s()
+        await agent.process.ask("export")
+        export_s = before_s, agent.mission_s()
+        status = await agent.status()
+        directory, agent_id = agent.process.directory, agent.agent_id
+        record, epoch_s = list(agent.ear.record), agent.epoch_s
+        path = directory / f"{agent_id}{SUFFIX}"
+        if not path.exists():
+            raise CannotTellError("the agent writes no trace")
+    trace = read_trace(path)
+    if trace is None:
+        raise WrongError("a trace with a valid first line", "its first line is missing or invalid")
+    must(trace.problem is None, "a trace that can be read", trace.problem)
+    try:
+        export = read_export(directory / f"{agent_id}.chain.json")
+    except ExportError as error:
+        raise WrongError("a chain export that can be read", str(error)) from None
+    said = [((at_s - epoch_s) * SPEEDUP, data) for at_s, by_agent, data in record if not by_agent]
+    sent = [data for _, by_agent, data in record if by_agent]
+    return _Records(trace, export, status, said, sent, export_s, round(epoch_s * MICROSECONDS))
+
+
+def _bytes(recorded: Recorded | None) -> bytes:
+    return base64.b64decode(recorded.text) if recorded is not None else b""
+
+
+@case("the trace has each datagram, event and command, in order and with its time", "contract, Trace")
+async def _inputs(bench: Bench) -> None:
+    played = await _played(bench)
+    runs, asides = played.trace.runs, [aside for _, aside in played.trace.asides]
+    drops = {aside.datagram.text: aside.dropped for aside in asides if isinstance(aside, Dropped)}
+    said = dict.fromkeys(data for _, data in played.said)
+    expected = {base64.b64encode(b"UC").decode(): "truncated"}
+    stranger = next(data for data in said if data[4:8] == STRANGER.to_bytes(4, "big"))
+    expected[base64.b64encode(stranger).decode()] = "sender not on the roster"
+    must(drops == expected, f"lines for 2 dropped datagrams: {', '.join(expected.values())}", drops)
+    received = [(run.t, _bytes(run.input)) for run in runs if run.trigger.kind == "message"]
+    handled = [data for _, data in played.said if base64.b64encode(data).decode() not in expected]
+    must([data for _, data in received] == handled, f"lines for {len(handled)} messages", f"{len(received)} lines")
+    for t, data in received:
+        sent_s = next(at_s for at_s, each in played.said if each == data)
+        late_s = t - sent_s
+        right = late_s > -MOMENT_S and t <= played.export_s[1]
+        must(right, f"`t` {sent_s:.1f} or a little later for a message of that mission second", t)
+    sent = [_bytes(sent.datagram) for run in runs for sent in run.sent]
+    must(sent == played.sent, f"lines with {len(played.sent)} sent messages", f"{len(sent)} messages")
+    events = sum(run.trigger.kind == "event" for run in runs)
+    must(events == EVENTS_OF_A_BLOCK + 1, f"{EVENTS_OF_A_BLOCK + 1} lines for events", events)
+    commands = [aside.command for aside in asides if not isinstance(aside, Dropped)]
+    must(commands == ["stop_events", "export"], "lines for the commands stop_events and export", commands)
+
+
+@case("the first line of the trace describes the mission", "contract, Trace")
+async def _header(bench: Bench) -> None:
+    played = await _played(bench)
+    header = played.trace.header
+    must({*header.roster} == {*ROSTER}, f"the roster {list(ROSTER)}", header.roster)
+    must(header.initial_data == base64.b64encode(INITIAL_DATA).decode(), "the initial data", header.initial_data)
+    lacking = {name: value for name, value in SETTINGS.items() if header.settings.get(name) != value}
+    must(not lacking, "the settings of the mission", f"other values of {', '.join(lacking)}")
+    clock = {"epoch_us": played.epoch_us, "speedup": SPEEDUP}
+    must(header.clock == clock, f"the clock {clock}", header.clock)
+
+
+@case("each handler run in the trace follows Algorithms 1 to 20", "contract, Trace")
+async def _steps(bench: Bench) -> None:
+    played = await _played(bench)
+    played.judged_by(steps.check(played.evidence()), "deviates", "the steps of the reference")
+
+
+@case("status, chain export and trace agree", "contract, Judgement")
+async def _agree(bench: Bench) -> None:
+    played = await _played(bench)
+    status, trace, export = played.status, played.trace, played.export
+    runs = len(trace.runs)
+    must(status["handled"] == runs, f"`handled` {runs}, the number of lines of handler runs", status["handled"])
+    sent_bytes = sum(map(len, played.sent))
+    must(status["bytes_sent"] == sent_bytes, f"`bytes_sent` {sent_bytes}", status["bytes_sent"])
+    drops = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, Dropped))
+    must(status.get("dropped", drops) == drops, f"`dropped` {dict(drops)}", status.get("dropped"))
+    completed = trace.completed()
+    must(export.completed == completed, "the completed blocks of the trace in the export", export.completed)
+    at_s = (export.exported_at_us - played.epoch_us) / MICROSECONDS
+    earliest, latest = played.export_s
+    in_time = earliest - MOMENT_S <= at_s <= latest + MOMENT_S
+    must(in_time, f"`exported_at_us` at mission second {earliest:.1f}", f"{at_s:.1f}")
+    current = base64.b64decode(export.current_block.event_data)
+    must(current.endswith(b"event of the next block"), "the event of the unfinished block", f"{len(current)} bytes")
+    played.judged_by(records.check(played.evidence()), "contradict", "records that agree")

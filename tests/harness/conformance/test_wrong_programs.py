@@ -1,0 +1,55 @@
+"""Handwritten cases find programs with mistakes outside the 20 algorithms."""
+
+import asyncio
+import sys
+from pathlib import Path
+
+import pytest
+
+from harness.conformance._handwritten import _play
+from harness.conformance._udp_lab import Air
+from harness.conformance.cases import ALL
+from harness.conformance.results import Case
+from tests.harness.conformance import wrong_programs
+
+pytestmark = pytest.mark.lab
+
+INPUTS = "the trace has each datagram, event and command, in order and with its time"
+HEADER = "the first line of the trace describes the mission"
+STEPS = "each handler run in the trace follows Algorithms 1 to 20"
+AGREE = "status, chain export and trace agree"
+
+
+def played(case: str, place: Path, *command: str) -> Case:
+    async def play() -> Case:
+        async with Air(place, command, 1) as air:
+            return await _play(air, next(each for each in ALL if each.name == case))
+
+    return asyncio.run(play())
+
+
+@pytest.mark.parametrize("case", [INPUTS, HEADER, STEPS, AGREE])
+def test_records_of_reference_pass(case: str, tmp_path: Path) -> None:
+    result = played(case, tmp_path, sys.executable, "-P", "-m", "ucp.node")
+    assert result.verdict == "passed", result.reason
+
+
+@pytest.mark.any_user
+@pytest.mark.parametrize(
+    ("mistake", "case", "reason"),
+    [
+        ("omits_commits_from_trace", INPUTS, "lines for 4 messages; came 3 lines"),
+        ("omits_drops_from_trace", INPUTS, "lines for 2 dropped datagrams"),
+        ("omits_commands_from_trace", INPUTS, "lines for the commands stop_events and export"),
+        ("writes_wall_seconds_into_trace", INPUTS, "for a message of that mission second"),
+        ("keeps_trace_in_memory", HEADER, "its first line is missing or invalid"),
+        ("leaves_settings_out_of_header", HEADER, "other values of vote_timeout_s"),
+        ("stamps_block_with_first_event", STEPS, "Algorithm 1, build_data_block"),
+        ("exports_no_completed_blocks", AGREE, "the completed blocks of the trace"),
+        ("exports_at_wrong_time", AGREE, "`exported_at_us` at mission second"),
+    ],
+)
+def test_wrong_record_fails_its_case(mistake: str, case: str, reason: str, tmp_path: Path) -> None:
+    result = played(case, tmp_path, sys.executable, "-P", "-m", wrong_programs.__name__, mistake)
+    assert result.verdict == "failed"
+    assert reason in result.reason
