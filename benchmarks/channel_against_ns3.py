@@ -1,0 +1,232 @@
+"""Measure the delivery of 802.11 broadcasts on a shared channel in ns-3: `python -m benchmarks.channel_against_ns3`.
+
+    pip install ns3==3.44.post0 && python -m benchmarks.channel_against_ns3 --measure [--jobs J]
+
+`--measure` needs the package ns3 and g++. It compiles `channel_ns3.cc`, plays all cells and writes
+`channel_ns3.json`.
+
+There are three families of cells. In each of them, stations broadcast without acknowledgement and without retry:
+
+- beacons: stations on a circle with a diameter of `metres` send messages of 100 bytes at random times (Poisson). The
+  offered load is the sum of the airtimes of all stations, as a share of the time. Delivery is the share of the copies
+  that arrive at all other stations.
+- hidden: stations on a line, with `metres` between neighbours, send the same messages. The load counts a station and
+  its two neighbours. Delivery is the share of the copies that arrive at the neighbours.
+- votes: station 0 on the circle sends a question of 78 bytes each second. Each station that receives it answers once,
+  with 47 bytes, after a uniformly distributed time up to the jitter. Delivery is the share of the other stations whose
+  answer station 0 receives. A majority needs more than half of all stations, with station 0 itself.
+
+Some of ns-3's defaults would measure something else, so the program sets or avoids them:
+
+- The stations send frames directly to the WifiNetDevice. The frames contain 28 bytes for the headers of IPv4 and UDP.
+  The internet stack would add ARP and the queue of the traffic-control layer.
+- The MAC queue has 10 packets in place of 500, so that it soon reaches its steady state. A packet may wait in it for
+  1000 s. The default of 500 ms would drop packets of a busy channel.
+- The rate of broadcasts is the attribute NonUnicastMode. By default, it is the lowest rate of the standard.
+- 1 Mbit/s is 802.11b: DSSS with the long preamble of 192 us, slots of 20 us, SIFS of 10 us, 31 as contention window.
+  6 Mbit/s is 802.11g: OFDM with a preamble and header of 20 us, slots of 20 us, SIFS of 10 us, 15 as contention
+  window. An ad hoc network at 2.4 GHz uses the long slot (IEEE 802.11-2020, 18.4.5). ns-3 does so, too, and adds the
+  6 us of signal extension. Some cells use 802.11a, with slots of 9 us and SIFS of 16 us, at the same path loss.
+- The path loss is that of `netem.radio.LogDistance` with its defaults. LogDistancePropagationLossModel has the same
+  exponent and the loss of Friis over the first metre as its reference loss (by default, that of 5.15 GHz).
+  RandomPropagationLossModel draws the shadowing of each copy independently.
+- The transmission power is 20 dBm in place of 16.02 dBm.
+- Preamble detection: a station receives a frame if 4 us after its start the power is at least -82 dBm, which is the
+  sensitivity of LogDistance, and the ratio of signal to noise and interference is at least 4 dB. These are ns-3's
+  defaults. The carrier is sensed by the same detection. A station that missed the preamble senses the frame only
+  above the energy threshold of -62 dBm, ns-3's default and that of the standard for OFDM.
+- Frame capture: none, ns-3's default. A station that receives a frame does not change to a stronger one. Within the
+  4 us of preamble detection it does.
+- The noise figure is 7 dB and the error model is TableBasedErrorRateModel, ns-3's defaults. The error model of DSSS is
+  DsssErrorRateModel in any case. Signals below -101 dBm do not interfere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Literal
+
+from harness.errors import CANNOT_HERE
+from netem.radio import LogDistance
+
+SOURCE = Path(__file__).with_name("channel_ns3.cc")
+TABLE = Path(__file__).with_name("channel_ns3.json")
+LIBRARIES = ("core", "network", "mobility", "propagation", "wifi")
+
+QUEUE = 10
+QUESTION_BYTES, ANSWER_BYTES, BEACON_BYTES = 78, 47, 100
+HEADER_BYTES = 64
+"""IPv4 and UDP 28, LLC 8, MAC header 24, frame check sequence 4."""
+
+RADIO = LogDistance()
+SETTINGS: dict[str, float | str] = {
+    "exponent": RADIO.exponent,
+    "reference_db": round(RADIO.power_dbm - RADIO.sensitivity_dbm - RADIO.margin_db(1.0), 4),
+    "power_dbm": RADIO.power_dbm,
+    "sensitivity_dbm": RADIO.sensitivity_dbm,
+    "preamble_db": 4.0,
+    "energy_dbm": -62.0,
+    "noise_figure_db": 7.0,
+    "errors": "TableBased",
+    "queue": QUEUE,
+}
+
+Family = Literal["beacons", "hidden", "votes"]
+Standard = Literal["b", "g", "a"]
+
+STATIONS = (2, 5, 20, 50)
+LOADS = (0.01, 0.1, 0.3, 0.6, 0.9, 1.2)
+JITTERS_MS = (0.5, 5.0, 48.0)
+METRES = (50.0, 150.0, 250.0, 350.0, 500.0)
+MESSAGES = {2: 20_000, 3: 16_000, 5: 12_000, 20: 5_000, 50: 3_000}
+VOTES = {2: 4_000, 5: 2_000, 20: 500, 50: 200}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One setting of stations and traffic. `load` counts for beacons and hidden stations, `jitter_ms` for votes."""
+
+    family: Family
+    standard: Standard
+    n: int
+    metres: float
+    shadowing_db: float
+    load: float = 0.0
+    jitter_ms: float = 0.0
+
+    @property
+    def per_second(self) -> float:
+        """Return the messages per second of a station."""
+        sharing = 3 if self.family == "hidden" else self.n
+        return self.load / sharing / (airtime_us(self.standard, BEACON_BYTES) / 1e6)
+
+    @property
+    def messages(self) -> int:
+        return VOTES[self.n] if self.family == "votes" else MESSAGES[self.n]
+
+    @property
+    def warm_up(self) -> int:
+        """Return the number of first messages that do not count, because the queues are still filling."""
+        return 40 * self.n
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """Shares of 0 to 1 with their standard errors. Only votes have `asked` and `majority`."""
+
+    delivered: float
+    error: float
+    asked: float | None = None
+    asked_error: float | None = None
+    majority: float | None = None
+    majority_error: float | None = None
+
+
+def airtime_us(standard: Standard, payload: int) -> float:
+    """Return the airtime of a UDP datagram, without the signal extension of 802.11g."""
+    bits = 8 * (payload + HEADER_BYTES)
+    return 192.0 + bits if standard == "b" else 20.0 + 4 * math.ceil((22 + bits) / 24)
+
+
+def cells() -> Iterator[Cell]:
+    standards: tuple[Standard, ...] = ("b", "g")
+    for standard in standards:
+        for n in STATIONS:
+            for metres in METRES:
+                for load in LOADS:
+                    yield Cell("beacons", standard, n, metres, RADIO.shadowing_db, load=load)
+                for jitter_ms in JITTERS_MS:
+                    yield Cell("votes", standard, n, metres, RADIO.shadowing_db, jitter_ms=jitter_ms)
+            for metres in (150.0, 300.0):
+                for shadowing_db in (0.0, RADIO.shadowing_db):
+                    for load in LOADS:
+                        yield Cell("hidden", standard, max(n, 3), metres, shadowing_db, load=load)
+    for n in (5, 50):
+        for metres in (50.0, 250.0):
+            for load in LOADS[2:]:
+                yield Cell("beacons", "a", n, metres, RADIO.shadowing_db, load=load)
+            for jitter_ms in JITTERS_MS:
+                yield Cell("votes", "a", n, metres, RADIO.shadowing_db, jitter_ms=jitter_ms)
+
+
+# ns-3
+
+
+def compile_ns3(directory: Path) -> Path:
+    """Compile the program that plays cells in ns-3. Raises PackageNotFoundError, OSError or CalledProcessError."""
+    root = Path(str(metadata.distribution("ns3").locate_file("ns3")))
+    version = ".".join(metadata.version("ns3").split(".")[:2])
+    program, libraries = directory / "channel_ns3", root / "lib64"
+    linked = [f"-L{libraries}", f"-Wl,-rpath,{libraries}", *(f"-lns{version}-{library}" for library in LIBRARIES)]
+    compiler = ["g++", "-std=c++20", "-O2", f"-I{root}/include", str(SOURCE), "-o", str(program), *linked]
+    subprocess.run(compiler, check=True)
+    return program
+
+
+def in_ns3(program: Path, number: int, cell: Cell) -> Delivery:
+    keys = {
+        **SETTINGS,
+        **asdict(cell),
+        "layout": "line" if cell.family == "hidden" else "circle",
+        "question": QUESTION_BYTES,
+        "payload": ANSWER_BYTES if cell.family == "votes" else BEACON_BYTES,
+        "messages": cell.messages,
+        "warm_up": cell.warm_up,
+        "per_second": cell.per_second,
+        "seed": number + 1,
+    }
+    line = " ".join(f"{key}={value}" for key, value in keys.items()) + "\n"
+    found = subprocess.run([program], input=line, capture_output=True, text=True, check=True).stdout
+    return Delivery(**{key: round(value, 5) for key, value in json.loads(found).items()})
+
+
+def measure(jobs: int) -> dict[Cell, Delivery]:
+    asked = list(cells())
+    with tempfile.TemporaryDirectory() as directory, ThreadPoolExecutor(jobs) as pool:
+        program = compile_ns3(Path(directory))
+        played = pool.map(lambda pair: in_ns3(program, *pair), enumerate(asked))
+        found = {}
+        for cell, delivery in zip(asked, played, strict=True):
+            found[cell] = delivery
+            sys.stderr.write(f"\r{len(found)} of {len(asked)} cells")
+    sys.stderr.write("\n")
+    return found
+
+
+def write_table(found: dict[Cell, Delivery]) -> None:
+    head = json.dumps({"ns3": metadata.version("ns3"), "settings": SETTINGS})
+    rows = (
+        json.dumps({key: value for key, value in {**asdict(cell), **asdict(delivery)}.items() if value is not None})
+        for cell, delivery in found.items()
+    )
+    TABLE.write_text("[\n" + ",\n".join((head, *rows)) + "\n]\n", encoding="utf-8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--measure", action="store_true", help="play all cells in ns-3 and write channel_ns3.json")
+    parser.add_argument("--jobs", type=int, default=1, help="number of cells to play at the same time")
+    options = parser.parse_args()
+    if options.measure:
+        try:
+            write_table(measure(options.jobs))
+        except metadata.PackageNotFoundError:
+            sys.stderr.write("The package ns3 is missing: install it with `pip install ns3==3.44.post0`.\n")
+            sys.exit(CANNOT_HERE)
+        except FileNotFoundError:
+            sys.stderr.write("The compiler g++ is missing: install the package g++.\n")
+            sys.exit(CANNOT_HERE)
+
+
+if __name__ == "__main__":
+    main()
