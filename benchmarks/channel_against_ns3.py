@@ -2,8 +2,8 @@
 
     pip install ns3==3.44.post0 && python -m benchmarks.channel_against_ns3 --measure [--jobs J]
 
-`--measure` needs the package ns3 and g++. It compiles `channel_ns3.cc`, plays all cells and writes
-`channel_ns3.json`.
+`--measure` needs the package ns3 and g++. It compiles `channel_ns3.cc`, plays the cells that `channel_ns3.json` lacks,
+and writes this file.
 
 There are three families of cells. In each of them, stations broadcast without acknowledgement and without retry:
 
@@ -51,7 +51,8 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Literal
@@ -88,8 +89,8 @@ STATIONS = (2, 5, 20, 50)
 LOADS = (0.01, 0.1, 0.3, 0.6, 0.9, 1.2)
 JITTERS_MS = (0.5, 5.0, 48.0)
 METRES = (50.0, 150.0, 250.0, 350.0, 500.0)
-MESSAGES = {2: 20_000, 3: 16_000, 5: 12_000, 20: 5_000, 50: 3_000}
-VOTES = {2: 4_000, 5: 2_000, 20: 500, 50: 200}
+MESSAGES = {2: 12_000, 3: 12_000, 5: 8_000, 20: 4_000, 50: 2_500}
+VOTES = {2: 3_000, 5: 1_500, 20: 400, 50: 120}
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,12 @@ class Cell:
     @property
     def warm_up(self) -> int:
         """Return the number of first messages that do not count, because the queues are still filling."""
-        return 40 * self.n
+        return (40 if self.load > 0.6 else 5) * self.n
+
+    @property
+    def after(self) -> int:
+        """Return the number of messages that keep up the load until the last ones that count have left the queues."""
+        return (12 if self.load > 0.6 else 3) * self.n
 
 
 @dataclass(frozen=True)
@@ -140,8 +146,8 @@ def airtime_us(standard: Standard, payload: int) -> float:
 
 def cells() -> Iterator[Cell]:
     standards: tuple[Standard, ...] = ("b", "g")
-    for standard in standards:
-        for n in STATIONS:
+    for n in STATIONS:
+        for standard in standards:
             for metres in METRES:
                 for load in LOADS:
                     yield Cell("beacons", standard, n, metres, RADIO.shadowing_db, load=load)
@@ -173,7 +179,7 @@ def compile_ns3(directory: Path) -> Path:
     return program
 
 
-def in_ns3(program: Path, number: int, cell: Cell) -> Delivery:
+def in_ns3(program: Path, cell: Cell) -> Delivery:
     keys = {
         **SETTINGS,
         **asdict(cell),
@@ -182,25 +188,24 @@ def in_ns3(program: Path, number: int, cell: Cell) -> Delivery:
         "payload": ANSWER_BYTES if cell.family == "votes" else BEACON_BYTES,
         "messages": cell.messages,
         "warm_up": cell.warm_up,
+        "after": cell.after,
         "per_second": cell.per_second,
-        "seed": number + 1,
+        "seed": 1,
     }
     line = " ".join(f"{key}={value}" for key, value in keys.items()) + "\n"
     found = subprocess.run([program], input=line, capture_output=True, text=True, check=True).stdout
     return Delivery(**{key: round(value, 5) for key, value in json.loads(found).items()})
 
 
-def measure(jobs: int) -> dict[Cell, Delivery]:
-    asked = list(cells())
+def measure(jobs: int) -> None:
+    """Play all cells that the table lacks, and write the table after each of them."""
+    found = read_table() if TABLE.exists() else {}
+    missing = [cell for cell in cells() if cell not in found]
     with tempfile.TemporaryDirectory() as directory, ThreadPoolExecutor(jobs) as pool:
         program = compile_ns3(Path(directory))
-        played = pool.map(lambda pair: in_ns3(program, *pair), enumerate(asked))
-        found = {}
-        for cell, delivery in zip(asked, played, strict=True):
+        for cell, delivery in zip(missing, pool.map(partial(in_ns3, program), missing), strict=True):
             found[cell] = delivery
-            sys.stderr.write(f"\r{len(found)} of {len(asked)} cells")
-    sys.stderr.write("\n")
-    return found
+            write_table(found)
 
 
 def write_table(found: dict[Cell, Delivery]) -> None:
@@ -212,6 +217,15 @@ def write_table(found: dict[Cell, Delivery]) -> None:
     TABLE.write_text("[\n" + ",\n".join((head, *rows)) + "\n]\n", encoding="utf-8")
 
 
+def read_table() -> dict[Cell, Delivery]:
+    _, *rows = json.loads(TABLE.read_text(encoding="utf-8"))
+    keys = [field.name for field in fields(Cell)]
+    return {
+        Cell(**{key: row[key] for key in keys}): Delivery(**{key: row[key] for key in row if key not in keys})
+        for row in rows
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--measure", action="store_true", help="play all cells in ns-3 and write channel_ns3.json")
@@ -219,7 +233,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.measure:
         try:
-            write_table(measure(options.jobs))
+            measure(options.jobs)
         except metadata.PackageNotFoundError:
             sys.stderr.write("The package ns3 is missing: install it with `pip install ns3==3.44.post0`.\n")
             sys.exit(CANNOT_HERE)

@@ -210,6 +210,7 @@ class Beacons : public Network
           m_payload(static_cast<uint32_t>(cell.Number("payload"))),
           m_wanted(static_cast<uint32_t>(cell.Number("messages"))),
           m_warmUp(static_cast<uint32_t>(cell.Number("warm_up"))),
+          m_after(static_cast<uint32_t>(cell.Number("after"))),
           m_line(cell.Word("layout") == "line"),
           m_gap(CreateObject<ExponentialRandomVariable>())
     {
@@ -249,8 +250,8 @@ class Beacons : public Network
     {
         if (m_next == m_copies.size())
         {
-            // The other stations go on for a while, so that the last messages meet the same load as the first.
-            if (++m_after > m_warmUp)
+            // The last messages that count meet the same load as the first.
+            if (m_after-- == 0)
             {
                 Simulator::Stop();
                 return;
@@ -277,10 +278,10 @@ class Beacons : public Network
     uint32_t m_payload;
     uint32_t m_wanted;
     uint32_t m_warmUp;
+    uint32_t m_after;
     bool m_line;
     Ptr<ExponentialRandomVariable> m_gap;
     uint32_t m_next = 0;
-    uint32_t m_after = 0;
     std::vector<uint32_t> m_copies;
     std::vector<uint32_t> m_receivers;
 };
