@@ -26,6 +26,7 @@ from typing import Any
 from netem import _choice, _namespaces
 from netem._fabric import Fabric
 from netem._lab_protocol import Receiver, WireError, encode
+from netem._udp_counters import read_udp_counters
 from netem.conditions import NetworkConditions
 from netem.engine import Engine
 from netem.errors import ConditionsError, EngineError, NetemError
@@ -104,6 +105,7 @@ class Server:
             "connect": self._connect,
             "apply": self._apply,
             "read": lambda _: self._require_engine().read().to_json(),
+            "datagrams": self._datagrams,
         }
         handler = handlers.get(message.get("request"))
         try:
@@ -223,6 +225,14 @@ class Server:
     def _apply(self, message: dict[str, Any]) -> dict[str, Any]:
         conditions = NetworkConditions.from_json(message["conditions"])
         return self._require_engine().apply(conditions).to_json()
+
+    def _datagrams(self, _: dict[str, Any]) -> dict[str, Any]:
+        fabric = self._require_fabric()
+        counted = {}
+        for vehicle in fabric.vehicles:
+            with fabric.inside(vehicle):
+                counted[str(vehicle)] = read_udp_counters()
+        return counted
 
     def _require_fabric(self) -> Fabric:
         if self._fabric is None:

@@ -28,6 +28,7 @@ from typing import Literal, Self
 
 from netem import _namespaces, addresses
 from netem._lab_channel import Channel
+from netem._udp_counters import UdpCounters
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
 from netem.errors import ConditionsError, LabError, LabUnavailable, SpawnError
@@ -271,6 +272,11 @@ class Lab:
         result, _ = await self._channel.ask("read")
         return Applied.from_json(result)
 
+    async def datagrams(self) -> dict[int, UdpCounters]:
+        """Return the UDP datagrams that the kernel has counted in the network of each vehicle, by vehicle."""
+        result, _ = await self._channel.ask("datagrams")
+        return {int(vehicle): UdpCounters(**counted) for vehicle, counted in result.items()}
+
     async def watch(self) -> None:
         """Wait until the first process of the lab ends by itself, then raise LabError."""
         await self._process.wait()
@@ -322,4 +328,4 @@ def _last_line(log: Path) -> str:
     return lines[-1] if lines else "it said nothing"
 
 
-__all__ = ["EngineName", "Lab", "LabError", "LabProcess", "LabUnavailable", "in_words"]
+__all__ = ["EngineName", "Lab", "LabError", "LabProcess", "LabUnavailable", "UdpCounters", "in_words"]

@@ -89,6 +89,11 @@ class ArduPilot:
         return airframe(self.setup.frame, self.vehicle_type)
 
     @property
+    def uses_udp(self) -> bool:
+        """True, because a build with CAN sends itself multicast datagrams."""
+        return True
+
+    @property
     def lack(self) -> str | None:
         """A sentence on missing default parameters, without which a vehicle may refuse to arm. None if complete."""
         if not self.missing:

@@ -51,6 +51,7 @@ class Embedded:
     lack: str | None = None
     frame: str | None = None
     sha256: str | None = None
+    uses_udp: bool = False
 
     @property
     def parameters(self) -> Mapping[str, float]:

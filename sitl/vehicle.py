@@ -136,6 +136,10 @@ class VehicleKind(Protocol):
     def lack(self) -> str | None:
         """A sentence on a missing requirement of flight, with a solution. None if nothing is missing."""
 
+    @property
+    def uses_udp(self) -> bool:
+        """True if the program receives UDP datagrams in its network namespace."""
+
     def check(self) -> None:
         """Raise VehicleError if this machine cannot run the vehicle with its setup."""
 

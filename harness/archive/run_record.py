@@ -208,6 +208,18 @@ class Counters(_Model):
     receivers: dict[AgentKey, ReceiverCounters] = {}
 
 
+class DatagramsRead(_Model):
+    """UDP datagrams that programs in the network of a vehicle read, as the kernel counted them over the whole run.
+
+    `before_start` of them were read before the mission began. The kernel discarded `overflowed` datagrams, because the
+    buffer of their socket was full.
+    """
+
+    read: int
+    before_start: int
+    overflowed: int
+
+
 class BlockHolders(_Model):
     """The vehicles that held a block directly after a loss of vehicles (`holders`), and at the end. `agent_id`
     completed it."""
@@ -320,6 +332,8 @@ class JudgedRecord(_Model):
     agents: dict[AgentKey, AgentRecord] = {}
     engine: str | None = None
     counters: Counters | None = None
+    datagrams: dict[AgentKey, DatagramsRead] = {}
+    """Datagrams that each agent read. An agent is missing if another program on its vehicle uses UDP."""
 
     @property
     def switched_off(self) -> dict[int, float]:

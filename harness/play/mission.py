@@ -36,6 +36,7 @@ class RunOutcome:
     settled: bool = False
     cycle: Cycle | None = None
     counters: dict[str, Any] | None = None
+    datagrams: dict[str, dict[str, int]] = field(default_factory=dict)
     capture: dict[str, dict[str, int]] | None = None
     agents: dict[str, Any] = field(default_factory=dict)
     vehicles: dict[str, Any] = field(default_factory=dict)

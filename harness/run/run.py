@@ -174,6 +174,7 @@ class Recording:
             vehicles=played.vehicles,
             unmatched_fates=played.unmatched_fates,
             counters=played.counters,
+            datagrams=played.datagrams,
             capture=played.capture,
             ground_station=played.ground_station,
         )

@@ -99,6 +99,21 @@ def test_an_idle_lab_is_silent(tmp_path: Path) -> None:
     in_lab(tmp_path, story)
 
 
+def test_kernel_counts_datagrams_that_programs_read(tmp_path: Path) -> None:
+    """Vehicle 2 reads three datagrams of its own and leaves the fourth in its socket."""
+    program = (
+        "import socket, sys; s = socket.socket(type=socket.SOCK_DGRAM); s.bind(('', 9)); "
+        "[s.sendto(b'x', ('127.0.0.1', 9)) for _ in range(4)]; [s.recv(1) for _ in range(3)]"
+    )
+
+    async def story(lab: Lab) -> None:
+        await output(lab, tmp_path, 2, sys.executable, "-c", program)
+        counted = await lab.datagrams()
+        assert {vehicle: (udp.read, udp.overflowed) for vehicle, udp in counted.items()} == {1: (0, 0), 2: (3, 0)}
+
+    in_lab(tmp_path, story)
+
+
 def test_the_first_process_loads_little() -> None:
     """A lab is up as soon as it is: what it imports is most of what it waits for."""
     words = subprocess.check_output(

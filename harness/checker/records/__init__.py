@@ -13,6 +13,7 @@ from harness.checker.records import (
     _captures_vs_traces,
     _conditions_vs_network,
     _counters,
+    _datagrams_vs_traces,
     _export_vs_store,
     _export_vs_trace,
     _handled_vs_faults,
@@ -42,6 +43,7 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
     _losses.compare,
     _captures_vs_traces.compare_counters,
     _captures_vs_traces.compare_captures,
+    _datagrams_vs_traces.compare,
 )
 
 

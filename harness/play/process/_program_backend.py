@@ -33,6 +33,7 @@ from netem.capture import LiveCapture
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
 from netem.errors import LabUnavailable, LiveCaptureError, NetemError
+from netem.lab import UdpCounters
 from sitl.circumstances import Circumstance
 from sitl.vehicle import VehicleKind
 from ucp.clock import MICROSECONDS, MissionClock
@@ -73,6 +74,7 @@ class ProcessRun:
         self.interrupted = interrupted
         self.played = RunOutcome()
         self._open_lab = open_lab
+        self._kinds = kinds
         self._keeps_disks = keeps_disks
         self._rogue = RogueProcess(scenario.rogue, scenario, seed, rundir) if scenario.rogue else None
         self.stage = "building the lab"
@@ -87,6 +89,7 @@ class ProcessRun:
         self._changing_network = asyncio.Lock()
         self._watchers = Watchers()
         self._fleet = Fleet(scenario, kinds, rundir, self.clock, self._watchers)
+        self._read_before_start: Mapping[int, UdpCounters] = {}
         self._injected: list[Injected] = []
         """What the rogue node was told."""
         self._passed_s = 0.0
@@ -200,6 +203,7 @@ class ProcessRun:
             captured = self.scenario.security.captured if self.scenario.security else None
             await self._rogue.begin(epoch_us, None if captured is None else self._keys.hand(captured, kept=True))
         self.clock.start(epoch_us)
+        self._read_before_start = await self._lab.network.datagrams()
 
     async def apply(self, change: Change) -> None:
         if isinstance(change, NetworkChange):
@@ -420,6 +424,7 @@ class ProcessRun:
             self.played.counters = self._of_the_swarm(await lab.read())
             self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
             await asyncio.gather(*(agent.stop() for agent in self.agents), self._fleet.stop())
+            self.played.datagrams = self._datagrams_read(await lab.network.datagrams())
             for agent in self.agents:
                 agent.put_together()
         except NetemError as error:  # the lab is gone, and with it whoever seemed to have crashed
@@ -432,6 +437,19 @@ class ProcessRun:
         except NetemError as error:
             self._ended_early(MachineError(str(error)))
         self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+
+    def _datagrams_read(self, counted: Mapping[int, UdpCounters]) -> dict[str, dict[str, int]]:
+        """Return the datagrams of each agent whose vehicle does not use UDP itself, for run.json."""
+        agents = [agent for agent in self._read_before_start if agent in self.scenario.roster]
+        return {
+            str(agent): {
+                "read": counted[agent].read,
+                "before_start": self._read_before_start[agent].read,
+                "overflowed": counted[agent].overflowed,
+            }
+            for agent in agents
+            if agent not in self._kinds or not self._kinds[agent].uses_udp
+        }
 
     async def _end_capture(self) -> None:
         if self._capture is None:

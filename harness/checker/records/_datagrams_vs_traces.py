@@ -1,0 +1,75 @@
+"""Compare the datagrams that an agent read, as the kernel counted them, with its trace.
+
+A trace has a line for each datagram that its agent handled or dropped. The agent also reads its own broadcasts, which
+it ignores. Any further datagram that it read is missing in its trace. A datagram that was read at the end of an
+incarnation may be missing, because the agent ended before it handled the datagram.
+"""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator
+
+from harness.archive.run_record import DatagramsRead
+from harness.archive.traces import Trace
+from harness.checker.evidence import Evidence
+from harness.checker.records.contradiction import Contradiction, of_agent
+from ucp.trace import Commanded, Dropped
+from ucp.trigger import MessageTrigger
+
+UNDER_WAY_WALL_S = 0.25
+"""Seconds of wall time before the end of an incarnation, in which a datagram may be read and not handled."""
+
+
+def compare(evidence: Evidence) -> Iterator[Contradiction]:
+    """Each agent recorded all datagrams that it read."""
+    record = evidence.record
+    if record is None or set(record.roster) - set(evidence.traces):
+        return
+    if any(_is_revocation(aside) for trace in evidence.traces.values() for _, aside in trace.asides):
+        return  # agents broadcast revocations, and ignore known ones, without a line in the trace
+    for agent_id, trace in evidence.traces.items():
+        counted = record.datagrams.get(str(agent_id))
+        if counted is None or trace.problem or not trace.header.has_inputs:
+            continue
+        if evidence.unknown_word("trigger", agent_id=agent_id):
+            continue
+        if evidence.injected.messages and _killed_at(evidence, agent_id):
+            continue  # the datagrams of a rogue node may have been under way
+        handled = sum(isinstance(run.trigger, MessageTrigger) for run in trace.runs)
+        dropped = sum(isinstance(aside, Dropped) for _, aside in trace.asides)
+        own = sum(len(run.sent) for run in trace.runs)
+        unrecorded = counted.read - counted.before_start - handled - dropped - own
+        if unrecorded > _at_the_end(evidence, agent_id, trace):
+            yield of_agent(agent_id, _sentence(counted, unrecorded, handled, dropped, own), short=True)
+
+
+def _is_revocation(aside: Dropped | Commanded) -> bool:
+    return isinstance(aside, Commanded) and aside.command == "revoke"
+
+
+def _sentence(counted: DatagramsRead, unrecorded: int, handled: int, dropped: int, own: int) -> str:
+    plural = "s" if unrecorded > 1 else ""
+    return (
+        f"it read {unrecorded} datagram{plural} that its trace lacks: the kernel counted {counted.read} datagrams that "
+        f"it read, but its trace has {handled} handled and {dropped} dropped ones, and it sent {own} itself"
+    )
+
+
+def _at_the_end(evidence: Evidence, agent_id: int, trace: Trace) -> int:
+    """Return the maximum number of datagrams that the agent read at the ends of its incarnations and did not handle."""
+    speedup = trace.header.clock.get("speedup")
+    before_s = UNDER_WAY_WALL_S * speedup if isinstance(speedup, int | float) else 0.0
+    ends = _killed_at(evidence, agent_id)
+    if (last_s := evidence.end_of(agent_id)) is not None:
+        ends.append(last_s)
+    sent = evidence.once(_sent_at)
+    return sum(1 + bisect_right(sent, end + before_s) - bisect_left(sent, end - before_s) for end in set(ends))
+
+
+def _killed_at(evidence: Evidence, agent_id: int) -> list[float]:
+    faults = evidence.record.faults if evidence.record else ()
+    return [fault.at_s for fault in faults if fault.kind.ends_a_life and agent_id in (fault.agents or ())]
+
+
+def _sent_at(evidence: Evidence) -> list[float]:
+    """Return the mission seconds at which agents sent messages, in order."""
+    return sorted(run.t for trace in evidence.traces.values() for run in trace.runs for _ in run.sent)

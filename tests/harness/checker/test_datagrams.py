@@ -1,0 +1,105 @@
+"""An agent that discards datagrams without a record is found by the counters of the kernel."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.archive.archive import RunArchive
+from harness.checker import Result, check, gather
+from harness.play.progress import Silent
+from harness.run.run import run
+from tests.harness.mission import edit
+from tests.harness.virtual import scenario
+
+DISCARDS_EVERY_TENTH = """
+import sys
+from functools import partial
+from ucp import node
+
+class Silent(node.Node):
+    read = 0
+
+    def _drive(self, feed):
+        if isinstance(feed, partial) and feed.func == self.agent.receive_datagram:
+            self.read += 1
+            if self.read % 10 == 0:
+                return
+        super()._drive(feed)
+
+sys.exit(node.main(sys.argv[1:], Silent))
+"""
+
+OFTEN = {"source": "random", "mean_s": 2}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three agents in virtual time, one of them killed and started again."""
+    asked = scenario(
+        agents=3,
+        duration_s=120,
+        events=OFTEN,
+        timeline=[{"at_s": 60, "kill": [3]}, {"at_s": 80, "restart": [3]}],
+    )
+    return run(asked, 1, tmp_path_factory.mktemp("whole") / "run", Silent(), backend="sim", delivers_all=True).directory
+
+
+def judged(directory: Path, tmp_path: Path, agent: int, more: int) -> Result:
+    """Judge the run if the kernel had counted the recorded datagrams of an agent, and some more."""
+    shutil.copytree(directory, tmp_path / "run")
+    lines = [json.loads(line) for line in (directory / f"agents/{agent}.trace.jsonl").read_text().splitlines()]
+    received = sum("message" in line.get("trigger", {}) for line in lines)
+    sent = sum(len(line.get("sent", ())) for line in lines)
+    counted = {str(agent): {"read": received + sent + more + 2, "before_start": 2, "overflowed": 0}}
+    edit(tmp_path / "run" / "run.json", lambda record: record.update(datagrams=counted))
+    return check(gather(RunArchive(tmp_path / "run")))
+
+
+@pytest.mark.lab
+def test_agent_that_discards_every_tenth_datagram_is_found(tmp_path: Path) -> None:
+    program = tmp_path / "agent.py"
+    program.write_text(DISCARDS_EVERY_TENTH)
+    asked = scenario(
+        agents=4,
+        duration_s=60,
+        speedup=20,
+        vehicles={"kind": "none"},
+        events=OFTEN,
+        agent_command={2: [sys.executable, str(program)]},
+        timeline=[
+            {"at_s": 15, "pause": [1]},
+            {"at_s": 25, "resume": [1]},
+            {"at_s": 30, "reboot": [3], "down_s": 10, "disk": "kept"},
+            {"at_s": 31, "kill": [4]},
+            {"at_s": 40, "restart": [4]},
+        ],
+    )
+    found = run(asked, 1, tmp_path / "run", Silent(), backend="process").result
+    records = found.beside["records"]
+    assert records.verdict == "contradict"
+    assert {finding.agent_id for finding in records.evidence} == {2}
+    assert "datagrams that its trace lacks" in records.evidence[0].detail
+    assert found.beside["steps"].verdict == "not applicable"
+
+
+@pytest.mark.parametrize(("more", "agrees"), [(-5, True), (0, True), (20, False)])
+def test_datagram_that_was_read_needs_a_line_in_the_trace(whole: Path, tmp_path: Path, more: int, agrees: bool) -> None:
+    found = judged(whole, tmp_path, 1, more).beside["records"]
+    assert (found.verdict == "agree") == agrees, found
+    assert agrees or "it read 20 datagrams that its trace lacks" in found.evidence[0].detail
+
+
+def test_datagram_under_way_at_a_kill_may_lack_its_line(whole: Path, tmp_path: Path) -> None:
+    assert judged(whole, tmp_path, 3, 1).beside["records"].verdict == "agree"
+
+
+def test_revocation_without_a_line_is_no_contradiction(whole: Path, tmp_path: Path) -> None:
+    copy: Any = tmp_path / "revoked"
+    shutil.copytree(whole, copy)
+    with (copy / "agents/2.trace.jsonl").open("a") as trace:
+        trace.write('{"t":500,"command":"revoke","request":{}}\n')
+    assert judged(copy, tmp_path, 1, 20).beside["records"].verdict == "agree"
