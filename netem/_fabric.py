@@ -56,6 +56,10 @@ class Fabric:
         """Run a block in a vehicle's network, or in the lab's own for None."""
         return _namespaces.inside(self.home if vehicle is None else self._namespaces[vehicle], self.home)
 
+    def inodes(self) -> dict[int, int]:
+        """Return the inode number of each vehicle's network namespace, by vehicle."""
+        return {vehicle: os.fstat(namespace).st_ino for vehicle, namespace in self._namespaces.items()}
+
     def _namespace(self, vehicle: int) -> Netlink:
         """Make a vehicle's namespace, if there is none yet, and return a netlink socket that stays in it."""
         if vehicle in self._namespaces:

@@ -161,7 +161,7 @@ class Server:
             self._engine, reason = _choice.choose(message["engine"], self._fabric, message["needs"])
         except EngineError as error:
             return {"engine": None, "reason": str(error)}
-        return {"engine": self._engine.name, "reason": reason}
+        return {"engine": self._engine.name, "reason": reason, "networks": self._fabric.inodes()}
 
     def _spawn(self, message: dict[str, Any]) -> dict[str, Any]:
         mode = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC

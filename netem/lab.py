@@ -103,6 +103,8 @@ class Lab:
         self.broadcast = addresses.BROADCAST
         self.engine = ""
         self.engine_reason = ""
+        self.networks: dict[int, int] = {}
+        """Vehicle -> inode number of its network namespace, as in /proc/PID/ns/net."""
 
     @classmethod
     async def open(
@@ -209,6 +211,7 @@ class Lab:
             raise LabUnavailable(f"{reason} here ({result['reason']})", " Or: ".join(wanted), "engine")
         self.engine = result["engine"]
         self.engine_reason = result["reason"]
+        self.networks = {int(vehicle): inode for vehicle, inode in result["networks"].items()}
         return None
 
     @property

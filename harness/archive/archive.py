@@ -28,6 +28,7 @@ from harness.archive.exports import (
     read_exports,
 )
 from harness.archive.history import in_time
+from harness.archive.lag import LAG_FILE, LagLine, MeasuredLag
 from harness.archive.record_file import RecordFile, read_record
 from harness.archive.run_record import JudgedRecord, RunRecord
 from harness.archive.traces import SUFFIX, Line, Trace, read_lines, read_trace, why_none
@@ -301,6 +302,12 @@ class RunArchive:
         """Return the recorded changes of network and faults, each as a `model`; None without a record."""
         path = self._in_directory(NETWORK_FILE)
         return [*JsonLines(path, model)] if path is not None and path.is_file() else None
+
+    def lag(self) -> MeasuredLag | None:
+        """Return the measured lag of the machine and the agents; None without a record."""
+        path = self._in_directory(LAG_FILE)
+        lines = [*JsonLines(path, LagLine)] if path is not None and path.is_file() else []
+        return MeasuredLag(lines) if lines else None
 
     # Damaged and missing files
 

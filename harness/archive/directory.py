@@ -9,6 +9,7 @@ network.jsonl       every change of conditions as the kernel applied it, and its
 tracks.jsonl        where the vehicles were, in metres north, east and up from the middle of the field
 replay.yaml         the scenario with the changes that the user made by hand (harness.play.interventions)
 rogue.jsonl         what the rogue node has sent, if the timeline injects; rogue.log has what it had to say
+lag.jsonl           how late the machine woke programs, and how busy each agent was (harness.archive.lag)
 lab.log             what the lab itself had to say
 report.html  report.md  junit.xml  chains.svg
 """
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from harness.archive import traces
 from harness.archive.connectivity import NETWORK_FILE
 from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE, SUFFIX, export_paths
+from harness.archive.lag import LAG_FILE
 from harness.archive.run_listing import RUNS
 from harness.archive.run_record import RunRecord
 from harness.archive.tracks import TRACKS_FILE
@@ -51,6 +53,7 @@ class RunDirectory:
         self.vehicles = self.path / "vehicles"
         self.lab_log = self.path / "lab.log"
         self.rogue_log = self.path / "rogue.log"
+        self.lag = self.path / LAG_FILE
         self.keys: Mapping[int, Path] = {}
         """Where each vehicle has its keys while it is played: elsewhere, for nothing secret is kept here."""
         claim(path, self.agents, self.vehicles)

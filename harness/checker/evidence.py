@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict
 from harness.archive.archive import RunArchive
 from harness.archive.connectivity import Link
 from harness.archive.exports import Export, name_blocks
+from harness.archive.lag import MeasuredLag
 from harness.archive.packets.capture_files import DIRECTORY, Captures, capture_files, read_captures
 from harness.archive.run_record import AgentRecord, Counters, JudgedRecord
 from harness.archive.traces import Trace
@@ -120,6 +121,8 @@ class Evidence:
     conditions: list[Condition] | None = None
     """What was taken down of network and faults as it was made; None if nothing was."""
     captures: Captures | None = None
+    lag: MeasuredLag | None = None
+    """How late machine and agents were; None if it was not measured."""
     public_keys: "PublicKeys | None" = None
     """Of a secured mission, by which blocks are told to be their makers'."""
     verified: "Callable[[Signed], bool] | None" = None
@@ -341,6 +344,7 @@ def gather(archive: RunArchive) -> Evidence:
         injected,
         archive.conditions(Condition),
         _captures(archive),
+        archive.lag(),
         archive.public_keys,
         scenario=archive.record.scenario,
         link_losses=[*archive.link_losses(archive.roster)],

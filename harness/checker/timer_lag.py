@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from statistics import quantiles
 
+from harness.archive.lag import MeasuredLag
 from harness.archive.traces import Trace
 
 ENOUGH = 20
@@ -24,25 +25,35 @@ class TimerLag:
         return self.late_s <= TOLERATED * self.asked_s
 
 
-def timer_lag(traces: Iterable[Trace]) -> TimerLag | None:
-    """Over all votes that no reconcile interrupted; None if too few tell."""
+def timer_lag(traces: Iterable[Trace], lag: MeasuredLag | None = None) -> TimerLag | None:
+    """Return the lateness of all votes that no reconcile interrupted. None if there are too few.
+
+    With a measured `lag`, lateness that it does not explain is not the machine's, and does not count.
+    """
     late: list[float] = []
     asked_s = 0.0
     for trace in traces:
         setting = trace.header.settings.get("vote_timeout_s")
         if isinstance(setting, int | float):
             asked_s = float(setting)
-            late += [lasted - asked_s for lasted in _votes(trace)]
+            late += [_of_machine(trace, ended_s, lasted_s - asked_s, lag) for ended_s, lasted_s in _votes(trace)]
     return TimerLag(quantiles(late, n=20)[-1], asked_s) if len(late) >= ENOUGH else None
 
 
-def _votes(trace: Trace) -> Iterator[float]:
-    """How long each vote lasted. A reconcile pauses the timer, and leaves its vote out."""
+def _of_machine(trace: Trace, ended_s: float, late_s: float, lag: MeasuredLag | None) -> float:
+    """Return the part of the lateness that the measured lag explains, in mission seconds."""
+    speedup = trace.header.clock.get("speedup")
+    explained_s = lag.explains(trace.header.agent_id, ended_s - max(0.0, late_s), ended_s) if lag else None
+    return late_s if explained_s is None or not speedup else min(late_s, explained_s * speedup)
+
+
+def _votes(trace: Trace) -> Iterator[tuple[float, float]]:
+    """Yield the end and the duration of each vote. A reconcile pauses the timer, and leaves its vote out."""
     for life in trace.lives():
         began: float | None = None
         for _, run in life:
             if run.handler == "vote_timer_expiration" and began is not None:
-                yield run.t - began
+                yield run.t, run.t - began
                 began = None
             if run.branch == "proposed":
                 began = run.t

@@ -203,7 +203,7 @@ class Recording:
         except RunDirectoryError as error:
             raise MachineError(f"{error}; run.json has the verdict") from None
         status = played.exit_status or (VIOLATED if result.bad else WRONG_REQUEST if played.unmatched_fates else 0)
-        late = None if in_virtual_time(self._record.backend) else timer_lag(evidence.traces.values())
+        late = None if in_virtual_time(self._record.backend) else timer_lag(evidence.traces.values(), evidence.lag)
         return Run(self.directory.path, played, self._record, result, survived, rogue, status, wall_s, page, late)
 
     def _update(self, **keys: Any) -> None:

@@ -49,6 +49,16 @@ class NotHandledError(Exception):
     """The reference would not have run this handler now: what the agent did, completing "it ..."."""
 
 
+class Expiry(NamedTuple):
+    """A timer whose handler ran at mission second `t`, `late_s` mission seconds after the timer expired."""
+
+    line: int
+    t: float
+    handler: str
+    timer: str
+    late_s: float
+
+
 class Tells(NamedTuple):
     """What an agent's trace has of what may be left out: tallies, of these handlers, and which timers were started."""
 
@@ -82,6 +92,8 @@ class Follower:
     ) -> None:
         self.deviations: list[Deviation] = []
         """Where it differs, in order."""
+        self.expiries: list[Expiry] = []
+        """Each expiry of a timer of the reference that the agent handled, in order."""
         self.lost: str | None = None
         """Why, and after which line, the agent cannot be followed any further."""
         self.stops_before_handler = False
@@ -134,7 +146,7 @@ class Follower:
                     breakpoint()
                 branch = handler.run(core, sender, message)
             else:
-                handler, inputs = self._input(run, now)
+                handler, inputs = self._input(line, run, now)
                 core.running = handler
                 core.told_sealed = sealed_of(run.sealed)
                 if self.stops_before_handler:
@@ -177,6 +189,7 @@ class Follower:
         keep += (*self._implementation.handlers.values(), *self._core.unchanging())
         memo: dict[int, Any] = {id(kept): kept for kept in keep}
         memo[id(self.deviations)] = []
+        memo[id(self.expiries)] = []
         return deepcopy(self, memo)
 
     def foresee(self, line: int, run: HandlerRun) -> list[Deviation]:
@@ -268,7 +281,7 @@ class Follower:
 
     # What came
 
-    def _input(self, run: HandlerRun, now: float) -> tuple[Handler, tuple[Any, ...]]:
+    def _input(self, line: int, run: HandlerRun, now: float) -> tuple[Handler, tuple[Any, ...]]:
         """The handler that this runs, and what it is given, where no message came. Raises NotHandledError."""
         trigger, on_local_event = run.trigger, self._implementation.on_local_event
         handler: Handler
@@ -276,7 +289,7 @@ class Follower:
         if isinstance(trigger, LocalTrigger):
             handler, inputs = self._local(run), ()
         elif isinstance(trigger, TimerTrigger):
-            handler, inputs = self._timer(timer_that_ended(run, trigger), now), ()
+            handler, inputs = self._timer(line, run, timer_that_ended(run, trigger), now), ()
         elif isinstance(trigger, EventTrigger):
             handler, inputs = on_local_event["Build Data Block"], self._event(run.input, trigger.event_id)
         elif trigger == OperatorTrigger("reconcile"):
@@ -319,7 +332,7 @@ class Follower:
             raise AnotherHandlerError(run, handler)
         return handler, sender, message
 
-    def _timer(self, name: str, now: float) -> Handler:
+    def _timer(self, line: int, run: HandlerRun, name: str, now: float) -> Handler:
         timer = self._timers.get(name)
         if timer is None or timer.deadline is None:
             raise NotHandledError(f"ran at the expiry of the {name[:60]} timer, which was not running")
@@ -327,6 +340,7 @@ class Follower:
         timer.stop()
         if early > self._header.early_s:
             raise NotHandledError(f"ran {early:.3g} s before the {name} timer expired")
+        self.expiries.append(Expiry(line, run.t, run.handler, name, -early / self._header.rate))
         handler: Handler = self._implementation.on_timer[name]
         return handler
 

@@ -20,6 +20,7 @@ from harness.play.agent_control import AgentRefusedError, Status
 from harness.play.mission import RunOutcome, Sought
 from harness.play.process._agent_process import AgentProcess, reboots_with_disk
 from harness.play.process._fleet import Fleet
+from harness.play.process._lag_meter import LagMeter
 from harness.play.process._rogue_process import RogueProcess
 from harness.play.process._run_lab import MissionLab, OpenLab
 from harness.play.process._watchers import Watchers, unless_interrupted
@@ -89,6 +90,7 @@ class ProcessRun:
         self._changing_network = asyncio.Lock()
         self._watchers = Watchers()
         self._fleet = Fleet(scenario, kinds, rundir, self.clock, self._watchers)
+        self._lag: LagMeter | None = None
         self._read_before_start: Mapping[int, UdpCounters] = {}
         self._injected: list[Injected] = []
         """What the rogue node was told."""
@@ -204,6 +206,8 @@ class ProcessRun:
             await self._rogue.begin(epoch_us, None if captured is None else self._keys.hand(captured, kept=True))
         self.clock.start(epoch_us)
         self._read_before_start = await self._lab.network.datagrams()
+        networks = {agent_id: self._lab.network.networks[agent_id] for agent_id in self.scenario.roster}
+        self._lag = await LagMeter.start(self.rundir.lag, epoch_us, self.scenario.speedup, networks)
 
     async def apply(self, change: Change) -> None:
         if isinstance(change, NetworkChange):
@@ -410,6 +414,8 @@ class ProcessRun:
         """Export whatever can be exported, and stop everybody. Never raises for an agent or vehicle."""
         self._show("exporting")
         self.played.mission_s = round(self.clock.now(), 1)
+        if self._lag is not None:
+            await self._lag.stop()
         exported = await asyncio.gather(*(agent.export_finally() for agent in self.agents), return_exceptions=True)
         for error in exported:
             if error is not None and not isinstance(error, HarnessError):

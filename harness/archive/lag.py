@@ -1,0 +1,52 @@
+"""Read `lag.jsonl`: how late the machine woke programs during a run, and how busy the processes of each agent were.
+
+`harness/play/process/_lag_probe.py` writes this file.
+"""
+
+from bisect import bisect_left
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from harness.archive.run_record import AgentKey
+
+LAG_FILE = "lag.jsonl"
+
+_Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class LagLine(BaseModel):
+    """A line of `lag.jsonl`: mission seconds `from_s` to `until_s`, and figures in seconds of wall time.
+
+    `machine_s` is how late the machine woke a program, at most, and how long programs waited for a disk or the
+    hypervisor. `busy_s` is how long the processes of an agent ran, or waited for a processor. An agent without
+    processes is missing.
+    """
+
+    model_config = ConfigDict(extra="ignore")
+
+    from_s: Annotated[float, Field(allow_inf_nan=False)]
+    until_s: Annotated[float, Field(allow_inf_nan=False)]
+    machine_s: _Seconds
+    busy_s: dict[AgentKey, _Seconds]
+
+
+class MeasuredLag:
+    """The lag that `lag.jsonl` shows at any time of the run."""
+
+    def __init__(self, lines: list[LagLine]) -> None:
+        self._lines = sorted(lines, key=lambda line: line.until_s)
+        self._ends = [line.until_s for line in self._lines]
+
+    def explains(self, agent_id: int, from_s: float, until_s: float) -> float | None:
+        """Return the lag, in seconds of wall time, of an agent that runs a timer at `until_s` that expired at `from_s`.
+
+        None if the lag of the agent was not measured all the time.
+        """
+        lines = self._lines[bisect_left(self._ends, from_s) : bisect_left(self._ends, until_s) + 1]
+        agent = str(agent_id)
+        if not lines or lines[0].from_s > from_s or lines[-1].until_s < until_s:
+            return None
+        if any(agent not in line.busy_s for line in lines):
+            return None
+        return sum(line.machine_s + line.busy_s[agent] for line in lines)

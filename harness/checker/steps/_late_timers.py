@@ -1,0 +1,54 @@
+"""Find timers that are later than the measured lag of the machine explains.
+
+A right agent runs a timer late only if the machine wakes it late, or if its process is busy or waits for a processor.
+The harness measures both during a run (`lag.jsonl`). The lag is an upper bound, so a single timer shows only a large
+error. A wrong duration makes all timers of a kind late. The mean over the run then shows a smaller error.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from statistics import mean
+
+from harness.archive.traces import Trace
+from harness.checker.evidence import Evidence
+from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.follower import Expiry
+
+SINGLE_WALL_S = 0.03
+"""Wall time that a single timer may be late without an explanation."""
+MEAN_WALL_S = 0.01
+"""Wall time that the timers of a kind may be late on average without an explanation."""
+ENOUGH = 8
+"""Minimum number of timers for a mean."""
+
+
+def late_timers(evidence: Evidence, trace: Trace, expiries: Sequence[Expiry]) -> Iterator[Deviation]:
+    """Yield the timers of an agent that the measured lag does not explain."""
+    lag, speedup = evidence.lag, trace.header.clock.get("speedup")
+    if lag is None or not isinstance(speedup, int | float) or speedup <= 0:
+        return
+    agent_id = trace.header.agent_id
+    explained: dict[str, list[tuple[Expiry, float]]] = defaultdict(list)
+    for expiry in expiries:
+        due_s = expiry.t - max(0.0, expiry.late_s)
+        lag_s = lag.explains(agent_id, due_s, expiry.t)
+        if lag_s is not None and not evidence.was_paused(agent_id, due_s, expiry.t):
+            explained[expiry.timer].append((expiry, lag_s * speedup))
+    for timer, of_kind in explained.items():
+        late = [(expiry, lag_s) for expiry, lag_s in of_kind if expiry.late_s > lag_s + SINGLE_WALL_S * speedup]
+        for expiry, lag_s in late:
+            what = (
+                f"it ran {expiry.late_s:.3g} s after the {timer} timer expired, but the measured lag explains only "
+                f"{lag_s:.2g} s"
+            )
+            yield Deviation(agent_id, expiry.line, expiry.t, expiry.handler, what)
+        if late or len(of_kind) < ENOUGH:
+            continue
+        late_s, lag_s = mean(expiry.late_s for expiry, _ in of_kind), mean(lag_s for _, lag_s in of_kind)
+        if late_s > lag_s + MEAN_WALL_S * speedup:
+            last, _ = of_kind[-1]
+            what = (
+                f"{len(of_kind)} {timer} timers ran {late_s:.3g} s after they expired on average, but the measured lag "
+                f"explains only {lag_s:.2g} s"
+            )
+            yield Deviation(agent_id, last.line, last.t, last.handler, what)

@@ -1,0 +1,45 @@
+"""The program that measures lag during a mission, started and ended by the orchestrator."""
+
+import asyncio
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+PROGRAM = Path(__file__).with_name("_lag_probe.py")
+END_LIMIT_S = 5.0
+
+
+class LagMeter:
+    """One run of `_lag_probe.py`. It ends with this process at the latest."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self._process = process
+
+    @classmethod
+    async def start(cls, path: Path, epoch_us: int, speedup: float, networks: Mapping[int, int]) -> "LagMeter":
+        """Measure from now on, and write to `path`. `networks` has the inode number of each agent's network namespace.
+
+        Raises OSError if the program cannot be started.
+        """
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-I", "-S", str(PROGRAM), str(path)),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.DEVNULL,
+            start_new_session=True,  # the terminal's Ctrl-C is for the orchestrator alone
+        )
+        assert process.stdin is not None
+        agents = {str(inode): str(agent) for agent, inode in networks.items()}
+        asked = {"epoch_us": epoch_us, "speedup": speedup, "networks": agents}
+        process.stdin.write(json.dumps(asked).encode() + b"\n")
+        return cls(process)
+
+    async def stop(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            await asyncio.wait_for(self._process.wait(), END_LIMIT_S)
+        except TimeoutError:
+            self._process.kill()
+            await self._process.wait()

@@ -1,0 +1,123 @@
+"""Measure how late this machine wakes programs, and how long each agent waits for a processor.
+
+The harness starts this program beside a mission. It writes JSON lines to the file in its first argument, and ends when
+its standard input ends. `harness.archive.lag` describes a line.
+
+A timer of an agent expires late for two reasons. The machine wakes its process late: this program sleeps for short
+times, and measures how late it wakes up itself. Or the process is awake and not finished with something else: the
+kernel counts for each process how long it ran and how long it waited for a processor (/proc/PID/schedstat), and for the
+machine how long programs waited for a disk (/proc/pressure/io). An agent in any language is measured in this way, and
+an agent can influence the figures only by using processor time. The program imports no package, because it starts
+with each run.
+"""
+
+import json
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import TextIO
+
+BEAT_S = 0.02
+"""Wall time between two measurements of the machine."""
+SLICE_MISSION_S = 2.0
+"""Time of one line in mission seconds. A line has at least `MIN_SLICE_S` and at most `MAX_SLICE_S` of wall time."""
+MIN_SLICE_S = 0.1
+MAX_SLICE_S = 1.0
+NANOSECONDS = 1e9
+MICROSECONDS = 1e6
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+class Counters:
+    """The counters of the kernel. Each method returns seconds of wall time since its previous call."""
+
+    def __init__(self, networks: dict[int, str]) -> None:
+        """`networks`: inode number of a network namespace -> the agent in it."""
+        self._networks = {f"net:[{inode}]": agent for inode, agent in networks.items()}
+        self._agent_of: dict[str, str | None] = {}
+        self._busy: dict[str, dict[str, int]] = {}
+        self._stalled = self._read_stalled()
+
+    def busy(self) -> dict[str, float]:
+        """Return how long the processes of each agent ran, or waited for a processor. An unknown agent is missing."""
+        present = [entry.name for entry in os.scandir("/proc") if entry.name.isdigit()]
+        self._agent_of = {pid: self._agent_of[pid] if pid in self._agent_of else self._agent(pid) for pid in present}
+        before, self._busy = self._busy, {}
+        busy: dict[str, float] = {}
+        for pid, agent in self._agent_of.items():
+            if agent is None:
+                continue
+            try:
+                threads = {entry.name: _busy_ns(entry.path) for entry in os.scandir(f"/proc/{pid}/task")}
+            except OSError:
+                continue  # it has ended
+            self._busy[pid] = threads
+            known = before.get(pid, {})
+            grown = sum(ns - known.get(thread, 0) for thread, ns in threads.items())
+            busy[agent] = busy.get(agent, 0.0) + grown / NANOSECONDS
+        return busy
+
+    def stalled(self) -> float:
+        """Return how long the whole machine was not there for a program: it waited for a disk or a hypervisor."""
+        before, self._stalled = self._stalled, self._read_stalled()
+        return sum(self._stalled) - sum(before)
+
+    def _agent(self, pid: str) -> str | None:
+        try:
+            return self._networks.get(str(Path("/proc", pid, "ns/net").readlink()))
+        except OSError:
+            return None
+
+    def _read_stalled(self) -> tuple[float, float]:
+        try:
+            some = Path("/proc/pressure/io").read_text(encoding="ascii").split("\n", 1)[0]
+            disk_s = int(some.rpartition("total=")[2]) / MICROSECONDS * (os.cpu_count() or 1)
+        except (OSError, ValueError):
+            disk_s = 0.0
+        fields = Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0].split()
+        return disk_s, int(fields[8]) / _TICKS_PER_S
+
+
+def _busy_ns(thread: str) -> int:
+    ran, waited, _ = Path(thread, "schedstat").read_text(encoding="ascii").split()
+    return int(ran) + int(waited)
+
+
+def measure(file: TextIO, started: float, speedup: float, counters: Counters) -> None:
+    """Write a line for each slice. `started` is the monotonic time of mission second 0."""
+    slice_s = min(MAX_SLICE_S, max(MIN_SLICE_S, SLICE_MISSION_S / speedup))
+    began = awake = time.monotonic()
+    late = 0.0
+    counters.busy()
+    while True:
+        time.sleep(BEAT_S)
+        before, awake = awake, time.monotonic()
+        late = max(late, awake - before - BEAT_S)
+        if awake - began < slice_s:
+            continue
+        line = {
+            "from_s": round((began - started) * speedup, 3),
+            "until_s": round((awake - started) * speedup, 3),
+            "machine_s": round(late + counters.stalled(), 4),
+            "busy_s": {agent: round(seconds, 4) for agent, seconds in counters.busy().items()},
+        }
+        file.write(json.dumps(line, separators=(",", ":")) + "\n")
+        file.flush()
+        began, late = awake, 0.0
+        awake = time.monotonic()
+
+
+def main(path: str) -> None:
+    asked = json.loads(sys.stdin.readline())
+    started = time.monotonic() - (time.time() - asked["epoch_us"] / MICROSECONDS)
+    counters = Counters({int(inode): agent for inode, agent in asked["networks"].items()})
+    with Path(path).open("a", encoding="ascii") as file:
+        arguments = (file, started, asked["speedup"], counters)
+        threading.Thread(target=measure, args=arguments, daemon=True).start()
+        sys.stdin.read()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

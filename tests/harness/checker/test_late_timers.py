@@ -1,0 +1,144 @@
+"""Timers that are later than the measured lag are deviations; a slow machine accuses no agent."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.archive.archive import RunArchive
+from harness.archive.lag import LAG_FILE, LagLine, MeasuredLag
+from harness.checker import check, gather
+from harness.checker.judgement import Judgement
+from harness.play.progress import Silent
+from harness.run.run import Run, run
+from tests.harness.mission import edit, edit_lines
+from tests.harness.virtual import scenario
+
+OFTEN = {"source": "random", "mean_s": 2}
+LATE_S = 0.5
+VOTES_LATE = """
+import sys
+from ucp import node
+from ucp.timers import Timer
+
+start = Timer.start
+Timer.start = lambda timer, now, duration_s: start(timer, now, duration_s + 15 * (timer.name == "voting"))
+sys.exit(node.main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture(scope="module")
+def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose headers have a voting timer of 10 s, but whose agents vote for half a second longer."""
+    asked = scenario(agents=3, duration_s=150, events=OFTEN, settings={"vote_timeout_s": 10 + LATE_S})
+    directory = run(asked, 1, tmp_path_factory.mktemp("late") / "run", Silent(), backend="sim").directory
+
+    def claim_ten_seconds(lines: list[dict[str, Any]]) -> None:
+        lines[0]["settings"]["vote_timeout_s"] = 10.0
+        lines[0]["clock"]["epoch_us"] = 1  # a run in real time
+        for line in lines:
+            line.pop("started", None)
+
+    for agent in "123":
+        edit_lines(directory / f"agents/{agent}.trace.jsonl", claim_ten_seconds)
+    return directory
+
+
+def judged(late: Path, tmp_path: Path, *, speedup: float = 1.0, lag: list[dict[str, Any]] | None = None) -> Judgement:
+    """Judge the steps as if mission time ran at this speed, and as if this lag were measured."""
+    directory = tmp_path / "run"
+    if not directory.exists():
+        shutil.copytree(late, directory)
+    for agent in "123":
+        edit_lines(directory / f"agents/{agent}.trace.jsonl", lambda lines: lines[0]["clock"].update(speedup=speedup))
+    if lag is not None:
+        (directory / LAG_FILE).write_text("".join(json.dumps(line) + "\n" for line in lag))
+    return check(gather(RunArchive(directory))).beside["steps"]
+
+
+def measured(machine_s: float = 0.0, *, busy_s: float = 0.0, agents: str = "123") -> list[dict[str, Any]]:
+    """Return lines of two mission seconds for the whole run, with the same figures in each."""
+    figures = {"machine_s": machine_s, "busy_s": dict.fromkeys(agents, busy_s)}
+    return [{"from_s": at, "until_s": at + 2, **figures} for at in range(0, 2000, 2)]
+
+
+def test_timer_later_than_the_measured_lag_is_a_deviation(late: Path, tmp_path: Path) -> None:
+    found = judged(late, tmp_path, lag=measured(0.1, busy_s=0.05))
+    assert found.verdict == "deviates"
+    assert {finding.agent_id for finding in found.evidence} == {1, 2, 3}
+    assert {finding.handler for finding in found.evidence} == {"vote_timer_expiration"}
+    assert "it ran 0.5 s after the voting timer expired, but the measured lag explains only" in found.evidence[0].detail
+
+
+@pytest.mark.parametrize("lag", [measured(0.6), measured(busy_s=0.6), measured(0.3, busy_s=0.3), measured(agents="")])
+def test_timer_that_the_lag_explains_is_no_deviation(late: Path, tmp_path: Path, lag: list[dict[str, Any]]) -> None:
+    assert judged(late, tmp_path, lag=lag).verdict == "as specified"
+
+
+def test_mean_shows_an_error_that_single_timers_do_not_show(late: Path, tmp_path: Path) -> None:
+    found = judged(late, tmp_path, speedup=20, lag=measured(0.005))
+    assert found.verdict == "deviates"
+    assert "voting timers ran 0.5 s after they expired on average" in found.evidence[0].detail
+    assert judged(late, tmp_path, speedup=20, lag=measured(0.02)).verdict == "as specified"
+
+
+def test_timer_of_a_paused_agent_is_no_deviation(late: Path, tmp_path: Path) -> None:
+    shutil.copytree(late, tmp_path / "run")
+    pause = {"at_s": 0.0, "what": "pause", "detail": "agents 1 2 3", "agents": [1, 2, 3]}
+    edit(tmp_path / "run" / "run.json", lambda record: record["faults"].append(pause))
+    assert judged(late, tmp_path, lag=measured()).verdict == "as specified"
+
+
+def test_reason_says_that_no_lag_is_recorded(late: Path, tmp_path: Path) -> None:
+    found = judged(late, tmp_path)
+    assert found.verdict == "as specified"
+    assert "the lag of the machine is not recorded" in found.reason
+    assert judged(late, tmp_path, lag=[{"at_s": 0}]).reason == found.reason
+
+
+def test_lag_outside_the_measured_time_is_unknown() -> None:
+    lag = MeasuredLag([LagLine.model_validate(line) for line in measured(0.1, busy_s=0.2)[1:3]])
+    assert lag.explains(1, 2.0, 3.0) == pytest.approx(0.3)
+    assert lag.explains(1, 3.0, 5.0) == pytest.approx(0.6)
+    assert lag.explains(1, 1.0, 3.0) is None
+    assert lag.explains(1, 5.0, 6.5) is None
+    assert lag.explains(4, 3.0, 5.0) is None
+
+
+@pytest.fixture
+def busy_machine() -> Iterator[None]:
+    """Twice as many processes as processors compute."""
+    burning = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 * (os.cpu_count() or 1))]
+    yield
+    for process in burning:
+        process.kill()
+        process.wait()
+
+
+def played(tmp_path: Path, **keys: Any) -> Run:
+    asked = scenario(agents=3, duration_s=80, speedup=20, vehicles={"kind": "none"}, events=OFTEN, **keys)
+    return run(asked, 1, tmp_path / "run", Silent(), backend="process")
+
+
+@pytest.mark.lab
+def test_busy_machine_accuses_no_agent(tmp_path: Path, busy_machine: None) -> None:
+    timeline = [{"at_s": 30, "pause": [1]}, {"at_s": 40, "resume": [1]}]
+    found = played(tmp_path, timeline=timeline).result
+    assert found.beside["steps"].verdict == "as specified", found.beside["steps"]
+    assert "not recorded" not in found.beside["steps"].reason
+    assert found.beside["records"].verdict == "agree", found.beside["records"]
+
+
+@pytest.mark.lab
+def test_agent_with_a_longer_voting_timer_is_found(tmp_path: Path) -> None:
+    program = tmp_path / "agent.py"
+    program.write_text(VOTES_LATE)
+    found = played(tmp_path, agent_command={2: [sys.executable, str(program)]}).result.beside["steps"]
+    assert found.verdict == "deviates"
+    assert {finding.agent_id for finding in found.evidence} == {2}
