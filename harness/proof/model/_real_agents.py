@@ -13,7 +13,7 @@ from harness.proof.model._snapshot import NOW_S, ReductionError, Snapshot, put_b
 from ucp.agent import HANDLERS, Agent
 from ucp.block import Block
 from ucp.clock import MICROSECONDS
-from ucp.events import LoggableEvent
+from ucp.events import EVENT_HEADER_BYTES, MAX_EVENT_BYTES, LoggableEvent
 from ucp.handler import EventHandler
 from ucp.quirks import wrong_handlers
 
@@ -92,10 +92,11 @@ def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHand
 def log(agent: Agent, ordinal: int) -> None:
     """Log events until a block is complete: the `ordinal`th of all."""
     completed = len(agent.state.completed)
+    data = bytes(min(MAX_EVENT_BYTES, agent.state.settings.max_event_bytes) - EVENT_HEADER_BYTES)
     for number in range(MOST_AT_ONCE):
         if len(agent.state.completed) > completed:
             return
-        agent.add_event(LoggableEvent(ordinal * MICROSECONDS + number, 1, bytes(256)), NOW_S)
+        agent.add_event(LoggableEvent(ordinal * MICROSECONDS + number, 1, data), NOW_S)
 
 
 def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:

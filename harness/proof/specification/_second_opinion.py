@@ -13,22 +13,13 @@ from harness.proof.graph._exploration import explore
 from harness.proof.model._global_states import Swarm
 from harness.proof.questions import _convergence
 from harness.proof.specification import _spec_states as states
-from harness.proof.specification._spec_states import readings, unspecified
+from harness.proof.specification._spec_states import TIMERS, readings, unspecified
 from harness.proof.specification._tlc import checked, command, in_tla
-from harness.scenario.agent_options import Staggered
 from ucp.clock import MICROSECONDS
 
 MEGABYTE = 1e6
 AS_PRINTED = {"change_without_new_vote": 5, "stop_after_stack": 16}
 """Quirks that the specification has, too: what the thesis prints, and cannot mean."""
-TIMERS: dict[Staggered, tuple[str, str]] = {
-    "vote_timeout_s": ("VoteTimeout", "VoteStagger"),
-    "phase1_timeout_s": ("Phase1Timeout", "Phase1Stagger"),
-    "phase2_timeout_s": ("Phase2Timeout", "Phase2Stagger"),
-    "phase3_timeout_s": ("Phase3Timeout", "Phase3Stagger"),
-    "finalize_gap_s": ("FinalizeGap", "FinalizeStagger"),
-}
-"""The constants of the specification for how long each lasts, and for how much longer from agent to agent."""
 INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4": "4", "NobodyHangs": "hang"}
 """In the specification, and as `prove` calls what they forbid."""
 
@@ -188,7 +179,7 @@ def _config(bounds: Bounds) -> str:
         raise BoundsError(f"the specification has only the quirks {' and '.join(AS_PRINTED)}: leave out {unknown[0]}")
     settings = bounds.agent_settings()
     if (name := unspecified(settings)) is not None:
-        raise BoundsError(f"the specification has only the settings of the thesis: leave out --setting {name}")
+        raise BoundsError(f"the specification does not have the setting {name}: leave out --settings {name}=...")
     durations = {
         name: round(duration_s * MICROSECONDS)
         for timer, names in TIMERS.items()

@@ -13,13 +13,25 @@ from typing import Any
 from harness.proof.graph._exploration import Graph
 from harness.proof.model._global_states import AGENTS
 from harness.proof.model._local_steps import LocalStates
+from harness.proof.specification._tlc import MODULES
+from harness.scenario.agent_options import Staggered
 from ucp.clock import MICROSECONDS
-from ucp.settings import CHOICES, Settings
+from ucp.settings import CHOICES, DECLARED, Settings
 from ucp.state import AgentState
 
 Plain = tuple[Any, ...]
 """An agent, or all of them."""
 
+TIMERS: dict[Staggered, tuple[str, str]] = {
+    "vote_timeout_s": ("VoteTimeout", "VoteStagger"),
+    "phase1_timeout_s": ("Phase1Timeout", "Phase1Stagger"),
+    "phase2_timeout_s": ("Phase2Timeout", "Phase2Stagger"),
+    "phase3_timeout_s": ("Phase3Timeout", "Phase3Stagger"),
+    "finalize_gap_s": ("FinalizeGap", "FinalizeStagger"),
+}
+"""The constants of the specification for the duration of each timer, and for the stagger between agents."""
+SIZES = {"max_block_bytes", "max_event_bytes"}
+"""Settings that the specification has as constants for the sizes of blocks and events."""
 NO_HASH = -1
 TOP_OF_CHAIN = 0
 _SIGNS = str.maketrans({"{": "\1", "}": "\2", "[": "{", "]": "}", "(": "{", ")": "}"})
@@ -140,9 +152,13 @@ class _Translator:
 
 
 def unspecified(settings: Settings) -> str | None:
-    """Return a setting that does not have its default and that the specification does not have."""
-    unknown = (name for name, choice in CHOICES.items() if choice.constant is None)
-    return next((name for name in unknown if getattr(settings, name) != CHOICES[name].values[0]), None)
+    """Return a setting that does not have its default and that the specification does not have, or None."""
+    constants = (MODULES / "Swarm.tla").read_text("utf-8")
+    choices = {name for name, choice in CHOICES.items() if choice.constant is not None and choice.constant in constants}
+    known, usual = choices | TIMERS.keys() | SIZES, Settings()
+    return next(
+        (name for name in DECLARED if name not in known and getattr(settings, name) != getattr(usual, name)), None
+    )
 
 
 def readings(settings: Settings) -> dict[str, bool]:

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from harness.proof import Bounds
+from harness.proof import Bounds, BoundsError
+from harness.proof.specification import _spec_states, second_opinion
 from harness.proof.specification import _tlc as tlc
-from harness.proof.specification import second_opinion
 from harness.scenario.agent_options import Stagger
 from tests.harness.command import harness, sentences
 from tests.machine import require_tlc
@@ -102,6 +102,29 @@ def test_the_command_says_it(tmp_path: Path) -> None:
     done = harness("prove", "--faults", "death", "--second-opinion")
     assert done.returncode == 2
     assert sentences(done.stderr) == ["the specification has no faults: leave out --faults"]
+
+
+@pytest.mark.parametrize("setting", ["asks_after_commit", "top_needs_majority"])
+def test_second_opinion_refuses_a_setting_that_the_specification_lacks(setting: str) -> None:
+    done = harness("prove", "--second-opinion", "--settings", f"{setting}=true")
+    assert done.returncode == 2
+    assert sentences(done.stderr) == [
+        f"the specification does not have the setting {setting}: leave out --settings {setting}=..."
+    ]
+
+
+def test_second_opinion_refuses_a_setting_whose_constant_the_specification_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "Swarm.tla").write_text((tlc.MODULES / "Swarm.tla").read_text().replace("Phase1TiePops", "Other"))
+    monkeypatch.setattr(_spec_states, "MODULES", tmp_path)
+    with pytest.raises(BoundsError, match="does not have the setting phase1_tie"):
+        second_opinion(Bounds(settings={"phase1_tie": "pop"}))
+
+
+def test_sizes_of_blocks_and_events_lead_to_the_same_states() -> None:
+    for settings in ({"max_block_bytes": 1000}, {"max_event_bytes": 100}):
+        assert second_opinion(Bounds(2, 1, settings=settings)).agrees
 
 
 def test_sigterm_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
