@@ -24,8 +24,8 @@ from harness.field.bisection import (
     differences,
     subject_of,
 )
-from harness.field.bisection.code_state import ROOT, interrupted_by_sigterm
 from harness.field.bisection.outcome import read
+from harness.run.code_state import ROOT, interrupted_by_sigterm
 from ucp.agent_files import write_atomically
 
 NOT_FOUND = 1

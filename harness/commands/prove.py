@@ -1,8 +1,9 @@
 """`ucp-harness prove`: look at everything that can happen within bounds."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 import yaml
@@ -13,7 +14,7 @@ from harness.commands._shared_options import RARE
 from harness.commands.terminal import Watcher, complain, print_json
 from harness.errors import INTERRUPTED
 from harness.play.core_version import edited_files
-from harness.proof import Bounds, BoundsError, Limits, Progress, specification
+from harness.proof import Bounds, BoundsError, Limits, Progress, original, specification
 from harness.run.parallel import cores, terminated_is_interrupted
 
 GIGABYTE = 1e9
@@ -91,6 +92,13 @@ def prove_command(
             "--second-opinion", rich_help_panel=RARE, help="Compare the states with those of the TLA+ specification."
         ),
     ] = False,
+    against: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ORIGINAL",
+            help="Commit or checkout of the original agent; exit status 1 only for findings that it does not have.",
+        ),
+    ] = None,
     cores_: Annotated[
         int | None,
         typer.Option("--cores", rich_help_panel=LIMITS, help="Number of processes; one for each core if not given."),
@@ -148,12 +156,26 @@ def prove_command(
             )
         _say(opinion.to_json(), opinion.in_words(), as_json)
         raise typer.Exit(opinion.exit_status)
+    if against is not None:
+        _compare(against, bounds, limits, out, as_json)
     with Watcher() as watcher, terminated_is_interrupted():
         proof = prove.prove(bounds, limits, out, watch=lambda progress: watcher.show(_how_far(progress)))
     _say(proof.to_json(), prove.in_words(proof), as_json)
     if proof.exit_status == INTERRUPTED:
         complain("interrupted")
     raise typer.Exit(proof.exit_status)
+
+
+def _compare(against: str, bounds: Bounds, limits: Limits, out: Path | None, as_json: bool) -> NoReturn:
+    """Prove the same for the original. Both proofs reduce states, or neither: their livelocks are then comparable."""
+    with original.code_of(against) as code, Watcher() as watcher, terminated_is_interrupted():
+        if bounds.reduced and original.is_edited(code):
+            complain(f"state reduction is disabled: it assumes the released core, and {against} has another one")
+            bounds = replace(bounds, reduced=False)
+        proof = prove.prove(bounds, limits, out, watch=lambda progress: watcher.show(_how_far(progress)))
+        comparison = original.Comparison(proof, original.prove_original(against, code, bounds, limits))
+    _say(comparison.to_json(), comparison.in_words(), as_json)
+    raise typer.Exit(comparison.exit_status)
 
 
 def _say(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:

@@ -42,14 +42,17 @@ FILES = (
 RELEASED = Path(__file__).with_name("released_core.sha256")
 
 
+CORE = Path(ucp.__file__).parent
+
+
 @cache
-def edited_files() -> tuple[str, ...]:
+def edited_files(core: Path = CORE) -> tuple[str, ...]:
     """Return the files of the core that differ from the released ones, such as "ucp/commit.py"."""
     released: dict[str, str] = {}
     for line in RELEASED.read_text("ascii").splitlines():
         digest, name = line.split()
         released[name] = digest
-    return tuple(name for name, digest in _digests().items() if released.get(name) != digest)
+    return tuple(name for name, digest in _digests(core).items() if released.get(name) != digest)
 
 
 def core_version() -> str:
@@ -60,10 +63,11 @@ def core_version() -> str:
 
 
 @cache
-def _digests() -> dict[str, str]:
-    """The SHA-256 of each file of the core, in hex."""
-    directory = Path(ucp.__file__).parent
-    return {f"ucp/{name}.py": hashlib.sha256((directory / f"{name}.py").read_bytes()).hexdigest() for name in FILES}
+def _digests(core: Path = CORE) -> dict[str, str]:
+    """The SHA-256 of each file of the core, in hex. A missing file counts as empty."""
+    paths = {f"ucp/{name}.py": core / f"{name}.py" for name in FILES}
+    contents = {name: path.read_bytes() if path.is_file() else b"" for name, path in paths.items()}
+    return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
 
 
 def record() -> None:

@@ -17,13 +17,13 @@ from harness.proof.graph._workers import Crew
 from harness.proof.model._any_sender import collect
 from harness.proof.model._flaws import Flaw
 from harness.proof.model._global_states import AGENTS, ZONE, Swarm
-from harness.proof.model._snapshot import ReductionError
+from harness.proof.model._snapshot import ReductionError, UncoveredError
 from harness.proof.questions import _convergence as liveness
 from harness.proof.questions import _livelock
 from harness.proof.questions._convergence import Liveness
 from harness.proof.questions._graph_cycles import cycles
 from harness.proof.questions._livelock import Livelock
-from harness.run.simulate import claim
+from harness.run.simulate import ENDED, claim
 
 INCOMPLETE = 4
 """Exit status: the proof reached a limit before it had explored all states."""
@@ -61,7 +61,7 @@ PLAYED = {
     "3": "3",
     "4": "4",
     "hang": "liveness",
-    "crash": "liveness",
+    "crash": ENDED,
     "steps": "steps",
 }
 """Kind of flaw -> the check that shows it in a simulated run."""
@@ -106,6 +106,8 @@ class Proof:
     """The nearest idle state with several chains. It violates no property, and stays as it is until an agent votes."""
     reluctant: Example | None = None
     """The nearest state that needs more than one further vote to reach one chain. None if none is known."""
+    forms: list[str] = field(default_factory=list)
+    """The forms of all livelocks, each as the timers of its states."""
     livelocks: list[Livelock] = field(default_factory=list)
     """One livelock of each form, replayed as a run. They may come from an exploration that is not complete."""
     way: list[str] = field(default_factory=list)
@@ -125,14 +127,35 @@ class Proof:
         return self.ended == "complete"
 
     @property
+    def decided(self) -> bool:
+        """True if every property was decided: no limit and no violation ended the search."""
+        whole = self.whole_ended == "complete" and (self.liveness is None or self.liveness.decided)
+        return self.complete and whole
+
+    @property
+    def findings(self) -> dict[str, str]:
+        """The violations, as key -> sentence. The same violation of another core has the same key.
+
+        A crash is known by its exception, a wrong step by its handler, and a livelock by its form.
+        """
+        found = {f"shown {key}": sentence for key, sentence in SHOWN.items() if key in self.shown}
+        if self.flaw is not None:
+            detail = {"crash": self.flaw.sentence, "steps": self.flaw.handler}.get(self.flaw.kind)
+            key = self.flaw.kind if detail is None else f"{self.flaw.kind} {detail}"
+            found[key] = f"{self.claims[self.flaw.kind]}: violated, {self.flaw.sentence}"
+        for form in self.forms:
+            found[f"livelock {form}"] = f"a cycle without losses lasts for ever, with the timers {form}"
+        if self.liveness is not None and self.liveness.lost is not None:
+            found["one chain"] = "from some state no path without losses leads to an idle swarm with one chain"
+        return found
+
+    @property
     def exit_status(self) -> int:
-        live = self.liveness
-        if self.flaw or self.shown or self.livelocks or (live is not None and (live.cycles or live.lost is not None)):
+        if self.findings:
             return VIOLATED
         if "interrupted" in (self.ended, self.whole_ended):
             return INTERRUPTED
-        whole = self.whole_ended == "complete" and (live is None or live.decided)
-        return 0 if self.complete and whole else INCOMPLETE
+        return 0 if self.decided else INCOMPLETE
 
     def to_json(self) -> dict[str, Any]:
         bounds, live, flaw = self.bounds, self.liveness, self.flaw
@@ -189,14 +212,14 @@ def prove(
     - `out`: the new file of the scenario that shows a violation. Without it, a new file under `runs/`.
     - `watch`: called with the progress every now and then.
 
-    Raises HarnessError if the file cannot be written, or if an agent does something that state reduction does not
-    allow.
+    Raises HarnessError if the file cannot be written, if an agent does something that state reduction does not allow,
+    or if its steps depend on something that is no part of a state.
     """
     try:
         if bounds.network == "any":
             return _alone(bounds, limits, out, watch)
         return _together(bounds, limits, out, watch)
-    except ReductionError as error:
+    except (ReductionError, UncoveredError) as error:
         raise HarnessError(f"{error}") from None
 
 
@@ -282,6 +305,7 @@ def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
     if proof.flaw is not None and graph.flawed is not None:
         proof.example = _example(graph, graph.flawed, proof.flaw.sentence, path, name)
     elif ways_round:
+        proof.forms = _livelock.in_timers(graph, ways_round)
         proof.livelocks = list(_livelock.show(graph, ways_round, path, name))
         proof.example = proof.livelocks[0].example
     elif live is not None and live.lost is not None:
@@ -302,6 +326,6 @@ def _example(graph: Graph, number: int, sentence: str, path: Path, name: str) ->
     way = graph.path(number)
     script = Script(graph, way)
     played = play(script.document(name))
-    said = [f"{sentence.capitalize()}: {len(way) - 1} instants after the beginning."]
+    said = [f"{sentence[:1].upper()}{sentence[1:]}: {len(way) - 1} instants after the beginning."]
     said += [f"This path needs a condition: it happens only {NO_CLOCKS}."] if script.contradictory else []
     return keep(played, path, graph.swarm.bounds, len(way) - 1, said)

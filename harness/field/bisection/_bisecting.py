@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 from harness.errors import RunDirectoryError
 from harness.field.bisection._playing import CannotBeTriedError, Workshop
-from harness.field.bisection.code_state import Commit, History, Narrowed, RepositoryError
 from harness.field.bisection.outcome import Outcome, differences
 from harness.report.difference import Difference, compare
+from harness.run.code_state import Commit, History, Narrowed, RepositoryError
 
 
 @dataclass(frozen=True)

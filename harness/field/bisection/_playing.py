@@ -10,9 +10,9 @@ from harness import checker
 from harness.archive.archive import RunArchive
 from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED, WRONG_REQUEST, HarnessError, InterruptedRunError
 from harness.field.bisection._live_replay import NotStartedError, ReplayFailedError, play_live
-from harness.field.bisection.code_state import ROOT, Ended, run_python
 from harness.field.bisection.outcome import Difference, OfAgent, Outcome, Subject, of_run
 from harness.field.replay import open_record
+from harness.run.code_state import ROOT, Ended, run_python
 from harness.scenario import Scenario
 
 SPEEDUP = 20.0

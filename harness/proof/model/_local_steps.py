@@ -5,6 +5,7 @@ written here.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 
 from harness.proof.bounds import Bounds
@@ -20,8 +21,10 @@ from harness.proof.model._snapshot import (
     ReductionError,
     Snapshot,
     Step,
+    UncoveredError,
     check_that_nothing_is_lost,
     put_back,
+    set_counts,
     take,
 )
 from harness.proof.model._tallies import TALLIES, Tallies
@@ -35,6 +38,12 @@ Content = tuple[int, Snapshot, "Flaw | None", Ordinals]
 """What another process needs to know of a local state."""
 
 
+OTHER_COUNTS = (1, 2, 1000)
+"""Counts with which each step of an unreduced proof is repeated."""
+COUNTED = ("reconciles", "sent", "chain_changed_at")
+"""Attributes of the state that are only counted, in the words of an error."""
+
+
 class LocalStates(KnownStates):
     """All local states that were come upon, and all steps between them."""
 
@@ -44,6 +53,8 @@ class LocalStates(KnownStates):
         super().__init__(bounds, Blocks(first.chain.inception, self.agents.made))
         self.steps = 0
         """How many the real agent has computed."""
+        self._counting = {agent_id: self.agents.new(agent_id) for agent_id in self.agents.by_id}
+        """Agents that repeat steps with other counts."""
         self._reference = Reference(bounds, self.agents.new) if bounds.steps else None
         self.timers = [timer.name for timer in first.timers]
         self.settings = settings = bounds.agent_settings()
@@ -267,6 +278,8 @@ class LocalStates(KnownStates):
         for number, _ in started:
             agent.state.timers[number].start(RUNNING_S, 0.0)
         after = take(agent, {} if boots else before.snapshot)
+        if not (self.bounds.reduced or boots or self.bounds.captured):
+            self._check_counts(before.agent_id, before.snapshot, give, after, sent)
         if flaw is None and all(after[name] is part for name, part in before.snapshot.items()):
             self.agents.leave_in(before.agent_id, after)
             return Step(local, sent, started)
@@ -276,6 +289,27 @@ class LocalStates(KnownStates):
             check_that_nothing_is_lost(before.snapshot, agent.state)
         local = self._intern(before.agent_id, agent, after, before.snapshot, flaw, keep=not boots)
         return Step(local, sent, started)
+
+    def _check_counts(
+        self, agent_id: int, before: Snapshot, give: Give, after: Snapshot, sent: tuple[int, ...]
+    ) -> None:
+        """Raise UncoveredError if the step is another one after the agent has counted more reconciles or messages."""
+        for count in OTHER_COUNTS:
+            agent = self._counting[agent_id]
+            put_back(agent, before)
+            set_counts(agent, count)
+            with suppress(Exception):  # the step itself reports an exception
+                give(agent)
+                end_at_once(agent)
+            also_sent = tuple(self.message(message) for _, message in agent.messages_to_send())
+            for timer in agent.state.timers:
+                if timer.deadline is not None and timer.deadline < RUNNING_S:
+                    timer.start(RUNNING_S, 0.0)
+            if also_sent != sent or take(agent, after).items() != after.items():
+                raise UncoveredError(
+                    f"a step of an agent depends on how often it has done something before ({', '.join(COUNTED)}); a "
+                    "state of the proof has no such count, so keep the count in an attribute of its own"
+                )
 
     def message(self, message: Message) -> int:
         """Its number."""

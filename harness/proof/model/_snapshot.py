@@ -12,14 +12,20 @@ from hashlib import blake2b
 from typing import Any, NamedTuple
 
 from harness.proof.model._flaws import Flaw
-from ucp.agent import Agent
+from ucp.agent import ON_MESSAGE, Agent
 from ucp.block import Block
 from ucp.chain import Chain
 from ucp.state import AgentState
 from ucp.timers import Timer
 
 REPORTED = frozenset(("now", "sent", "reconciles", "chain_changed_at", "_sequence"))
-"""What an agent only counts or notes; no handler reads it but to make a trace or a datagram's number."""
+"""Counters and notes, which only a trace or the number of a datagram needs.
+
+They grow for ever, so they cannot be part of a state. Every step begins with them at zero. `LocalStates` repeats each
+step of an unreduced proof with other counts, and refuses an agent whose step depends on them.
+"""
+COUNTS = ("reconciles", "_sequence", "chain_changed_at")
+"""Those that are numbers and that no input sets."""
 FIXED = frozenset(("agent_id", "settings", "timers", "reconcile_timers", "running", "_tracing", "_seal", "sealed"))
 """What never changes (no agent that is looked at seals its events), or is another name of what is there."""
 HANDED_OVER = frozenset(("outbox", "changes", "announced", "started"))
@@ -29,6 +35,8 @@ NOW_S = 1000.0
 """The mission second of every input: what matters of time is in the zones."""
 RUNNING_S = 1e15
 """The deadline of a timer that was running before the input."""
+
+MESSAGE_NAMES = tuple(message.NAME for message in ON_MESSAGE)
 
 Snapshot = dict[str, Any]
 NameOf = Callable[[bytes], int]
@@ -82,8 +90,11 @@ def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) ->
     """
     state = vars(agent.state)
     state["now"] = NOW_S
+    set_counts(agent, 0)
     for name in HANDED_OVER & state.keys():
         state[name].clear()
+    for name in [name for name in state if name not in snapshot and name not in LEFT_OUT]:
+        del state[name]  # an attribute that a handler adds later
     for name, value in snapshot.items():
         if since is not None and name in since and since[name] is value:
             continue
@@ -91,6 +102,13 @@ def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) ->
             value.put_back(state[name])
         else:
             state[name] = _copied(value)
+
+
+def set_counts(agent: Agent, count: int) -> None:
+    """Set everything that the agent only counts to `count`."""
+    state = vars(agent.state)
+    state.update(dict.fromkeys(COUNTS, count))
+    state["sent"] = Counter(dict.fromkeys(MESSAGE_NAMES, count) if count else ())
 
 
 def _is_part(part: Any, value: Any) -> bool:
@@ -282,6 +300,10 @@ class Parts:
         name = int.from_bytes(digest[:8])
         assert self._hashes.setdefault(name, digest) == digest, "no two hashes that there are begin alike"
         return name
+
+
+class UncoveredError(Exception):
+    """The agent depends on something that is no part of a state, so no proof covers it."""
 
 
 class ReductionError(Exception):

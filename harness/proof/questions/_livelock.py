@@ -23,7 +23,7 @@ MOST_PLAYED = 5
 ROUNDS = 3
 """For so many rounds it is worked out how far apart what leads there may be."""
 
-_Form = tuple[object, ...]
+_Form = tuple[tuple[tuple[tuple[int, ...], bool], ...], ...]
 
 
 @dataclass(frozen=True)
@@ -94,6 +94,19 @@ def _form(graph: Graph, cycle: Sequence[int]) -> _Form:
         for number in cycle
     ]
     return min(tuple(looks[first:] + looks[:first]) for first in range(len(looks)))
+
+
+def in_timers(graph: Graph, cycles: Sequence[list[int]]) -> list[str]:
+    """Return the forms of the cycles in words: the states of a cycle, and in each state the timers of each agent."""
+    names = graph.swarm.local.timers
+
+    def agent(running: tuple[int, ...], waits: bool) -> str:
+        return "+".join(names[timer] for timer in running) or ("waiting" if waits else "idle")
+
+    def form(cycle: Sequence[int]) -> str:
+        return " > ".join(", ".join(agent(*look) for look in looks) for looks in _form(graph, cycle))
+
+    return sorted({form(cycle) for cycle in cycles})
 
 
 class _Round(NamedTuple):

@@ -18,7 +18,7 @@ from typing import Literal
 
 from harness.errors import HarnessError, InterruptedRunError, MachineError
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 """Of the harness that runs now."""
 GRACE_S = 30.0
 """A run that is asked to stop takes its lab down first."""
@@ -50,7 +50,7 @@ class Ended:
 
 
 def run_python(
-    arguments: Sequence[str], *, first: Sequence[Path], cwd: Path, limit_s: float, stdin: str | None = None
+    arguments: Sequence[str], *, first: Sequence[Path], cwd: Path, limit_s: float | None, stdin: str | None = None
 ) -> Ended:
     """Run this interpreter with these directories before all other places of modules.
 
