@@ -31,7 +31,12 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
         yield from _handler_runs(agent_id, recorded, trace, lives)
         yield from _counted(evidence, agent_id, recorded, trace, lives)
         export = evidence.exports.get(agent_id)
-        if export is not None and recorded.outcome == "exported" and recorded.idle not in (None, export.idle):
+        if (
+            export is not None
+            and recorded.outcome == "exported"
+            and recorded.idle not in (None, export.idle)
+            and _ran_nothing_since(recorded, lives[-1])
+        ):
             idle, not_idle = ("idle", "not idle") if recorded.idle else ("not idle", "idle")
             yield of_agent(
                 agent_id, f"it was {idle} at the end according to run.json, but {not_idle} according to its export"
@@ -41,6 +46,12 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
             yield of_agent(
                 agent_id, "its trace ends in the middle of a line, although the agent ended by itself", short=True
             )
+
+
+def _ran_nothing_since(recorded: AgentRecord, life: Life) -> bool:
+    """Return True unless the agent ran handlers after its last report, which may have changed what it reported."""
+    counted = recorded.handler_runs[-1] if recorded.handler_runs else None
+    return counted is None or counted.counted == len(life.runs)
 
 
 def _lives(agent_id: int, recorded: AgentRecord, lives: list[Life]) -> Iterator[Contradiction]:

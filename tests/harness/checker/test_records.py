@@ -347,6 +347,30 @@ def test_of_a_run_that_was_broken_off_nothing_tells_how_long_its_traces_should_b
     assert "the run did not end normally" in result.beside["steps"].reason
 
 
+@pytest.mark.parametrize(("runs_later", "agrees"), [(0, False), (1, True)])
+def test_report_before_the_last_handler_run_may_differ_from_the_export(
+    directory: Path, runs_later: int, agrees: bool
+) -> None:
+    """An agent of a run in real time reports that it is not idle, and its export says that it is."""
+
+    def in_real_time(document: list[Document]) -> None:
+        for header in document:
+            if "schema" in header:
+                header["clock"]["epoch_us"] = 1
+
+    for agent in (1, 2, 3):
+        edit_lines(trace(directory, agent), in_real_time)
+    times_s = [line["t"] for line in lines(trace(directory, 1)) if "handler" in line]
+    last_s = times_s[-1 - runs_later]
+    report = {"counted": len(times_s) - runs_later, "from_s": last_s, "until_s": last_s}
+
+    def report_busy(document: Document) -> None:
+        document["agents"]["1"].update(idle=False, handler_runs=[report])
+
+    edit(directory / "run.json", report_busy)
+    assert ("it was not idle at the end" in said(judged(directory))) != agrees
+
+
 @pytest.mark.parametrize(
     ("passed", "lost", "sentence"),
     [
