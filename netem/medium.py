@@ -33,7 +33,7 @@ from netem.link import Delay, GilbertElliott, LinkConditions
 LATENCY = Delay(mean_s=0.026, jitter_s=0.024)
 """Latency of messages if the conditions have neither a delay nor a rate."""
 
-_AT_ONCE = Delay(0.0)
+AT_ONCE = Delay(0.0)
 _HEADERS = 42  # bytes of a frame beside the datagram's data: Ethernet, IPv4, UDP
 _WORD = 1 << 32
 _BROADCASTS_AT_ONCE = 64
@@ -56,14 +56,16 @@ class RandomDraws(Protocol):
 class Medium:
     """The network between `vehicles` in virtual time. Conditions are perfect until the first call of `apply`."""
 
-    def __init__(self, vehicles: Sequence[int], seed: int) -> None:
+    def __init__(self, vehicles: Sequence[int], seed: int, latency: Delay = LATENCY) -> None:
+        self.latency = latency
+        """Latency of messages if the conditions have neither a delay nor a rate, from the next call of `apply` on."""
         self._vehicles = tuple(vehicles)
         self._seed = seed
         self._words = [_Words(self._stream("loss", sender), self._stream("latency", sender)) for sender in vehicles]
         self._rare: dict[int, tuple[Random, ...]] = {}  # by sender, where the air was ever not plain
         self._links: list[list[_Link]] = [[] for _ in vehicles]  # of each sender, to all; none where the air is plain
-        self.soonest = LATENCY.mean_s
-        self.latest = LATENCY.mean_s
+        self.soonest = latency.mean_s
+        self.latest = latency.mean_s
         """Bounds, in seconds, of the delays of all copies so far and under the current conditions: `soonest` and
         `latest`."""
         self.apply(NetworkConditions())
@@ -105,9 +107,9 @@ class Medium:
         hears = [number != index and self.hears(number, index) for index in range(len(links))]
         if all(_is_plain(link) for link in set(links)):
             self._links[number] = []
-            return _PlainAir(links, hears, self._words[number])
+            return _PlainAir(links, hears, self._words[number], self.latency)
         before: Sequence[_Link | None] = self._links[number] or [None] * len(links)
-        self._links[number] = [_Link(link, earlier) for link, earlier in zip(links, before, strict=True)]
+        self._links[number] = [_Link(link, earlier, self.latency) for link, earlier in zip(links, before, strict=True)]
         if number not in self._rare:
             concerns = ("duplication", "reordering", "corruption")
             self._rare[number] = tuple(self._stream(concern, sender) for concern in concerns)
@@ -135,8 +137,8 @@ draw."""
 _NO_WAY: _Way = (_WORD, 0.0, 0.0)
 
 
-def _way(link: LinkConditions) -> _Way:
-    delay = link.delay or LATENCY
+def _way(link: LinkConditions, latency: Delay) -> _Way:
+    delay = link.delay or latency
     return round(link.independent_loss * _WORD), delay.mean_s - delay.jitter_s, 2 * delay.jitter_s / _WORD
 
 
@@ -149,12 +151,12 @@ def _is_plain(link: LinkConditions) -> bool:
 class _PlainAir:
     """Links with independent loss and uniform latency. Each receiver needs two words of 32 bits."""
 
-    def __init__(self, links: list[LinkConditions], hears: list[bool], words: _Words) -> None:
+    def __init__(self, links: list[LinkConditions], hears: list[bool], words: _Words, latency: Delay) -> None:
         self.receivers = len(links)
-        self.ways = [_way(link) if heard else _NO_WAY for link, heard in zip(links, hears, strict=True)]
+        self.ways = [_way(link, latency) if heard else _NO_WAY for link, heard in zip(links, hears, strict=True)]
         self.reached = [(receiver, *way) for receiver, way in enumerate(self.ways) if way != _NO_WAY]
         self.certain = all(lost_below in (0, _WORD) for _, lost_below, _, _ in self.reached)
-        delays = [link.delay or LATENCY for link in links]
+        delays = [link.delay or latency for link in links]
         self.soonest_of_all = min(delay.mean_s - delay.jitter_s for delay in delays)
         self.latest = max(delay.mean_s + delay.jitter_s for delay in delays)
         self._words = words
@@ -275,9 +277,9 @@ class _Link:
     `before` is the link under the previous conditions. Its queue continues if both conditions need one.
     """
 
-    def __init__(self, conditions: LinkConditions, before: _Link | None) -> None:
+    def __init__(self, conditions: LinkConditions, before: _Link | None, latency: Delay = LATENCY) -> None:
         self.conditions = conditions
-        self._delay = conditions.delay or (LATENCY if conditions.rate is None else _AT_ONCE)
+        self._delay = conditions.delay or (latency if conditions.rate is None else AT_ONCE)
         self._bad = False
         self._last = -inf  # when the last packet leaves
         self._departures: list[float] = []  # a heap of when the packets leave that wait; some may have left

@@ -188,6 +188,11 @@ class Course:
         self._segments = segments
         *self._begin_s, self.end_s = itertools.accumulate((part.duration_s for part in segments), initial=begin_s)
 
+    @property
+    def rests_from_s(self) -> float:
+        """The time after which the place does not change any more; infinite if it always does."""
+        return self._begin_s[-1] if isinstance(self._segments[-1], Rest) else self.end_s
+
     def at(self, now_s: float) -> Motion:
         """The motion at `now_s`; before the beginning that of the beginning, after the end that of the end."""
         index = max(0, bisect.bisect_right(self._begin_s, now_s) - 1)

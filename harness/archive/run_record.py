@@ -189,6 +189,27 @@ class CapturedFrames(_Model):
     dropped: int
 
 
+class ChannelRecord(_Model):
+    """Frames on a radio channel that all vehicles shared. `model` has the preset and all figures of the radio."""
+
+    model: dict[str, Any]
+    frames: int
+    """Number of frames that were sent."""
+    airtime_s: float
+    """Sum of the durations of all frames."""
+    lost: dict[str, dict[AgentKey, int]]
+    """Reason -> receiver -> number of frames that it lost. Reasons: collision, half_duplex, fade, range, partition."""
+    dropped: dict[str, dict[AgentKey, int]]
+    """Reason -> sender -> number of messages that its radio did not send. Reasons: queue, too_long."""
+    load_interval_s: Annotated[float, Field(gt=0)]
+    load: list[float]
+    """Share of each interval in which at least one frame was on the channel, from mission second 0 on."""
+
+    def total(self, reason: str) -> int:
+        """Return the number of frames or messages lost for this reason."""
+        return sum((self.lost.get(reason) or self.dropped.get(reason, {})).values())
+
+
 class ReceiverCounters(_Model):
     """Packets to one vehicle: numbers that the kernel passed, lost, and cut off by a partition. Further keys are the
     applied conditions."""
@@ -334,6 +355,8 @@ class JudgedRecord(_Model):
     counters: Counters | None = None
     datagrams: dict[AgentKey, DatagramsRead] = {}
     """Datagrams that each agent read. An agent is missing if another program on its vehicle uses UDP."""
+    channel: ChannelRecord | None = None
+    """Frames on the shared channel. null without one."""
 
     @property
     def switched_off(self) -> dict[int, float]:

@@ -35,6 +35,12 @@ def figures(evidence: Evidence) -> dict[str, float | int | None]:
         if completed and messages is not None and all_known
         else None,
     }
+    if evidence.record and (channel := evidence.record.channel):
+        result["collisions"] = channel.total("collision")
+        result["airtime_s"] = round(channel.airtime_s, 3)
+        result["airtime_per_block_s"] = (
+            round(channel.airtime_s / len(completed), 3) if completed and all_known else None
+        )
     if evidence.before_final_reconcile:
         before = [export.chain_of_block_hashes for export in evidence.before_final_reconcile.values()]
         result["mutual_chain_before_final_reconcile"] = common_prefix(before)

@@ -65,7 +65,7 @@ def in_words(components: Iterable[Iterable[int]]) -> str:
 
 def tracks_of(scenario: Scenario) -> dict[int, Track]:
     """How the vehicles fly in virtual time; none do where no plan, radio or ground station asks where they are."""
-    if not (scenario.flight or scenario.network.radio or scenario.gcs):
+    if not (scenario.flight or scenario.network.radio or scenario.network.channel or scenario.gcs):
         return {}
     return {vehicle: _track(scenario, vehicle, index) for index, vehicle in enumerate(scenario.roster)}
 

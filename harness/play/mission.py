@@ -37,6 +37,8 @@ class RunOutcome:
     cycle: Cycle | None = None
     counters: dict[str, Any] | None = None
     datagrams: dict[str, dict[str, int]] = field(default_factory=dict)
+    channel: dict[str, Any] | None = None
+    """Frames on a shared channel."""
     capture: dict[str, dict[str, int]] | None = None
     agents: dict[str, Any] = field(default_factory=dict)
     vehicles: dict[str, Any] = field(default_factory=dict)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from harness.archive.connectivity import Connectivity, Losses, Pair, quality
-from harness.archive.run_record import FaultRecord, NetworkState, OperatorCommand, RunRecord
+from harness.archive.run_record import ChannelRecord, FaultRecord, NetworkState, OperatorCommand, RunRecord
 from harness.play.backends import in_virtual_time
 from harness.present import text
 from harness.report import _network_strip
@@ -16,6 +16,16 @@ from harness.report.map_parts import divisions
 MOST_PAIRS = 10
 """Lanes of pairs; of more only those that lost most."""
 NAMED_PAIRS = 3
+REASONS = {
+    "collision": "collision with other frames",
+    "half_duplex": "receiver was sending",
+    "fade": "fading of the signal",
+    "range": "out of range",
+    "partition": "on another channel",
+    "queue": "full queue",
+    "too_long": "message too long for the radio",
+}
+"""Reason of a loss on a channel -> its description."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +36,9 @@ class Strip:
     picture: Markup
 
 
-def strip(network: Connectivity, faults: Sequence[FaultRecord], end_s: float) -> Strip | None:
+def strip(
+    network: Connectivity, faults: Sequence[FaultRecord], end_s: float, channel: ChannelRecord | None = None
+) -> Strip | None:
     """What the network did up to `end_s`, as it is on record; None if it is not."""
     if not network.states:
         return None
@@ -38,10 +50,37 @@ def strip(network: Connectivity, faults: Sequence[FaultRecord], end_s: float) ->
     lanes = [
         ("partition", _network_strip.steps(partitions, end_s)),
         ("loss", _network_strip.steps(losses, end_s)),
+        *([("channel load", _load(channel, end_s))] if channel else []),
         *_pairs(network, end_s),
     ]
     ticks = [(fault.at_s, f"{text.duration(fault.at_s)}: {fault.what}") for fault in faults]
     return Strip([name for name, _ in lanes], _network_strip.draw(lanes, ticks, end_s))
+
+
+def _load(channel: ChannelRecord, end_s: float) -> list[_network_strip.Span]:
+    """Return the load of the channel over time. Intervals of the same load, rounded to percent, form one span."""
+    loads = [round(share, 2) for share in channel.load] + [0.0]
+    changes = [number for number, load in enumerate(loads) if number == 0 or load != loads[number - 1]]
+    states = [(number * channel.load_interval_s, text.percent(loads[number]), loads[number]) for number in changes]
+    return _network_strip.steps(states, end_s)
+
+
+def channel(record: RunRecord) -> list[str]:
+    """Sentences on the shared channel: its model, its load, and the reasons of losses."""
+    if (found := record.channel) is None:
+        return []
+    mean = sum(found.load) * found.load_interval_s / record.mission_s if record.mission_s else 0.0
+    preset, airtime = found.model.get("preset"), text.value(round(found.airtime_s, 1))
+    sentences = [
+        f"All vehicles shared one channel, {preset}: {text.value(found.frames)} frames with an airtime of {airtime} s. "
+        f"The channel was busy for {text.percent(round(mean, 3))} of the mission, and for "
+        f"{text.percent(max(found.load, default=0.0))} of the busiest {text.value(found.load_interval_s)} s."
+    ]
+    for reason, by_vehicle in {**found.lost, **found.dropped}.items():
+        counts = ", ".join(f"{vehicle}: {text.value(count)}" for vehicle, count in by_vehicle.items())
+        whose = "Frames lost by receiver" if reason in found.lost else "Messages dropped by sender"
+        sentences.append(f"{whose}, {REASONS.get(reason, reason)}: {counts}.")
+    return sentences
 
 
 def _pairs(network: Connectivity, end_s: float) -> list[tuple[str, list[_network_strip.Span]]]:

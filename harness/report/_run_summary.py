@@ -34,6 +34,7 @@ def to_markdown(left: ReportSource) -> str:
     if survived := _survival_section.section(record.survival, left.ink):
         lines += _listed(survived.sentences)
     lines += _happened(_network_section.happened(record))
+    lines += _listed(_network_section.channel(record))
     lines += _listed([station] if (station := _network_section.ground_station(record)) else [])
     lines += _listed(_rogue_section.sentences(record.rogue))
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())

@@ -23,6 +23,9 @@ FIGURES = {
     "copies_mean": "copies of a block, mean",
     "messages": "messages sent",
     "bytes": "bytes sent",
+    "collisions": "frames lost in collisions",
+    "airtime_s": "seconds of airtime",
+    "airtime_per_block_s": "seconds of airtime per block",
     "mutual_chain_before_final_reconcile": "blocks in the mutual chain before the final reconcile",
     "distinct_chains_before_final_reconcile": "distinct chains before the final reconcile",
 }

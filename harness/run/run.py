@@ -175,6 +175,7 @@ class Recording:
             unmatched_fates=played.unmatched_fates,
             counters=played.counters,
             datagrams=played.datagrams,
+            channel=played.channel,
             capture=played.capture,
             ground_station=played.ground_station,
         )

@@ -157,6 +157,7 @@ class InMemory:
                 "final_reconcile": simulation.played.final_reconcile,
                 "cycle": simulation.played.cycle,
                 "faults": simulation.played.faults,
+                "channel": simulation.played.channel,
                 "mission_s": simulation.played.mission_s,
                 "stagger": simulation.scenario.stagger,
                 "agents": simulation.played.agents,

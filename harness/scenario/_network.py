@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
 
+from harness.scenario._channel import ChannelModel
 from harness.scenario.strict_model import MAX_AGENTS, Model, Probability, VehicleId, VehicleKey
 from netem import radio
 from netem.conditions import Delay, Distribution, GilbertElliott, LinkConditions, NetworkConditions
@@ -272,10 +273,14 @@ class NetworkModel(Model):
     """Conditions of single links, at most 10,000 entries."""
     radio: RadioModel | None = None
     """Additional loss that depends on the distance between two vehicles. Without it, distance has no effect."""
+    channel: ChannelModel | None = None
+    """A radio channel that all vehicles share. Without it, all vehicles may send at the same time."""
 
     @model_validator(mode="after")
     def _means_something(self) -> "NetworkModel":
         self.conditions()
+        if self.radio is not None and self.channel is not None:
+            raise ValueError("`radio` and `channel` both compute the loss over distance: leave out one of them")
         return self
 
     def named(self) -> Iterator[tuple[str, int]]:

@@ -38,6 +38,8 @@ class NetworkChange:
     """Changed losses of the radio: pair of vehicles, as in "1-2" -> probability, 0 to 1."""
     by_hand: bool = False
     """True if a user requested the change during the run."""
+    channel: str | None = None
+    """Preset of the channel that vehicles share. A channel may lose any message."""
 
     def to_json(self, at_s: float) -> dict[str, Any]:
         """Return the record of this change at mission second `at_s`."""
@@ -45,7 +47,7 @@ class NetworkChange:
             "at_s": at_s,
             "what": self.what,
             "detail": self.detail,
-            "fully_connected": self.conditions.fully_connected,
+            "fully_connected": self.conditions.fully_connected and self.channel is None,
             **({"losses": dict(self.losses)} if self.losses else {}),
             **({} if self.what in (RANGE, FINAL_RECONCILE) else planned(self.at_s, at_s)),
             **_hand(self.by_hand),
@@ -106,7 +108,11 @@ def injected_nothing(begun: Sequence[Injected], sent: Mapping[int, int]) -> list
 
 def _network_states(scenario: Scenario) -> list[Change]:
     """Return all states of the network. Changes at the same instant form one state."""
-    return [_change(step.at_s, step.what, step.network.conditions()) for step in scenario.network_steps()]
+    changes = [_change(step.at_s, step.what, step.network.conditions()) for step in scenario.network_steps()]
+    if (channel := scenario.network.channel) is None:
+        return [*changes]
+    detail = f"shared channel {channel.preset}"
+    return [replace(change, detail=f"{change.detail}, {detail}", channel=channel.preset) for change in changes]
 
 
 def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -47,6 +47,9 @@ FigureName = Literal[
     "messages",
     "bytes",
     "messages_per_block",
+    "collisions",
+    "airtime_s",
+    "airtime_per_block_s",
     "mutual_chain_before_final_reconcile",
     "distinct_chains_before_final_reconcile",
 ]

@@ -296,7 +296,9 @@ class Scenario(Model):
 
     @model_validator(mode="after")
     def _plans_can_be_flown(self) -> "Scenario":
-        for key, asked in (("flight", self.flight), ("network.radio", self.network.radio)):
+        network = self.network
+        positions = {"flight": self.flight, "network.radio": network.radio, "network.channel": network.channel}
+        for key, asked in positions.items():
             if asked and self.vehicles.kind == "none":
                 raise ValueError(f"`{key}` needs vehicles, but `vehicles.kind` is none: leave out one of them")
         self.vehicles.check_frames(self.roster)
@@ -390,10 +392,14 @@ class Scenario(Model):
     @model_validator(mode="after")
     def _network_means_something_all_along(self) -> "Scenario":
         for step in self.network_steps():
+            where = f"{', '.join(step.keys) or 'network'}, at {step.at_s:g} s"
             try:
-                step.network.uncut()
+                conditions = step.network.uncut()
             except ConditionsError as error:
-                raise ValueError(f"{', '.join(step.keys)}, at {step.at_s:g} s: {error}") from None
+                raise ValueError(f"{where}: {error}") from None
+            for need in conditions.needs() if self.network.channel else ():
+                if need.split()[-1] in ("rate", "limit"):
+                    raise ValueError(f"{where}: `{need}` and `network.channel` both queue messages: leave out one")
         return self
 
     @model_validator(mode="after")

@@ -1,8 +1,8 @@
 """A radio channel that all vehicles share. `_channel.py` has the model."""
 
 from netem.channel._channel import Channel
-from netem.channel._frame import Fate, Transmission
+from netem.channel._frame import Fate, Transmission, numbers
 from netem.channel._parameters import Chirps, Contention, Radio, Turns
 from netem.channel._presets import PRESETS
 
-__all__ = ["PRESETS", "Channel", "Chirps", "Contention", "Fate", "Radio", "Transmission", "Turns"]
+__all__ = ["PRESETS", "Channel", "Chirps", "Contention", "Fate", "Radio", "Transmission", "Turns", "numbers"]

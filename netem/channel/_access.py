@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import Protocol
 
 from netem.channel._frame import Frame
@@ -25,13 +25,13 @@ class Access(Protocol):
     def take_due(self) -> list[int]:
         """Remove the stations that send at `next_due`, and return them."""
 
-    def wait(self, frame: Frame, now: int, active: Iterable[Frame]) -> None:
+    def wait(self, frame: Frame, now: int, active: Collection[Frame]) -> None:
         """Choose when the sender of `frame` sends it. `active` are the frames on the air."""
 
     def begun(self, frames: list[Frame], now: int) -> None:
         """React to the beginning of these frames, which `take_due` has named."""
 
-    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Iterable[Frame]) -> None:
+    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Collection[Frame]) -> None:
         """React to the end of `frame`. `waiting` is the next frame of its sender."""
 
     def too_long(self, airtime_ns: int) -> bool:
@@ -58,7 +58,7 @@ class DutyCycle:
         self.next_due = min(self._due.values(), default=NEVER)
         return stations
 
-    def wait(self, frame: Frame, now: int, active: Iterable[Frame]) -> None:
+    def wait(self, frame: Frame, now: int, active: Collection[Frame]) -> None:
         due = self._due[frame.sender] = self._chosen(frame, max(now, self._silent_until[frame.sender]))
         self.next_due = min(self.next_due, due)
 
@@ -66,7 +66,7 @@ class DutyCycle:
         for frame in frames:
             self._silent_until[frame.sender] = now + math.ceil(frame.airtime_ns / self._duty)
 
-    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Iterable[Frame]) -> None:
+    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Collection[Frame]) -> None:
         if waiting is not None:
             self.wait(waiting, now, active)
 

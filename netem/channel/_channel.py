@@ -63,7 +63,8 @@ class Channel:
         Return Fate.QUEUE or Fate.TOO_LONG if the radio drops the message.
         """
         now_ns = nanoseconds(now)
-        self._play(now_ns)
+        if self._next_end <= now_ns or self._access.next_due <= now_ns:
+            self._play(now_ns)
         airtime = self._airtimes.get(data_bytes)
         if airtime is None:
             airtime = self._airtimes[data_bytes] = self._radio.airtime_ns(data_bytes)
@@ -157,7 +158,7 @@ class Channel:
 
     def _end(self, frame: Frame, now: int) -> None:
         self._active.remove(frame)
-        self._next_end = min([other.ends_ns for other in self._active], default=NEVER)
+        self._next_end = min([other.ends_ns for other in self._active]) if self._active else NEVER
         self._sending &= ~(1 << frame.sender)
         queue = self._queues[frame.sender]
         self._access.ended(frame, queue[0] if queue else None, now, self._active)

@@ -12,7 +12,7 @@ began less than `sense_s` ago is not sensed yet.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from random import Random
 
 from netem.channel._access import NEVER
@@ -50,11 +50,11 @@ class CarrierSense:
             del self._due[station]
         return stations
 
-    def wait(self, frame: Frame, now: int, active: Iterable[Frame]) -> None:
+    def wait(self, frame: Frame, now: int, active: Collection[Frame]) -> None:
         station = frame.sender
         self._resting.discard(station)
         left = self._counted(station, now)
-        if busy_until := self._busy_until(station, now, active):
+        if active and (busy_until := self._busy_until(station, now, active)):
             if left == 0:
                 self._left[station] = self._drawn(station)
             self._from[station] = max(self._from[station], busy_until + self._difs)
@@ -88,7 +88,7 @@ class CarrierSense:
             if due < next_due:
                 next_due = due
         self.next_due = next_due
-        for station in list(self._resting):
+        for station in [*self._resting] if self._resting else ():
             if self._counted(station, now) == 0:
                 self._resting.remove(station)
                 continue
@@ -97,12 +97,13 @@ class CarrierSense:
                     all_from[station] = max(all_from[station], idle_from)
                     break
 
-    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Iterable[Frame]) -> None:
+    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Collection[Frame]) -> None:
         if failed := frame.receiving & frame.disturbed:
             self._wait_for_longer(failed, now)
         station = frame.sender
         self._left[station] = self._drawn(station)
-        self._from[station] = max(now, self._busy_until(station, now, active)) + self._difs
+        busy_until = self._busy_until(station, now, active) if active else now
+        self._from[station] = max(now, busy_until) + self._difs
         if waiting is None:
             self._resting.add(station)
         else:

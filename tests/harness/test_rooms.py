@@ -23,7 +23,6 @@ DOORS = {
     "harness.cli": "a program",
     "netem.init": "a program",
     "netem.tap": "a program",
-    "netem.channel": "the model of a shared channel, which benchmarks use",
     "ucp.contract.vectors.replay": "a program",
     "harness.play.containers.start": "a program that is copied beside a compose file",
 }

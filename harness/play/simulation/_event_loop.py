@@ -17,6 +17,7 @@ from harness.play.core_version import edited_files
 from harness.play.mission import Sought
 from harness.play.simulation._crash import crash_of
 from harness.play.simulation._recurrence import Recurrence
+from harness.play.simulation._shared_channel import ChannelTraffic
 from harness.play.simulation._simulated_agent import OwnAgent, Stored, VirtualAgent
 from harness.play.simulation.air import Happening, InFlight, Logged, StrayDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, LateTimers, NameOf
@@ -25,7 +26,7 @@ from harness.play.simulation.run_files import Recorder
 from harness.play.simulation.seals import seals_of
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
-from netem.medium import Medium
+from netem.medium import AT_ONCE, LATENCY, Medium
 from ucp.events import LoggableEvent, RandomEvents
 from ucp.interest import ONLY_COUNTED
 from ucp.messages import Message, datagram_bytes
@@ -94,9 +95,12 @@ class Clockwork:
         self._foreigners = self._foreign_agents(programs) if scenario.foreign else None
         self._late = {self._number[agent_id]: LateTimers(text) for agent_id, text in scenario.lateness.items()}
         """By number, of the agents that have any."""
-        self._medium = Medium(self.roster, seed)
+        self._channel = self._shared_channel()
+        self._medium = Medium(self.roster, seed, AT_ONCE if self._channel else LATENCY)
         self._script = fate_script(scenario.fates, self.roster, BlockNames(self.roster, self._lives).of)
-        self._air = air(self.roster, scenario.settings, self._medium, self._script, deliver_all=deliver_all)
+        self._air = air(
+            self.roster, scenario.settings, self._medium, self._script, self._channel, deliver_all=deliver_all
+        )
         self._rogue = self._rogue_node() if scenario.rogue else None
         self._on_the_air: deque[tuple[int, int, Message, float]] | None = deque(maxlen=REMEMBERED) if told else None
         """What a rogue node would have heard, if there is none and may be one."""
@@ -109,6 +113,10 @@ class Clockwork:
         """What agents have run at the last change; None once time has passed."""
         self._recurrence: Recurrence | None = None
         """Is told of timers that end, once the swarm has had its time to finish."""
+
+    def _shared_channel(self) -> ChannelTraffic[InFlight | StrayDatagram] | None:
+        asked = self.scenario.network.channel
+        return ChannelTraffic(self.roster, asked.radio(), asked.processing_s, self.seed) if asked else None
 
     def _foreign_agents(self, programs: "Programs | None") -> "Foreigners":
         from harness.play.simulation.foreign._foreigners import Foreigners  # most scenarios have none

@@ -8,6 +8,10 @@ has its place in the order, (time, rank, receiver), whether or not anything else
 
 Most answers are only tallied. They are not delivered one by one: the agent is told of those that have come, in order,
 before it looks at its tally (`hear`), and nobody works out when an answer reaches whom until then.
+
+If vehicles share a radio channel, every message occupies it, also one that matters to no agent. A message arrives when
+its frame ends. Only then is it known which agents receive it and which of them ask for it, so it is delivered to these
+agents at once, and no answer is kept.
 """
 
 from collections import defaultdict
@@ -16,8 +20,12 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from typing import Literal
 
+from harness.play.simulation._shared_channel import ChannelTraffic
 from harness.play.simulation.fate_script import RIGHT_AFTER_S, FateScript
-from netem.medium import Medium, RandomDraws
+from netem.channel import Transmission, numbers
+from netem.conditions import NetworkConditions
+from netem.medium import LATENCY, Medium, RandomDraws
+from netem.radio import Place
 from ucp.interest import ANSWERED, ASKED, MATTERS, ONLY_COUNTED, STILL_ASKED, Question
 from ucp.messages import BlockAddResponse, Message
 from ucp.settings import Settings
@@ -94,6 +102,23 @@ class StrayDatagram:
     datagram: bytes
 
 
+class _Copies:
+    """The copies of a broadcast that arrive: (receiver, delay in seconds)."""
+
+    def __init__(self, copies: list[tuple[int, float]]) -> None:
+        self._copies = copies
+        self.latest = max((delay for _, delay in copies), default=0.0)
+
+    def copies_to(self, receiver: int) -> tuple[float, ...]:
+        return tuple(delay for number, delay in self._copies if number == receiver)
+
+    def to_all(self) -> list[tuple[int, float]]:
+        return self._copies
+
+
+_UNKNOWN = _Copies([])
+"""The copies of a message whose frame has not ended."""
+
 Happening = tuple[float, int, int, InFlight | Logged | StrayDatagram | None]
 """(mission seconds, rank, number of the agent, what): a message, an event, or None for the end of a timer.
 
@@ -106,7 +131,14 @@ class VirtualAir:
     """The air between `roster`, whose agents are numbered in its order. `deliver_all`: even what cannot matter."""
 
     def __init__(
-        self, roster: tuple[int, ...], settings: Settings, medium: Medium, script: FateScript, *, deliver_all: bool
+        self,
+        roster: tuple[int, ...],
+        settings: Settings,
+        medium: Medium,
+        script: FateScript,
+        channel: ChannelTraffic[InFlight | StrayDatagram] | None,
+        *,
+        deliver_all: bool,
     ) -> None:
         self.busy_until = [0.0] * len(roster)
         """Until when, at least, the agent with this number reconciles, and so answers nobody."""
@@ -116,14 +148,15 @@ class VirtualAir:
         """Since when the agents are paused that are; what has come since waits for them."""
         self.asked_by: list[dict[About, _Asked]] = [{} for _ in roster]
         """What the agent with this number waits to hear."""
-        self.quiet_at = 0.0
-        """Nothing that was broadcast so far arrives later."""
+        self._quiet_at = 0.0
+        """When the last copy arrives that is not on the channel."""
         self.place: Happening = (0.0, 0, 0, None)
         """Where in the order the world stands."""
         self._roster = roster
         self._settings = settings
         self._medium = medium
         self._script = script
+        self._channel = channel
         self._deliver_all = deliver_all
         self._coming: list[Happening] = []
         self._rank = 0
@@ -138,10 +171,25 @@ class VirtualAir:
         """From now on deliver even what cannot matter."""
         self._deliver_all = True
 
+    @property
+    def quiet_at(self) -> float:
+        """Nothing that was broadcast so far arrives later. On a channel, this is when its next event takes place."""
+        channel = self._channel
+        return self._quiet_at if channel is None or channel.next_s == NEVER else max(self._quiet_at, channel.next_s)
+
     def until(self, mission_s: float) -> Iterator[Happening]:
         """What comes up to and at `mission_s`, in order, with whatever comes of it meanwhile."""
         coming = self._coming
-        while coming and coming[0][0] <= mission_s:
+        while True:
+            channel = self._channel
+            while (
+                channel is not None and channel.next_s <= mission_s and not (coming and coming[0][0] <= channel.next_s)
+            ):
+                at = channel.next_s
+                for transmission, message in channel.advance():
+                    self._end(at, transmission, message)
+            if not coming or coming[0][0] > mission_s:
+                break
             happening = heappop(coming)
             self.place = happening
             yield happening
@@ -161,13 +209,16 @@ class VirtualAir:
     def inject(self, at: float, stray: StrayDatagram, numbers: Iterable[int]) -> None:
         """`stray` reaches the agents with these numbers at `at`."""
         self._rank += 1
-        self.quiet_at = max(self.quiet_at, at)
+        self._quiet_at = max(self._quiet_at, at)
         for number in numbers:
             heappush(self._coming, (at, self._rank, number, stray))
 
     def broadcast_stray(self, now: float, number: int, datagram: bytes) -> None:
         """The agent with this number sends what is no message of its own. No fate is about it."""
         stray = StrayDatagram(self._roster[number], datagram)
+        if self._channel is not None:
+            self._channel.send(now, number, stray, len(datagram))
+            return
         for receiver, delay in self._medium.draw(number, now, len(datagram)).to_all():
             self.inject(now + delay, stray, [receiver])
 
@@ -183,16 +234,19 @@ class VirtualAir:
     ) -> None:
         """The agent with this number sends `message`, in a datagram with so many bytes of data."""
         self._rank += 1
-        lots = self._medium.draw(number, now, data_bytes)
-        kind = type(message)
+        channel, kind = self._channel, type(message)
+        lots = self._medium.draw(number, now, data_bytes) if channel is None else _UNKNOWN
         flight = InFlight(
             self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots, datagram, sealed
         )
-        if now + lots.latest > self.quiet_at:
-            self.quiet_at = now + lots.latest
         answered = None if self._deliver_all else ANSWERED.get(kind)
         if answered is None and kind in ASKED and (self._topics or not self._deliver_all):
             self._ask(number, ASKED[kind](message, self._settings))
+        if channel is not None:
+            channel.send(now, number, flight, data_bytes)
+            return
+        if now + lots.latest > self._quiet_at:
+            self._quiet_at = now + lots.latest
         if self._script.listens and self._scripted(now, number, flight):
             return
         if answered is None:
@@ -208,6 +262,61 @@ class VirtualAir:
             at = now + delay
             if deliver_all or at >= busy_until[receiver]:
                 heappush(coming, (at, rank, receiver, flight))
+
+    # The channel, if there is one
+
+    def move(self, places: Mapping[int, Place], now: float) -> None:
+        """Put the vehicles at these places."""
+        if self._channel is not None:
+            self._channel.move([places[agent_id] for agent_id in self._roster], now)
+
+    def apply(self, conditions: NetworkConditions, now: float, *, clears_all: bool) -> None:
+        """Apply these conditions to later broadcasts. `clears_all` also ends the channel, with all its messages."""
+        if clears_all and self._channel is not None:
+            self._channel, self._medium.latency = None, LATENCY
+        self._medium.apply(conditions)
+        if self._channel is not None:
+            groups = conditions.groups(self._roster)
+            self._channel.tune(
+                [next(index for index, group in enumerate(groups) if agent_id in group) for agent_id in self._roster],
+                now,
+            )
+
+    def _end(self, at: float, transmission: Transmission, message: InFlight | StrayDatagram) -> None:
+        """Deliver a message whose frame ends. The conditions of the network apply to each copy that arrives."""
+        sender, received = transmission.sender, transmission.received
+        lots = self._medium.draw(sender, at, transmission.data_bytes)
+        if isinstance(message, StrayDatagram):
+            for receiver in numbers(received):
+                for delay in lots.copies_to(receiver):
+                    self.inject(at + delay, message, [receiver])
+            return
+        message.sent_at = transmission.began_at
+        if self._script.listens:
+            message.lots = _Copies([copy for copy in lots.to_all() if received >> copy[0] & 1])
+            if self._scripted(at, sender, message):
+                return
+        if message.rank - self._swept_at > SWEEP_EVERY:
+            self._sweep(message)
+        for receiver in self._concerned(received, message, at):
+            for delay in lots.copies_to(receiver):
+                self._arrive(message, receiver, at + delay)
+
+    def _concerned(self, received: int, flight: InFlight, at: float) -> Iterable[int]:
+        """Return the receivers to which the message can matter.
+
+        An agent that reconciles ignores questions. An answer that arrives at once matters only to the agents that ask
+        now. A paused agent may ask before it reads the answer.
+        """
+        if self._deliver_all or self._medium.latest > 0:
+            return numbers(received)
+        answered = ANSWERED.get(type(flight.message))
+        if answered is None:
+            busy_until = self.busy_until
+            return [receiver for receiver in numbers(received) if at >= busy_until[receiver]]
+        topic = self._topics.get(answered(flight.message))
+        asking = topic.askers | self.paused_at.keys() if topic else self.paused_at.keys()
+        return [receiver for receiver in sorted(asking) if received >> receiver & 1]
 
     # Answers, to whom they matter
 
@@ -271,7 +380,7 @@ class VirtualAir:
         """Keep an answer for those who ask, or will before it arrives."""
         topic = self._topics[question]
         topic.answer_count += 1
-        topic.quiet_at = self.quiet_at
+        topic.quiet_at = self._quiet_at
         flights = topic.answers.get(sender)
         if flights is None:
             topic.answers[sender] = [flight]
@@ -354,7 +463,7 @@ class VirtualAir:
             self._arrive(flight, receiver, max(at, would_arrive))
 
     def _arrive(self, flight: InFlight, receiver: int, at: float) -> None:
-        self.quiet_at = max(self.quiet_at, at)
+        self._quiet_at = max(self._quiet_at, at)
         heappush(self._coming, (at, flight.rank, receiver, flight))
 
     def unmatched_fates(self) -> list[str]:

@@ -97,6 +97,10 @@ class Simulation(Clockwork):
         self._reach = RadioRange(scenario)
         self._tracks = tracks_of(scenario)
         self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
+        self._all_rest_from_s = NEVER
+        """The time after which all places stay the same, if only a channel needs places."""
+        if self._channel and not (scenario.flight or scenario.gcs):
+            self._all_rest_from_s = max(track.course.rests_from_s for track in self._tracks.values())
         self._moves_at = NEVER
         self.lost_vehicles: set[int] = set()
         """Those that fly no more."""
@@ -139,7 +143,8 @@ class Simulation(Clockwork):
             self.run(mission_s)
             return
         while (self._now < mission_s or self._in_an_instant) and self._found is None:
-            furthest = min(mission_s, self._now + BREATH_S, self._moves_at)
+            breath_s = self._now + BREATH_S if self._breathe is not None else NEVER
+            furthest = min(mission_s, breath_s, self._moves_at)
             if self._pace is None:
                 self.run(furthest)
             else:
@@ -204,7 +209,7 @@ class Simulation(Clockwork):
         self._recorder.changed(record)
 
     def _put_into_force(self, change: NetworkChange, **more: Any) -> None:
-        self._medium.apply(change.conditions)
+        self._air.apply(change.conditions, self._now, clears_all=change.clears_all)
         self.network = change.detail
         record = change.to_json(round(self._now, 3))
         self.played.record(record)
@@ -216,9 +221,10 @@ class Simulation(Clockwork):
             return
         places = {vehicle: Place(*track.in_field(self._now)) for vehicle, track in self._tracks.items()}
         self._recorder.moved(self._now, places)
+        self._air.move(places, self._now)
         if change := self._reach.move(self._now, places):
             self._put_into_force(change)
-        self._moves_at = self._now + self._move_every_s
+        self._moves_at = self._now + self._move_every_s if self._now < self._all_rest_from_s else NEVER
 
     async def stop_events(self) -> None:
         self._generating = False
@@ -250,7 +256,7 @@ class Simulation(Clockwork):
         moving = bool(self._tracks) and self.scenario.network.radio and self.played.final_reconcile is None
         delays = self._medium.certain_delays()
         unknown = self._anybody_is_unknown or self._rogue is not None
-        if self._generating or moving or unknown or delays is None:
+        if self._generating or moving or unknown or delays is None or self._channel is not None:
             return None
         return Recurrence(delays)
 
@@ -342,9 +348,16 @@ class Simulation(Clockwork):
             self.played,
             mission_s=round(self._now, 3),
             network=network if last_s is None else disconnected_until(last_s, network),
+            channel=self._channel_to_json(),
             unmatched_fates=[*self._air.unmatched_fates(), *self._injected_nothing()],
             agents={str(agent_id): self._agent_to_json(number) for agent_id, number in self._number.items()},
         )
+
+    def _channel_to_json(self) -> dict[str, Any] | None:
+        asked = self.scenario.network.channel
+        if self._channel is None or asked is None:
+            return None
+        return {"model": asked.to_json(), **self._channel.totals.to_json()}
 
     def _injected_nothing(self) -> list[str]:
         return injected_nothing(self._injected, self._rogue.sent) if self._rogue is not None else []

@@ -1,0 +1,129 @@
+"""The messages of agents on a radio channel that they share, in virtual time.
+
+A message waits for the processing time of its agent, then in the queue of its radio. It arrives, if at all, when its
+frame ends. `ChannelTraffic` connects the messages with their frames, and counts what became of them.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from heapq import heappop, heappush
+from random import Random
+from typing import Any, Generic, TypeVar
+
+from netem.channel import Channel, Fate, Radio, Transmission, numbers
+from netem.radio import Place
+
+NEVER = float("inf")
+LOAD_S = 1.0
+"""Seconds of an interval of the load."""
+
+_WORD_BITS = 32
+
+
+Message = TypeVar("Message")
+
+
+class ChannelTraffic(Generic[Message]):
+    """The channel of `roster`, with its messages on the way."""
+
+    def __init__(self, roster: Sequence[int], radio: Radio, processing_s: float, seed: int) -> None:
+        self.next_s = NEVER
+        """When a message reaches its radio, or a frame begins or ends."""
+        self.totals = ChannelTotals(roster)
+        self._channel = Channel(roster, radio, seed)
+        self._processing_s = processing_s / (1 << _WORD_BITS)
+        self._draws = [Random(f"{seed}/processing/{agent_id}") for agent_id in roster]
+        self._processed: list[tuple[float, int, int, int, Message]] = []
+        self._processed_at = [0.0] * len(roster)
+        self._order = 0
+        self._queued: dict[int, Message] = {}
+        """Frame number -> message."""
+
+    def send(self, now: float, sender: int, message: Message, data_bytes: int) -> None:
+        """Process the message, and give it to the radio after this. The order of an agent's messages stays."""
+        at = now + self._draws[sender].getrandbits(_WORD_BITS) * self._processing_s
+        at = self._processed_at[sender] = max(at, self._processed_at[sender])
+        self._order += 1
+        heappush(self._processed, (at, self._order, sender, data_bytes, message))
+        if at < self.next_s:
+            self.next_s = at
+
+    def advance(self) -> list[tuple[Transmission, Message]]:
+        """Play what happens at `next_s`, and return the frames that end then."""
+        now, processed = self.next_s, self._processed
+        while processed and processed[0][0] <= now:
+            at, _, sender, data_bytes, message = heappop(processed)
+            number = self._channel.send(sender, at, data_bytes)
+            if isinstance(number, Fate):
+                self.totals.dropped(sender, number)
+            else:
+                self._queued[number] = message
+        ended = [(frame, self._queued.pop(frame.number)) for frame in self._channel.advance(now)]
+        for frame, _ in ended:
+            self.totals.ended(frame)
+        event = self._channel.next_event()
+        self.next_s = min(NEVER if event is None else event, processed[0][0] if processed else NEVER)
+        return ended
+
+    def move(self, places: Sequence[Place], now: float) -> None:
+        self._channel.move(places, now)
+
+    def tune(self, groups: Sequence[int], now: float) -> None:
+        self._channel.tune(groups, now)
+
+
+class ChannelTotals:
+    """Counts of frames, of their fates by receiver, and of the load over time."""
+
+    def __init__(self, roster: Sequence[int]) -> None:
+        self.frames = 0
+        self.airtime_s = 0.0
+        self._roster = roster
+        self._all = (1 << len(roster)) - 1
+        self._receivers: dict[Fate, list[int]] = {}
+        self._drops: dict[Fate, Counter[int]] = {}
+        self._load: list[float] = []
+        self._busy_until = 0.0
+
+    def ended(self, frame: Transmission) -> None:
+        began_at, ended_at = frame.began_at, frame.ended_at
+        self.frames += 1
+        self.airtime_s += ended_at - began_at
+        for fate, receivers in frame.lost().items() if frame.received | 1 << frame.sender != self._all else ():
+            counts = self._receivers.get(fate)
+            if counts is None:
+                counts = self._receivers[fate] = [0] * len(self._roster)
+            for receiver in numbers(receivers):
+                counts[receiver] += 1
+        began_at = max(began_at, self._busy_until)
+        if ended_at > began_at:
+            self._busy_until = ended_at
+            self._occupy(began_at, ended_at)
+
+    def dropped(self, sender: int, fate: Fate) -> None:
+        self._drops.setdefault(fate, Counter())[sender] += 1
+
+    def _occupy(self, began_at: float, ended_at: float) -> None:
+        """Add a time in which the channel is busy to the intervals of the load."""
+        while began_at < ended_at:
+            index = int(began_at / LOAD_S)
+            until = min(ended_at, (index + 1) * LOAD_S)
+            if len(self._load) <= index:
+                self._load.extend([0.0] * (index + 1 - len(self._load)))
+            self._load[index] += until - began_at
+            began_at = until
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the counts as run.json has them."""
+        lost = {fate.value: self._by_id(dict(enumerate(counts))) for fate, counts in sorted(self._receivers.items())}
+        return {
+            "frames": self.frames,
+            "airtime_s": round(self.airtime_s, 6),
+            "lost": lost,
+            "dropped": {fate.value: self._by_id(counts) for fate, counts in sorted(self._drops.items())},
+            "load_interval_s": LOAD_S,
+            "load": [round(busy_s / LOAD_S, 4) for busy_s in self._load],
+        }
+
+    def _by_id(self, counts: "dict[int, int] | Counter[int]") -> dict[str, int]:
+        return {str(self._roster[number]): count for number, count in sorted(counts.items()) if count}
