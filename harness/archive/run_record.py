@@ -169,6 +169,8 @@ class AgentRecord(_Model):
     """Number of starts with the data on its disk."""
     completed_before: list[str] = []
     """Hashes of the blocks that it completed in incarnations without an export, because it was killed."""
+    left_behind: list[str] = []
+    """Names of the processes that ran on after the end of the agent, and that the harness ended."""
     idle: bool | None = None
     reconciles: int | None = None
     chain_changed_at_s: float | None = None

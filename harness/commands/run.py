@@ -225,6 +225,13 @@ def _show_end(console: Console, finished: Run) -> None:
         complain(error)
     for sentence in finished.played.unmatched_fates:
         complain(f"{sentence}, so this run differs from its script")
+    for agent_id, agent in finished.record.agents.items():
+        if agent.left_behind:
+            names = ", ".join(agent.left_behind)
+            complain(
+                f"agent {agent_id} ended and left processes running ({names}), which the harness ended: an agent must "
+                "end all processes that it starts"
+            )
     captured = finished.played.capture or {}
     if lacks := gaps({vehicle: CapturedFrames.model_validate(frames) for vehicle, frames in captured.items()}):
         complain(f"{lacks}: choose a smaller --speedup")

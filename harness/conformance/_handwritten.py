@@ -47,7 +47,7 @@ async def _play(air: Air, case: ByHand) -> Case:
         return replace(named, verdict="failed", **said)  # type: ignore[arg-type]
     except (AgentEndedError, AgentRefusedError) as error:
         return replace(named, verdict="failed", reason=str(error), wrong=(str(error),))
-    except (AttributeError, KeyError, LookupError, TypeError, ValueError, OSError) as error:
+    except (AssertionError, AttributeError, KeyError, LookupError, TypeError, ValueError, OSError) as error:
         reason = f"its answer is not usable: {type(error).__name__}: {error}"
         return replace(named, verdict="failed", reason=reason, wrong=(reason,))
     return named

@@ -22,6 +22,7 @@ from harness.conformance._state_space import Variant
 from harness.conformance._subject import NO_KEYS, mission
 from harness.errors import HarnessError, MachineError, UnsupportedError
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
+from harness.play.child_processes import ChildProcesses
 from netem.errors import LabUnavailable, NetemError, SpawnError
 from netem.lab import Lab, LabProcess
 from ucp.features import UNSUPPORTED
@@ -213,13 +214,18 @@ class Ear:
 class Process:
     """An agent as a process, from its start to its end, with the files that it leaves."""
 
-    def __init__(self, air: Air, directory: Path, agent_id: int, process: LabProcess) -> None:
+    def __init__(
+        self, air: Air, directory: Path, agent_id: int, process: LabProcess, processes: ChildProcesses
+    ) -> None:
         self._air = air
         self.directory = directory
         self.agent_id = agent_id
         self.process = process
+        self.processes = processes
         self.control = AgentControl(directory / f"{agent_id}.control")
         self.output = directory / f"{agent_id}.out"
+        self.signalled = False
+        """The harness sent a signal, so the agent need not answer."""
 
     @classmethod
     async def start(cls, air: Air, directory: Path, mission: dict[str, Any] | bytes, agent_id: int) -> "Process":
@@ -228,19 +234,20 @@ class Process:
         text = mission if isinstance(mission, bytes) else json.dumps(mission).encode()
         (directory / name).write_bytes(text)
         output = directory / f"{agent_id}.out"
+        processes = ChildProcesses()
         try:
             process = await air.lab.spawn(
                 AGENTS,
                 [*air.command, name],
                 cwd=directory,
-                env=dict(os.environ),
+                env=processes.environment(os.environ),
                 stdout=output,
                 stderr=output,
                 role="agent",
             )
         except SpawnError as error:
             raise NoAgentError(str(error)) from None
-        return cls(air, directory, agent_id, process)
+        return cls(air, directory, agent_id, process, processes)
 
     async def ready(self) -> dict[str, Any]:
         """Its first status. Raises UnsupportedError, AgentEndedError."""
@@ -307,9 +314,20 @@ class Process:
             raise AgentEndedError("its export is not a JSON object")
         return document
 
+    async def send_signal(self, number: int) -> None:
+        self.signalled = True
+        await self.process.send_signal(number)
+
+    async def pause(self) -> None:
+        await self.send_signal(signal.SIGSTOP)
+
+    async def resume(self) -> None:
+        await self.process.resume()
+        self.signalled = False
+
     async def kill(self) -> None:
         self.control.close()
-        await self.process.send_signal(signal.SIGKILL)
+        await self.send_signal(signal.SIGKILL)
         await self.process.wait()
 
 

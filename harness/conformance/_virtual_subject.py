@@ -34,6 +34,7 @@ from harness.conformance._udp_lab import (
 )
 from harness.conformance._virtual_lines import given_line, virtual_mission
 from harness.errors import UnsupportedError
+from harness.play.child_processes import ChildProcesses
 from ucp.clock import MICROSECONDS
 
 ANSWER_BYTES = 4 * 1024 * 1024
@@ -46,12 +47,14 @@ class Program:
     def __init__(
         self,
         process: subprocess.Popen[bytes],
+        processes: ChildProcesses,
         given: asyncio.StreamWriter,
         reading: asyncio.ReadTransport,
         answers: asyncio.StreamReader,
         errors: Path,
     ) -> None:
         self._process = process
+        self._processes = processes
         self._given = given
         self._reading = reading
         self._answers = answers
@@ -63,6 +66,7 @@ class Program:
     async def start(cls, command: Sequence[str], errors: Path) -> "Program":
         """Not by asyncio's own subprocess_exec: where that is cancelled, it waits for ever for pipes nobody closes."""
         try:
+            processes = ChildProcesses()
             with errors.open("ab") as file:
                 process = subprocess.Popen(
                     [*command, "--virtual"],
@@ -71,17 +75,18 @@ class Program:
                     stdout=subprocess.PIPE,
                     stderr=file,
                     start_new_session=True,
+                    env=processes.environment(os.environ),
                 )
         except OSError as error:
             raise NoAgentError(f"the agent cannot be started: {error.strerror}") from None
         try:
-            return await cls._connected(process, errors)
+            return await cls._connected(process, processes, errors)
         except BaseException:
-            await _end(process)
+            await _end(process, processes)
             raise
 
     @classmethod
-    async def _connected(cls, process: subprocess.Popen[bytes], errors: Path) -> "Program":
+    async def _connected(cls, process: subprocess.Popen[bytes], processes: ChildProcesses, errors: Path) -> "Program":
         loop = asyncio.get_running_loop()
         answers = asyncio.StreamReader(ANSWER_BYTES)
         protocol = asyncio.StreamReaderProtocol(asyncio.StreamReader())  # which tells a writer when there is room
@@ -91,7 +96,7 @@ class Program:
         except BaseException:
             reading.close()
             raise
-        return cls(process, asyncio.StreamWriter(writing, protocol, None, loop), reading, answers, errors)
+        return cls(process, processes, asyncio.StreamWriter(writing, protocol, None, loop), reading, answers, errors)
 
     async def ask(self, line: dict[str, Any], limit_s: float = ANSWER_LIMIT_S) -> dict[str, Any]:
         """Its answer. Raises AgentEndedError, UnsupportedError."""
@@ -130,15 +135,16 @@ class Program:
         if not self._given.is_closing():
             self._given.transport.abort()
         self._reading.close()
-        await _end(self._process)
+        await _end(self._process, self._processes)
 
 
-async def _end(process: subprocess.Popen[bytes]) -> None:
+async def _end(process: subprocess.Popen[bytes], processes: ChildProcesses) -> None:
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     for pipe in filter(None, (process.stdin, process.stdout)):
         pipe.close()
     await _ended(process)
+    processes.end()
 
 
 async def _ended(process: subprocess.Popen[bytes]) -> None:

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequenc
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from harness.conformance._reference_model import AGENT, EVENT_ID, INITIAL_DATA
 from harness.conformance._state_space import VARIANTS
@@ -23,6 +23,9 @@ PATIENCE_S = 3.0
 CALM_S = 0.25
 """So long for what must not come."""
 INCEPTION = InceptionBlock(INITIAL_DATA).chain_hash
+
+
+Heard = TypeVar("Heard", bound=Message)
 
 
 class WrongError(Exception):
@@ -101,6 +104,14 @@ class Alone:
         must(len(heard) == count, what, f"{len(heard)} messages: {_names(heard)}")
         return heard
 
+    async def hear_one(self, kind: type[Heard], after: str) -> Heard:
+        """Return the next message. Raises WrongError if there is none, or one of another type."""
+        what = f"a {kind.NAME} after {after}"
+        (heard,) = await self.hear(1, what)
+        if not isinstance(heard, kind):
+            raise WrongError(what, f"came {heard.NAME}")
+        return heard
+
     async def hear_nothing(self, why: str, for_s: float = CALM_S) -> None:
         await asyncio.sleep(for_s)
         heard = [_message(data) for _, data in self.ear.take()]
@@ -148,7 +159,7 @@ class Bench:
             try:
                 yield alone
             except WrongError:
-                if alone.process.process.returncode is None:
+                if not alone.process.signalled and alone.process.process.returncode is None:
                     await alone.process.check_answers()
                 raise
 

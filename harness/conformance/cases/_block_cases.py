@@ -58,9 +58,9 @@ async def _stopped(bench: Bench) -> None:
     async with bench.agent() as agent:
         await agent.log(b"event")
         await agent.hear(1, "a Block Add Request")
-        await agent.process.process.pause()
+        await agent.process.pause()
         await agent.hear_nothing("while it is stopped", 25.0 / SPEEDUP)
-        await agent.process.process.resume()
+        await agent.process.resume()
         (committed,) = await agent.hear(1, "a Commit Block when it goes on")
         must(isinstance(committed, CommitBlock), "a Commit Block when it goes on", committed.NAME)
         await agent.hear_nothing("after that")

@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+from collections import Counter
 from random import Random
 
 from harness.conformance._reference_model import PEERS, STRANGER
@@ -35,6 +36,8 @@ async def _malformed(bench: Bench) -> None:
             (heard,) = await agent.hear(1, f"an answer after a datagram that is {what}")
             must(heard.NAME == "Chain Contain Response", f"nothing comes of a datagram that is {what}", heard.NAME)
         after = await agent.status()
+        reasons = Counter(filter(None, (drop_vectors.dropped(data) for _, data in drop_vectors.cases())))
+        must(after.get("dropped", reasons) == reasons, f"`dropped` {dict(reasons)}", after.get("dropped"))
         must(after["chain"] == before["chain"], "the chain stays as it was", f"{after['chain']} blocks")
 
 

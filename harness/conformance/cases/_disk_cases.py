@@ -41,7 +41,7 @@ async def _no_export(bench: Bench) -> None:
             must(False, "`ok` false to export", "`ok` true")
         except AgentRefusedError:
             pass
-        await agent.process.process.send_signal(signal.SIGTERM)
+        await agent.process.send_signal(signal.SIGTERM)
         returned = await agent.end()
         must(returned == 1, "exit status 1", f"status {returned}")
 

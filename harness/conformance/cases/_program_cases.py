@@ -4,20 +4,35 @@ import asyncio
 import json
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from harness.conformance._reference_model import PEERS
 from harness.conformance._state_space import VARIANTS
 from harness.conformance._subject import NO_KEYS
 from harness.conformance._udp_lab import last_line
-from harness.conformance.cases._bench import INCEPTION, PATIENCE_S, SPEEDUP, Alone, Bench, WrongError, case, must
+from harness.conformance.cases._bench import (
+    INCEPTION,
+    PATIENCE_S,
+    SPEEDUP,
+    Alone,
+    Bench,
+    CannotTellError,
+    WrongError,
+    case,
+    must,
+)
 from harness.play.agent_control import AgentRefusedError
+from ucp.block import Block, next_chain_hash
 from ucp.features import UNSUPPORTED
-from ucp.messages import ChainContainQuery
+from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
 
 WRONG_MISSION = 2
+NO_EXPIRY = {**VARIANTS["default"].settings.told(), "vote_timeout_s": 10_000.0}
+"""Settings with which no vote ends during a case."""
+INPUTS = 50
 
 
 async def _refused(agent: Alone, command: str, why: str, **arguments: Any) -> None:
@@ -66,11 +81,12 @@ async def _ahead(bench: Bench) -> None:
 
 
 async def _ends(bench: Bench, number: int) -> None:
-    async with bench.agent() as agent:
+    async with bench.agent({"settings": NO_EXPIRY}) as agent:
         await agent.log(b"event")
-        await agent.hear(1, "a Block Add Request")
-        await agent.process.process.send_signal(number)
+        await agent.hear_one(BlockAddRequest, "an event that fills a block")
+        await agent.process.send_signal(number)
         returned = await agent.end()
+        await agent.hear_nothing("after its end")
         must(returned == 0, "exit status 0", f"status {returned}")
         path = agent.process.directory / f"{agent.agent_id}.chain.json"
         must(path.exists(), "a chain export", "none")
@@ -78,6 +94,9 @@ async def _ends(bench: Bench, number: int) -> None:
         must(len(export["completed"]) == 1, "one completed block in the export", len(export["completed"]))
         socket = agent.process.directory / f"{agent.agent_id}.control"
         must(not socket.exists(), "no control socket any more", "it is there")
+        own = {f"{agent.agent_id}.{each}" for each in ("mission.json", "chain.json", "trace.jsonl", "log", "out")}
+        others = sorted({file.name for file in agent.process.directory.iterdir()} - own)
+        must(not others, "only the files that the contract lists", ", ".join(others))
 
 
 @case("SIGTERM exports the chain, exit status 0", "contract, The program")
@@ -88,6 +107,52 @@ async def _sigterm(bench: Bench) -> None:
 @case("SIGINT exports the chain, exit status 0", "contract, The program")
 async def _sigint(bench: Bench) -> None:
     await _ends(bench, signal.SIGINT)
+
+
+async def _processes(agent: Alone) -> list[int]:
+    """The processes of the agent. Raises CannotTellError if they are not visible."""
+    pids = await asyncio.to_thread(agent.process.processes.pids)
+    if not pids:
+        raise CannotTellError("the processes of the agent are not visible here")
+    return pids
+
+
+@case("a chain export replaces the earlier one in one step", "contract, The program")
+async def _whole_export(bench: Bench) -> None:
+    async with bench.agent() as agent:
+        await agent.process.export()
+        with (agent.process.directory / f"{agent.agent_id}.chain.json").open() as earlier:
+            await agent.process.export()
+            must(os.fstat(earlier.fileno()).st_nlink == 0, "a new file with the name of the earlier export", "the same")
+
+
+@case("the agent leaves no process running at its end", "contract, The program")
+async def _children(bench: Bench) -> None:
+    async with bench.agent() as agent:
+        await _processes(agent)
+        await agent.process.send_signal(signal.SIGTERM)
+        await agent.end()
+        left = await asyncio.to_thread(agent.process.processes.end_left_behind)
+        must(not left, "no process that runs after the end of the agent", ", ".join(left))
+
+
+@case("inputs and clients leave no descriptors open", "contract, The program")
+async def _descriptors(bench: Bench) -> None:
+    async with bench.agent() as agent:
+        before = _open_descriptors(await _processes(agent))
+        for _ in range(INPUTS):
+            agent.say(PEERS[0], ChainContainQuery(INCEPTION))
+            await agent.hear(1, "an answer to each Chain Contain Query")
+            await _lines(agent, b'{"command": "status"}')
+        opened = _open_descriptors(await _processes(agent)) - before
+        must(opened < INPUTS // 2, f"as many open descriptors after {INPUTS} messages and clients", f"{opened} more")
+
+
+def _open_descriptors(pids: Iterable[int]) -> int:
+    try:
+        return sum(len(list(Path(f"/proc/{pid}/fd").iterdir())) for pid in pids)
+    except OSError:
+        raise CannotTellError("the descriptors of the agent are not visible here") from None
 
 
 async def _ends_with(
@@ -132,6 +197,16 @@ async def _feature(bench: Bench) -> None:
     await _ends_with(bench, UNSUPPORTED, "an unknown feature", {"features": ["an unknown feature"]})
 
 
+@case("an agent makes a requested mistake, or refuses the mission with status 127", "contract, Quirks")
+async def _quirk(bench: Bench) -> None:
+    keys = {"features": ["quirks"], "quirks": {"ignore_commit": 1.0}}
+    async with bench.agent(keys) as agent:
+        block = Block(PEERS[0], 1, b"block")
+        agent.say(PEERS[0], CommitBlock(block, next_chain_hash(INCEPTION, block.block_hash)))
+        await agent.answers_only(INCEPTION, "a Commit Block, which the mission requests it to ignore")
+        must((await agent.status())["chain"] == 0, "an empty chain, as `ignore_commit` 1 requests", "a block")
+
+
 @case("unknown keys of the mission file are ignored", "contract, The mission file")
 async def _unknown_keys(bench: Bench) -> None:
     async with bench.agent({"something": {"else": [1, 2, 3]}}) as agent:
@@ -153,7 +228,7 @@ async def _port(bench: Bench) -> None:
 
 
 async def _lines(agent: Alone, *requests: bytes) -> list[Any]:
-    """Answers to raw lines, on one connection."""
+    """Return the answers to raw lines, which arrive together on one connection."""
     directory = os.open(agent.process.directory, os.O_PATH)
     try:
         path = f"/proc/self/fd/{directory}/{agent.agent_id}.control"
@@ -162,9 +237,9 @@ async def _lines(agent: Alone, *requests: bytes) -> list[Any]:
         os.close(directory)
     try:
         answers = []
-        for request in requests:
-            writer.write(request + b"\n")
-            await writer.drain()
+        writer.write(b"".join(request + b"\n" for request in requests))
+        await writer.drain()
+        for _ in requests:
             text = await asyncio.wait_for(reader.readline(), PATIENCE_S)
             answers.append(json.loads(text) if text else None)
         return answers

@@ -20,6 +20,7 @@ from ucp.clock import MICROSECONDS
 from ucp.messages import (
     BlockAddRequest,
     BlockAddResponse,
+    BlockResponse,
     ChainContainQuery,
     ChainContainResponse,
     CommitBlock,
@@ -65,21 +66,17 @@ async def _played(bench: Bench) -> _Records:
         agent.ear.say(b"UC")
         agent.say(STRANGER, ChainContainQuery(top))
         agent.say(second, RequestForBlock(block.block_hash))
-        await agent.hear(1, "a Block Response")
+        await agent.hear_one(BlockResponse, "a Request for Block")
         for _ in range(EVENTS_OF_A_BLOCK):
             await agent.log(LARGEST_EVENT)
-        (proposed,) = await agent.hear(1, "a Block Add Request")
-        assert isinstance(proposed, BlockAddRequest)
+        proposed = await agent.hear_one(BlockAddRequest, "events that fill a block")
         agent.say(first, BlockAddResponse(proposed.block_hash, True))
-        (committed,) = await agent.hear(1, "a Commit Block after an approved vote")
-        must(isinstance(committed, CommitBlock), "a Commit Block after an approved vote", committed.NAME)
+        await agent.hear_one(CommitBlock, "an approved vote")
         await agent.process.ask("reconcile")
-        (asked,) = await agent.hear(1, "a Chain Contain Query")
-        assert isinstance(asked, ChainContainQuery)
+        asked = await agent.hear_one(ChainContainQuery, "the command reconcile")
         agent.say(first, ChainContainResponse(asked.chain_hash, False))
-        await agent.hear(1, "a Chain Contain Query about the chain below")
-        (back,) = await agent.hear(1, "a Commit Block of the popped block")
-        must(back.NAME == "Commit Block", "a Commit Block of the popped block", back.NAME)
+        await agent.hear_one(ChainContainQuery, "an agent disagrees")
+        await agent.hear_one(CommitBlock, "a reconcile without further answers")
         await agent.log(b"event of the next block")
         await agent.process.ask("stop_events")
         before_s = agent.mission_s()

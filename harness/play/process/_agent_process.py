@@ -12,7 +12,7 @@ import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from harness.play.agent_control import (
     located,
     of_a_shell,
 )
+from harness.play.child_processes import ChildProcesses
 from harness.play.process._run_lab import MissionLab, Program
 from harness.play.process.agent_mission import mission_file
 from harness.scenario import Scenario
@@ -66,6 +67,7 @@ class _Incarnation:
 
     directory: Path
     store: Path
+    processes: ChildProcesses = field(default_factory=ChildProcesses)
     status: Status | None = None
     between_s: tuple[float, float] = (0.0, 0.0)
     """When it told its status, in mission seconds."""
@@ -106,6 +108,7 @@ class AgentProcess:
         self._being_asked = asyncio.Lock()
         """Nobody stops or kills it while it is asked for its status."""
         self._completed_before: list[str] = []
+        self._left_behind: list[str] = []
 
     @property
     def lives(self) -> int:
@@ -162,7 +165,7 @@ class AgentProcess:
                 self.agent_id,
                 [*self._command, path.name],
                 cwd=life.directory,
-                env=dict(os.environ),
+                env=life.processes.environment(os.environ),
                 stdout=output,
                 stderr=output,
                 role="agent",
@@ -215,6 +218,7 @@ class AgentProcess:
             self._lives[-1].killed = not disk_kept
             await self._process.send_signal(signal.SIGKILL)
             await self._process.wait()
+            await self._end_children()
             self._control_path.unlink(missing_ok=True)
 
     async def switch_off(self) -> None:
@@ -227,6 +231,7 @@ class AgentProcess:
             self._control.close()
             status = await self._process.terminate(STOP_GRACE_S)
             self._lives[-1].switched_off = True
+            self._left_behind += await self._end_children()
             if status != 0:
                 raise self._failed("not exported", f"was switched off (SIGTERM) and ended with {self._process.end}")
             self.outcome, self.detail = "exported", f"switched off at {at_s:.1f} s"
@@ -331,6 +336,12 @@ class AgentProcess:
                 await self._process.wait()
             else:
                 await self._process.terminate(STOP_GRACE_S)
+        left = await self._end_children()
+        if self._process.returncode != -signal.SIGKILL:  # no agent ends its children after SIGKILL
+            self._left_behind += left
+
+    async def _end_children(self) -> list[str]:
+        return await asyncio.to_thread(self._lives[-1].processes.end_left_behind)
 
     def put_together(self) -> None:
         """Put what all lives have left where that of one life would be: for the checker. Raises OSError.
@@ -356,6 +367,7 @@ class AgentProcess:
             "restarts": sum(not life.reboot for life in lives[1:]),
             "reboots": sum(life.reboot for life in lives),
             "completed_before": list(dict.fromkeys(self._completed_before)),
+            "left_behind": self._left_behind,
         }
         statuses = [life.status for life in lives if life.status is not None]
         if not statuses:

@@ -115,6 +115,8 @@ class VirtualTime(Backend):
                 await _compare_again(simulation, breathe)
             for agent_id, problem in files.problems().items():
                 simulation.played.agents[str(agent_id)]["trace_problem"] = problem
+            for agent_id, names in programs.close().items() if programs else ():
+                simulation.played.agents[str(agent_id)]["left_behind"] = names
 
 
 def _of_real_vehicles(scenario: Scenario) -> list[str]:

@@ -78,7 +78,7 @@ async def _late(place: Path) -> tuple[Seen | None, bool, Seen | None]:
         subject = await OverUdp.start(air, VARIANTS["default"], BESIDE_OTHERS)
         try:
             assert await subject.step(INPUTS[LOG]) is not None
-            await subject.process.process.pause()
+            await subject.process.pause()
             resuming = asyncio.get_running_loop().create_task(_resume(subject, 0.7))
             late = await subject.step(INPUTS["Block Add Request on an unknown chain"])
             await resuming
@@ -89,7 +89,7 @@ async def _late(place: Path) -> tuple[Seen | None, bool, Seen | None]:
 
 async def _resume(subject: OverUdp, after_s: float) -> None:
     await asyncio.sleep(after_s)
-    await subject.process.process.resume()
+    await subject.process.resume()
 
 
 def test_of_a_late_machine_nothing_is_said_and_the_agent_is_followed(tmp_path: Path) -> None:

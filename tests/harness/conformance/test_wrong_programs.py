@@ -46,6 +46,17 @@ def test_records_of_reference_pass(case: str, tmp_path: Path) -> None:
         ("leaves_settings_out_of_header", HEADER, "other values of vote_timeout_s"),
         ("stamps_block_with_first_event", STEPS, "Algorithm 1, build_data_block"),
         ("exports_no_completed_blocks", AGREE, "the completed blocks of the trace"),
+        ("leaves_children", "the agent leaves no process running at its end", "came sleep"),
+        ("leaks_descriptors", "inputs and clients leave no descriptors open", "came 50 more"),
+        ("writes_export_in_place", "a chain export replaces the earlier one in one step", "came the same"),
+        ("leaves_other_files", "SIGTERM exports the chain, exit status 0", "came scratch.tmp"),
+        ("sends_after_sigterm", "SIGINT exports the chain, exit status 0", "came Chain Contain Query"),
+        ("receives_only_1500_bytes", "malformed datagrams are dropped and change nothing", "expected `dropped`"),
+        (
+            "ignores_requested_quirks",
+            "an agent makes a requested mistake, or refuses the mission with status 127",
+            "as `ignore_commit` 1 requests",
+        ),
         ("exports_at_wrong_time", AGREE, "`exported_at_us` at mission second"),
     ],
 )

@@ -24,6 +24,7 @@ from typing import IO
 
 from harness.archive.exports import MAX_EXPORT_BYTES
 from harness.play.agent_control import LOOKED_AT_BYTES, last_words, last_words_in
+from harness.play.child_processes import ChildProcesses
 from harness.play.simulation.foreign._answer import Outcome
 
 START_LIMIT_S = 30.0
@@ -59,6 +60,9 @@ class Program:
         self.owes_an_answer = False
         self._answered = False
         self._said = b""
+        self._processes = ChildProcesses()
+        self.left_behind: list[str] = []
+        """Names of the processes that ran on after its end."""
         self._errors: IO[bytes] = log.open("ab") if log is not None else _passing_file()
         try:
             self._process = subprocess.Popen(
@@ -68,6 +72,7 @@ class Program:
                 stderr=self._errors,
                 bufsize=0,
                 cwd=tempfile.gettempdir(),
+                env=self._processes.environment(os.environ),
                 process_group=0,
                 preexec_fn=_die_with_parent,
             )
@@ -204,6 +209,9 @@ class Program:
             with suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)  # a script, and what it has started
             self._process.wait()
+            self._processes.end_left_behind()
+        else:
+            self.left_behind = self._processes.end_left_behind()
         self.let_go()
 
     def close(self) -> None:
@@ -280,8 +288,8 @@ class Programs:
             if len(self._idle) > MAX_IDLE:
                 self._idle.pop(0).close()
 
-    def close(self) -> None:
-        """End all of them."""
+    def close(self) -> dict[int, list[str]]:
+        """End all of them. Return the names of processes that they left behind, by agent, if they have logs."""
         programs = [*self._taken, *self._idle]
         self._taken.clear()
         self._idle.clear()
@@ -290,6 +298,7 @@ class Programs:
         deadline = time.monotonic() + GRACE_S
         for program in programs:
             program.end(max(0.0, deadline - time.monotonic()))
+        return {int(each.log.stem): each.left_behind for each in programs if each.log is not None and each.left_behind}
 
     def forget(self) -> None:
         """They are another process's."""

@@ -1,0 +1,78 @@
+"""Processes that an agent starts, and may leave behind at its end.
+
+The harness puts a random mark into the environment of each agent, and a child inherits the environment. A process that
+has the mark after the end of its agent was left behind. The harness ends it. The mark also finds children that left
+the session of the agent. A child that cleared its environment is not found. It ends with the lab or the container.
+"""
+
+import os
+import secrets
+import signal
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+NAME = "UCP_HARNESS_AGENT"
+GRACE_S = 0.5
+"""Wall seconds in which a child may end after its agent."""
+LOOK_AGAIN_S = 0.02
+MAX_ROUNDS = 20
+"""Number of times that children are ended, because they may start others meanwhile."""
+
+
+class ChildProcesses:
+    """The processes of one agent and its children."""
+
+    def __init__(self) -> None:
+        self._mark = f"{NAME}={secrets.token_hex(16)}".encode()
+
+    def environment(self, inherited: Mapping[str, str]) -> dict[str, str]:
+        """Return the environment of the agent."""
+        name, _, value = self._mark.decode().partition("=")
+        return {**inherited, name: value}
+
+    def pids(self) -> list[int]:
+        """Return the processes that run, as this process sees them. A process that has ended is not among them."""
+        return [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit() and self._has_mark(entry)]
+
+    def _has_mark(self, entry: Path) -> bool:
+        try:
+            return self._mark in (entry / "environ").read_bytes().split(b"\0")
+        except OSError:  # the process has ended, or belongs to another user
+            return False
+
+    def end_left_behind(self) -> list[str]:
+        """End the processes that remain after the end of the agent, and return their names."""
+        deadline = time.monotonic() + GRACE_S
+        while (left := self.pids()) and time.monotonic() < deadline:
+            time.sleep(LOOK_AGAIN_S)
+        names = sorted(filter(None, map(_name, left)))
+        self.end()
+        return names
+
+    def end(self) -> None:
+        """End all of these processes at once."""
+        for _ in range(MAX_ROUNDS):
+            pids = self.pids()
+            for pid in pids:
+                self._kill(pid)
+            if not pids:
+                return
+
+    def _kill(self, pid: int) -> None:
+        """Kill the process, unless another process has this number by now."""
+        with suppress(OSError):
+            descriptor = os.pidfd_open(pid)
+            try:
+                if self._has_mark(Path("/proc") / str(pid)):
+                    signal.pidfd_send_signal(descriptor, signal.SIGKILL)
+            finally:
+                os.close(descriptor)
+
+
+def _name(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/comm").read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""

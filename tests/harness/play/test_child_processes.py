@@ -1,0 +1,42 @@
+"""Processes that an agent leaves running at its end."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from harness.play.child_processes import ChildProcesses
+from tests.harness.command import harness, write_scenario
+from tests.harness.conformance import wrong_programs
+
+AGENT = f"2={sys.executable} -P -m {wrong_programs.__name__} leaves_children"
+
+
+def test_children_outside_the_session_are_ended() -> None:
+    processes = ChildProcesses()
+    script = "setsid sleep 1000 & setsid sh -c 'sleep 1000 & wait' &"
+    subprocess.run(["sh", "-c", script], env=processes.environment(os.environ), check=True)
+    assert processes.end_left_behind() == ["sh", "sleep", "sleep"]
+    assert not processes.pids()
+
+
+def test_processes_of_another_agent_are_spared() -> None:
+    processes, others = ChildProcesses(), ChildProcesses()
+    with subprocess.Popen(["sleep", "1000"], env=others.environment(os.environ)) as child:
+        assert not processes.end_left_behind()
+        assert child.poll() is None
+        others.end()
+
+
+@pytest.mark.parametrize("backend", [pytest.param("process", marks=pytest.mark.lab), "sim"])
+def test_run_ends_and_reports_what_an_agent_leaves_behind(backend: str, tmp_path: Path) -> None:
+    scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, events={"source": "scripted"}, duration_s=50)
+    out = tmp_path / "run"
+    done = harness("run", scenario, "--backend", backend, "--ucp-agent", AGENT, "--seed", "1", "--out", out)
+    assert done.returncode == 0, done.stderr
+    agents = json.loads((out / "run.json").read_text())["agents"]
+    assert [agents[agent_id]["left_behind"] for agent_id in "123"] == [[], ["sleep"], []]
+    assert "agent 2 ended and left processes running (sleep)" in " ".join(done.stderr.split())
