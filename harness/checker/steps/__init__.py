@@ -15,10 +15,9 @@ from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.recorded_inputs import Blocks, decoded
 from harness.checker.records import cross_examine
-from harness.checker.records.contradiction import in_virtual_time
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
-from harness.checker.steps._late_timers import late_timers
+from harness.checker.steps._late_timers import JudgedTimers
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, Tells
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, UnknownSettingError, checked
@@ -32,6 +31,7 @@ def check(evidence: Evidence) -> Judgement:
     """`deviates` at the first step that differs; `not applicable` where not every step of every agent can be judged."""
     blocks = Blocks(block for export in evidence.exports.values() for block in export.blocks())
     deviations: list[Deviation] = []
+    timers = JudgedTimers()
     steps, unjudged, lost = 0, dict[int, str](), list[str]()
     for agent_id, trace in evidence.traces.items():
         if not trace.header.has_inputs:
@@ -48,7 +48,7 @@ def check(evidence: Evidence) -> Judgement:
         followers = _followers(evidence, trace, header, blocks)
         _follow(evidence, agent_id, trace, followers)
         deviations += [deviation for follower in followers for deviation in follower.deviations]
-        deviations += late_timers(evidence, trace, [expiry for follower in followers for expiry in follower.expiries])
+        deviations += timers.judge(evidence, trace, [expiry for follower in followers for expiry in follower.expiries])
         for line, aside in trace.numbered_asides():
             if (deviation := wrongly_dropped(header, line, aside)) is not None:
                 deviations.append(deviation)
@@ -65,15 +65,7 @@ def check(evidence: Evidence) -> Judgement:
     }
     if unjudged or not evidence.traces:
         return Judgement(NAME, "not applicable", _why(unjudged))
-    return Judgement(
-        NAME, "as specified", f"{steps} handler runs, each following Algorithms 1 to 20{_of_timers(evidence)}"
-    )
-
-
-def _of_timers(evidence: Evidence) -> str:
-    if evidence.lag is not None or all(in_virtual_time(trace) for trace in evidence.traces.values()):
-        return ""
-    return "; the lag of the machine is not recorded, so timers that are up to 1 s of wall time late are not judged"
+    return Judgement(NAME, "as specified", f"{steps} handler runs, each following Algorithms 1 to 20{timers.remark}")
 
 
 def _why(unjudged: dict[int, str]) -> str:

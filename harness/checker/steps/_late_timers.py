@@ -7,10 +7,12 @@ error. A wrong duration makes all timers of a kind late. The mean over the run t
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from statistics import mean
 
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
+from harness.checker.records.contradiction import in_virtual_time
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Expiry
 
@@ -22,33 +24,56 @@ ENOUGH = 8
 """Minimum number of timers for a mean."""
 
 
-def late_timers(evidence: Evidence, trace: Trace, expiries: Sequence[Expiry]) -> Iterator[Deviation]:
-    """Yield the timers of an agent that the measured lag does not explain."""
-    lag, speedup = evidence.lag, trace.header.clock.get("speedup")
-    if lag is None or not isinstance(speedup, int | float) or speedup <= 0:
+@dataclass
+class JudgedTimers:
+    """The expiries of all agents: their number, and the number of those for which no lag was measured."""
+
+    expiries: int = 0
+    unmeasured: int = 0
+
+    @property
+    def remark(self) -> str:
+        """The limit of the judgement, for its reason. Empty if each timer was compared with the measured lag."""
+        if not self.unmeasured:
+            return ""
+        which = "timers" if self.unmeasured == self.expiries else f"{self.unmeasured} of {self.expiries} timers"
+        return f"; the lag of the machine is not recorded for {which}, so they may be up to 1 s of wall time late"
+
+    def judge(self, evidence: Evidence, trace: Trace, expiries: Sequence[Expiry]) -> Iterator[Deviation]:
+        """Yield the timers of an agent that the measured lag does not explain."""
+        speedup = trace.header.clock.get("speedup")
+        if in_virtual_time(trace) or not isinstance(speedup, int | float) or speedup <= 0:
+            return
+        agent_id = trace.header.agent_id
+        explained: dict[str, list[tuple[Expiry, float]]] = defaultdict(list)
+        for expiry in expiries:
+            due_s = expiry.t - max(0.0, expiry.late_s)
+            lag_s = evidence.lag.explains(agent_id, due_s, expiry.t) if evidence.lag else None
+            self.expiries += 1
+            if lag_s is None:
+                self.unmeasured += 1
+            elif not evidence.was_paused(agent_id, due_s, expiry.t):
+                explained[expiry.timer].append((expiry, lag_s * speedup))
+        for timer, of_kind in explained.items():
+            yield from _of_kind(agent_id, timer, of_kind, speedup)
+
+
+def _of_kind(agent_id: int, timer: str, expiries: list[tuple[Expiry, float]], speedup: float) -> Iterator[Deviation]:
+    """Yield each timer that is too late by itself; otherwise the last one, if all are too late on average."""
+    late = [(expiry, lag_s) for expiry, lag_s in expiries if expiry.late_s > lag_s + SINGLE_WALL_S * speedup]
+    for expiry, lag_s in late:
+        what = (
+            f"it ran {expiry.late_s:.3g} s after the {timer} timer expired, but the measured lag explains only "
+            f"{lag_s:.2g} s"
+        )
+        yield Deviation(agent_id, expiry.line, expiry.t, expiry.handler, what)
+    if late or len(expiries) < ENOUGH:
         return
-    agent_id = trace.header.agent_id
-    explained: dict[str, list[tuple[Expiry, float]]] = defaultdict(list)
-    for expiry in expiries:
-        due_s = expiry.t - max(0.0, expiry.late_s)
-        lag_s = lag.explains(agent_id, due_s, expiry.t)
-        if lag_s is not None and not evidence.was_paused(agent_id, due_s, expiry.t):
-            explained[expiry.timer].append((expiry, lag_s * speedup))
-    for timer, of_kind in explained.items():
-        late = [(expiry, lag_s) for expiry, lag_s in of_kind if expiry.late_s > lag_s + SINGLE_WALL_S * speedup]
-        for expiry, lag_s in late:
-            what = (
-                f"it ran {expiry.late_s:.3g} s after the {timer} timer expired, but the measured lag explains only "
-                f"{lag_s:.2g} s"
-            )
-            yield Deviation(agent_id, expiry.line, expiry.t, expiry.handler, what)
-        if late or len(of_kind) < ENOUGH:
-            continue
-        late_s, lag_s = mean(expiry.late_s for expiry, _ in of_kind), mean(lag_s for _, lag_s in of_kind)
-        if late_s > lag_s + MEAN_WALL_S * speedup:
-            last, _ = of_kind[-1]
-            what = (
-                f"{len(of_kind)} {timer} timers ran {late_s:.3g} s after they expired on average, but the measured lag "
-                f"explains only {lag_s:.2g} s"
-            )
-            yield Deviation(agent_id, last.line, last.t, last.handler, what)
+    late_s, lag_s = mean(expiry.late_s for expiry, _ in expiries), mean(lag_s for _, lag_s in expiries)
+    if late_s > lag_s + MEAN_WALL_S * speedup:
+        last, _ = expiries[-1]
+        what = (
+            f"{len(expiries)} {timer} timers ran {late_s:.3g} s after they expired on average, but the measured lag "
+            f"explains only {lag_s:.2g} s"
+        )
+        yield Deviation(agent_id, last.line, last.t, last.handler, what)

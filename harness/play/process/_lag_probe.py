@@ -85,17 +85,19 @@ def _busy_ns(thread: str) -> int:
     return int(ran) + int(waited)
 
 
-def measure(file: TextIO, started: float, speedup: float, counters: Counters) -> None:
-    """Write a line for each slice. `started` is the monotonic time of mission second 0."""
+def measure(file: TextIO, started: float, speedup: float, counters: Counters, ended: threading.Event) -> None:
+    """Write a line for each slice until `ended`. `started` is the monotonic time of mission second 0."""
     slice_s = min(MAX_SLICE_S, max(MIN_SLICE_S, SLICE_MISSION_S / speedup))
     began = awake = time.monotonic()
     late = 0.0
     counters.busy()
-    while True:
+    ending = False
+    while not ending:
+        ending = ended.is_set()
         time.sleep(BEAT_S)
         before, awake = awake, time.monotonic()
         late = max(late, awake - before - BEAT_S)
-        if awake - began < slice_s:
+        if awake - began < slice_s and not ending:
             continue
         line = {
             "from_s": round((began - started) * speedup, 3),
@@ -114,9 +116,12 @@ def main(path: str) -> None:
     started = time.monotonic() - (time.time() - asked["epoch_us"] / MICROSECONDS)
     counters = Counters({int(inode): agent for inode, agent in asked["networks"].items()})
     with Path(path).open("a", encoding="ascii") as file:
-        arguments = (file, started, asked["speedup"], counters)
-        threading.Thread(target=measure, args=arguments, daemon=True).start()
+        ended = threading.Event()
+        measuring = threading.Thread(target=measure, args=(file, started, asked["speedup"], counters, ended))
+        measuring.start()
         sys.stdin.read()
+        ended.set()
+        measuring.join()
 
 
 if __name__ == "__main__":
