@@ -21,7 +21,8 @@ from harness.checker.evidence import Evidence, gather
 from harness.checker.judgement import Judgement
 from harness.checker.records import cross_examine
 from harness.checker.records._doubt import in_doubt
-from harness.scenario.verdict_names import JUDGED
+from harness.errors import INCOMPLETE, VIOLATED
+from harness.scenario.verdict_names import JUDGED, UNFINISHED
 
 CHECKS = {
     "1": _distributed.check,
@@ -63,8 +64,18 @@ class Result:
 
     @property
     def bad(self) -> tuple[str, ...]:
-        """Numbers and keys of the bad judgements. If there is one, the exit status is 1."""
+        """Numbers and keys of the bad judgements."""
         return tuple(key for key, judgement in self.judgements.items() if judgement.kind == "bad")
+
+    @property
+    def wrong(self) -> tuple[str, ...]:
+        """Numbers and keys of the bad judgements, without a swarm that may only need more time."""
+        return tuple(key for key in self.bad if self.judgements[key].verdict != UNFINISHED)
+
+    @property
+    def exit_status(self) -> int:
+        """The exit status for these judgements: 0, 1 for a violation, or 4 if a swarm only needs more time."""
+        return VIOLATED if self.wrong else INCOMPLETE if self.bad else 0
 
     def to_json(self) -> dict[str, Any]:
         """Return the keys of the schema `ucp-run/1` that contain the verdict."""

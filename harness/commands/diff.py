@@ -10,9 +10,11 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from harness.archive.archive import RunArchive
 from harness.commands.terminal import complain, print_json
 from harness.report.agent_programs import in_sentence
 from harness.report.difference import AgentDifference, Difference, Parting, Step, compare
+from harness.run.provenance import differing_versions
 from ucp.trigger import MessageTrigger, Trigger
 
 DIFFERENT = 1
@@ -30,10 +32,14 @@ def diff_command(
     Exit status 0: the runs do not differ. 1: they differ.
     """
     difference = compare(run_a, run_b)
+    differing = differing_versions(*(RunArchive(run).record.versions for run in (run_a, run_b)))
     if as_json:
-        print_json({"a": str(run_a), "b": str(run_b), **difference.to_json()})
+        versions = {"differing_versions": differing}
+        print_json({"a": str(run_a), "b": str(run_b), **difference.to_json(), **versions})
     else:
         console = Console()
+        for version in differing:
+            console.print(Text(f"versions of A and B: {version}"), soft_wrap=True)
         for line in _lines(difference):
             console.print(Text(line), soft_wrap=True)
     for sentence in difference.errors:

@@ -49,7 +49,7 @@ def matrix_command(
     three or more swarm sizes or mission lengths, it also has power laws of how figures grow.
 
     Exit status 0: no run is bad. 1: a run is bad or failed, or a figure is worse than in --against. 3: an agent does
-    not support a run.
+    not support a run. 4: no run is bad, but some needed more time.
     """
     request = matrix.load_matrix(file, backend)
     if secured:

@@ -15,11 +15,13 @@ from rich.text import Text
 
 from harness import checker, report
 from harness.archive.archive import RunArchive
+from harness.checker import stored_verdict
 from harness.checker.survival import survival
 from harness.commands.terminal import complain, print_json, show_programs, show_result, show_survival
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, MachineError, RunDirectoryError
 from harness.report.agent_programs import programs
 from harness.report.live.server_process import require_packages
+from harness.run.provenance import differing_versions, same_judge, versions
 
 if TYPE_CHECKING:
     from harness.report.live.feed import Feed
@@ -56,23 +58,36 @@ def check_command(
 ) -> None:
     """Judge chain exports and traces by the six characteristics.
 
-    Exit status 0: no verdict is bad. 1: a verdict is bad. 2: no export exists, or a file could not be read. 3: no
-    verdict is bad, and an agent did not support the run.
+    Exit status 0: no verdict is bad. 1: a verdict is bad, or a file was edited after the run. 2: no export exists, or a
+    file could not be read. 3: no verdict is bad, and an agent did not support the run. 4: the only bad verdict is `not
+    finished`.
     """
     archive = RunArchive(*paths)
     evidence = checker.gather(archive)
     result, survived = checker.check(evidence), survival(evidence)
+    stored = [*stored_verdict.differences(archive.record, result, survived)]
+    differing = differing_versions(archive.record.versions, versions()) if archive.record.versions else []
     if as_json:
         ran = [program.to_json() for program in programs(archive.record)]
-        print_json({**result.to_json(), "survival": survived.model_dump(), "programs": ran})
+        beside = {"differs_from_stored": stored, "differing_versions": differing}
+        print_json({**result.to_json(), "survival": survived.model_dump(), "programs": ran, **beside})
     else:
         show_result(Console(), result)
         show_programs(Console(), archive.record)
         show_survival(Console(), survived)
+        if differing:
+            Console().print(
+                Text(f"the run and this check differ in {'; '.join(differing)}", style="dim"), soft_wrap=True
+            )
+    for sentence in stored:
+        complain(sentence)
     for error in result.errors:
         complain(error)
-    if result.bad:
-        raise typer.Exit(VIOLATED)
+    altered = bool(stored) and same_judge(archive.record.versions)
+    if altered:
+        complain("the same checker wrote run.json, so a file was edited after the run")
+    if altered or result.exit_status:
+        raise typer.Exit(VIOLATED if altered else result.exit_status)
     if archive.record.outcome == "not supported":
         raise typer.Exit(CANNOT_HERE)
     if result.errors or not evidence.exports:

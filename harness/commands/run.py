@@ -100,7 +100,8 @@ def run_command(
     """Play a scenario, judge it, and write a report.
 
     Exit status 0: no verdict is bad. 1: a verdict is bad, or an agent failed. 2: the scenario is wrong, or a scripted
-    fate matched no message. 3: this machine cannot play it, or an agent does not support it. 130: interrupted.
+    fate matched no message. 3: this machine cannot play it, or an agent does not support it. 4: the only bad verdict is
+    `not finished`. 130: interrupted.
     """
     console = Console()
     asked, own_seed = scenario_of(scenario)

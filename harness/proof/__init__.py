@@ -13,8 +13,8 @@ swarm is and what the network may do. The sub-packages answer one question each:
 """
 
 from harness.proof._progress_bar import Progress
-from harness.proof._proof import INCOMPLETE, Limits, Proof, prove
+from harness.proof._proof import Limits, Proof, prove
 from harness.proof._proof_text import in_words
 from harness.proof.bounds import Bounds, BoundsError, Network
 
-__all__ = ["INCOMPLETE", "Bounds", "BoundsError", "Limits", "Network", "Progress", "Proof", "in_words", "prove"]
+__all__ = ["Bounds", "BoundsError", "Limits", "Network", "Progress", "Proof", "in_words", "prove"]

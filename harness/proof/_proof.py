@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.directory import default_path
-from harness.errors import INTERRUPTED, VIOLATED, HarnessError
+from harness.errors import INCOMPLETE, INTERRUPTED, VIOLATED, HarnessError
 from harness.proof._progress_bar import Budget, Ended, Figures, GivenUpError, Progress
 from harness.proof.bounds import Bounds, BoundsError
 from harness.proof.examples._example import Example, keep, play
@@ -25,7 +25,6 @@ from harness.proof.questions._graph_cycles import cycles
 from harness.proof.questions._livelock import Livelock
 from harness.run.simulate import ENDED, claim
 
-INCOMPLETE = 4
 """Exit status: the proof reached a limit before it had explored all states."""
 CLAIMS = {
     "2": "an idle agent has committed every block that it completed",

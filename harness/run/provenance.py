@@ -4,6 +4,7 @@ import hashlib
 import platform
 import subprocess
 import sys
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -32,6 +33,28 @@ def versions() -> dict[str, str]:
         "kernel": f"{platform.release()} (User Mode Linux)" if uml.inside() else platform.release(),
         "platform": sys.platform,
     }
+
+
+JUDGE = ("ucp-harness", "commit", "reference")
+"""The keys of `versions` that identify the code of the checker."""
+MODIFIED = "-dirty"
+
+
+def same_judge(recorded: Mapping[str, str]) -> bool:
+    """Return true if these versions and the present ones are those of the same, unmodified checker."""
+    present = versions()
+    return not present.get("commit", "").endswith(MODIFIED) and all(
+        recorded.get(key) == present.get(key) for key in JUDGE
+    )
+
+
+def differing_versions(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
+    """Return the differing versions of harness, commit, core and reference in words, such as "core x and y"."""
+    return [
+        f"{key} {a.get(key, 'unknown')} and {b.get(key, 'unknown')}"
+        for key in ("ucp-harness", "commit", "core", "reference")
+        if a.get(key) != b.get(key)
+    ]
 
 
 @cache

@@ -21,7 +21,7 @@ from harness.checker.injections import account
 from harness.checker.recurring_cycles import cycle_of
 from harness.checker.survival import survival
 from harness.checker.timer_lag import TimerLag, timer_lag
-from harness.errors import VIOLATED, WRONG_REQUEST, HarnessError, MachineError, RunDirectoryError
+from harness.errors import WRONG_REQUEST, HarnessError, MachineError, RunDirectoryError
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
@@ -203,7 +203,7 @@ class Recording:
             page = report.write_report(archive)
         except RunDirectoryError as error:
             raise MachineError(f"{error}; run.json has the verdict") from None
-        status = played.exit_status or (VIOLATED if result.bad else WRONG_REQUEST if played.unmatched_fates else 0)
+        status = played.exit_status or result.exit_status or (WRONG_REQUEST if played.unmatched_fates else 0)
         late = None if in_virtual_time(self._record.backend) else timer_lag(evidence.traces.values(), evidence.lag)
         return Run(self.directory.path, played, self._record, result, survived, rogue, status, wall_s, page, late)
 

@@ -37,6 +37,9 @@ BAD_IN_WORDS = {
 }
 """Number or key of a check -> a bad verdict in words."""
 
+UNFINISHED: Verdict = "not finished"
+"""The bad verdict of a swarm that may only need more time. It has an exit status of its own."""
+
 Kind = Literal["good", "bad", "unknown"]
 
 _GOOD = frozenset(("holds", "as specified", "agree", "finished"))
@@ -44,5 +47,5 @@ _BAD = frozenset(("violated", "deviates", "contradict", "not finished", "never f
 
 
 def kind_of(verdict: str) -> Kind:
-    """Return whether a verdict is good, bad or unknown. A bad verdict leads to exit status 1."""
+    """Return whether a verdict is good, bad or unknown. A bad verdict leads to exit status 1 or 4."""
     return "good" if verdict in _GOOD else "bad" if verdict in _BAD else "unknown"

@@ -54,6 +54,8 @@ class Examination:
     contradictions: list[Contradiction]
     short: dict[int, str]
     """Agents whose trace is not whole -> how one knows."""
+    unsent: dict[int, int]
+    """Agent -> number of messages that it could not send, by its own count."""
 
     def touching(self, number: str) -> list[Finding]:
         """What puts this characteristic in doubt."""
@@ -69,7 +71,9 @@ def cross_examine(evidence: Evidence) -> Examination:
             short.setdefault(contradiction.finding.agent_id, contradiction.finding.detail)
     for agent_id in _untold(evidence):
         short.setdefault(agent_id, "the run did not end normally, so the expected end of the trace is unknown")
-    return Examination(contradictions, short)
+    recorded = {agent_id: evidence.recorded(agent_id) for agent_id in evidence.traces}
+    unsent = {agent_id: agent.send_failures for agent_id, agent in recorded.items() if agent and agent.send_failures}
+    return Examination(contradictions, short, unsent)
 
 
 def _untold(evidence: Evidence) -> Iterator[int]:

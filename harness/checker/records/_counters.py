@@ -109,6 +109,9 @@ def _counted(
             "its trace"
         )
         yield of_agent(agent_id, detail, "1")
+    if (failures := recorded.send_failures or 0) > sent:
+        detail = f"it could not send {failures} messages according to run.json, but its trace has only {sent}"
+        yield of_agent(agent_id, detail, "1")
     sent_bytes = _bytes_sent(trace) if trace.header.has_inputs else None
     if sent_bytes is not None and recorded.bytes_sent is not None and recorded.bytes_sent > sent_bytes:
         yield of_agent(

@@ -1,14 +1,16 @@
-"""A characteristic in the light of what the records contradict: doubted where they do, unknown where one is short."""
+"""Adjust the judgement on a characteristic to the contradictions between records, and to their gaps."""
 
-from harness.checker.judgement import MAX_EVIDENCE, Judgement, times
+from harness.checker.judgement import MAX_EVIDENCE, Judgement, agents, times
 from harness.checker.records import Examination, not_whole
 
-LOOK_AT_TRACES = frozenset("123")
-"""What is said to hold at every step holds of steps that nobody has seen only if there are none."""
+NEEDS_TRACES = frozenset("123")
+"""Characteristics that must hold at every step. They do not hold if steps are missing on record."""
+NEEDS_CONNECTIVITY = frozenset("56")
+"""Characteristics that must hold under full connectivity. An agent that could not send was not connected."""
 
 
 def in_doubt(number: str, judgement: Judgement, examination: Examination) -> Judgement:
-    """The judgement on the characteristic with this number, as it can stand."""
+    """Return the judgement on the characteristic with this number, in view of all records."""
     touching = examination.touching(number)
     if touching:
         contradict = f"{times(len(touching))}: the records behind this verdict contradict each other"
@@ -16,6 +18,10 @@ def in_doubt(number: str, judgement: Judgement, examination: Examination) -> Jud
         reason = f"{judgement.reason}; {contradict}" if violated else contradict
         evidence = [*(judgement.evidence if violated else ()), *touching]
         return Judgement(judgement.name, "violated", reason, evidence[:MAX_EVIDENCE])
-    if judgement.verdict == "holds" and number in LOOK_AT_TRACES and examination.short:
+    if judgement.verdict == "holds" and number in NEEDS_TRACES and examination.short:
         return Judgement(judgement.name, "not applicable", not_whole(examination))
+    if judgement.verdict == "violated" and number in NEEDS_CONNECTIVITY and examination.unsent:
+        unsent = sum(examination.unsent.values())
+        reason = f"{agents([*examination.unsent])} could not send {unsent} messages, so not all agents were connected"
+        return Judgement(judgement.name, "not applicable", reason)
     return judgement

@@ -8,7 +8,15 @@ from pathlib import Path
 
 from harness import checker
 from harness.archive.archive import RunArchive
-from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED, WRONG_REQUEST, HarnessError, InterruptedRunError
+from harness.errors import (
+    CANNOT_HERE,
+    INCOMPLETE,
+    INTERRUPTED,
+    VIOLATED,
+    WRONG_REQUEST,
+    HarnessError,
+    InterruptedRunError,
+)
 from harness.field.bisection._live_replay import NotStartedError, ReplayFailedError, play_live
 from harness.field.bisection.outcome import Difference, OfAgent, Outcome, Subject, of_run
 from harness.field.replay import open_record
@@ -117,7 +125,11 @@ class Workshop:
             raise CannotBeTriedError(archive.record.outcome_detail or said)
         if played.status == CANNOT_HERE:
             raise MachineCannotError(said)
-        if played.status not in (0, VIOLATED, WRONG_REQUEST) or archive is None or not archive.exports.by_agent:
+        if (
+            played.status not in (0, VIOLATED, WRONG_REQUEST, INCOMPLETE)
+            or archive is None
+            or not archive.exports.by_agent
+        ):
             raise CannotBeTriedError(said)
         return of_run(
             self.subject.in_words, checker.check(checker.gather(archive)), archive.exports.by_agent, exact=exact

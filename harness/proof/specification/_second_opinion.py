@@ -5,9 +5,9 @@ from dataclasses import asdict, dataclass, replace
 from math import gcd
 from typing import Any
 
-from harness.errors import INTERRUPTED, VIOLATED
+from harness.errors import INCOMPLETE, INTERRUPTED, VIOLATED
 from harness.proof._progress_bar import Ended, Progress
-from harness.proof._proof import INCOMPLETE, Limits
+from harness.proof._proof import Limits
 from harness.proof.bounds import Bounds, BoundsError
 from harness.proof.graph._exploration import explore
 from harness.proof.model._global_states import Swarm

@@ -34,14 +34,14 @@ class Searched:
 
 
 def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> Searched:
-    """Play `seeds` in order until a run has a bad verdict.
+    """Play `seeds` in order until a run violates something. A swarm that only needs more time does not count.
 
     The result is the first such seed, for any number of `jobs`. Ctrl-C ends the search early. Raises HarnessError if
     the scenario cannot be played.
     """
     searched = Searched()
     try:
-        with sweep(seeds, lambda seed: judge(scenario, seed).bad, jobs, what="seeds" if shown else None) as outcomes:
+        with sweep(seeds, lambda seed: judge(scenario, seed).wrong, jobs, what="seeds" if shown else None) as outcomes:
             for seed, outcome in outcomes:
                 searched.played += 1
                 if isinstance(outcome, Failed):
@@ -133,7 +133,7 @@ def explore(
     watcher.on_violation(searched.violation)
 
     def still(candidate: Scenario) -> bool:
-        return key in judge(candidate, seed).bad
+        return key in judge(candidate, seed).wrong
 
     def recorded(document: Document) -> Recording:
         return record(scenario_of(document), seed)
@@ -187,7 +187,7 @@ def _written(
     recorded: Callable[[Document], Recording],
 ) -> Shrunk:
     result = judge(scenario_of(document), seed)
-    judgements = {key: result.judgements[key] for key in result.bad}
+    judgements = {key: result.judgements[key] for key in result.wrong}
     replay = f"ucp-harness run {path} --backend sim --seed {seed}"
     header = [
         *evidence_lines(judgements),

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
-from harness.scenario.verdict_names import JUDGED, Verdict, kind_of
+from harness.scenario.verdict_names import JUDGED, UNFINISHED, Verdict, kind_of
 from harness.sweep.matrix import _growth_metrics
 from harness.sweep.matrix._estimate import BEFORE_FINAL_RECONCILE, METRICS, Estimate, estimate_share
 from harness.sweep.matrix._matrix_file import Point, Task
@@ -55,7 +55,7 @@ class Cell(Placed):
     """The runs at one point of a matrix. `failed` and `unsupported` count the runs without figures.
 
     `estimates` has an estimate for each metric. `verdicts` counts the verdicts of each check. `violated` has the seeds
-    of the runs with a bad verdict, by check.
+    of the runs with a bad verdict, by check. `unfinished` has the seeds of the runs that only needed more time.
     """
 
     runs: int
@@ -63,6 +63,7 @@ class Cell(Placed):
     estimates: dict[str, Estimate]
     verdicts: dict[str, dict[Verdict, int]]
     violated: dict[str, list[int]]
+    unfinished: list[int] = []
     unsupported: int = 0
 
     @property
@@ -71,6 +72,11 @@ class Cell(Placed):
         told = self.verdicts.get("liveness", {})
         finished = told.get("finished", 0)
         return estimate_share(finished, finished + told.get("not finished", 0) + told.get("never finishes", 0))
+
+
+def is_wrong(verdict: Verdict) -> bool:
+    """Return true for a bad verdict other than that of a swarm that only needs more time."""
+    return kind_of(verdict) == "bad" and verdict != UNFINISHED
 
 
 def sum_up(point: Point, runs: Sequence[Run], *, grows: bool = False) -> Cell:
@@ -82,7 +88,9 @@ def sum_up(point: Point, runs: Sequence[Run], *, grows: bool = False) -> Cell:
     further = BEFORE_FINAL_RECONCILE + (_growth_metrics.METRICS if grows else ())
     known = {metric.name: metric.estimate(run.figures for run in judged) for metric in further}
     verdicts = {key: {run.seed: run.verdicts[key] for run in judged if key in run.verdicts} for key in JUDGED}
-    bad = {key: [seed for seed in by_seed if kind_of(by_seed[seed]) == "bad"] for key, by_seed in verdicts.items()}
+    bad = {key: [seed for seed, verdict in by_seed.items() if is_wrong(verdict)] for key, by_seed in verdicts.items()}
+    wrong = {seed for seeds in bad.values() for seed in seeds}
+    unfinished = [seed for seed, verdict in verdicts["liveness"].items() if verdict == UNFINISHED and seed not in wrong]
     return Cell(
         **point._asdict(),
         runs=len(runs),
@@ -91,4 +99,5 @@ def sum_up(point: Point, runs: Sequence[Run], *, grows: bool = False) -> Cell:
         estimates=estimates | {name: estimate for name, estimate in known.items() if estimate.n},
         verdicts={key: dict(Counter(by_seed.values())) for key, by_seed in verdicts.items() if by_seed},
         violated={key: seeds for key, seeds in bad.items() if seeds},
+        unfinished=unfinished,
     )

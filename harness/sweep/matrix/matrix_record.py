@@ -6,7 +6,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
-from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED
+from harness.errors import CANNOT_HERE, INCOMPLETE, INTERRUPTED, VIOLATED
 from harness.sweep.matrix._cell import Cell, Placed
 from harness.sweep.matrix._comparison import Comparison
 from harness.sweep.matrix._growth import Growth
@@ -62,6 +62,8 @@ class MatrixRecord(BaseModel):
     def exit_status(self) -> int:
         """The exit status of the command `matrix`. A failed run counts as a bad one.
 
+        Without a bad run, a run that only needed more time leads to status 4.
+
         Runs that an agent does not support are neither good nor bad. Without a bad run they lead to status 3.
         """
         if self.outcome == "interrupted":
@@ -69,6 +71,8 @@ class MatrixRecord(BaseModel):
         regressed = self.against is not None and self.against.regressions
         if self.failed or regressed or any(cell.violated for cell in self.cells):
             return VIOLATED
+        if any(cell.unfinished for cell in self.cells):
+            return INCOMPLETE
         return CANNOT_HERE if self.unsupported else 0
 
     def to_json(self) -> dict[str, Any]:

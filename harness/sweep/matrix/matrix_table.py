@@ -135,10 +135,12 @@ def violated(cell: Cell) -> int:
 
 def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
     """A sentence for each thing that is wrong in a cell."""
-    for key, seeds in cell.violated.items():
-        which = ", ".join(map(str, seeds[:NAMED])) + (", \u2026" if len(seeds) > NAMED else "")
-        plural = "s" if len(seeds) > 1 else ""
-        yield f"{BAD_IN_WORDS[key]} in {len(seeds)} of {cell.runs} runs, seed{plural} {which}"
+    by_words = {BAD_IN_WORDS[key]: seeds for key, seeds in cell.violated.items()}
+    for trouble, seeds in {**by_words, "more time needed": cell.unfinished}.items():
+        if seeds:
+            which = ", ".join(map(str, seeds[:NAMED])) + (", \u2026" if len(seeds) > NAMED else "")
+            plural = "s" if len(seeds) > 1 else ""
+            yield f"{trouble} in {len(seeds)} of {cell.runs} runs, seed{plural} {which}"
     failed = [run for run in record.failed if run.point == cell.point]
     for run in failed[:NAMED]:
         yield f"seed {run.seed} failed: {run.reason}"

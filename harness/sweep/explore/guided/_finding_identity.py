@@ -48,7 +48,7 @@ def identities(result: Result, cycle: Cycle | None, scenario: Scenario) -> tuple
             next((finding.handler for finding in judgement.evidence if finding.handler), ""),
             ", ".join(part for part in (_shape(key, judgement, result, cycle), settings) if part),
         )
-        for key, judgement in ((key, result.judgements[key]) for key in result.bad)
+        for key, judgement in ((key, result.judgements[key]) for key in result.wrong)
         if cycle is None or key not in FOLLOW_FROM_A_CYCLE
     )
 

@@ -263,7 +263,7 @@ class _Nightwatch:
 
     def _write(self, finding: Finding, document: Document, words: str) -> None:
         result = simulated(scenario_of(document), finding.seed)
-        lines = evidence_lines({key: result.judgements[key] for key in result.bad})
+        lines = evidence_lines({key: result.judgements[key] for key in result.wrong})
         finding.words[:] = [line[:500] for line in lines][:20]
         header = [*lines, f"Found by exploring {self._night.scenario.name!r}, {words}."]
         path = self._corpus.write_scenario(

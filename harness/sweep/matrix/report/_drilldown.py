@@ -9,7 +9,7 @@ from pathlib import Path
 from harness.present import text
 from harness.report.verdict_section import ICONS
 from harness.scenario.verdict_names import JUDGED, kind_of
-from harness.sweep.matrix._cell import Run
+from harness.sweep.matrix._cell import Run, is_wrong
 from harness.sweep.matrix._cell_play import directory_name
 from harness.sweep.matrix._cell_scenarios import scenario_file
 from harness.sweep.matrix.matrix_run import Finished
@@ -80,7 +80,7 @@ def _count(runs: Sequence[Run]) -> str:
 
 
 def _bad(run: Run) -> bool:
-    return any(kind_of(verdict) == "bad" for verdict in run.verdicts.values())
+    return any(map(is_wrong, run.verdicts.values()))
 
 
 def _row(run: Run, figures: Sequence[str], directory: Path) -> Row:

@@ -1,0 +1,90 @@
+"""`check` compares stored verdicts and versions with its own. Unfinished swarms have a status of their own."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.commands import report
+from harness.play.progress import Silent
+from harness.run import provenance
+from harness.run.run import run
+from tests.harness.command import harness
+from tests.harness.virtual import scenario
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    asked = scenario(agents=3, duration_s=100, events={"source": "random", "mean_s": 5})
+    return run(asked, 1, tmp_path_factory.mktemp("stored") / "run", Silent(), backend="sim").directory
+
+
+@pytest.fixture
+def directory(stored: Path, tmp_path: Path) -> Path:
+    shutil.copytree(stored, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def edit(directory: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    record = json.loads((directory / "run.json").read_text())
+    change(record)
+    (directory / "run.json").write_text(json.dumps(record))
+
+
+EDITS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
+    (lambda record: record["characteristics"]["3"].update(verdict="violated"), "'violated' for characteristic 3"),
+    (lambda record: record["steps"].update(verdict="deviates"), "'deviates' for `every step`"),
+    (lambda record: record["figures"].update(blocks=1), "1 as figure blocks"),
+    (lambda record: record["survival"].update(completed=1), "another survival"),
+]
+
+
+@pytest.mark.parametrize(("change", "expected"), EDITS)
+def test_check_reports_another_stored_verdict(
+    directory: Path, change: Callable[[dict[str, Any]], Any], expected: str
+) -> None:
+    edit(directory, change)
+    assert expected in harness("check", directory).stderr
+
+
+def test_edited_verdict_of_same_checker_is_status_1(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    edit(directory, EDITS[0][0])
+    monkeypatch.setattr(report, "same_judge", lambda recorded: True)
+    with pytest.raises(report.typer.Exit) as ended:
+        report.check_command([directory])
+    assert ended.value.exit_code == 1
+
+
+def test_unaltered_run_has_its_stored_verdict(directory: Path) -> None:
+    checked = harness("check", directory, "--json")
+    assert (checked.returncode, checked.stderr) == (0, "")
+    verdict = json.loads(checked.stdout)
+    assert verdict["differs_from_stored"] == [] == verdict["differing_versions"]
+
+
+def test_check_and_diff_name_differing_versions(directory: Path, stored: Path) -> None:
+    edit(directory, lambda record: record["versions"].update(reference="0123456789ab"))
+    assert "differ in reference 0123456789ab and" in harness("check", directory).stdout
+    assert "versions of A and B: reference" in harness("diff", stored, directory).stdout
+
+
+def test_modified_clone_is_never_the_same_judge(monkeypatch: pytest.MonkeyPatch) -> None:
+    versions = {"ucp-harness": "1", "commit": "abc-dirty", "reference": "def"}
+    monkeypatch.setattr(provenance, "versions", lambda: versions)
+    assert not provenance.same_judge(versions)
+    monkeypatch.setattr(provenance, "versions", lambda: {**versions, "commit": "abc"})
+    assert provenance.same_judge({**versions, "commit": "abc"})
+
+
+def test_swarm_that_needs_more_time_has_status_4(tmp_path: Path) -> None:
+    asked = tmp_path / "short.yaml"
+    asked.write_text(
+        "{name: short, agents: 3, duration_s: 60, events: {source: random, mean_s: 2}, settle: {limit_s: 1}}"
+    )
+    played = harness("run", asked, "--backend", "sim", "--seed", 1, "--out", tmp_path / "run")
+    assert "not finished" in played.stdout
+    assert played.returncode == 4
+    assert harness("check", tmp_path / "run").returncode == 4
