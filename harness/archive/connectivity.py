@@ -142,7 +142,7 @@ class Network:
             conditions = NetworkConditions.from_json(line.asked)
             self._cut_off = {pair for pair in self._pairs.values() if len(components(conditions, pair)) > 1}
             self._asked = {
-                (low, high): (_loss(conditions.link(low, high)), _loss(conditions.link(high, low)))
+                (low, high): (_asked_loss(conditions, low, high), _asked_loss(conditions, high, low))
                 for low, high in self._pairs.values()
             }
         self._over_the_radio |= losses
@@ -163,7 +163,7 @@ class Network:
         """What each link loses now, in either direction: everything where there is none."""
         losses: dict[Link, float] = {}
         for low, high in self._asked:
-            there, back = self.directions((low, high))
+            there, back = (1.0, 1.0) if self.lost & {low, high} else self._directions((low, high))
             losses |= {(low, high): there, (high, low): back}
         return losses
 
@@ -200,6 +200,10 @@ class Network:
             groups.append(frozenset(reached))
             left -= reached
         return tuple(sorted(groups, key=lambda group: (-len(group), min(group))))
+
+
+def _asked_loss(conditions: NetworkConditions, sender: int, receiver: int) -> float:
+    return 1.0 if conditions.is_cut(sender, receiver) else _loss(conditions.link(sender, receiver))
 
 
 def _loss(link: LinkConditions) -> float:

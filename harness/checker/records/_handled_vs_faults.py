@@ -105,8 +105,13 @@ class _Cuts:
 
 
 def _cuts(evidence: Evidence) -> _Cuts | None:
-    """Return the cut links. None if no link was ever cut, or if scripted fates may deliver messages over a cut link."""
-    if evidence.has_fates or not any(loss == 1.0 for _, losses in evidence.link_losses for loss in losses.values()):
+    """Return the cut links. None if no link was ever cut, or if messages may pass a cut link.
+
+    Scripted fates deliver messages regardless of the loss, and netem may pass a second copy of a lost message.
+    """
+    if evidence.has_fates or any(link.duplicate > 0 for link in evidence.links_asked or ()):
+        return None
+    if not any(loss == 1.0 for _, losses in evidence.link_losses for loss in losses.values()):
         return None
     slack = max(map(slack_s, evidence.traces.values()), default=ROUNDED_S)
     return _Cuts(evidence.link_losses, max(slack, SAME_TIME_S))

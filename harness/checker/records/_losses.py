@@ -10,8 +10,8 @@ Only messages count that a right agent handles if they arrive:
 - Of processes and containers, any message. Their agents may still handle fewer messages than arrive, because they were
   stopped or a socket was full. So handled messages count only if they are too many. An engine that counts packets shows
   whether too few or too many were lost.
-- In virtual time, requests, queries and commits to an agent that runs and does not reconcile. Virtual time withholds
-  other messages if they have no effect.
+- In virtual time, three types of messages to an agent that runs and does not reconcile. Virtual time withholds other
+  messages if they have no effect.
 """
 
 from bisect import bisect_right
@@ -29,13 +29,11 @@ from harness.scenario.changes import RANGE
 from harness.scenario.faults.fault import SAME_TIME_S
 from netem.link import GilbertElliott, LinkConditions
 from netem.medium import LATENCY
-from ucp.messages import BlockAddResponse, BlockResponse, ChainContainResponse, NextInSequenceResponse
+from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
 from ucp.trigger import MessageTrigger
 
-ANSWERS = frozenset(
-    message.NAME for message in (BlockAddResponse, BlockResponse, ChainContainResponse, NextInSequenceResponse)
-)
-"""Messages that matter only to agents that asked for them."""
+NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, CommitBlock, ChainContainQuery))
+"""Messages that virtual time delivers to each agent that does not reconcile. Others it withholds without effect."""
 
 MAX_CHANCE = 1e-12
 """Highest probability of an observation that counts as impossible."""
@@ -93,8 +91,8 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         return
     if any(isinstance(link.loss, GilbertElliott) for link in links):
         return  # draws in a burst are not independent
-    if any(link.delay or link.rate or link.corrupt for link in links):
-        return  # messages are late, or lost for another reason
+    if any(link.delay or link.rate or link.corrupt or link.duplicate for link in links):
+        return  # messages are late, lost for another reason, or pass as a second copy although the first is lost
     if set(evidence.record.roster if evidence.record else ()) - set(evidence.traces):
         return  # messages of an agent without a trace are not on record
     if any(trace.problem or trace.cut_off for trace in evidence.traces.values()):
@@ -163,7 +161,7 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
 
 
 class _Ready:
-    """The times at which an agent in virtual time handles each request, query and commit that arrives."""
+    """The times at which an agent in virtual time handles each arriving message that is never withheld."""
 
     def __init__(self, evidence: Evidence, agent_id: int) -> None:
         self._latest_s = LATENCY.mean_s + LATENCY.jitter_s
@@ -185,7 +183,7 @@ class _Ready:
     def handles(self, message: str, sent_s: float) -> bool:
         """Return true if the agent is ready at each possible time of arrival."""
         arrives_s = sent_s + self._latest_s
-        if message in ANSWERS or arrives_s >= self._end_s:
+        if message not in NEVER_WITHHELD or arrives_s >= self._end_s:
             return False
         number = bisect_right(self._starts, arrives_s + SAME_TIME_S)
         return all(until_s < sent_s - SAME_TIME_S for _, until_s in self._busy[max(0, number - 2) : number])
@@ -201,7 +199,7 @@ def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterato
         return
     losses = [link.loss for link in links if isinstance(link.loss, float)]
     flies = any(state.what == RANGE for state in record.network)
-    if flies or max(losses) == 1.0 or any(link.duplicate > 0 for link in links):
+    if flies or max(losses) == 1.0:
         return
     expected = _expected(evidence, (min(losses), max(losses)))
     for receiver, seen in expected.items():
