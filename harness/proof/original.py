@@ -18,9 +18,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from harness.errors import INTERRUPTED, VIOLATED, HarnessError
+from harness.errors import INCOMPLETE, INTERRUPTED, VIOLATED, HarnessError
 from harness.play.core_version import edited_files
-from harness.proof._proof import INCOMPLETE, Limits, Proof, prove
+from harness.proof._proof import Limits, Proof, prove
 from harness.proof._proof_text import in_words
 from harness.proof.bounds import Bounds
 from harness.run.code_state import ROOT, History, run_python

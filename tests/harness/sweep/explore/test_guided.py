@@ -133,7 +133,7 @@ def test_livelocks_are_told_apart_by_the_timers_on_the_way_round() -> None:
             {"since_s": 1, "period_s": 20, "agents": [*range(1, len(ways) + 1)], "steps": steps}
         )
         judgement = Judgement("Liveness", "never finishes", "round in circles")
-        result = SimpleNamespace(judgements={"liveness": judgement}, bad=["liveness"], chains={})
+        result = SimpleNamespace(judgements={"liveness": judgement}, wrong=["liveness"], chains={})
         (identity,) = identities(result, cycle, ordinary())  # type: ignore[arg-type]
         return identity.shape
 
