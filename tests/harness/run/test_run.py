@@ -396,8 +396,9 @@ def test_a_shell_that_does_not_find_the_agent_is_a_failure_and_no_agent_that_lac
 def test_a_lab_that_dies_is_blamed_and_not_the_agents_that_die_with_it(tmp_path: Path) -> None:
     run = Running(write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}), tmp_path / "run")
     run.wait_for_mission(1, 2, 3)
-    (unshare,) = Path(f"/proc/{run.process.pid}/task/{run.process.pid}/children").read_text().split()
-    os.kill(int(unshare), signal.SIGKILL)
+    children = Path(f"/proc/{run.process.pid}/task/{run.process.pid}/children").read_text().split()
+    (unshare,) = (int(child) for child in children if b"netem.init" in Path(f"/proc/{child}/cmdline").read_bytes())
+    os.kill(unshare, signal.SIGKILL)
     status, _, err = run.end()
     assert status == 3
     assert sentences(err)[0].startswith("The lab's first process ended unexpectedly")
