@@ -49,7 +49,7 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _ran_nothing_since(recorded: AgentRecord, life: Life) -> bool:
-    """Return True unless the agent ran handlers after its last report, which may have changed what it reported."""
+    """Return False if the agent ran handlers after its last report."""
     counted = recorded.handler_runs[-1] if recorded.handler_runs else None
     return counted is None or counted.counted == len(life.runs)
 
