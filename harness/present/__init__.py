@@ -1,1 +1,1 @@
-"""What reports, tables and commands show with: words, colours, SVG, Markdown, and JUnit XML for build servers."""
+"""Helpers for output: text, colours, SVG charts, Markdown, and JUnit XML."""

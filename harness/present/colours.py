@@ -1,8 +1,8 @@
-"""A colour for each agent that people with any colour vision can tell apart, in light and in dark.
+"""A colour for each agent, distinguishable with any colour vision, in light and in dark mode.
 
-The first eight are Okabe and Ito's (https://jfly.uni-koeln.de/color/, black replaced by grey). Further agents get the
-same hues lighter, darker, and with a dashed outline; after that colours repeat. No picture relies on colour alone:
-every box says whose it is.
+The first eight colours are those of Okabe and Ito (https://jfly.uni-koeln.de/color/), with grey in place of black.
+Further agents get the same hues lighter, darker, and with a dashed outline. After 32 agents the colours repeat. No
+picture relies on colour alone: every box also names its agent.
 """
 
 from collections.abc import Iterable
@@ -25,7 +25,7 @@ Rgb = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Ink:
-    """How an agent's blocks are drawn; colours are `#rrggbb`."""
+    """The style of an agent's blocks. Colours are `#rrggbb`."""
 
     fill: str
     stroke: str
@@ -34,18 +34,18 @@ class Ink:
 
 
 def inks(agent_ids: Iterable[int]) -> dict[int, Ink]:
-    """An ink for each agent; the same agents always get the same."""
+    """Return an ink for each agent. The same set of agents always gets the same inks."""
     return {agent_id: _ink(position) for position, agent_id in enumerate(sorted(set(agent_ids)))}
 
 
 def ramp(first: Rgb, last: Rgb, steps: int) -> list[Ink]:
-    """From one colour to another, for values that grow: where the second is darker or lighter, anybody sees it."""
+    """Return inks from one colour to another for growing values. Choose two colours of different lightness."""
     fills = [_mixed(first, last, step / (steps - 1)) for step in range(steps)]
     return [Ink(fill, fill, _text_on(fill)) for fill in fills]
 
 
 def contrast(first: str, second: str) -> float:
-    """The contrast ratio of WCAG 2, 1 to 21."""
+    """Return the contrast ratio of WCAG 2, from 1 to 21."""
     dark, light = sorted((_luminance(first), _luminance(second)))
     return (light + 0.05) / (dark + 0.05)
 

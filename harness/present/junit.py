@@ -1,6 +1,6 @@
-"""JUnit XML, as build servers read it: Jenkins, GitLab, and the actions of GitHub that show test results.
+"""JUnit XML for build servers such as Jenkins, GitLab and GitHub.
 
-https://github.com/jenkinsci/xunit-plugin, junit-10.xsd: the strictest that anybody holds it to.
+The output follows https://github.com/jenkinsci/xunit-plugin, junit-10.xsd, which is the strictest known schema.
 """
 
 import re
@@ -13,9 +13,9 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A test case, which passed if it was not `skipped`, with a reason, and nothing is in `wrong`.
+    """A test case. It passed if `skipped` is None and `wrong` is empty.
 
-    `wrong` are lines, the first of which says it all.
+    The first line of `wrong` is a complete message. `skipped` is a reason.
     """
 
     name: str
@@ -24,7 +24,7 @@ class Case:
 
 
 def to_xml(suite: str, classname: str, started_at: str, wall_s: float | None, cases: Iterable[Case]) -> str:
-    """A file with one suite. Characters that XML cannot hold are written as question marks."""
+    """Return a file with one suite. Characters that XML does not allow become question marks."""
     all_cases = list(cases)
     failures, skipped = sum(bool(case.wrong) for case in all_cases), sum(case.skipped is not None for case in all_cases)
     counts = {"tests": str(len(all_cases)), "failures": str(failures), "errors": "0"}

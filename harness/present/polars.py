@@ -1,7 +1,7 @@
-"""Polars, the package that makes tables for notebooks. It is optional: extra `data`.
+"""Polars, the package for the tables in notebooks. It is optional (extra `data`).
 
-Polars and not pandas: it writes Parquet by itself, so one package does what pandas does with pyarrow and NumPy; its
-columns have one declared type also where values are missing; and its import takes a third of the time.
+Polars was chosen over pandas for three reasons. It writes Parquet itself, whereas pandas needs pyarrow and NumPy. Its
+columns have one declared type even with missing values. Its import takes a third of the time.
 """
 
 from harness.errors import MachineError

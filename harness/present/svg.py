@@ -1,6 +1,6 @@
-"""What our charts share: axes, their marks and ticks, and the file around small panels side by side.
+"""Common parts of charts: axes with ticks, marks, and an SVG file with panels side by side.
 
-Colours stand in attributes, so that programs without style sheets draw a chart too; `chart.css` adds the dark scheme.
+Colours are attributes, so that programs without style sheets also draw the chart. `chart.css` adds a dark scheme.
 """
 
 import math
@@ -16,17 +16,17 @@ WIDTH, MARGIN = 900, 16
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', 'DejaVu Sans', sans-serif"
 INK, QUIET, RULE, GROUND = "#1c2126", "#57616b", "#d9dee2", "#ffffff"
 COLOURS = ("#0072b2", "#a83900", "#00785a", "#8a3f74")
-"""Of the lines in a panel: Okabe and Ito's hues, dark enough for text on white."""
+"""Colours of the lines in a panel: hues of Okabe and Ito, dark enough for text on white."""
 CLASSES = ("first", "second", "third", "fourth")
 DASHES = ("", "6 3", "2 3", "9 3 2 3")
 TITLE_LENGTH = 80
 
-_LEFT, _RIGHT, _TOP, _BOTTOM = 48, 18, 34, 40  # of a panel, around its axes
+_LEFT, _RIGHT, _TOP, _BOTTOM = 48, 18, 34, 40  # margins of a panel around its axes
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """From values to a place in the picture; `log` is for values above 0."""
+    """A mapping from values to pixels. With `log`, the values must be above 0."""
 
     first: float
     last: float
@@ -44,7 +44,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """A panel's place."""
+    """The rectangle of a panel."""
 
     x: float
     y: float
@@ -53,35 +53,38 @@ class Area:
 
     @property
     def across(self) -> tuple[float, float]:
-        """Where a horizontal axis starts and ends."""
+        """Start and end of a horizontal axis."""
         return self.x + _LEFT, self.x + self.width - _RIGHT
 
     @property
     def up(self) -> tuple[float, float]:
-        """Where a vertical axis starts and ends."""
+        """Start and end of a vertical axis."""
         return self.y + self.height - _BOTTOM, self.y + _TOP
 
 
 def grid(count: int, columns: int, top: float, height: float) -> list[Area]:
-    """Places of panels, row by row, below `top`."""
+    """Return the rectangles of panels, row by row, below `top`."""
     width = (WIDTH - 2 * MARGIN) / columns
     return [Area(MARGIN + at % columns * width, top + at // columns * height, width, height) for at in range(count)]
 
 
 def linear_axis(first: float, last: float, place: tuple[float, float]) -> Axis:
-    """From `first` to `last`, with ticks at round numbers between."""
+    """Return an axis from `first` to `last` with ticks at round numbers."""
     every = step(last - first, 5)
     ticks = [number * every for number in range(math.ceil(first / every - 1e-9), math.floor(last / every + 1e-9) + 1)]
     return Axis(first, last, *place, ticks)
 
 
 def share_axis(place: tuple[float, float]) -> Axis:
-    """From 0 to 1, with a tick at each quarter; `place` is where it begins and ends, in pixels."""
+    """Return an axis from 0 to 1 with a tick at each quarter. `place` is its start and end in pixels."""
     return Axis(0.0, 1.0, *place, [0.0, 0.25, 0.5, 0.75, 1.0])
 
 
 def log_axis(first: float, last: float, place: tuple[float, float], most: int = 6) -> Axis:
-    """From below `first` to above `last`, with at most so many ticks: powers of ten, or if there is room more."""
+    """Return an axis that covers `first` to `last`, with at most `most` ticks.
+
+    The ticks are powers of ten, with further values between them if there is room.
+    """
     for factors, every in (((1, 2, 5), 1), ((1, 3), 1), *(((1,), decades) for decades in range(1, 700))):
         begin, end = math.floor(math.log10(first) / every) * every, math.ceil(math.log10(last) / every + 1e-9) * every
         ticks = [factor * 10.0**power for power in range(begin, end + 1, every) for factor in factors]
@@ -94,13 +97,15 @@ def log_axis(first: float, last: float, place: tuple[float, float], most: int = 
 
 
 def step(span: float, most: int) -> float:
-    """The smallest of 1, 2, 2.5, 5, 10, ... that takes at most so many steps across the span."""
+    """Return the smallest round step (1, 2, 2.5 or 5 times a power of ten) that divides the span into at most `most`
+    steps.
+    """
     unit: float = 10.0 ** math.floor(math.log10(span / most))
     return next(factor * unit for factor in (1, 2, 2.5, 5, 10) if factor * unit * most >= span * (1 - 1e-9))
 
 
 def frame(title: str, across: Axis, up: Axis, across_texts: Iterable[str], up_texts: Iterable[str]) -> Markup:
-    """A panel's title, rules and ticks."""
+    """Draw a panel's title, grid lines and ticks."""
     parts = [
         Markup('<text x="{}" y="{}" font-weight="600" fill="{}">{}</text>').format(
             n(across.start - _LEFT + 4), n(up.end - _TOP + 16), INK, title
@@ -123,7 +128,7 @@ def frame(title: str, across: Axis, up: Axis, across_texts: Iterable[str], up_te
 
 
 def line(points: Iterable[tuple[float, float]], number: int) -> Markup:
-    """Through places in the picture, in the colour and the dashes of the panel's so-many-th line."""
+    """Draw a line through these points, in the colour and dashes of the panel's line `number`."""
     dash = DASHES[number % len(DASHES)]
     return Markup('<path class="line" d="M{}" stroke="{}" stroke-width="2" stroke-linejoin="round"{}/>').format(
         "L".join(f"{n(x)} {n(y)}" for x, y in points),
@@ -133,14 +138,14 @@ def line(points: Iterable[tuple[float, float]], number: int) -> Markup:
 
 
 def dot(x: float, y: float, number: int, tip: str) -> Markup:
-    """With a tooltip."""
+    """Draw a dot with a tooltip."""
     return Markup(
         '<circle cx="{}" cy="{}" r="3" fill="{}" stroke="{}" stroke-width="2"><title>{}</title></circle>'
     ).format(n(x), n(y), GROUND, COLOURS[number % len(COLOURS)], tip)
 
 
 def name(x: float, y: float, anchor: str, number: int, text: str) -> Markup:
-    """A line's name."""
+    """Draw the name of a line."""
     return Markup('<text x="{}" y="{}" font-size="12" text-anchor="{}" fill="{}">{}</text>').format(
         n(x), n(y), anchor, COLOURS[number % len(COLOURS)], text
     )
@@ -186,7 +191,7 @@ def document(
 
 
 def n(number: float) -> str:
-    """A place, as short as a tenth of a pixel allows."""
+    """Format a coordinate to a tenth of a pixel."""
     return f"{number:.1f}".removesuffix(".0")
 
 

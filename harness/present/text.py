@@ -1,4 +1,4 @@
-"""Values as text: for people, for a terminal, and in Markdown."""
+"""Values as text: for people, for a terminal, and for Markdown."""
 
 import json
 from collections.abc import Iterable
@@ -8,12 +8,12 @@ from typing import Any
 from rich.text import Text
 
 _EPOCH_FROM_US = 1_000_000_000_000_000
-"""Block timestamps from here on (2001) are since the Unix epoch; smaller ones are since the start of a virtual run."""
+"""Timestamps from here on (2001) are since the Unix epoch. Smaller ones are since the start of a virtual run."""
 _LAST_EPOCH_US = 253_402_300_799_000_000
 
 
 def moment(timestamp_us: int) -> str:
-    """A block's timestamp, to the millisecond."""
+    """Format a block's timestamp to the millisecond."""
     if _EPOCH_FROM_US <= timestamp_us <= _LAST_EPOCH_US:
         at = datetime.fromtimestamp(timestamp_us // 1_000_000, UTC)
         return f"{at:%Y-%m-%d %H:%M:%S}.{timestamp_us // 1000 % 1000:03d} UTC"
@@ -21,7 +21,7 @@ def moment(timestamp_us: int) -> str:
 
 
 def started(text: Any) -> str:
-    """An ISO 8601 time without its punctuation, or whatever was written instead."""
+    """Format an ISO 8601 time as date, time and zone. Any other text is returned unchanged."""
     try:
         at = datetime.fromisoformat(str(text))
     except ValueError:
@@ -30,17 +30,17 @@ def started(text: Any) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Mission or wall time, in the unit of everything else: 45 s, 1200 s."""
+    """Format mission or wall time in seconds: "45 s", "1200 s"."""
     return f"{_shortest(seconds)}\u00a0s"
 
 
 def percent(share: float) -> str:
-    """A share of 0 to 1: 12.5 %."""
+    """Format a share from 0 to 1, such as "12.5 %"."""
     return f"{_shortest(100 * share)}\u00a0%"
 
 
 def value(anything: Any) -> str:
-    """Any JSON value in a cell or a tile."""
+    """Format a JSON value for a table cell."""
     if anything is None:
         return "\u2013"
     if isinstance(anything, bool):
@@ -53,7 +53,7 @@ def value(anything: Any) -> str:
 
 
 def label(key: str) -> str:
-    """A key of a JSON document as a label: real_time_factor -> real time factor."""
+    """Turn a JSON key into a label: real_time_factor -> real time factor."""
     return key.replace("_", " ")
 
 
@@ -62,12 +62,12 @@ def _shortest(number: float) -> str:
 
 
 def row(fields: Iterable[str]) -> str:
-    """Of a table; the fields are Markdown themselves."""
+    """Return a row of a Markdown table. The fields are Markdown."""
     return f"| {' | '.join(fields)} |"
 
 
 def escaped(text: str) -> str:
-    """As words on one line, whatever they hold."""
+    """Return the text as literal Markdown on one line."""
     line = " ".join(text.splitlines())
     return "".join(f"\\{character}" if character in "\\`*_{}[]<>#|~&" else character for character in line)
 
@@ -76,5 +76,5 @@ _CONTROL = dict.fromkeys((*range(32), *range(127, 160)), "�")
 
 
 def shown(words: str, style: str = "") -> Text:
-    """One line; what no reader could see is shown as a replacement character."""
+    """Return one line of text. Control characters become replacement characters."""
     return Text(words.translate(_CONTROL), style=style)

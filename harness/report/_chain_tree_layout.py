@@ -1,9 +1,9 @@
-"""Where everything of a chain tree goes: rows upwards in time, columns so that nothing overlaps.
+"""Positions of all marks of a chain tree: rows grow upwards with time, and columns do not overlap.
 
-Each subtree is packed by its outline, row by row, against those to its left (after Reingold and Tilford, "Tidier
-Drawings of Trees", 1981). What stands on a block is centred over it, unless most of the block's agents go on one way:
-then that way goes straight up, and the few that part from it branch off to the side. An oval stands on top of its
-block, or to the right of it if other chains go on from there.
+Each subtree is packed against the subtrees to its left by its outline, row by row (after Reingold and Tilford, "Tidier
+Drawings of Trees", 1981). A block stands below the middle of its successors. If more than half of the agents follow one
+successor, this successor stands straight above the block, and the others branch off to the side. An oval stands on top
+of its block, or to the right of the block if other chains continue above it.
 """
 
 import math
@@ -14,7 +14,8 @@ from harness.report.chain_tree import Mark
 
 FONT_SIZE = 13
 CHARACTER_WIDTH = 0.66 * FONT_SIZE
-"""At least the width of a digit or lower-case letter in the common system fonts (0.64 em in DejaVu Sans, Verdana)."""
+"""Upper limit of the width of a digit or lower-case letter in common system fonts (0.64 em in DejaVu Sans and Verdana).
+"""
 SMALL_FONT_SIZE = 12
 BOX_HEIGHT = 26
 LINE_HEIGHT = 17
@@ -27,7 +28,7 @@ MARGIN = 8
 
 
 @dataclass(slots=True)
-class Placed:
+class PlacedMark:
     """A mark with its centre `x` and top `y`; units are CSS pixels, y grows downwards."""
 
     mark: Mark
@@ -36,16 +37,16 @@ class Placed:
     row: int
     x: float = 0.0
     y: float = 0.0
-    children: list["Placed"] = field(default_factory=list)
-    beside: "Placed | None" = None
+    children: list["PlacedMark"] = field(default_factory=list)
+    beside: "PlacedMark | None" = None
 
     @property
     def rows(self) -> range:
-        """The rows that it stands in the way of: those that it reaches into, the gap below a row being that row's."""
+        """The rows that the mark occupies. The gap above a row belongs to this row."""
         return range(self.row, self.row + math.ceil((self.height + ROW_GAP) / ROW_HEIGHT))
 
-    def walk(self) -> Iterator["Placed"]:
-        """This and everything above it, each after what it stands on."""
+    def walk(self) -> Iterator["PlacedMark"]:
+        """Yield this mark and all marks above it. Each mark follows the mark below it."""
         to_visit = [self]
         while to_visit:
             placed = to_visit.pop()
@@ -57,13 +58,13 @@ class Placed:
 
 @dataclass(slots=True)
 class Layout:
-    root: Placed
+    root: PlacedMark
     width: float
     height: float
 
 
 class _Outline:
-    """How far a subtree reaches left and right in each row, as seen from its root."""
+    """The leftmost and rightmost positions of a subtree in each row, relative to its root."""
 
     def __init__(self) -> None:
         self.shift = 0.0
@@ -73,16 +74,16 @@ class _Outline:
         for row in rows:
             self._rows[row] = (-width / 2 - self.shift, width / 2 - self.shift)
 
-    def room_needed(self, right: "_Outline", gap: float = COLUMN_GAP) -> float:
-        """How far to the right of this one's root that one's root must be, with `gap` between them."""
+    def distance_to(self, right: "_Outline", gap: float = COLUMN_GAP) -> float:
+        """Return the smallest distance from this root to a root on its right that leaves `gap` between the subtrees."""
         shared = self._rows.keys() & right._rows.keys()
         return max(
             (self._rows[row][1] + self.shift - right._rows[row][0] - right.shift + gap for row in shared),
             default=0.0,
         )
 
-    def joined(self, other: "_Outline", x: float) -> "_Outline":
-        """This outline and the other with its root at `x`; the smaller is merged into the larger."""
+    def merged_with(self, other: "_Outline", x: float) -> "_Outline":
+        """Merge the outline whose root is at `x` into this one. The smaller outline is merged into the larger one."""
         other.shift += x
         large, small = (self, other) if len(self._rows) >= len(other._rows) else (other, self)
         by = small.shift - large.shift
@@ -94,24 +95,27 @@ class _Outline:
 
 def lay_out(root: Mark) -> Layout:
     placed = _sized(root)
-    everything = list(placed.walk())
-    offsets = _offsets(everything)
-    for item in everything:
+    placed_marks = list(placed.walk())
+    offsets = _offsets(placed_marks)
+    for item in placed_marks:
         for child in item.children:
             child.x = item.x + offsets[id(child)]
         if item.beside:
             item.beside.x = item.x + offsets[id(item.beside)]
-    left = min(item.x - item.width / 2 for item in everything) - MARGIN
-    right = max(item.x + item.width / 2 for item in everything) + MARGIN
-    floor = max(item.row * ROW_HEIGHT + item.height for item in everything) + MARGIN
-    for item in everything:
+    left = min(item.x - item.width / 2 for item in placed_marks) - MARGIN
+    right = max(item.x + item.width / 2 for item in placed_marks) + MARGIN
+    floor = max(item.row * ROW_HEIGHT + item.height for item in placed_marks) + MARGIN
+    for item in placed_marks:
         item.x -= left
         item.y = floor - item.row * ROW_HEIGHT - item.height
     return Layout(placed, right - left, floor + MARGIN)
 
 
-def _sized(root: Mark) -> Placed:
-    """The marks with their sizes and rows; all boxes but the inception block's are as wide as the longest label."""
+def _sized(root: Mark) -> PlacedMark:
+    """Return the marks with sizes and rows.
+
+    All boxes are as wide as the longest label, except the inception block's.
+    """
     names = [0]
     to_measure = list(root.children)
     while to_measure:
@@ -120,14 +124,14 @@ def _sized(root: Mark) -> Placed:
         to_measure.extend(mark.children)
     box_width = _width(max(names))
 
-    def sized(mark: Mark, row: int) -> Placed:
+    def sized(mark: Mark, row: int) -> PlacedMark:
         if mark.kind == "ellipsis":
             longest = max(len(line) for line in mark.lines)
-            return Placed(mark, longest * CHARACTER_WIDTH * SMALL_FONT_SIZE / FONT_SIZE, BOX_HEIGHT, row)
+            return PlacedMark(mark, longest * CHARACTER_WIDTH * SMALL_FONT_SIZE / FONT_SIZE, BOX_HEIGHT, row)
         width = max(_width(len(line)) for line in mark.lines)
         if mark.kind == "block":
             width = max(width, box_width)
-        return Placed(mark, width, BOX_HEIGHT + (len(mark.lines) - 1) * LINE_HEIGHT, row)
+        return PlacedMark(mark, width, BOX_HEIGHT + (len(mark.lines) - 1) * LINE_HEIGHT, row)
 
     placed = sized(root, 0)
     to_size = [placed]
@@ -144,36 +148,38 @@ def _width(characters: int) -> float:
     return float(round(characters * CHARACTER_WIDTH + 2 * PADDING))
 
 
-def _offsets(everything: list[Placed]) -> dict[int, float]:
-    """For each placed mark but the root, by identity: how far it is to the right of what it stands on or beside."""
+def _offsets(placed_marks: list[PlacedMark]) -> dict[int, float]:
+    """Return the distance of each mark from the mark that it stands on or beside, by `id` of the mark; the root has
+    none.
+    """
     offsets: dict[int, float] = {}
     outlines: dict[int, _Outline] = {}
-    beside = {id(item.beside) for item in everything}
-    for item in reversed(everything):
+    beside = {id(item.beside) for item in placed_marks}
+    for item in reversed(placed_marks):
         if id(item) in beside:
             continue
         outline = _Outline()
         positions: list[float] = []
         for child in item.children:
             right = outlines.pop(id(child))
-            x = outline.room_needed(right)
+            x = outline.distance_to(right)
             positions.append(x)
-            outline = outline.joined(right, x)
+            outline = outline.merged_with(right, x)
         own = _root_position(item, positions)
         outline.shift -= own
         outline.add(item.rows, item.width)
         if item.beside:
             oval = _Outline()
             oval.add(item.beside.rows, item.beside.width)
-            offsets[id(item.beside)] = outline.room_needed(oval, OVAL_GAP)
-            outline = outline.joined(oval, offsets[id(item.beside)])
+            offsets[id(item.beside)] = outline.distance_to(oval, OVAL_GAP)
+            outline = outline.merged_with(oval, offsets[id(item.beside)])
         outlines[id(item)] = outline
         for child, x in zip(item.children, positions, strict=True):
             offsets[id(child)] = x - own
     return offsets
 
 
-def _root_position(item: Placed, positions: list[float]) -> float:
+def _root_position(item: PlacedMark, positions: list[float]) -> float:
     for child, x in zip(item.children, positions, strict=True):
         if 2 * len(child.mark.holders) > len(item.mark.holders):
             return x

@@ -1,4 +1,4 @@
-"""Where the vehicles flew, and who could reach whom: a map of the tracks, and the swarm at telling moments."""
+"""The map section of the report: the tracks of the vehicles, and small maps of the swarm at notable moments."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,18 +11,31 @@ from harness.present import text
 from harness.present.colours import Ink
 from harness.report import map_svg
 from harness.report.facts import link_qualities
-from harness.report.map_parts import MAX_STRETCHES, Division, Extent, Life, divisions, extent, letter, lives, longest
+from harness.report.map_parts import (
+    MAX_SEGMENTS,
+    Division,
+    Extent,
+    Flight,
+    divisions,
+    extent,
+    flights,
+    letter,
+    longest_divisions,
+)
 from harness.scenario.changes import RANGE
 from sitl.vehicle import VehicleType
 
 MOVES_M = 1.0
-"""A vehicle that stays within so many metres stands."""
+"""A vehicle that stays within this number of metres counts as standing still."""
 MOMENTS = 6
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """The swarm at one moment: `at` and, if something happened, `what`; and how the network then was."""
+    """A small map of the swarm.
+
+    `at` is the time, `what` the event at this time or "", and `network` the network's state.
+    """
 
     at: str
     what: str
@@ -31,25 +44,22 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
-    """`tracks` is None if there is nothing to draw, and `notes` then say why."""
+class MapSection:
+    """The map with its legend. If nothing can be drawn, `tracks` is None and `notes` give the reason."""
 
     tracks: Markup | None
     legend: list[tuple[Markup, str]]
-    """How something is drawn, and what it is."""
+    """Pairs of a sample and its meaning."""
     moments: list[Moment]
     notes: list[str]
 
 
 def section(
     tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink], types: Mapping[int, VehicleType]
-) -> Section | None:
-    """None if no vehicle of the run is known to have moved, and nothing was wrong with what was read.
-
-    `types` are the vehicles', as far as they are known.
-    """
+) -> MapSection | None:
+    """Return the section, or None if no vehicle moved and no file is damaged. `types` holds the known vehicle types."""
     if not any(_moved(tracks, vehicle) for vehicle in tracks.by_vehicle):
-        return Section(None, [], [], tracks.problems) if tracks.problems else None
+        return MapSection(None, [], [], tracks.problems) if tracks.problems else None
     return _drawn(tracks, network, ink, types)
 
 
@@ -61,36 +71,39 @@ def _moved(tracks: Tracks, vehicle: int) -> bool:
     )
 
 
-def _drawn(tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink], types: Mapping[int, VehicleType]) -> Section:
+def _drawn(
+    tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink], types: Mapping[int, VehicleType]
+) -> MapSection:
     end_s = max(fixes[-1].at_s for fixes in tracks.by_vehicle.values())
     known = [division for division in divisions(network.states) if division.at_s <= end_s]
-    kept = longest(known, end_s, max(MAX_STRETCHES // len(tracks.by_vehicle), 2))
-    flown = [life for vehicle in tracks.by_vehicle for life in lives(vehicle, tracks, network, kept, end_s)]
-    land = extent([fix for fixes in tracks.by_vehicle.values() for fix in fixes])
+    kept = longest_divisions(known, end_s, max(MAX_SEGMENTS // len(tracks.by_vehicle), 2))
+    flown = [flight for vehicle in tracks.by_vehicle for flight in flights(vehicle, tracks, network, kept, end_s)]
+    area_extent = extent([fix for fixes in tracks.by_vehicle.values() for fix in fixes])
     reboots = [(tracks.at(vehicle, at_s), vehicle) for at_s, vehicle in network.reboots if at_s <= end_s]
     moments = [
-        _moment(at_s, division, tracks, network, flown, land, ink, types)
-        for at_s, division in _telling(known, network, tracks, end_s)
+        _moment(at_s, division, tracks, network, flown, area_extent, ink, types)
+        for at_s, division in _notable_moments(known, network, tracks, end_s)
     ]
     notes = [*tracks.problems, *network.problems]
     if not known:
         notes.append("network.jsonl: the network conditions are not recorded")
     elif len(kept) < len(known):
         notes.append(f"network.jsonl: the map shows the {len(kept) - 1} longest of {len(known) - 1} network states")
-    return Section(
-        map_svg.draw_tracks(flown, reboots, land, ink, _description(tracks, land, moments)),
+    return MapSection(
+        map_svg.draw_tracks(flown, reboots, area_extent, ink, _description(tracks, area_extent, moments)),
         [*_legend(flown, rebooted=bool(reboots)), *_legend_of_moments(moments, set(types.values()))],
         moments,
         notes,
     )
 
 
-def _telling(
+def _notable_moments(
     known: Sequence[Division], network: Connectivity, tracks: Tracks, end_s: float
 ) -> list[tuple[float, Division | None]]:
-    """Begin, end, the changes between that did most to most vehicles for longest, and when links lost most.
+    """Return up to `MOMENTS` + 1 moments with the division of the network at each one.
 
-    With what was then in force.
+    The moments are the start, the end, the most important network changes and the time of the worst losses. The
+    importance of a change is the number of affected vehicles multiplied by the duration of the new state.
     """
     begin_s = min(fixes[0].at_s for fixes in tracks.by_vehicle.values())
     ends = [*(division.at_s for division in known[1:]), end_s]
@@ -110,15 +123,15 @@ def _moment(
     division: Division | None,
     tracks: Tracks,
     network: Connectivity,
-    flown: Sequence[Life],
-    land: Extent,
+    flown: Sequence[Flight],
+    area_extent: Extent,
     ink: Mapping[int, Ink],
     types: Mapping[int, VehicleType],
 ) -> Moment:
     living = set(ink) if division is None else division.living
     seen = {vehicle: tracks.at(vehicle, at_s) for vehicle in sorted(living) if vehicle in tracks.by_vehicle}
     links = network.links(at_s) if division else []
-    lost = [life.end for life in flown if life.lost and life.end.at_s <= at_s and life.vehicle not in living]
+    lost = [flight.end for flight in flown if flight.lost and flight.end.at_s <= at_s and flight.vehicle not in living]
     what = division.what if division and division.at_s == at_s and division.what not in (RANGE, "start") else ""
     state = "network not recorded" if division is None else division.in_words()
     losses = {pair: network.loss(pair, at_s) for pair in links if pair[0] in seen and pair[1] in seen}
@@ -130,7 +143,7 @@ def _moment(
         lost,
         losses,
         division,
-        land,
+        area_extent,
         ink,
         types,
         f"The swarm at {at}: {state}",
@@ -138,13 +151,13 @@ def _moment(
     return Moment(at, what, state, picture)
 
 
-def _legend(flown: Sequence[Life], *, rebooted: bool) -> list[tuple[Markup, str]]:
-    """What is on the map of the tracks, and no more."""
+def _legend(flown: Sequence[Flight], *, rebooted: bool) -> list[tuple[Markup, str]]:
+    """Return a legend of the marks that this map contains."""
     parts: dict[str, set[int]] = {}
-    for life in flown:
-        for stretch in life.stretches:
-            part = stretch.division.part_of(life.vehicle) if stretch.division else None
-            parts.setdefault(map_svg.look(stretch.division, life.vehicle), set()).update(
+    for flight in flown:
+        for segment in flight.segments:
+            part = segment.division.part_of(flight.vehicle) if segment.division else None
+            parts.setdefault(map_svg.css_class(segment.division, flight.vehicle), set()).update(
                 () if part is None else (part,)
             )
     means = {
@@ -154,17 +167,17 @@ def _legend(flown: Sequence[Life], *, rebooted: bool) -> list[tuple[Markup, str]
     }
     entries = [
         (which, means.get(which) or f"part {', '.join(map(letter, sorted(parts[which])))}")
-        for which in map_svg.LOOKS
+        for which in map_svg.TRACK_CLASSES
         if which in parts
     ]
     entries += [("start", "start"), ("end", "end")]
-    entries += [("lost", "lost")] if any(life.lost for life in flown) else []
+    entries += [("lost", "lost")] if any(flight.lost for flight in flown) else []
     entries += [("reboot", "agent reboots")] if rebooted else []
     return [(map_svg.sample(which), meaning) for which, meaning in entries]
 
 
 def _in_words(losses: Collection[float]) -> str:
-    """What links lose; nothing if that is next to nothing."""
+    """Return a phrase with the range of the losses, or "" if they are negligible."""
     least, most = min(losses, default=0.0), max(losses, default=0.0)
     if not quality(most):
         return ""
@@ -173,7 +186,7 @@ def _in_words(losses: Collection[float]) -> str:
 
 
 def _legend_of_moments(moments: Sequence[Moment], types: set[VehicleType]) -> list[tuple[Markup, str]]:
-    """What the small maps show beside that: links that lose messages; of several types of vehicles, which is which."""
+    """Return legend entries for lossy links, and for vehicle types if there are several."""
     drawn = "".join(moment.picture for moment in moments)
     entries = [
         (map_svg.sample(f"q{which}"), words)
@@ -184,12 +197,12 @@ def _legend_of_moments(moments: Sequence[Moment], types: set[VehicleType]) -> li
     return entries + [(map_svg.sample(vehicle_type), vehicle_type) for vehicle_type in shapes]
 
 
-def _description(tracks: Tracks, land: Extent, moments: Sequence[Moment]) -> str:
-    """What the map shows, in words."""
+def _description(tracks: Tracks, area_extent: Extent, moments: Sequence[Moment]) -> str:
+    """Return a text alternative for the map."""
     count = len(tracks.by_vehicle)
     states = "; ".join(
         f"at {moment.at}{f', {moment.what}' if moment.what else ''}: {moment.network}" for moment in moments
     )
     vehicles = f"{count} vehicles" if count > 1 else "1 vehicle"
-    area = f"{land.width_m:.0f} m from west to east, {land.height_m:.0f} m from south to north"
+    area = f"{area_extent.width_m:.0f} m from west to east, {area_extent.height_m:.0f} m from south to north"
     return f"{vehicles}; {area}; {states}."

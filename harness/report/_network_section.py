@@ -1,4 +1,4 @@
-"""What the network was set to, what it did, and what happened to it, as it is on record."""
+"""The network section of the report: the settings at the start, the states over time, and the recorded events."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from harness.report import _network_strip
 from harness.report.map_parts import divisions
 
 MOST_PAIRS = 10
-"""Lanes of pairs; of more only those that lost most."""
+"""Maximum number of lanes with pairs of vehicles. The lanes with the largest losses are kept."""
 NAMED_PAIRS = 3
 REASONS = {
     "collision": "collision with other frames",
@@ -29,8 +29,8 @@ REASONS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Strip:
-    """Lanes along mission time, from top to bottom, and what they are called."""
+class NetworkStrip:
+    """Names of the lanes from top to bottom, and a picture of their states over mission time."""
 
     names: list[str]
     picture: Markup
@@ -38,8 +38,8 @@ class Strip:
 
 def strip(
     network: Connectivity, faults: Sequence[FaultRecord], end_s: float, channel: ChannelRecord | None = None
-) -> Strip | None:
-    """What the network did up to `end_s`, as it is on record; None if it is not."""
+) -> NetworkStrip | None:
+    """Draw the recorded network states up to `end_s`. Return None if there are none."""
     if not network.states:
         return None
     partitions = [
@@ -54,7 +54,7 @@ def strip(
         *_pairs(network, end_s),
     ]
     ticks = [(fault.at_s, f"{text.duration(fault.at_s)}: {fault.what}") for fault in faults]
-    return Strip([name for name, _ in lanes], _network_strip.draw(lanes, ticks, end_s))
+    return NetworkStrip([name for name, _ in lanes], _network_strip.draw(lanes, ticks, end_s))
 
 
 def _load(channel: ChannelRecord, end_s: float) -> list[_network_strip.Span]:
@@ -84,7 +84,10 @@ def channel(record: RunRecord) -> list[str]:
 
 
 def _pairs(network: Connectivity, end_s: float) -> list[tuple[str, list[_network_strip.Span]]]:
-    """A lane for the pairs whose links were alike all along, those that lost most first; none if all were alike."""
+    """Return a lane for each group of pairs with equal losses over time, the largest losses first.
+
+    Return no lanes if all pairs have equal losses.
+    """
     alike: defaultdict[tuple[tuple[float, float], ...], list[Pair]] = defaultdict(list)
     for pair, history in network.pair_losses.items():
         alike[tuple(history)].append(pair)
@@ -112,25 +115,25 @@ def _in_words(losses: Losses) -> str:
     return mean if mean == worst else f"{mean}, the worst link {worst}"
 
 
-def start(states: Sequence[NetworkState]) -> str | None:
-    """What the network was set to at the start, in words; None if that is not on record."""
+def initial_state(states: Sequence[NetworkState]) -> str | None:
+    """Return a description of the network at the start, or None if it is not recorded."""
     return states[0].detail if states else None
 
 
-def happened(record: RunRecord) -> list[tuple[str, str, str]]:
-    """When, what, and everything else that is known of each fault, and of each command of an operator, in order."""
-    rows = [(fault.at_s, fault.what, _of_fault(fault)) for fault in record.faults]
+def event_rows(record: RunRecord) -> list[tuple[str, str, str]]:
+    """Return time, event and details of each fault and operator command, in time order."""
+    rows = [(fault.at_s, fault.what, _fault_detail(fault)) for fault in record.faults]
     station, refused = record.ground_station, "; refused" if in_virtual_time(record.backend) else ""
     if station is not None:
-        rows += [(command.at_s, "operator", _of_command(command) + refused) for command in station.commands]
+        rows += [(command.at_s, "operator", _command_detail(command) + refused) for command in station.commands]
     rows.sort(key=lambda row: row[0])
-    told = [(text.duration(at_s), what, detail) for at_s, what, detail in rows]
+    rows_text = [(text.duration(at_s), what, detail) for at_s, what, detail in rows]
     if station is not None and station.commands_left_out:
-        told.append(("later", "operator", f"{station.commands_left_out} more commands, which are not recorded"))
-    return told
+        rows_text.append(("later", "operator", f"{station.commands_left_out} more commands, which are not recorded"))
+    return rows_text
 
 
-def _of_fault(fault: FaultRecord) -> str:
+def _fault_detail(fault: FaultRecord) -> str:
     details = [fault.detail] if fault.detail else []
     if fault.fully_connected is not None:
         details.append(f"fully connected: {text.value(fault.fully_connected)}")
@@ -139,10 +142,13 @@ def _of_fault(fault: FaultRecord) -> str:
     return "; ".join(details)
 
 
-def _of_command(command: OperatorCommand) -> str:
-    """ "vehicle 2: MAV_CMD_DO_SET_MODE; param1 1, param2 6; 3 times until 2:05": what is 0 goes without saying."""
-    who = f"vehicle{'s' if len(command.vehicles) > 1 else ''} {' '.join(map(str, command.vehicles))}"
-    details = [f"{who}: {command.command or command.message}"]
+def _command_detail(command: OperatorCommand) -> str:
+    """Return a text like "vehicle 2: MAV_CMD_DO_SET_MODE; param1 1, param2 6; 3 times until 2:05".
+
+    Parameters with the value 0 are left out.
+    """
+    vehicles = f"vehicle{'s' if len(command.vehicles) > 1 else ''} {' '.join(map(str, command.vehicles))}"
+    details = [f"{vehicles}: {command.command or command.message}"]
     values = [f"{name} {text.value(value)}" for name, value in command.values.items() if value]
     if values:
         details.append(", ".join(values))
@@ -152,7 +158,7 @@ def _of_command(command: OperatorCommand) -> str:
 
 
 def ground_station(record: RunRecord) -> str | None:
-    """A sentence on what passed between the vehicles and a ground station, if there was one."""
+    """Return a sentence about the traffic with the ground station, or None if there was no ground station."""
     if (station := record.ground_station) is None:
         return None
     dropped = f", and {text.value(station.dropped)} were dropped" if station.dropped else ""

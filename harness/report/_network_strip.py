@@ -1,6 +1,6 @@
-"""What the network did along mission time: a strip with the partitions and the loss, and a tick for each fault.
+"""A strip of the network over mission time: partitions, losses, and a tick for each fault.
 
-Drawn in per cent of its width, so that it fits a phone and a projector alike and its text is never scaled.
+Horizontal positions are percentages of the width. The strip therefore fits any screen, and its text is never scaled.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from harness.present import text as words
 from harness.present.svg import linear_axis
-from harness.report._timeline_plot import short
+from harness.report._timeline_plot import format_number
 
 _LANE = 24
 
@@ -23,11 +23,11 @@ class Span:
     to_s: float
     text: str
     level: float = 1.0
-    """How much of the lane's height is filled, 0..1."""
+    """The filled share of the lane's height, 0 to 1."""
 
 
 def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[Span]:
-    """Spans from changes (at_s, text, level), each lasting until the next; a level of 0 is no span."""
+    """Turn changes (at_s, text, level) into spans. Each span lasts until the next change. Level 0 gives no span."""
     spans: list[Span] = []
     in_time = sorted(changes, key=lambda change: change[0])
     for number, (at_s, text, level) in enumerate(in_time):
@@ -38,7 +38,7 @@ def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[Spa
 
 
 def draw(lanes: Sequence[tuple[str, list[Span]]], ticks: Sequence[tuple[float, str]], end_s: float) -> Markup:
-    """The named lanes from top to bottom; `ticks` are (at_s, text)."""
+    """Draw the named lanes from top to bottom. `ticks` are pairs (at_s, text)."""
     parts: list[Markup] = []
     for number, (name, spans) in enumerate(lanes):
         parts.append(
@@ -59,7 +59,7 @@ def draw(lanes: Sequence[tuple[str, list[Span]]], ticks: Sequence[tuple[float, s
         anchor = "end" if tick > 0.95 * end_s else "middle" if tick else "start"
         parts.append(
             Markup('<text class="axis" x="{}" y="{}" text-anchor="{}">{}</text>').format(
-                _share(tick, end_s), height + 14, anchor, short(tick)
+                _share(tick, end_s), height + 14, anchor, format_number(tick)
             )
         )
     return Markup(
@@ -69,7 +69,7 @@ def draw(lanes: Sequence[tuple[str, list[Span]]], ticks: Sequence[tuple[float, s
 
 
 def _span(lane: str, span: Span, y: float, end_s: float) -> Markup:
-    """A nested <svg>, because it cuts off a text that has no room."""
+    """Draw a span as a nested <svg>, which clips a text that is too long."""
     filled = max(2.0, _LANE * span.level)
     return Markup(
         '<svg x="{}" y="{}" width="{}" height="{}"><title>{}</title><rect class="span" y="{:.1f}" width="100%"'
@@ -86,5 +86,5 @@ def _span(lane: str, span: Span, y: float, end_s: float) -> Markup:
     )
 
 
-def _share(seconds: float, end_s: float) -> str:
-    return f"{100 * seconds / end_s:.3f}%"
+def _share(format_seconds: float, end_s: float) -> str:
+    return f"{100 * format_seconds / end_s:.3f}%"

@@ -1,4 +1,6 @@
-"""What a report is made of: a run's archive, with ink for each agent and a sentence for everything that is missing."""
+"""The input of a report: the archive of a run, a colour for each agent, and a sentence for each missing or damaged
+file.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +19,7 @@ from harness.report import _swarm_section, facts
 
 @dataclass(frozen=True)
 class ReportSource:
-    """Made by `read_source`."""
+    """The input of a report, made by `read_source`."""
 
     archive: RunArchive
     run_dir: Path
@@ -33,7 +35,7 @@ class ReportSource:
 
     @cached_property
     def traces(self) -> dict[int, Trace]:
-        """Large ones without what only took a message in."""
+        """The traces by agent. Large traces are read without the handler runs that only received a message."""
         traces = self.archive.traces
         return {agent: trace.skimmed() for agent, trace in traces.items()} if self.archive.large else traces
 
@@ -43,12 +45,12 @@ class ReportSource:
 
     @property
     def chains_missing(self) -> list[str]:
-        """A sentence for each agent without a usable export, and for each export that cannot be used."""
+        """Sentences about agents without a usable export, and about damaged exports."""
         return [*_swarm_section.missing(self.archive), *map(self.archive.within, self.exports.errors)]
 
     @property
     def files_missing(self) -> list[str]:
-        """Likewise for everything else that a whole run leaves."""
+        """Sentences about all other missing or damaged files."""
         exports = set(self.exports.errors)
         problems = [*(problem for problem in self.archive.problems if problem not in exports), *self.archive.gaps]
         return [
@@ -59,7 +61,10 @@ class ReportSource:
 
 
 def read_source(archive: RunArchive) -> ReportSource:
-    """Raises RunDirectoryError if this is no run directory, or one of another version."""
+    """Read the input of a report.
+
+    Raises RunDirectoryError if the directory holds no run, or a run of another version.
+    """
     error, directory = archive.record_error, archive.directory
     if directory is None or not (archive.recorded or archive.roster):
         raise error or RunDirectoryError(f"{directory}: no files of a run found; is this a run directory?")

@@ -1,4 +1,4 @@
-"""What the rogue node sent, and what the agents did with it, as the page says it."""
+"""The rogue section of the report: the datagrams that the rogue node sent, and the agents' reactions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ MAX_ROWS = 500
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """`message` is a type of message, or says why agents refuse the datagrams."""
+class InjectionRow:
+    """One outcome of an injection. `message` is a message type, or the reason why agents refuse the datagrams."""
 
     at: str
     what: str
@@ -24,25 +24,24 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
-    """`left_out` says how many rows there were no room for."""
+class RogueSection:
+    """Rows of the table. `left_out` is the number of rows above `MAX_ROWS`."""
 
-    rows: list[Row]
+    rows: list[InjectionRow]
     left_out: int
 
 
-def section(injections: Sequence[RogueInjection]) -> Section | None:
-    """None if no rogue node was on the air, or the run's record says nothing of it."""
+def section(injections: Sequence[RogueInjection]) -> RogueSection | None:
+    """Return the section, or None if the record contains no injections."""
     rows = [row for injection in injections for row in _rows(injection)]
-    return Section(rows[:MAX_ROWS], max(0, len(rows) - MAX_ROWS)) if rows else None
+    return RogueSection(rows[:MAX_ROWS], max(0, len(rows) - MAX_ROWS)) if rows else None
 
 
 def sentences(injections: Sequence[RogueInjection]) -> list[str]:
-    """One for each injection."""
     return [in_words(injection) for injection in injections]
 
 
-def _rows(injection: RogueInjection) -> list[Row]:
+def _rows(injection: RogueInjection) -> list[InjectionRow]:
     outcomes = [(of.message, of.sent, done_with(of), text.value(of.changed)) for of in injection.messages]
     outcomes += [(f"none: {reason}", count, "refused", "\u2013") for reason, count in injection.refused.items()]
     outcomes += (
@@ -50,6 +49,6 @@ def _rows(injection: RogueInjection) -> list[Row]:
     )
     begun = (text.duration(injection.at_s), injection.what, injection.detail)
     return [
-        Row(*begun, message, text.value(sent), done, changed)
+        InjectionRow(*begun, message, text.value(sent), done, changed)
         for message, sent, done, changed in outcomes or [("\u2013", 0, "nothing sent", "\u2013")]
     ]

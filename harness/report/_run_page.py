@@ -1,8 +1,7 @@
 """The page of a run, and all files of its report.
 
-The page loads nothing; its Content-Security-Policy allows its own style sheet and the script of its timeline, which
-it can do without, and nothing else.
-Whatever comes from agents and scenarios is text to the template, which escapes all of it.
+The page loads nothing. Its Content-Security-Policy allows only its own style sheet and the script of its timeline. The
+page also works without the script. The template escapes all text from agents and scenarios.
 """
 
 from collections.abc import Mapping
@@ -39,7 +38,7 @@ _TEMPLATE = Path(__file__).with_name("page.html.j2")
 
 
 def draw(left: ReportSource) -> str:
-    """The page, as HTML."""
+    """Return the page as HTML."""
     record, exports, ink = left.record, left.exports, left.ink
     judged, outcome = verdict_section.verdicts(record), facts.outcome(record)
     timeline_section = timeline.section(left, name_blocks(exports.by_agent))
@@ -66,8 +65,8 @@ def draw(left: ReportSource) -> str:
         timeline=timeline_section,
         strip=_network_section.strip(left.network, record.faults, timeline.end_s(left), record.channel),
         channel=_network_section.channel(record),
-        network=_network_section.start(record.network),
-        happened=_network_section.happened(record),
+        network=_network_section.initial_state(record.network),
+        happened=_network_section.event_rows(record),
         ground_station=_network_section.ground_station(record),
         rogue=_rogue_section.section(record.rogue),
         flight=_map_section.section(left.archive.tracks(ink), left.network, ink, facts.vehicle_types(record)),
@@ -81,7 +80,7 @@ def draw(left: ReportSource) -> str:
 def _pictures(
     exports: Mapping[int, Export], before: Mapping[int, Export], ink: Mapping[int, Ink]
 ) -> list[dict[str, Any]]:
-    """The chains at the end of the run, and how the mission had left them where a final reconcile changed them."""
+    """Return the chain trees at the end of the mission and after the final reconcile, or one tree if both are equal."""
     if not exports:
         return []
     if not before:
@@ -111,16 +110,17 @@ def _picture(heading: str, exports: Mapping[int, Export], ink: Mapping[int, Ink]
 
 @gc_paused()
 def write_report(archive: RunArchive) -> Path:
-    """Write `report.html`, `chains.svg`, `report.md` and `junit.xml` into the run directory; the path of the page.
+    """Write `report.html`, `chains.svg`, `report.md` and `junit.xml` into the run directory. Return the path of the
+    page.
 
-    Raises RunDirectoryError if there is nothing of a run in the directory, or if the disk refuses the report. What is
-    missing or damaged is said on the page.
+    The page lists missing and damaged files. Raises RunDirectoryError if the directory contains no run, or if the files
+    cannot be written.
     """
     return write(read_source(archive))
 
 
 def write(left: ReportSource) -> Path:
-    """As `write_report` does, of what was read."""
+    """Write the report of a run that has already been read. See `write_report`."""
     _write(left.run_dir / "chains.svg", ChainTreePicture(left.exports.by_agent, left.ink).standalone())
     _write(left.run_dir / "report.md", to_markdown(left))
     _write(left.run_dir / "junit.xml", to_junit(left.record, _chains(left)))

@@ -1,4 +1,4 @@
-"""A run in short: report.md for people, junit.xml for build servers."""
+"""The short forms of a report: report.md for people, and junit.xml for build servers."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -33,7 +33,7 @@ def to_markdown(left: ReportSource) -> str:
         lines += [" \u00b7 ".join(f"{_short(label)} **{_short(figure)}**" for label, figure in figures), ""]
     if survived := _survival_section.section(record.survival, left.ink):
         lines += _listed(survived.sentences)
-    lines += _happened(_network_section.happened(record))
+    lines += _happened(_network_section.event_rows(record))
     lines += _listed(_network_section.channel(record))
     lines += _listed([station] if (station := _network_section.ground_station(record)) else [])
     lines += _listed(_rogue_section.sentences(record.rogue))
@@ -70,7 +70,7 @@ def _happened(happened: Sequence[tuple[str, str, str]]) -> Iterator[str]:
 
 
 def _listed(sentences: Iterable[str]) -> list[str]:
-    """An item for each; nothing, if there is none."""
+    """Return a Markdown list of the sentences, shortened to `SENTENCES_SHOWN`; no lines without a sentence."""
     all_sentences = list(sentences)
     items = [f"- {_short(sentence)}" for sentence in all_sentences[:SENTENCES_SHOWN]]
     if len(all_sentences) > SENTENCES_SHOWN:
@@ -83,8 +83,11 @@ def _short(text: str) -> str:
 
 
 def to_junit(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> str:
-    """A characteristic fails if it is violated, or other than its scenario expects: as in pytest. One that was not
-    applicable is skipped, with the reason. `chains` has the blocks of each agent's."""
+    """Return the run as JUnit XML. `chains` holds the block hashes of each agent's chain.
+
+    A characteristic fails if it is violated, or if its verdict differs from the verdict that the scenario expects. A
+    characteristic that is not applicable is skipped with its reason.
+    """
     return to_xml(facts.title(record), "ucp-run", record.started_at or "", record.wall_s, _cases(record, chains))
 
 

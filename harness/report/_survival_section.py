@@ -1,4 +1,4 @@
-"""What became of the blocks where vehicles were lost, as the page says it."""
+"""The survival section of the report: the blocks that were lost together with vehicles."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from harness.report.chain_tree import ranges
 
 
 @dataclass(frozen=True, slots=True)
-class BlockRow:
-    """A block that lost vehicles had completed, or that is gone."""
+class LostBlockRow:
+    """A block that a lost vehicle completed, or that no vehicle holds any more."""
 
     name: str
     ink: Ink | None
@@ -26,27 +26,27 @@ class LossRow:
     what: str
     vehicles: str
     counts: list[str]
-    """Blocks completed by then, that survived, that were gone, and that are gone at the end."""
-    blocks: list[BlockRow]
+    """Numbers of blocks: completed before the loss, survived, gone after the loss, gone at the end."""
+    blocks: list[LostBlockRow]
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class SurvivalSection:
     sentences: list[str]
     losses: list[LossRow]
 
 
-def section(survived: Survival | None, ink: Mapping[int, Ink]) -> Section | None:
-    """None if the run's record says nothing of it."""
+def section(survived: Survival | None, ink: Mapping[int, Ink]) -> SurvivalSection | None:
+    """Return the section, or None if the record contains no survival figures."""
     if survived is None:
         return None
-    return Section(in_words(survived), [_row(loss, ink) for loss in survived.losses])
+    return SurvivalSection(in_words(survived), [_row(loss, ink) for loss in survived.losses])
 
 
 def _row(loss: Loss, ink: Mapping[int, Ink]) -> LossRow:
     counts = (loss.completed, loss.survived, loss.gone, loss.gone_at_end)
     blocks = [
-        BlockRow(block.block, ink.get(block.agent_id), _listed(block.holders), _listed(block.holders_at_end))
+        LostBlockRow(block.block, ink.get(block.agent_id), _listed(block.holders), _listed(block.holders_at_end))
         for block in loss.blocks
     ]
     return LossRow(

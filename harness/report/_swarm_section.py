@@ -1,4 +1,4 @@
-"""Who flew, and what each agent and each block came to."""
+"""The swarm section of the report: a table of the agents with their vehicles, and a table of the blocks."""
 
 import shlex
 from collections.abc import Mapping
@@ -14,9 +14,9 @@ from harness.report.agent_programs import programs
 from harness.report.chain_tree import holders, ranges
 
 IN_THE_RECORD_ONLY = {"binary_sha256", "parameters_file"}
-"""Of what run.json says of a vehicle."""
-MAX_GIVEN = 10
-"""More parameters that a vehicle was given are not shown."""
+"""Fields of a vehicle in run.json that the table omits."""
+MAX_PARAMETERS = 10
+"""Maximum number of vehicle parameters in a cell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +35,14 @@ def agent_inks(archive: RunArchive) -> dict[int, Ink]:
 
 
 def missing(archive: RunArchive) -> list[str]:
-    """A sentence for all agents of the run without a usable export for the same reason."""
-    alike: dict[str, list[int]] = {}
+    """Return one sentence for each reason why agents have no usable export."""
+    by_reason: dict[str, list[int]] = {}
     for agent_id in archive.roster:
         if agent_id not in archive.exports.by_agent:
-            alike.setdefault(_fate(archive.record.agents.get(str(agent_id))), []).append(agent_id)
-    return [f"{'agent' if len(ids) == 1 else 'agents'} {', '.join(ranges(ids))}{fate}" for fate, ids in alike.items()]
+            by_reason.setdefault(_fate(archive.record.agents.get(str(agent_id))), []).append(agent_id)
+    return [
+        f"{'agent' if len(ids) == 1 else 'agents'} {', '.join(ranges(ids))}{fate}" for fate, ids in by_reason.items()
+    ]
 
 
 def _fate(agent: AgentRecord | None) -> str:
@@ -52,12 +54,12 @@ def _fate(agent: AgentRecord | None) -> str:
     return ": no usable export" + (f" ({why})" if why else "")
 
 
-BEFALLEN = "befallen"
-"""Of a vehicle's record."""
+VEHICLE_FAULTS_KEY = "befallen"
+"""Key of the list of faults in a vehicle's record."""
 
 
 def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
-    """Column labels, and a row (agent ID, ink, cells by column) for each agent and its vehicle."""
+    """Return column labels, and a row (agent ID, ink, cells by column) for each agent with its vehicle."""
     record, exports = archive.record, archive.exports.by_agent
     mixed = bool(programs(record))
     rows = []
@@ -75,13 +77,16 @@ def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
                 "waiting": len(export.blocks_to_be_committed) + len(export.reconcile_stack),
             }
         for key, value in record.vehicles.get(str(agent_id), {}).items():
-            if key == BEFALLEN:
-                cells[key] = _befallen(value)
+            if key == VEHICLE_FAULTS_KEY:
+                cells[key] = _vehicle_faults(value)
                 continue
             if key in IN_THE_RECORD_ONLY:
                 continue
             if key == "parameters_given" and isinstance(value, dict):
-                value = ", ".join(f"{name} {text.value(given)}" for name, given in list(value.items())[:MAX_GIVEN])
+                value = ", ".join(
+                    f"{name} {text.value(parameter_value)}"
+                    for name, parameter_value in list(value.items())[:MAX_PARAMETERS]
+                )
             label = text.label(key)
             cells[f"vehicle {label}" if label in cells or key == "detail" else label] = value
         cells["detail"] = agent.detail if agent else None
@@ -90,14 +95,14 @@ def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
     return {"columns": sorted(columns, key=lambda label: label == "detail"), "rows": rows}
 
 
-def _befallen(told: Any) -> str:
-    """ "lose_gps at 40 s, wind at 80 s: not simulated": what befell a vehicle, as it is on record."""
+def _vehicle_faults(recorded: Any) -> str:
+    """Return the faults of a vehicle, like "lose_gps at 40 s, wind at 80 s: not simulated"."""
     try:
         return ", ".join(
-            f"{it['what']} at {it['at_s']:g} s{'' if it['parameters'] else ': not simulated'}" for it in told
+            f"{it['what']} at {it['at_s']:g} s{'' if it['parameters'] else ': not simulated'}" for it in recorded
         )
     except (KeyError, TypeError, ValueError):
-        return text.value(told)
+        return text.value(recorded)
 
 
 def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
@@ -113,32 +118,33 @@ def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
 
 
 def counts(exports: Mapping[int, Export], record: RunRecord) -> str | None:
-    """Where the blocks are that were completed and are in no chain, and whose those are that are in one all the same.
+    """Return a sentence about completed blocks that are in no chain, and about chain blocks that no record says
+    completed.
 
-    None if the blocks that were completed are those in the chains.
+    Return None if the completed blocks are exactly the blocks in the chains.
     """
     completed = {block for export in exports.values() for block in export.completed}
     completed |= {block for agent in record.agents.values() for block in agent.completed_before}
     in_chains = {block.block_hash for export in exports.values() for block in export.chain}
-    aside = {block.block_hash for export in exports.values() for block in export.blocks()} - in_chains
+    outside_chains = {block.block_hash for export in exports.values() for block in export.blocks()} - in_chains
     if completed == in_chains:
         return None
-    parts = [f"of {len(completed)} completed blocks {_are(len(completed & in_chains))} in a chain"]
-    if waiting := len(completed & aside):
-        parts.append(f"{_are(waiting)} only in a deque or on a reconcile stack")
-    if gone := len(completed - in_chains - aside):
-        parts.append(f"{_are(gone)} in no available export")
-    if strange := len((in_chains | aside) - completed):
-        parts.append(f"beside these {_are(strange)} held without a record of completion")
+    parts = [f"of {len(completed)} completed blocks {_count_are(len(completed & in_chains))} in a chain"]
+    if waiting := len(completed & outside_chains):
+        parts.append(f"{_count_are(waiting)} only in a deque or on a reconcile stack")
+    if gone := len(completed - in_chains - outside_chains):
+        parts.append(f"{_count_are(gone)} in no available export")
+    if strange := len((in_chains | outside_chains) - completed):
+        parts.append(f"beside these {_count_are(strange)} held without a record of completion")
     return "; ".join(parts).capitalize() + "."
 
 
-def _are(count: int) -> str:
+def _count_are(count: int) -> str:
     return f"{count} is" if count == 1 else f"{count} are"
 
 
 def block_rows(exports: Mapping[int, Export], ink: Mapping[int, Ink]) -> list[BlockRow]:
-    """Every block that is in a chain, oldest first."""
+    """Return a row for each block in a chain, oldest first."""
     names, held_by = name_blocks(exports), holders(exports)
     blocks = {block.block_hash: block for export in exports.values() for block in export.chain}
     return [

@@ -1,4 +1,4 @@
-"""Charts below the timeline's lanes: chains, copies of blocks, and the cycle of a livelock."""
+"""Charts below the lanes of the timeline: lengths of chains, copies of blocks, and the cycle of a livelock."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from harness.archive.run_record import Cycle, FaultRecord
 from harness.checker.recurring_cycles import findings, in_words
 from harness.present import text
 from harness.present.svg import n
-from harness.report._timeline_plot import Shade, pin, plot, seconds, shaded, short
+from harness.report._timeline_plot import Shade, draw_background, format_number, format_seconds, pin, plot
 
 HEIGHT = 72
 MAX_MOMENTS = 600
@@ -23,7 +23,7 @@ Figure = Callable[[Replication], float | None]
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """`lines` say how each line is drawn, and what it is."""
+    """A chart. `lines` are pairs of a sample and its meaning."""
 
     name: str
     lines: list[tuple[Markup, str]]
@@ -38,21 +38,24 @@ _CHARTS: tuple[tuple[str, tuple[tuple[str, Figure], ...]], ...] = (
     ("distinct chains", (("chains", lambda spread: spread.distinct_chains),)),
     ("copies in chains", (("mean", lambda spread: spread.copies_mean), ("fewest", lambda spread: spread.copies_min))),
 )
-_LOOKS = ("broken", "whole")
-"""Of two lines; one by itself is whole."""
+_LINE_CLASSES = ("broken", "whole")
+"""CSS classes of two lines. A single line uses the last one."""
 
 
 def draw(
     spreads: Sequence[Replication], faults: Sequence[FaultRecord], shades: Sequence[Shade], end_s: float
 ) -> list[Chart]:
-    """A chart for each group of figures; `spreads` are how things stood from when on, in order, one at least."""
-    moments = thinned(spreads, end_s)
-    behind = shaded(shades, faults, HEIGHT)
+    """Return a chart for each group of figures. `spreads` holds at least one replication state, in time order."""
+    moments = thin_states(spreads, end_s)
+    behind = draw_background(shades, faults, HEIGHT)
     return [_chart(name, figures, moments, behind, end_s) for name, figures in _CHARTS]
 
 
-def thinned(spreads: Sequence[Replication], end_s: float) -> Sequence[Replication]:
-    """Where there are many: of those that nobody could tell apart in the whole picture, the worst and the last."""
+def thin_states(spreads: Sequence[Replication], end_s: float) -> Sequence[Replication]:
+    """Reduce a long sequence to the states that are visible at full zoom-out.
+
+    Each interval of one picture column keeps the state with the shortest mutual chain and the last state.
+    """
     if len(spreads) <= MAX_MOMENTS:
         return spreads
     kept: dict[int, tuple[Replication, Replication]] = {}
@@ -69,21 +72,21 @@ def _chart(
     highest = max(
         (value for _, figure in figures for moment in moments if (value := figure(moment)) is not None), default=0
     )
-    looks = _LOOKS[-len(figures) :]
+    classes = _LINE_CLASSES[-len(figures) :]
     per_px = max(highest, 1) / (HEIGHT - _TOP - _BOTTOM)
     lines = [
-        Markup('<path class="line {}" d="{}"/>').format(look, _steps(moments, figure, per_px, end_s))
-        for look, (_, figure) in zip(looks, figures, strict=True)
+        Markup('<path class="line {}" d="{}"/>').format(css_class, _steps(moments, figure, per_px, end_s))
+        for css_class, (_, figure) in zip(classes, figures, strict=True)
     ]
     until = [*(moment.at_s for moment in moments[1:]), end_s]
     tips = [
         Markup('<rect class="tip" x="{}" width="{}" height="{}"><title>{}</title></rect>').format(
-            short(moment.at_s), short(until_s - moment.at_s), HEIGHT, _tip(moment, figures, name)
+            format_number(moment.at_s), format_number(until_s - moment.at_s), HEIGHT, _tip(moment, figures, name)
         )
         for moment, until_s in zip(moments, until, strict=True)
         if until_s > moment.at_s
     ]
-    base = Markup('<path class="base" d="M0 {}H{}"/>').format(n(HEIGHT - _BOTTOM), short(end_s))
+    base = Markup('<path class="base" d="M0 {}H{}"/>').format(n(HEIGHT - _BOTTOM), format_number(end_s))
     scale = Markup('<text class="scale" x="4" y="11">{}</text>').format(text.value(highest))
     at_end = ", ".join(f"{what} {text.value(figure(moments[-1]))}" for what, figure in figures)
     description = f"{name} over mission time: maximum {text.value(highest)}; at the end {at_end}"
@@ -93,36 +96,36 @@ def _chart(
             (
                 Markup(
                     '<svg width="34" height="16" aria-hidden="true"><path class="line {}" d="M1 8h32"/></svg>'
-                ).format(look),
+                ).format(css_class),
                 what,
             )
-            for look, (what, _) in zip(looks, figures, strict=True)
+            for css_class, (what, _) in zip(classes, figures, strict=True)
         ],
         plot([behind, base, *lines, *tips], [scale], HEIGHT, end_s, description),
     )
 
 
 def _steps(moments: Sequence[Replication], figure: Figure, per_px: float, end_s: float) -> str:
-    """A line that goes up or down where the value does, and begins where there is one."""
+    """Return a step line as an SVG path. The line starts at the first known value."""
     path = ""
     last: float | None = None
     for moment in moments:
         value = figure(moment)
         if value is not None and value != last:
             y = n(HEIGHT - _BOTTOM - value / per_px)
-            path += f"H{short(moment.at_s)}V{y}" if path else f"M{short(moment.at_s)} {y}"
+            path += f"H{format_number(moment.at_s)}V{y}" if path else f"M{format_number(moment.at_s)} {y}"
             last = value
-    return f"{path}H{short(end_s)}" if path else ""
+    return f"{path}H{format_number(end_s)}" if path else ""
 
 
 def _tip(moment: Replication, figures: Sequence[tuple[str, Figure]], name: str) -> str:
     values = ", ".join(f"{what} {text.value(figure(moment))}" for what, figure in figures)
-    return f"from {seconds(moment.at_s)}: {name}: {values}"
+    return f"from {format_seconds(moment.at_s)}: {name}: {values}"
 
 
 CYCLE_HEIGHT = 34
 MAX_ROUNDS = 400
-"""More brackets than anyone tells apart; the last are drawn."""
+"""Maximum number of brackets. More could not be distinguished, so only the last ones are drawn."""
 MOST_ROUNDS = 1_000_000
 MAX_TEXT = 1000
 
@@ -130,16 +133,16 @@ _CYCLE_TOP, _CYCLE_BOTTOM = 3, 12
 _TEXT = 28
 
 
-def row(cycle: Cycle, end_s: float) -> Chart:
-    """A chart that ends with the run, at mission second `end_s`."""
+def cycle_chart(cycle: Cycle, end_s: float) -> Chart:
+    """Draw a recurring cycle up to the end of the run at mission second `end_s`."""
     start_s = max(0.0, min(cycle.since_s, end_s))
     period_s = cycle.period_s if cycle.period_s is not None and cycle.period_s > 0 else end_s - start_s
-    told = "; ".join(f"agent {finding.agent_id}, {finding.detail}" for finding in findings(cycle))[:MAX_TEXT]
+    fault_text = "; ".join(f"agent {finding.agent_id}, {finding.detail}" for finding in findings(cycle))[:MAX_TEXT]
     rounds = ceil(min((end_s - start_s) / period_s, MOST_ROUNDS)) if period_s > 0 else 0
     starts = [start_s + number * period_s for number in range(max(0, rounds - MAX_ROUNDS), rounds)]
     brackets = [_bracket(at_s, min(at_s + period_s, end_s)) for at_s in starts]
     tip = Markup('<rect class="tip" x="{}" width="{}" height="{}"><title>{}</title></rect>').format(
-        short(start_s), short(end_s - start_s), CYCLE_HEIGHT, f"{in_words(cycle)}. {told}"
+        format_number(start_s), format_number(end_s - start_s), CYCLE_HEIGHT, f"{in_words(cycle)}. {fault_text}"
     )
     label = (
         f"every {cycle.period_s:.4g} s since {start_s:.0f} s" if cycle.period_s else f"inactive since {start_s:.0f} s"
@@ -149,11 +152,17 @@ def row(cycle: Cycle, end_s: float) -> Chart:
     return Chart(
         "repeats a cycle" if cycle.period_s else "hangs",
         [],
-        plot([*brackets, tip], [pin(start_s, end_s, _TEXT, text)], CYCLE_HEIGHT, end_s, f"{in_words(cycle)}. {told}"),
+        plot(
+            [*brackets, tip],
+            [pin(start_s, end_s, _TEXT, text)],
+            CYCLE_HEIGHT,
+            end_s,
+            f"{in_words(cycle)}. {fault_text}",
+        ),
     )
 
 
 def _bracket(start_s: float, end_s: float) -> Markup:
     return Markup('<path class="round" d="M{} {}V{}H{}V{}"/>').format(
-        short(start_s), _CYCLE_TOP, _CYCLE_BOTTOM, short(end_s), _CYCLE_TOP
+        format_number(start_s), _CYCLE_TOP, _CYCLE_BOTTOM, format_number(end_s), _CYCLE_TOP
     )

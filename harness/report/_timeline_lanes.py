@@ -1,9 +1,10 @@
-"""The lanes: an agent each, with its votes above, its commits between, and its reconciles below.
+"""The lanes of the timeline. Each agent has one lane: votes at the top, commits in the middle, reconciles at the
+bottom.
 
-Nothing is told by colour alone: votes that were not approved are hollow, phases have heights, faults have shapes, and
-everything has a tooltip.
+No information depends on colour alone. Votes without approval are hollow, phases have different heights, faults have
+different shapes, and each mark has a tooltip.
 
-Of what there are thousands, `%` makes the marks: it escapes as `format` does, in a third of the time.
+Frequent marks are formatted with `%`. It escapes like `format`, and takes a third of the time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from markupsafe import Markup
 from harness.archive.history import CUT_SHORT, Commit, History, Phase, Reconcile, Tie, Vote
 from harness.archive.run_record import FaultRecord
 from harness.present.svg import n
-from harness.report._timeline_plot import Shade, pin, plot, seconds, shaded, short, told
+from harness.report._timeline_plot import Shade, draw_background, fault_text, format_number, format_seconds, pin, plot
 from harness.scenario.faults import KINDS
 
 OUTCOMES = {
@@ -26,16 +27,16 @@ OUTCOMES = {
     "reconcile in progress": "given up for a reconcile",
     CUT_SHORT: "cut short",
 }
-"""Outcome of a vote -> in words."""
+"""Outcome of a vote -> description."""
 PHASE_HEIGHTS = {"phase 1": 4, "phase 2": 7, "phase 3": 10, "finalize": 2}
 BAR_HEIGHT = 7
-"""Of a whole reconcile, where there is no room for phases."""
+"""Height of a whole reconcile, if there are too many phases to draw."""
 
 MAX_BARS = 6000
 MAX_COMMITS = 4000
 MANY_AGENTS = 16
 
-_TALL, _LOW = 34, 22  # a lane's height, for few agents and for many
+_TALL, _LOW = 34, 22  # height of a lane, for few agents and for many
 _VOTE_HEIGHT, _PHASES_HEIGHT = 7, 10
 
 
@@ -44,16 +45,16 @@ class Picture:
     drawing: Markup
     lane_height: int
     legend: list[tuple[Markup, str]]
-    """How something is drawn, and what it is."""
+    """Pairs of a sample and its meaning."""
     notes: list[str]
-    """What was left out of it."""
+    """Sentences about marks that were left out."""
 
 
 Span = TypeVar("Span", Vote, Reconcile)
 
 
 def draw(
-    course: History,
+    history: History,
     faults: Sequence[FaultRecord],
     shades: Sequence[Shade],
     agents: Sequence[int],
@@ -62,10 +63,10 @@ def draw(
     description: str,
 ) -> Picture:
     lane_height = _TALL if len(agents) <= MANY_AGENTS else _LOW
-    votes, reconciles = _longest(course.votes), _longest(course.reconciles)
+    votes, reconciles = _longest(history.votes), _longest(history.reconciles)
     notes = [
         f"Of {len(every)} {what} the {len(drawn)} longest are drawn"
-        for what, every, drawn in (("votes", course.votes, votes), ("reconciles", course.reconciles, reconciles))
+        for what, every, drawn in (("votes", history.votes, votes), ("reconciles", history.reconciles, reconciles))
         if len(drawn) < len(every)
     ]
     by_phase = sum(len(reconcile.phases) for reconcile in reconciles) <= MAX_BARS
@@ -76,9 +77,9 @@ def draw(
         drawn[vote.agent].append(_vote(vote, names))
     for reconcile in reconciles:
         drawn[reconcile.agent] += _phases(reconcile, lane_height) if by_phase else [_bar(reconcile, lane_height)]
-    for group in gathered(course.commits, end_s):
+    for group in group_commits(history.commits, end_s):
         drawn[group[0].agent].append(_commit(group, lane_height, names))
-    for tie in course.ties[:MAX_BARS]:
+    for tie in history.ties[:MAX_BARS]:
         drawn[tie.agent].append(_tie(tie, lane_height))
     height = lane_height * len(agents)
     grounds, lanes = (
@@ -86,7 +87,7 @@ def draw(
             Markup('<g transform="translate(0 {})">{}</g>').format(place * lane_height, Markup("").join(parts[agent]))
             for place, agent in enumerate(agents)
         ]
-        for parts in ({agent: _alive(agent, faults, lane_height, end_s) for agent in agents}, drawn)
+        for parts in ({agent: _running_background(agent, faults, lane_height, end_s) for agent in agents}, drawn)
     )
     marks = [
         pin(fault.at_s, end_s, (agents.index(agent) + 0.5) * lane_height, _mark(fault))
@@ -94,28 +95,28 @@ def draw(
         for agent in fault.agents or ()
         if agent in agents and fault.kind.mark
     ]
-    view = [*grounds, shaded(shades, [fault for fault in faults if not fault.agents], height), *lanes]
+    view = [*grounds, draw_background(shades, [fault for fault in faults if not fault.agents], height), *lanes]
     arrows = Markup('<svg class="arrows" width="100%" height="{}"></svg>').format(height)
     drawing = plot(view, [arrows, *marks], height, end_s, description)
-    return Picture(drawing, lane_height, _legend(course, faults, shades, by_phase=by_phase), notes)
+    return Picture(drawing, lane_height, _legend(history, faults, shades, by_phase=by_phase), notes)
 
 
 def _legend(
-    course: History, faults: Sequence[FaultRecord], shades: Sequence[Shade], *, by_phase: bool
+    history: History, faults: Sequence[FaultRecord], shades: Sequence[Shade], *, by_phase: bool
 ) -> list[tuple[Markup, str]]:
-    """What is in the picture, and no more."""
-    outcomes = {vote.outcome for vote in course.votes}
-    phases = {phase.name for reconcile in course.reconciles for phase in reconcile.phases}
+    """Return a legend of the marks that the picture contains."""
+    outcomes = {vote.outcome for vote in history.votes}
+    phases = {phase.name for reconcile in history.reconciles for phase in reconcile.phases}
     entries = [
-        (f'<rect class="vote {_look(outcome)}" x="4" y="4" width="26" height="8"/>', f"vote {label}")
+        (f'<rect class="vote {_css_class(outcome)}" x="4" y="4" width="26" height="8"/>', f"vote {label}")
         for outcome, label in (
             ("approved", "approved"),
             ("not approved", "not approved"),
             ("chain changed", "undecided"),
         )
-        if any(_look(known) == _look(outcome) for known in outcomes)
+        if any(_css_class(known) == _css_class(outcome) for known in outcomes)
     ]
-    if course.commits:
+    if history.commits:
         entries.append(('<path class="commit" d="M17 2v12"/>', "commit"))
     heights = {f"reconcile, {name}": PHASE_HEIGHTS[name] for name in PHASE_HEIGHTS if name in phases}
     if not by_phase:
@@ -124,7 +125,7 @@ def _legend(
         (f'<rect class="reconcile" x="4" y="{13 - height}" width="26" height="{height}"/>', meaning)
         for meaning, height in heights.items()
     ]
-    if course.ties:
+    if history.ties:
         entries.append(('<path class="tie" d="M17 8h.01"/>', "tie"))
     suffered = {fault.kind for fault in faults if fault.agents}
     meanings = {kind.meaning: kind.mark for kind in KINDS if kind in suffered}
@@ -142,21 +143,24 @@ def _legend(
     ]
 
 
-def named(block: str, names: Mapping[str, str]) -> str:
-    """The block's name, or the beginning of its hash if no export knows it."""
+def block_label(block: str, names: Mapping[str, str]) -> str:
+    """Return the name of the block, or the first 12 digits of its hash if no export contains the block."""
     return names.get(block, block[:12])
 
 
 def phases_in_words(reconcile: Reconcile) -> str:
-    """How many rounds of each phase, in the order in which they began."""
+    """Return the phases with their numbers of rounds, in the order in which the phases began."""
     rounds: dict[str, int] = {}
     for phase in reconcile.phases:
         rounds[phase.name] = rounds.get(phase.name, 0) + phase.rounds
     return ", ".join(f"{name} \u00d7{count}" if count > 1 else name for name, count in rounds.items()) or "no phase"
 
 
-def gathered(commits: Sequence[Commit], end_s: float) -> list[list[Commit]]:
-    """Commits of one agent that nobody could tell apart in the whole picture are one mark, where there are many."""
+def group_commits(commits: Sequence[Commit], end_s: float) -> list[list[Commit]]:
+    """Group the commits of each agent into at most about `MAX_COMMITS` marks.
+
+    Commits in one group lie close together.
+    """
     groups = [[commit] for commit in commits]
     within_s = end_s / 4000
     while len(groups) > MAX_COMMITS:
@@ -171,22 +175,22 @@ def gathered(commits: Sequence[Commit], end_s: float) -> list[list[Commit]]:
 
 
 def _longest(spans: Sequence[Span]) -> list[Span]:
-    """As many as there is room for; of those that are as long the earliest, whosoever they are."""
+    """Return the `MAX_BARS` longest spans in time order. The earlier of two equally long spans is kept."""
     kept = sorted(spans, key=lambda span: (round(span.start_s - span.end_s, 3), span.start_s))[:MAX_BARS]
     return sorted(kept, key=attrgetter("start_s"))
 
 
-def _look(outcome: str) -> str:
-    """The class of a vote; whatever is neither approved nor refused is undecided."""
+def _css_class(outcome: str) -> str:
+    """Return the CSS class of a vote. All outcomes except approval and disapproval are undecided."""
     return {"approved": "approved", "not approved": "refused"}.get(outcome, "undecided")
 
 
 def _vote(vote: Vote, names: Mapping[str, str]) -> Markup:
-    tip = f"agent {vote.agent}: vote on {named(vote.block, names)}, {_from_to(vote)}:"
+    tip = f"agent {vote.agent}: vote on {block_label(vote.block, names)}, {_from_to(vote)}:"
     return Markup('<rect class="vote %s" x="%s" y="3" width="%s" height="%s"><title>%s</title></rect>') % (
-        _look(vote.outcome),
-        short(vote.start_s),
-        short(vote.end_s - vote.start_s),
+        _css_class(vote.outcome),
+        format_number(vote.start_s),
+        format_number(vote.end_s - vote.start_s),
         _VOTE_HEIGHT,
         f"{tip} {OUTCOMES.get(vote.outcome, vote.outcome[:40])}",
     )
@@ -212,28 +216,29 @@ def _bar(reconcile: Reconcile, lane_height: int) -> Markup:
 
 def _reconcile_bar(span: Phase | Reconcile, height: int, lane_height: int, tip: str) -> Markup:
     return Markup('<rect class="reconcile" x="%s" y="%s" width="%s" height="%s"><title>%s</title></rect>') % (
-        short(span.start_s),
+        format_number(span.start_s),
         lane_height - 3 - height,
-        short(span.end_s - span.start_s),
+        format_number(span.end_s - span.start_s),
         height,
         f"{tip}, {_from_to(span)}",
     )
 
 
 def _from_to(span: Vote | Reconcile | Phase) -> str:
-    return f"{seconds(span.start_s)} to {seconds(span.end_s)}"
+    return f"{format_seconds(span.start_s)} to {format_seconds(span.end_s)}"
 
 
 def _commit(group: Sequence[Commit], lane_height: int, names: Mapping[str, str]) -> Markup:
     first, last = group[0], group[-1]
-    tip = f"agent {first.agent} commits {named(first.block, names)} ({first.how}), {seconds(first.at_s)}"
+    tip = f"agent {first.agent} commits {block_label(first.block, names)} ({first.how}), {format_seconds(first.at_s)}"
     if len(group) > 1:
-        tip = f"agent {first.agent} commits {len(group)} blocks, {seconds(first.at_s)} to {seconds(last.at_s)}"
+        times = f"{format_seconds(first.at_s)} to {format_seconds(last.at_s)}"
+        tip = f"agent {first.agent} commits {len(group)} blocks, {times}"
     top, bottom = _VOTE_HEIGHT + 4, lane_height - _PHASES_HEIGHT - 1
     if bottom - top < 6:
         top, bottom = 2, lane_height - 2
     return Markup('<path class="commit" d="M%s %sV%s"><title>%s</title></path>') % (
-        short(first.at_s),
+        format_number(first.at_s),
         top,
         bottom,
         tip,
@@ -241,16 +246,16 @@ def _commit(group: Sequence[Commit], lane_height: int, names: Mapping[str, str])
 
 
 def _tie(tie: Tie, lane_height: int) -> Markup:
-    """A stroke without length and with round caps is a dot, however the view stretches."""
+    """Draw a dot. A stroke of length 0 with round caps stays round when the view is stretched."""
     return Markup('<path class="tie" d="M{} {}h0"><title>{}</title></path>').format(
-        short(tie.at_s),
+        format_number(tie.at_s),
         n(lane_height - 3 - _PHASES_HEIGHT / 2),
-        f"agent {tie.agent}: {tie.branch[:60]}, {seconds(tie.at_s)}",
+        f"agent {tie.agent}: {tie.branch[:60]}, {format_seconds(tie.at_s)}",
     )
 
 
-def _alive(agent: int, faults: Sequence[FaultRecord], lane_height: int, end_s: float) -> list[Markup]:
-    """The lane's ground, where the agent ran; a broken line where it was paused."""
+def _running_background(agent: int, faults: Sequence[FaultRecord], lane_height: int, end_s: float) -> list[Markup]:
+    """Draw the background of a lane while the agent runs, and a broken line while it is paused."""
     ran: list[tuple[float, float]] = []
     paused: list[tuple[float, float]] = []
     since_s: float | None = 0.0
@@ -270,16 +275,16 @@ def _alive(agent: int, faults: Sequence[FaultRecord], lane_height: int, end_s: f
     paused += [(paused_s, end_s)] if paused_s is not None else []
     grounds = [
         Markup('<rect class="ran" x="{}" y="1" width="{}" height="{}"/>').format(
-            short(start_s), short(until_s - start_s), lane_height - 2
+            format_number(start_s), format_number(until_s - start_s), lane_height - 2
         )
         for start_s, until_s in ran
     ]
     stills = [
         Markup('<path class="paused" d="M{} {}H{}"><title>{}</title></path>').format(
-            short(start_s),
+            format_number(start_s),
             n(lane_height / 2),
-            short(until_s),
-            f"agent {agent} is paused, {seconds(start_s)} to {seconds(until_s)}",
+            format_number(until_s),
+            f"agent {agent} is paused, {format_seconds(start_s)} to {format_seconds(until_s)}",
         )
         for start_s, until_s in paused
     ]
@@ -287,4 +292,4 @@ def _alive(agent: int, faults: Sequence[FaultRecord], lane_height: int, end_s: f
 
 
 def _mark(fault: FaultRecord) -> Markup:
-    return Markup('<path class="mark" d="{}"><title>{}</title></path>').format(fault.kind.mark, told(fault))
+    return Markup('<path class="mark" d="{}"><title>{}</title></path>').format(fault.kind.mark, fault_text(fault))

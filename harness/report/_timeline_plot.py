@@ -1,7 +1,8 @@
-"""What the pictures along mission time share: a view that zooming changes, marks pinned to a second, and the axis.
+"""Common parts of the pictures over mission time: a zoomable view, marks pinned to a second, and the axis.
 
-Inside a view one unit across is a mission second, and one down is a pixel; to zoom is to change its viewBox. So shapes
-in it stretch, and strokes (`vector-effect` in `timeline.css`) do not. What must not stretch is pinned outside the view.
+In a view, one horizontal unit is a mission second and one vertical unit is a pixel. Zooming changes the viewBox of the
+view. Shapes in the view are stretched, but strokes are not (`vector-effect` in `timeline.css`). Marks that must keep
+their shape are pinned outside the view.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,19 +18,19 @@ TICK_HEIGHT = 22
 
 @dataclass(frozen=True, slots=True)
 class Shade:
-    """The network was parted from one mission second to another, and how."""
+    """A period of mission time with a partition, and its description."""
 
     start_s: float
     end_s: float
     text: str
 
 
-def seconds(moment: float) -> str:
-    """Mission seconds to the millisecond: 300.25 s."""
-    return f"{short(moment)}\u00a0s"
+def format_seconds(moment: float) -> str:
+    """Format mission seconds to the millisecond, for example "300.25 s"."""
+    return f"{format_number(moment)}\u00a0s"
 
 
-def short(moment: float) -> str:
+def format_number(moment: float) -> str:
     return f"{moment:.3f}".rstrip("0").rstrip(".")
 
 
@@ -39,45 +40,54 @@ def plot(view: Iterable[Markup], pinned: Iterable[Markup], height: float, end_s:
         '<svg class="view" width="100%" height="{h}" viewBox="0 0 {end} {h}" preserveAspectRatio="none">{view}</svg>'
         "{pinned}</svg>"
     ).format(
-        h=n(height), end=short(end_s), desc=description, view=Markup("").join(view), pinned=Markup("").join(pinned)
+        h=n(height),
+        end=format_number(end_s),
+        desc=description,
+        view=Markup("").join(view),
+        pinned=Markup("").join(pinned),
     )
 
 
 def pin(at_s: float, end_s: float, y: float, shape: Markup) -> Markup:
-    """The shape with its origin at this second, wherever that is in the view."""
+    """Place the origin of the shape at this second, independent of the zoom."""
     return Markup('<svg class="pin" data-at="{}" x="{}%" y="{}">{}</svg>').format(
-        short(at_s), short(100 * at_s / end_s), n(y), shape
+        format_number(at_s), format_number(100 * at_s / end_s), n(y), shape
     )
 
 
-def shaded(shades: Sequence[Shade], faults: Sequence[FaultRecord], height: float) -> Markup:
-    """Behind everything: when the network was parted, and a rule where something was done to it or to agents."""
+def draw_background(shades: Sequence[Shade], faults: Sequence[FaultRecord], height: float) -> Markup:
+    """Draw the background: shades for partitions, and vertical lines for network changes and faults."""
     parts = [
         Markup('<rect class="shade" x="{}" width="{}" height="{}"><title>{}</title></rect>').format(
-            short(shade.start_s),
-            short(shade.end_s - shade.start_s),
+            format_number(shade.start_s),
+            format_number(shade.end_s - shade.start_s),
             n(height),
-            f"{seconds(shade.start_s)} to {seconds(shade.end_s)}: {shade.text}",
+            f"{format_seconds(shade.start_s)} to {format_seconds(shade.end_s)}: {shade.text}",
         )
         for shade in shades
     ]
     parts += [
         Markup('<path class="{}" d="M{} 0V{}"><title>{}</title></path>').format(
-            "fault" if fault.agents else "change", short(fault.at_s), n(height), told(fault)
+            "fault" if fault.agents else "change", format_number(fault.at_s), n(height), fault_text(fault)
         )
         for fault in faults
     ]
     return Markup("").join(parts)
 
 
-def told(fault: FaultRecord) -> str:
-    return f"{seconds(fault.at_s)}: {fault.what[:60]}, {fault.detail[:300]}"
+def fault_text(fault: FaultRecord) -> str:
+    return f"{format_seconds(fault.at_s)}: {fault.what[:60]}, {fault.detail[:300]}"
 
 
 def axis(end_s: float) -> Markup:
     ticks = linear_axis(0.0, end_s, (0.0, 100.0)).ticks
     marks = (
-        pin(tick, end_s, 0, Markup('<path d="M0 0v4"/><text y="17" text-anchor="middle">{}</text>').format(short(tick)))
+        pin(
+            tick,
+            end_s,
+            0,
+            Markup('<path d="M0 0v4"/><text y="17" text-anchor="middle">{}</text>').format(format_number(tick)),
+        )
         for tick in ticks
     )
     return Markup(

@@ -1,6 +1,6 @@
-"""The timeline: what each agent did along mission time, and under it how far the data had spread.
+"""The timeline section of the report: the actions of each agent, and charts of the spread of the data.
 
-The page is whole without its script: the pictures then show the whole run, and the tables what is in them.
+Without its script the page shows the whole run, and tables list the votes and reconciles.
 """
 
 import json
@@ -21,7 +21,7 @@ from harness.present.colours import Ink
 from harness.report import _timeline_charts, _timeline_lanes, facts
 from harness.report._report_source import ReportSource
 from harness.report._timeline_lanes import OUTCOMES
-from harness.report._timeline_plot import Shade, axis, seconds
+from harness.report._timeline_plot import Shade, axis, format_seconds
 from harness.report.map_parts import divisions
 
 _HERE = Path(__file__).parent
@@ -35,16 +35,16 @@ MAX_FAULTS = 500
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
-    """`left_out` says how many rows there were no room for."""
+class TimelineTable:
+    """Rows of a table. `left_out` is the number of rows above `MAX_ROWS`."""
 
     rows: list[list[str]]
     left_out: int
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
-    """`messages` is what the script draws arrows from, as JSON: null if they are left out."""
+class Timeline:
+    """The timeline. `messages` is the JSON from which the script draws arrows, or "null" if messages are left out."""
 
     end_s: float
     agents: list[tuple[int, Ink]]
@@ -54,34 +54,34 @@ class Drawn:
     charts: list[_timeline_charts.Chart]
     axis: Markup
     messages: str
-    votes: Table
-    reconciles: Table
+    votes: TimelineTable
+    reconciles: TimelineTable
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
-    """`notes` say what was left out."""
+class TimelineSection:
+    """The timeline, and notes about the parts that were left out."""
 
-    drawn: Drawn
+    drawn: Timeline
     notes: list[str]
 
 
-def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
-    """`names` are those of blocks by hash. None if there is no trace."""
+def section(left: ReportSource, names: Mapping[str, str]) -> TimelineSection | None:
+    """Return the section, or None if there is no trace. `names` maps block hashes to names."""
     traces, ink = left.traces, left.ink
     if not traces:
         return None
     notes = []
     faults = possible(left.record.faults)
     ends_s = end_s(left)
-    course = history_of(traces, faults, ends_s, whole=not left.archive.large)
+    history = history_of(traces, faults, ends_s, whole=not left.archive.large)
     unknown = {agent: unknown_words(trace.runs) for agent, trace in sorted(traces.items())}
-    untold = [agent for agent, words_of_agent in unknown.items() if words_of_agent]
-    all_held = not any("operation" in unknown[agent] for agent in untold)
-    if untold:
-        first, more = first_of(unknown[untold[0]]), len(untold) - 1
+    incomplete = [agent for agent, words_of_agent in unknown.items() if words_of_agent]
+    all_held = not any("operation" in unknown[agent] for agent in incomplete)
+    if incomplete:
+        first, more = first_of(unknown[incomplete[0]]), len(incomplete) - 1
         others = f", and such words in {more} more" if more else ""
-        notes.append(f"some steps of agent {untold[0]} are not shown: {first} in its trace{others}")
+        notes.append(f"some steps of agent {incomplete[0]} are not shown: {first} in its trace{others}")
     shades, shades_left_out = _shades(left.network, ends_s)
     if shades_left_out:
         notes.append(f"{shades_left_out} shorter partitions are not shaded")
@@ -89,49 +89,49 @@ def section(left: ReportSource, names: Mapping[str, str]) -> Section | None:
         notes.append(f"the first {MAX_FAULTS} of {len(faults)} faults and network changes are drawn")
         faults = faults[:MAX_FAULTS]
     agents = [(agent, ink[agent]) for agent in sorted(traces)]
-    messages, without = _messages(course.messages, [agent for agent, _ in agents], names)
+    messages, without = _messages(history.messages, [agent for agent, _ in agents], names)
     picture = _timeline_lanes.draw(
-        course,
+        history,
         faults,
         shades,
         [agent for agent, _ in agents],
         names,
         ends_s,
-        _in_words(course, len(agents), ends_s, bool(untold)),
+        _in_words(history, len(agents), ends_s, bool(incomplete)),
     )
-    drawn = Drawn(
+    drawn = Timeline(
         ends_s,
         agents,
         picture.lane_height,
         picture.drawing,
         picture.legend,
         [
-            *([_timeline_charts.row(left.record.cycle, ends_s)] if left.record.cycle else []),
+            *([_timeline_charts.cycle_chart(left.record.cycle, ends_s)] if left.record.cycle else []),
             *(_timeline_charts.draw(replication_of(traces, faults), faults, shades, ends_s) if all_held else []),
         ],
         axis(ends_s),
         messages,
-        _table(course.votes, lambda vote: _vote_row(vote, names)),
-        _table(course.reconciles, _reconcile_row),
+        _table(history.votes, lambda vote: _vote_row(vote, names)),
+        _table(history.reconciles, _reconcile_row),
     )
-    return Section(drawn, [*notes, *without, *picture.notes])
+    return TimelineSection(drawn, [*notes, *without, *picture.notes])
 
 
 def end_s(left: ReportSource) -> float:
-    """When what is drawn of a run is over, in mission seconds."""
+    """Return the mission second at which the timeline ends."""
     faults = possible(left.record.faults)
     return max(ends_at(left.traces), *(fault.at_s for fault in faults), _planned_s(left.record), 1.0)
 
 
 def _planned_s(record: RunRecord) -> float:
-    """How many mission seconds the run was to last, if it did not end before."""
+    """Return the planned duration of a completed run in mission seconds, or 0."""
     if record.scenario is None or record.scenario.duration_s > LATEST_S or facts.outcome(record) is not None:
         return 0.0
     return record.scenario.duration_s
 
 
 def _shades(network: Connectivity, end_s: float) -> tuple[list[Shade], int]:
-    """When the network was parted, and how many shorter times there were no room for."""
+    """Return the partitions with their times, and the number of shorter partitions above `MAX_SHADES`."""
     known = divisions(network.states)
     ends = [*(division.at_s for division in known[1:]), end_s]
     shades = [
@@ -146,24 +146,28 @@ def _shades(network: Connectivity, end_s: float) -> tuple[list[Shade], int]:
 def _messages(
     messages: Sequence[Message] | None, agents: Sequence[int], names: Mapping[str, str]
 ) -> tuple[str, list[str]]:
-    """Names of messages, agents, and of each message: when, from which lane, name, block, and [lane, when] handled."""
+    """Return the received messages as JSON, and notes about left-out messages.
+
+    The JSON holds the message names, the agent IDs, and one list for each message: time, lane of the sender, index of
+    the name, block, and a pair [lane, time] for each receipt.
+    """
     if messages is None:
         return "null", ["Messages are not drawn, because the traces are too large"]
-    heard = [message for message in messages if message.receipts]
-    arrows = sum(len(message.receipts) for message in heard)
+    received = [message for message in messages if message.receipts]
+    arrows = sum(len(message.receipts) for message in received)
     if arrows > MAX_ARROWS:
         return "null", [f"Messages are not drawn, because {arrows} are too many for a page"]
     lanes = {agent: lane for lane, agent in enumerate(agents)}
-    kinds = {name: place for place, name in enumerate(dict.fromkeys(message.name for message in heard))}
+    kinds = {name: place for place, name in enumerate(dict.fromkeys(message.name for message in received))}
     sent = [
         [
             round(message.at_s, 3),
             lanes[message.sender],
             kinds[message.name],
-            _timeline_lanes.named(message.block, names) if message.block else "",
+            _timeline_lanes.block_label(message.block, names) if message.block else "",
             [[lanes[agent], round(at_s, 3)] for agent, at_s in message.receipts],
         ]
-        for message in heard
+        for message in received
     ]
     document = {"kinds": [name[:40] for name in kinds], "agents": list(agents), "sent": sent}
     return json.dumps(document, separators=(",", ":")), []
@@ -172,37 +176,38 @@ def _messages(
 Span = TypeVar("Span", Vote, Reconcile)
 
 
-def _table(spans: Sequence[Span], row: Callable[[Span], list[str]]) -> Table:
+def _table(spans: Sequence[Span], cycle_chart: Callable[[Span], list[str]]) -> TimelineTable:
     first = sorted(spans, key=lambda span: (span.start_s, span.agent))[:MAX_ROWS]
-    return Table([row(span) for span in first], len(spans) - len(first))
+    return TimelineTable([cycle_chart(span) for span in first], len(spans) - len(first))
 
 
 def _vote_row(vote: Vote, names: Mapping[str, str]) -> list[str]:
     return [
-        seconds(vote.start_s),
+        format_seconds(vote.start_s),
         str(vote.agent),
-        _timeline_lanes.named(vote.block, names),
+        _timeline_lanes.block_label(vote.block, names),
         OUTCOMES.get(vote.outcome, vote.outcome[:40]),
-        seconds(vote.end_s - vote.start_s),
+        format_seconds(vote.end_s - vote.start_s),
     ]
 
 
 def _reconcile_row(reconcile: Reconcile) -> list[str]:
     return [
-        seconds(reconcile.start_s),
+        format_seconds(reconcile.start_s),
         str(reconcile.agent),
         reconcile.reason,
         _timeline_lanes.phases_in_words(reconcile) + ("" if reconcile.done else ", cut short"),
-        seconds(reconcile.end_s - reconcile.start_s),
+        format_seconds(reconcile.end_s - reconcile.start_s),
     ]
 
 
-def _in_words(course: History, agents: int, end_s: float, unknown: bool) -> str:
-    """What the lanes show, for who does not see them; with `unknown` words in traces there may be more."""
-    approved = sum(vote.outcome == "approved" for vote in course.votes)
+def _in_words(history: History, agents: int, end_s: float, unknown: bool) -> str:
+    """Return a text alternative for the lanes. `unknown` adds that unknown words in the traces may hide events."""
+    approved = sum(vote.outcome == "approved" for vote in history.votes)
     return (
-        f"Timeline of {agents} agents over {text.duration(round(end_s, 1))}: {len(course.votes)} votes, {approved} of"
-        f" them approved, {len(course.commits)} commits, {len(course.reconciles)} reconciles, {len(course.ties)} ties."
+        f"Timeline of {agents} agents over {text.duration(round(end_s, 1))}: {len(history.votes)} votes, {approved} of"
+        f" them approved, {len(history.commits)} commits, {len(history.reconciles)} reconciles,"
+        f" {len(history.ties)} ties."
         " The tables below list votes and reconciles."
         f"{' The traces contain unknown words, so there may be more.' if unknown else ''}"
     )

@@ -1,4 +1,4 @@
-"""Who ran what, where not all agents were the harness's own."""
+"""The programs that the agents ran, for runs with agents other than the harness's own."""
 
 import shlex
 from collections.abc import Iterable, Mapping
@@ -13,9 +13,9 @@ from harness.scenario import Scenario
 
 @dataclass(frozen=True)
 class Program:
-    """What these agents ran: `command` as the scenario has it, None for the harness's own.
+    """A program of one or more agents. `command` is the scenario's command, or None for the harness's own agent.
 
-    `version` is what the agents said of themselves, None if they said nothing.
+    `version` is the version that the agents reported, or None.
     """
 
     agents: tuple[int, ...]
@@ -24,7 +24,7 @@ class Program:
 
     @property
     def in_words(self) -> str:
-        """ "agent 2 ran ./my_agent --fast (1.4)", "agents 1, 3 ran the harness's own"."""
+        """A phrase like "agent 2 ran ./my_agent --fast (1.4)" or "agents 1, 3 ran the harness's own"."""
         program = "the harness's own" if self.command is None else shlex.join(self.command)
         of_version = "" if self.version is None else f" ({self.version})"
         return f"agent{'s' * (len(self.agents) > 1)} {', '.join(ranges([*self.agents]))} ran {program}{of_version}"
@@ -34,12 +34,15 @@ class Program:
 
 
 def programs(record: RunRecord) -> list[Program]:
-    """In the order of their first agents; none where all agents are the harness's own, or nothing is known of them."""
+    """Return the programs in the order of their first agents. Return none if all agents are the harness's own."""
     return [] if record.scenario is None else asked_for(record.scenario, record.agents)
 
 
 def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingProxyType({})) -> list[Program]:
-    """The same of a scenario; `agents` is what is on record of them."""
+    """Return the programs that a scenario asks for.
+
+    `agents` are the records of the agents, if the scenario was played.
+    """
     if not scenario.foreign:
         return []
     alike: dict[tuple[tuple[str, ...] | None, str | None], list[int]] = {}

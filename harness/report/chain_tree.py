@@ -1,10 +1,10 @@
-"""The system-wide result as a tree: the agents' chains, together where they agree and apart where they do not.
+"""The chains of all agents as a tree. Equal beginnings of chains share a branch.
 
-A block stands in the tree once per history that it follows, so one that diverged agents both hold is on two branches
-(Figure 4.4). `marks` turns the tree into what is drawn: a box per block, an oval where agents' chains end and, if
-asked, an ellipsis for the middle of a long branchless stretch.
+A block appears once for each history that it follows. If diverged agents hold the same block, it is therefore on two
+branches (Figure 4.4). `marks` turns the tree into marks to draw: a box for each block, an oval where chains end and, on
+request, an ellipsis for the middle of a long stretch without branches.
 
-Chains are long and Python's stack is not: everything here loops instead of recursing.
+A chain can be longer than Python's recursion limit. All functions here use loops instead of recursion.
 """
 
 import math
@@ -15,46 +15,46 @@ from typing import Literal
 from harness.archive.exports import Export, ExportedBlock
 
 KEPT_AT_EACH_END = 3
-"""Blocks of a stretch that are drawn before and after its ellipsis."""
+"""Number of blocks that are drawn before and after the ellipsis of a stretch."""
 FEWEST_HIDDEN = 3
-"""An ellipsis for less would save no room."""
+"""Minimum number of blocks behind an ellipsis. An ellipsis for fewer blocks would save no room."""
 
 OVAL_LINE_CHARACTERS = 14
 
 
 @dataclass(slots=True)
 class Node:
-    """A block after one history, or the inception block (`block` is None)."""
+    """A block after one history. In the inception block, `block` is None."""
 
     block: ExportedBlock | None
     holders: list[int] = field(default_factory=list)
-    """Agents whose chain follows this history up to here or beyond."""
+    """Agents whose chains contain this history up to this block."""
     ends: list[int] = field(default_factory=list)
-    """Agents whose chain ends here."""
+    """Agents whose chains end at this block."""
     children: dict[str, "Node"] = field(default_factory=dict)
 
     @property
     def is_plain(self) -> bool:
-        """A block after which nothing happens but the next."""
+        """True for a block with exactly one successor at which no chain ends."""
         return self.block is not None and len(self.children) == 1 and not self.ends
 
 
 @dataclass(slots=True)
 class Mark:
-    """Something to draw, and what stands on it."""
+    """A mark to draw, and the marks above it."""
 
     kind: Literal["block", "ellipsis", "oval"]
     nodes: list[Node]
-    """The block; the blocks hidden by an ellipsis; the block at which an oval's agents end."""
+    """The block of a box, the hidden blocks of an ellipsis, or the last block of an oval's agents."""
     lines: list[str]
     holders: list[int]
     children: list["Mark"] = field(default_factory=list)
     beside: "Mark | None" = None
-    """The oval of a block that some chains end at and others go on from."""
+    """The oval of a block at which some chains end and others continue."""
 
 
 def chain_tree(exports: Mapping[int, Export]) -> Node:
-    """The inception block, and above it the chains of all agents."""
+    """Return the inception block with the chains of all agents above it."""
     inception = Node(None)
     for agent_id, export in sorted(exports.items()):
         node = inception
@@ -67,7 +67,7 @@ def chain_tree(exports: Mapping[int, Export]) -> Node:
 
 
 def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
-    """Block hash -> the agents that have the block in their chain, whatever its history there."""
+    """Return the agents whose chains contain each block, by block hash. The history of the block does not matter."""
     held_by: dict[str, list[int]] = {}
     for agent_id, export in sorted(exports.items()):
         for block_hash in dict.fromkeys(export.chain_of_block_hashes):
@@ -76,9 +76,10 @@ def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def marks(inception: Node, names: Mapping[str, str], *, abridged: bool) -> Mark:
-    """What to draw, from the inception block up; `names` are those of `harness.archive.exports.name_blocks`.
+    """Return the mark of the inception block with all marks above it. `names` come from
+    `harness.archive.exports.name_blocks`.
 
-    What stands on a block is ordered by the lowest agent ID that it leads to.
+    The marks above a block are ordered by their lowest agent ID.
     """
     root = Mark("block", [inception], ["inception block"], inception.holders)
     to_grow = [(root, inception)]
@@ -98,7 +99,10 @@ def marks(inception: Node, names: Mapping[str, str], *, abridged: bool) -> Mark:
 
 
 def _stretch(below: Mark, first: Node, names: Mapping[str, str], abridged: bool) -> tuple[Mark, Node]:
-    """Put the blocks from `first` to the next that is not plain onto `below`; the topmost mark and its node."""
+    """Add marks from `first` to the next block that is not plain, above `below`.
+
+    Return the topmost mark and its node.
+    """
     stretch = [first]
     while stretch[-1].is_plain:
         stretch.extend(stretch[-1].children.values())
@@ -123,7 +127,10 @@ def _name(node: Node, names: Mapping[str, str]) -> str:
 
 
 def ranges(agent_ids: list[int]) -> list[str]:
-    """[1, 2, 3, 5, 6] -> 1 to 3, 5, 6: three or more in a row are a range, written with an en dash."""
+    """Shorten [1, 2, 3, 5, 6] to ranges: "1 to 3", "5", "6", with an en dash for "to".
+
+    A range has three or more consecutive IDs.
+    """
     runs: list[list[int]] = []
     for agent_id in sorted(agent_ids):
         if runs and agent_id == runs[-1][-1] + 1:
@@ -137,7 +144,7 @@ def ranges(agent_ids: list[int]) -> list[str]:
 
 
 def wrapped(parts: list[str]) -> list[str]:
-    """The parts as one comma-separated text, broken into even lines that are wider the more there is to say."""
+    """Join the parts with commas, and break the text into lines of similar length. Longer texts get wider lines."""
     characters = len(", ".join(parts))
     widest = max(OVAL_LINE_CHARACTERS, round((2.5 * characters) ** 0.5))
     even = math.ceil(characters / math.ceil(characters / widest)) + 1

@@ -1,6 +1,7 @@
-"""The chain tree as SVG, as in the thesis's Figures 4.1-4.7: read from bottom to top, a colour for each agent.
+"""The chain tree as SVG, as in Figures 4.1 to 4.7 of the thesis. It grows from bottom to top, with a colour for each
+agent.
 
-Colours stand in attributes, so that programs without style sheets draw it too; `chain_tree.css` adds the dark scheme.
+The colours are attributes, so that programs without style sheets also draw them. `chain_tree.css` adds a dark scheme.
 """
 
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ from harness.report._chain_tree_layout import (
     LINE_HEIGHT,
     SMALL_FONT_SIZE,
     Layout,
-    Placed,
+    PlacedMark,
     lay_out,
 )
 from harness.report.chain_tree import Node, chain_tree, holders, marks, ranges
@@ -28,16 +29,16 @@ STYLE = (Path(__file__).parent / "chain_tree.css").read_text(encoding="utf-8")
 _FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', 'DejaVu Sans', sans-serif"
 _INCEPTION = Ink("#ffffff", "#5c6670", "#1c2126")
 _CORNER = 6
-_TURN = 11  # how far above a block the links to what stands beside it turn
+_TURN = 11  # distance above a block at which links to diverging successors turn
 _FIRST_DOT, _DOT_SPACING = 5, 7
-_DOTS_LENGTH = 2 * _DOT_SPACING + 1  # three dots, one of them just before the end
+_DOTS_LENGTH = 2 * _DOT_SPACING + 1  # three dots; the last one lies just before the end
 
 
 class ChainTreePicture:
-    """The tree of these exports, ready to be drawn abridged or with every block.
+    """A chain tree that can be drawn abridged or with all blocks.
 
-    `key` keeps the identifiers of several pictures on one page apart. `names` are those of the blocks, if whoever asks
-    knows more of them than these exports say.
+    `key` keeps the identifiers of several pictures on one page distinct. `names` maps block hashes to names, if the
+    caller knows more names than these exports contain.
     """
 
     def __init__(
@@ -56,23 +57,23 @@ class ChainTreePicture:
         self.hidden = sum(
             len(placed.mark.nodes) for placed in self._abridged.root.walk() if placed.mark.kind == "ellipsis"
         )
-        """Blocks that the abridged form does not draw."""
+        """Number of blocks that the abridged form omits."""
 
     def draw(self, form: Literal["abridged", "full"]) -> Markup:
-        """To stand inside a page that includes STYLE; the two forms can stand on one page."""
+        """Return the SVG for a page that includes STYLE. One page can contain both forms."""
         if form == "abridged":
             return self._draw(self._abridged, form, Markup(""))
         return self._draw(lay_out(marks(self._tree, self._names, abridged=False)), form, Markup(""))
 
     def standalone(self) -> str:
-        """The abridged tree as a file of its own."""
+        """Return the abridged tree as the text of an SVG file."""
         paper = Markup('<style>{}</style><rect class="ground" width="100%" height="100%" fill="#ffffff"/>').format(
             STYLE
         )
         return str(self._draw(self._abridged, "abridged", paper))
 
     def description(self) -> str:
-        """What the picture shows, in words."""
+        """Return a text alternative for the picture."""
         agents = self._tree.holders
         if not agents:
             return "No chain: only the inception block."
@@ -128,8 +129,8 @@ class ChainTreePicture:
             shapes=Markup("").join(shapes),
         )
 
-    def _shape(self, placed: Placed) -> Markup:
-        """One mark, with a tooltip: what it is, and where it is held."""
+    def _shape(self, placed: PlacedMark) -> Markup:
+        """Draw one mark with a tooltip that names it and its holders."""
         mark = placed.mark
         text = _text(placed, "#1c2126")
         if mark.kind == "ellipsis":
@@ -172,8 +173,8 @@ class ChainTreePicture:
         return self._names[node.block.block_hash] if node.block else "inception block"
 
 
-def _path(below: Placed, above: Placed) -> str:
-    """From the top of one to the bottom of the other, around two corners if it is not straight above."""
+def _path(below: PlacedMark, above: PlacedMark) -> str:
+    """Return a path from the top of `below` to the bottom of `above`. It turns two corners if they are not aligned."""
     start, end = below.y, above.y + above.height
     if above.x == below.x:
         return f"M{_n(below.x)} {_n(start)}V{_n(end)}"
@@ -186,20 +187,20 @@ def _path(below: Placed, above: Placed) -> str:
     )
 
 
-def _path_beside(block: Placed, oval: Placed) -> str:
-    """From the right side of the block to the oval; a tall one stands on the same floor."""
+def _path_beside(block: PlacedMark, oval: PlacedMark) -> str:
+    """Return a path from the right side of the block to the oval. The bottoms of both are level."""
     middle = block.y + block.height / 2
     return f"M{_n(block.x + block.width / 2)} {_n(middle)}H{_n(oval.x - oval.width / 2)}"
 
 
-def _rectangle(placed: Placed) -> Markup:
-    """An unfinished <rect>."""
+def _rectangle(placed: PlacedMark) -> Markup:
+    """Return an unfinished <rect> element."""
     return Markup('<rect x="{}" y="{}" width="{}" height="{}"').format(
         _n(placed.x - placed.width / 2), _n(placed.y), _n(placed.width), _n(placed.height)
     )
 
 
-def _text(placed: Placed, colour: str) -> Markup:
+def _text(placed: PlacedMark, colour: str) -> Markup:
     small = placed.mark.kind == "ellipsis"
     line_height, size = (BOX_HEIGHT / 2, SMALL_FONT_SIZE) if small else (LINE_HEIGHT, FONT_SIZE)
     first = placed.y + placed.height / 2 - (len(placed.mark.lines) - 1) * line_height / 2 + 0.36 * size

@@ -1,4 +1,4 @@
-"""Facts of a run that the page and report.md share: settings, end, figures, gaps in captures."""
+"""Facts of a run that the page and report.md share: settings, outcome, figures, and gaps in captures."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -32,7 +32,7 @@ FIGURES = {
 
 
 def vehicle_types(record: RunRecord) -> dict[int, VehicleType]:
-    """Of each vehicle, as the scenario has them."""
+    """Return the type of each vehicle according to the scenario."""
     if record.scenario is None:
         return {}
     return {vehicle: record.scenario.vehicles.type_of(vehicle) for vehicle in record.scenario.roster}
@@ -43,7 +43,7 @@ def title(record: RunRecord) -> str:
 
 
 def summary(record: RunRecord, exports: Exports) -> list[str]:
-    """In a few words each: how it ended, who flew, what was asked, where and when it was played."""
+    """Return short phrases about the outcome, the swarm, the main settings, and the place and time of the run."""
     scenario = record.scenario
     parts: list[str] = [] if record.outcome == "running" else [record.outcome]
     agents = len({*record.known_agents, *exports.by_agent})
@@ -56,7 +56,8 @@ def summary(record: RunRecord, exports: Exports) -> list[str]:
         if not in_virtual_time(record.backend):
             parts.append(f"speedup {text.value(scenario.speedup)}")
     played = {"seed": record.seed, "backend": record.backend, "engine": record.engine}
-    parts += [f"{key} {value}" for key, value in played.items() if value is not None]  # to be typed again, so no groups
+    # numbers to type again: no digit groups
+    parts += [f"{key} {value}" for key, value in played.items() if value is not None]
     parts += [program.in_words for program in programs(record)]
     if record.wall_s is not None:
         parts.append(f"{text.duration(record.wall_s)} wall time")
@@ -66,7 +67,7 @@ def summary(record: RunRecord, exports: Exports) -> list[str]:
 
 
 def outcome(record: RunRecord) -> tuple[str, str] | None:
-    """What kept the run from completing and the details, if something did."""
+    """Return a headline and details if the run did not complete, or None."""
     if record.outcome == "completed":
         return None
     detail = record.outcome_detail
@@ -78,12 +79,12 @@ def outcome(record: RunRecord) -> tuple[str, str] | None:
 
 
 def figures(record: RunRecord) -> list[tuple[str, str]]:
-    """Labels and values."""
+    """Return pairs of label and value."""
     return [(FIGURES.get(key, text.label(key)), text.value(figure)) for key, figure in record.figures.items()]
 
 
 def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
-    """A sentence of what the captures of these vehicles lack, if they lack anything."""
+    """Return a sentence about frames that captures dropped, or None."""
     lacking = sorted(int(vehicle) for vehicle, frames in captured.items() if frames.dropped)
     if not lacking:
         return None

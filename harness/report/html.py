@@ -1,6 +1,6 @@
-"""A page in one file that loads nothing: its Content-Security-Policy allows its own styles and script, and no more.
+"""A page in one file. Its Content-Security-Policy allows only its own styles and its own script.
 
-Whatever a template is given is text to it, which it escapes, unless it is Markup.
+The template escapes every text except Markup.
 """
 
 import base64
@@ -16,12 +16,12 @@ from harness.present import text as words
 
 _HERE = Path(__file__).parent
 PALETTE = (_HERE / "palette.css").read_text(encoding="utf-8")
-"""The colours that a report and the live page share."""
+"""Colours that the report and the live page share."""
 PAGE_STYLE = PALETTE + (_HERE / "page.css").read_text(encoding="utf-8")
 
 
 def render(template: Path, *, styles: Sequence[str], script: str = "", **content: Any) -> str:
-    """`template` fills the blocks of `base.html.j2`; a drawing in it may have one of `styles` as its own."""
+    """Fill `template`, which extends `base.html.j2`. The styles and the script are allowed by their digests."""
     environment = Environment(
         loader=FileSystemLoader([template.parent, _HERE]),
         autoescape=True,
@@ -31,14 +31,14 @@ def render(template: Path, *, styles: Sequence[str], script: str = "", **content
     )
     environment.filters.update(value=words.value)
     return environment.get_template(template.name).render(
-        styles=[Markup(style) for style in styles],  # noqa: S704 - ours; escaped they would not be what the digests are of
+        styles=[Markup(style) for style in styles],  # noqa: S704 - our own text; escaping would change its digest
         style_digests=[_digest(style) for style in styles],
-        script=Markup(script),  # noqa: S704 - ours as well
+        script=Markup(script),  # noqa: S704 - our own text
         script_digest=_digest(script),
         **content,
     )
 
 
 def _digest(text: str) -> str:
-    """As a Content-Security-Policy names what it allows."""
+    """Return the SHA-256 digest in the form that a Content-Security-Policy uses."""
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")

@@ -1,7 +1,7 @@
-"""Geometry of the map, and the parts into which the network falls.
+"""Geometry of the map, and the division of the network into parts.
 
-A part is two or more vehicles that reach each other and not everybody; whoever reaches nobody is alone. A part keeps
-its letter from one state to the next as long as most of it does.
+A part is a group of two or more vehicles that reach each other but not the whole swarm. A vehicle that reaches no other
+vehicle is alone. A part keeps its letter in the next state if more than half of its vehicles stay together.
 """
 
 import math
@@ -17,17 +17,17 @@ from harness.archive.tracks import Fix, Tracks, between
 from harness.present import svg
 from harness.report.chain_tree import ranges
 
-MAX_STRETCHES = 4000
-"""Of all vehicles together; nobody could tell more of them apart."""
+MAX_SEGMENTS = 4000
+"""Maximum number of track segments of all vehicles together. More could not be distinguished."""
 MAX_NAMED = 6
-"""Parts that are told one by one."""
+"""Maximum number of parts that a text lists one by one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Division:
-    """From `at_s` on the living vehicles were in these parts, by number from 0, the rest alone.
+    """The parts of the network from `at_s` on, by number from 0. All other living vehicles are alone.
 
-    While everybody reaches everybody, all are `together`, and there is no part.
+    If all vehicles reach each other, all are in `together`, and there are no parts.
     """
 
     at_s: float
@@ -41,28 +41,31 @@ class Division:
         return self.together | self.alone | frozenset().union(*self.parts.values())
 
     def place_of(self, vehicle: int) -> tuple[int | None, frozenset[int]]:
-        """Its part, and whom it reaches."""
-        return self.part_of(vehicle), self.fellows(vehicle)
+        """Return the vehicle's part, and the vehicles that it reaches."""
+        return self.part_of(vehicle), self.reachable_from(vehicle)
 
     def part_of(self, vehicle: int) -> int | None:
-        """The number of its part; None if it is in none."""
+        """Return the number of the vehicle's part, or None."""
         return next((number for number, members in self.parts.items() if vehicle in members), None)
 
-    def fellows(self, vehicle: int) -> frozenset[int]:
-        """Those that it reaches, and itself."""
+    def reachable_from(self, vehicle: int) -> frozenset[int]:
+        """Return the vehicles that this vehicle reaches, and itself."""
         part = self.part_of(vehicle)
         if part is not None:
             return self.parts[part]
         return self.together if vehicle in self.together else frozenset({vehicle})
 
     def changed_since(self, before: "Division") -> int:
-        """How many vehicles were lost or back, or reached others than before of those that lived before and after."""
+        """Return the number of vehicles that were lost, came back, or reach other vehicles than before.
+
+        Vehicles that live in only one of the two states are ignored in the comparison of reached vehicles.
+        """
         both = self.living & before.living
-        moved = sum(self.fellows(vehicle) & both != before.fellows(vehicle) & both for vehicle in both)
+        moved = sum(self.reachable_from(vehicle) & both != before.reachable_from(vehicle) & both for vehicle in both)
         return moved + len(self.living ^ before.living)
 
     def in_words(self) -> str:
-        """Such as "all 5 connected", or "A 1-3; B 4, 5; alone 6"."""
+        """Return a text like "all 5 connected" or "A 1-3; B 4, 5; alone 6"."""
         if self.together:
             return f"all {len(self.together)} connected" if len(self.together) > 1 else "1 vehicle"
         phrases = [f"{letter(number)} {listed(members)}" for number, members in self.parts.items()]
@@ -76,8 +79,11 @@ class Division:
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
-    """A vehicle's way while its place in the network did not change; `division` is the one in which it began."""
+class TrackSegment:
+    """A section of a track in which the vehicle's place in the network is constant.
+
+    `division` is the one at its start.
+    """
 
     vehicle: int
     fixes: list[Fix]
@@ -85,24 +91,24 @@ class Stretch:
 
 
 @dataclass(frozen=True, slots=True)
-class Life:
-    """From take-off, or from where it was first seen, until the run ended or the vehicle was lost."""
+class Flight:
+    """The track of a vehicle from its start, or its first known position, until its loss or the end of the run."""
 
     vehicle: int
-    stretches: list[Stretch]
+    segments: list[TrackSegment]
     lost: bool
 
     @property
     def start(self) -> Fix:
-        return self.stretches[0].fixes[0]
+        return self.segments[0].fixes[0]
 
     @property
     def end(self) -> Fix:
-        return self.stretches[-1].fixes[-1]
+        return self.segments[-1].fixes[-1]
 
 
 def letter(number: int) -> str:
-    """A, B, ... Z, A2, B2, ..."""
+    """Return the letters A, B, ... Z, A2, B2, ..."""
     return chr(ord("A") + number % 26) + (str(number // 26 + 1) if number >= 26 else "")
 
 
@@ -111,22 +117,25 @@ def listed(vehicles: frozenset[int]) -> str:
 
 
 def divisions(states: Sequence[Topology]) -> list[Division]:
-    divided: list[Division] = []
+    all_divisions: list[Division] = []
     before: dict[int, frozenset[int]] = {}
     for state in states:
         if len(state.components) == 1:
-            divided.append(Division(state.at_s, state.what, {}, frozenset(), state.components[0]))
+            all_divisions.append(Division(state.at_s, state.what, {}, frozenset(), state.components[0]))
             continue
         parts = [group for group in state.components if len(group) > 1]
         alone = frozenset().union(*(group for group in state.components if len(group) == 1))
         numbered = _numbered(parts, before)
         before = numbered or before
-        divided.append(Division(state.at_s, state.what, numbered, alone, frozenset()))
-    return divided
+        all_divisions.append(Division(state.at_s, state.what, numbered, alone, frozenset()))
+    return all_divisions
 
 
 def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]) -> dict[int, frozenset[int]]:
-    """The parts by number: that of the former part most of which is in it, or else the first that is free."""
+    """Number the parts. A part keeps the number of a former part if it contains more than half of its vehicles.
+
+    Other parts get the lowest free numbers.
+    """
     numbers: dict[int, frozenset[int]] = {}
     for part in parts:
         shared = {number: len(part & members) for number, members in before.items() if number not in numbers}
@@ -138,60 +147,60 @@ def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]
     return dict(sorted((number if number >= 0 else next(free), part) for number, part in numbers.items()))
 
 
-def longest(divided: Sequence[Division], end_s: float, most: int) -> list[Division]:
-    """The first, and those of the others that lasted longest; each then lasts until the next that is left."""
-    if len(divided) <= most:
-        return list(divided)
-    ends = [*(division.at_s for division in divided[1:]), end_s]
-    by_length = sorted(range(1, len(divided)), key=lambda at: divided[at].at_s - ends[at])
-    return [divided[at] for at in sorted([0, *by_length[: most - 1]])]
+def longest_divisions(all_divisions: Sequence[Division], end_s: float, most: int) -> list[Division]:
+    """Return the first division and the longest others, at most `most`. Each lasts until the next one that is kept."""
+    if len(all_divisions) <= most:
+        return list(all_divisions)
+    ends = [*(division.at_s for division in all_divisions[1:]), end_s]
+    by_length = sorted(range(1, len(all_divisions)), key=lambda at: all_divisions[at].at_s - ends[at])
+    return [all_divisions[at] for at in sorted([0, *by_length[: most - 1]])]
 
 
-def lives(
-    vehicle: int, tracks: Tracks, network: Connectivity, divided: Sequence[Division], end_s: float
-) -> Iterator[Life]:
-    """The ways of a vehicle, and of those that took its place after it was lost."""
+def flights(
+    vehicle: int, tracks: Tracks, network: Connectivity, all_divisions: Sequence[Division], end_s: float
+) -> Iterator[Flight]:
+    """Yield the flights of a vehicle and of the vehicles that replaced it after a loss."""
     wreck: Fix | None = None
     for begin_s, until_s, lost in network.lives(vehicle, end_s):
         flown = [fix for fix in tracks.by_vehicle[vehicle] if begin_s <= fix.at_s <= until_s]
-        while wreck and flown and flown[0][1:] == wreck[1:]:  # the new vehicle is not there yet
+        while wreck and flown and flown[0][1:] == wreck[1:]:  # the replacement still reports the position of the wreck
             del flown[0]
         if flown:
             end = tracks.at(vehicle, until_s)
-            yield Life(vehicle, list(_stretches(vehicle, [*flown, end], divided)), lost)
+            yield Flight(vehicle, list(_segments(vehicle, [*flown, end], all_divisions)), lost)
             wreck = end
 
 
-def _stretches(vehicle: int, way: list[Fix], divided: Sequence[Division]) -> Iterator[Stretch]:
-    now = next((division for division in reversed(divided) if division.at_s <= way[0].at_s), None)
+def _segments(vehicle: int, path: list[Fix], all_divisions: Sequence[Division]) -> Iterator[TrackSegment]:
+    now = next((division for division in reversed(all_divisions) if division.at_s <= path[0].at_s), None)
     begin = 0
-    for division in divided:
+    for division in all_divisions:
         unchanged = now is not None and now.place_of(vehicle) == division.place_of(vehicle)
-        if unchanged or not way[0].at_s < division.at_s < way[-1].at_s:
+        if unchanged or not path[0].at_s < division.at_s < path[-1].at_s:
             continue
-        end = bisect_left(way, division.at_s, begin, key=attrgetter("at_s"))
-        turn = between(way[end - 1], way[end], division.at_s)
-        yield Stretch(vehicle, [*way[begin:end], turn], now)
-        way[end - 1], begin, now = turn, end - 1, division
-    yield Stretch(vehicle, way[begin:], now)
+        end = bisect_left(path, division.at_s, begin, key=attrgetter("at_s"))
+        turn = between(path[end - 1], path[end], division.at_s)
+        yield TrackSegment(vehicle, [*path[begin:end], turn], now)
+        path[end - 1], begin, now = turn, end - 1, division
+    yield TrackSegment(vehicle, path[begin:], now)
 
 
 Point = tuple[float, float]
-"""x and y in CSS pixels; y grows downwards."""
+"""x and y in CSS pixels. y grows downwards."""
 
 MIN_SPAN_M = 20.0
-"""A map of less would make much of the wind."""
-SLIMMEST = 0.45
-"""The shorter side of a map, as a share of the longer."""
+"""Minimum size of a map. On a smaller map, drift in the wind would look like a flight."""
+MIN_ASPECT = 0.45
+"""Minimum ratio of the shorter side of a map to the longer side."""
 MARGIN = 0.05
-"""Around all that was flown, as a share of each side."""
-FINEST = 0.5
-"""Pixels: what nobody sees."""
+"""Margin around the tracks, as a share of each side."""
+INVISIBLE_PX = 0.5
+"""Deviation in pixels that is not visible."""
 
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """A piece of land, in metres north and east of the field's centre."""
+    """A rectangle of land, in metres north and east of the field's centre."""
 
     south_m: float
     north_m: float
@@ -208,13 +217,13 @@ class Extent:
 
 
 def extent(fixes: Sequence[Fix]) -> Extent:
-    """Around these fixes, of which there is one at least."""
+    """Return an extent around the fixes. There must be at least one fix."""
     north, east = [fix.north_m for fix in fixes], [fix.east_m for fix in fixes]
-    shortest = max(MIN_SPAN_M, SLIMMEST * max(max(north) - min(north), max(east) - min(east)))
-    return Extent(*_widened(min(north), max(north), shortest), *_widened(min(east), max(east), shortest))
+    shortest = max(MIN_SPAN_M, MIN_ASPECT * max(max(north) - min(north), max(east) - min(east)))
+    return Extent(*_widen(min(north), max(north), shortest), *_widen(min(east), max(east), shortest))
 
 
-def _widened(low: float, high: float, shortest: float) -> tuple[float, float]:
+def _widen(low: float, high: float, shortest: float) -> tuple[float, float]:
     span = max(high - low, shortest) * (1 + 2 * MARGIN)
     middle = (low + high) / 2
     return middle - span / 2, middle + span / 2
@@ -222,7 +231,7 @@ def _widened(low: float, high: float, shortest: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Projection:
-    """`land`, as large as fits into a room of so many pixels whose upper left corner is at `left`, `top`."""
+    """A projection of `land` into a rectangle in pixels. `left` and `top` are its upper left corner."""
 
     land: Extent
     left: float
@@ -252,14 +261,14 @@ class Projection:
         return self.x(fix.east_m), self.y(fix.north_m)
 
     def ticks_m(self) -> tuple[list[float], list[float]]:
-        """Round metres north and east, in equal steps."""
+        """Return round metres north and round metres east, in equal steps."""
         every = svg.step(max(self.land.width_m, self.land.height_m), 9)
         return _multiples(every, self.land.south_m, self.land.north_m), _multiples(
             every, self.land.west_m, self.land.east_m
         )
 
     def scale_bar_m(self) -> float:
-        """A round length of a fifth of the map's width or somewhat more."""
+        """Return a round length of about a fifth of the map's width, or more."""
         return svg.step(self.land.width_m, 5)
 
 
@@ -267,24 +276,24 @@ def _multiples(every: float, low: float, high: float) -> list[float]:
     return [number * every for number in range(math.ceil(low / every), math.floor(high / every) + 1)]
 
 
-def thinned(lines: Sequence[Sequence[Point]], most: int) -> list[list[Point]]:
-    """The lines, of half a pixel's exactness, or as coarse as it takes to have at most so many points in all.
+def thin(lines: Sequence[Sequence[Point]], most: int) -> list[list[Point]]:
+    """Simplify the lines to half a pixel, or further until they have at most `most` points in total.
 
-    A line of which nothing is left keeps both its ends.
+    Each line keeps both its ends.
     """
-    tolerance, thin = FINEST, [simplified(line, FINEST) for line in lines]
+    tolerance, thin = INVISIBLE_PX, [simplify(line, INVISIBLE_PX) for line in lines]
     while sum(map(len, thin)) > max(most, 2 * len(lines)):
         tolerance *= 4
-        thin = [simplified(line, tolerance) for line in thin]
+        thin = [simplify(line, tolerance) for line in thin]
     return thin
 
 
-def simplified(line: Sequence[Point], tolerance: float) -> list[Point]:
-    """Those of its points without which it would stray by more than `tolerance` (Douglas and Peucker, 1973)."""
+def simplify(line: Sequence[Point], tolerance: float) -> list[Point]:
+    """Remove points as long as the line moves by at most `tolerance` (Douglas and Peucker, 1973)."""
     half = tolerance / 2
     apart = [line[0]]
     for point in line[1:-1]:
-        if math.dist(point, apart[-1]) > half:  # a vehicle that hovers is in one place
+        if math.dist(point, apart[-1]) > half:  # a hovering vehicle stays at one point
             apart.append(point)
     apart.append(line[-1])
     kept = {0, len(apart) - 1}
@@ -304,7 +313,7 @@ def simplified(line: Sequence[Point], tolerance: float) -> list[Point]:
 
 
 def _distance(point: Point, start: Point, end: Point) -> float:
-    """From the point to the nearest of the straight line between the two others."""
+    """Return the distance from the point to the segment between the other two points."""
     (x, y), (x1, y1), (x2, y2) = point, start, end
     dx, dy = x2 - x1, y2 - y1
     length = dx * dx + dy * dy

@@ -1,7 +1,7 @@
-"""The map as SVG: tracks, parts of the network, and the vehicles' IDs.
+"""The map as SVG: tracks, parts of the network, and vehicle IDs.
 
-Colour is never all: parts have letters and dashes, vehicles their IDs, and everything has a tooltip. `map.css` has the
-colours, so the pictures stand inside a page that includes STYLE.
+No information depends on colour alone. Parts have letters and dashes, vehicles have IDs, and each mark has a tooltip.
+The colours are in `map.css`, so the page must include STYLE.
 """
 
 import math
@@ -15,13 +15,13 @@ from harness.archive.tracks import Fix
 from harness.present import text as words
 from harness.present.colours import Ink
 from harness.present.svg import FONT, n
-from harness.report.map_parts import Division, Extent, Life, Point, Projection, Stretch, letter, listed, thinned
+from harness.report.map_parts import Division, Extent, Flight, Point, Projection, TrackSegment, letter, listed, thin
 from sitl.vehicle import VehicleType
 
 HEIGHT, DIGIT, PADDING = 16, 7.5, 8
 NEAR, FAR = 14, 34
-"""From a place to the middle of its tag, in pixels, where the tag is above it."""
-_WAYS = ((0, -1), (0, 1), (1, -1), (-1, -1), (1, 1), (-1, 1), (1, 0), (-1, 0))
+"""Distances in pixels from a place to the middle of its tag, if the tag is above the place."""
+_DIRECTIONS = ((0, -1), (0, 1), (1, -1), (-1, -1), (1, 1), (-1, 1), (1, 0), (-1, 0))
 
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom."""
@@ -30,24 +30,27 @@ Box = tuple[float, float, float, float]
 def tags(
     tagged: Sequence[tuple[int, Point]], crosses: Sequence[Point], to_px: Projection, ink: Mapping[int, Ink]
 ) -> Markup:
-    """Clear of the `crosses`, too. Who finds no room has only the tooltip of its place."""
-    taken = [(x - 5, y - 5, x + 5, y + 5) for x, y in (*(place for _, place in tagged), *crosses)]
+    """Draw ID tags that overlap neither each other nor the `crosses`.
+
+    A vehicle without room for a tag has only its tooltip.
+    """
+    occupied = [(x - 5, y - 5, x + 5, y + 5) for x, y in (*(place for _, place in tagged), *crosses)]
     drawn = []
     for vehicle, place in tagged:
         for box in _boxes(len(str(vehicle)), place):
-            if _inside(box, to_px) and not any(_overlap(box, taken_box) for taken_box in taken):
-                taken.append(box)
+            if _inside(box, to_px) and not any(_overlap(box, occupied_box) for occupied_box in occupied):
+                occupied.append(box)
                 drawn.append(_tag(vehicle, box, place, ink[vehicle]))
                 break
     return Markup("").join(drawn)
 
 
 def _boxes(digits: int, place: Point) -> list[Box]:
-    """All that come into question, the best first."""
+    """Return candidate boxes of a tag, the best first."""
     width = digits * DIGIT + PADDING
     boxes = []
     for distance in (NEAR, FAR):
-        for right, down in _WAYS:
+        for right, down in _DIRECTIONS:
             x = place[0] + right * (distance - HEIGHT / 2 + width / 2)
             y = place[1] + down * distance
             boxes.append((x - width / 2, y - HEIGHT / 2, x + width / 2, y + HEIGHT / 2))
@@ -93,52 +96,52 @@ def _overlap(first: Box, second: Box) -> bool:
 
 STYLE = (Path(__file__).parent / "map.css").read_text(encoding="utf-8")
 
-PART_LOOKS = 4
-"""Parts that look different; further ones look the same again, and have other letters."""
-LOOKS = ("unknown", "whole", *(f"part{number}" for number in range(PART_LOOKS)), "alone")
+PART_CLASSES = 4
+"""Number of different line styles for parts. Further parts reuse the styles with other letters."""
+TRACK_CLASSES = ("unknown", "whole", *(f"part{number}" for number in range(PART_CLASSES)), "alone")
 MAX_POINTS = 20_000
 MAX_LINKS = 1500
-"""Drawn at one moment; of more only the shortest."""
+"""Maximum number of links at one moment. The shortest links are kept."""
 MOST_TAGGED_AT_A_MOMENT = 15
-"""Vehicles that have their IDs written beside them in a small map."""
+"""Maximum number of vehicles in a small map with ID tags."""
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 14, 62
 _ROOM_WIDTH, _ROOM_HEIGHT = 900, 600
 _MOMENT_WIDTH, _MOMENT_HEIGHT = 300, 240
 
 
-def look(division: Division | None, vehicle: int) -> str:
-    """The class of what is drawn of a vehicle at that time."""
+def css_class(division: Division | None, vehicle: int) -> str:
+    """Return the CSS class for a vehicle in this division of the network."""
     if division is None:
         return "unknown"
     if vehicle in division.together:
         return "whole"
     part = division.part_of(vehicle)
-    return "alone" if part is None else f"part{part % PART_LOOKS}"
+    return "alone" if part is None else f"part{part % PART_CLASSES}"
 
 
 def draw_tracks(
-    lives: Sequence[Life],
+    flights: Sequence[Flight],
     reboots: Sequence[tuple[Fix, int]],
     land: Extent,
     ink: Mapping[int, Ink],
     description: str,
 ) -> Markup:
-    """`reboots` say where and whose agent went down; `description` says in words what the picture shows."""
+    """Draw the map. `reboots` are places and agents of reboots, and `description` is a text alternative."""
     to_px = Projection(land, _LEFT, _TOP, _ROOM_WIDTH, _ROOM_HEIGHT)
     return Markup(
         '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
         ' aria-labelledby="tracks-title tracks-desc" font-family="{font}" font-size="12">'
         '<title id="tracks-title">Map of the tracks</title><desc id="tracks-desc">{desc}</desc>\n'
-        "{frame}\n{ways}\n{marks}</svg>\n"
+        "{frame}\n{tracks}\n{marks}</svg>\n"
     ).format(
         w=n(_LEFT + to_px.width + _RIGHT),
         h=n(_TOP + to_px.height + _BOTTOM),
         font=FONT,
         desc=description,
         frame=frame(to_px),
-        ways=_ways([stretch for life in lives for stretch in life.stretches], to_px),
-        marks=_marks(lives, reboots, to_px, ink),
+        tracks=_track_paths([segment for flight in flights for segment in flight.segments], to_px),
+        marks=_marks(flights, reboots, to_px, ink),
     )
 
 
@@ -152,7 +155,7 @@ def draw_moment(
     types: Mapping[int, VehicleType],
     description: str,
 ) -> Markup:
-    """The living vehicles of the `swarm`, what their `links` lose, and where others were `lost`."""
+    """Draw the living vehicles of the `swarm`, the losses of their `links`, and the places of `lost` vehicles."""
     to_px = Projection(land, 1, 1, _MOMENT_WIDTH, _MOMENT_HEIGHT)
     at = {vehicle: to_px(fix) for vehicle, fix in swarm.items()}
     dots = (_dot(vehicle, place, division, ink[vehicle], types.get(vehicle, "copter")) for vehicle, place in at.items())
@@ -176,12 +179,12 @@ def draw_moment(
 
 
 def _links(at: Mapping[int, Point], links: Mapping[tuple[int, int], float], division: Division | None) -> Markup:
-    """Those that lose most below: what can be relied on is seen first."""
+    """Draw the links in order of falling loss, so that good links are on top."""
     drawn: dict[tuple[int, str], list[str]] = {}
     shortest = sorted(links, key=lambda pair: math.dist(at[pair[0]], at[pair[1]]))
-    for vehicle, fellow in shortest[:MAX_LINKS]:
-        (x1, y1), (x2, y2) = at[vehicle], at[fellow]
-        which = quality(links[vehicle, fellow]), look(division, vehicle)
+    for vehicle, neighbour in shortest[:MAX_LINKS]:
+        (x1, y1), (x2, y2) = at[vehicle], at[neighbour]
+        which = quality(links[vehicle, neighbour]), css_class(division, vehicle)
         drawn.setdefault(which, []).append(f"M{n(x1)} {n(y1)}L{n(x2)} {n(y2)}")
     return Markup("").join(
         Markup('<path class="link {} q{}" d="{}"/>').format(which, grade, "".join(lines))
@@ -190,14 +193,14 @@ def _links(at: Mapping[int, Point], links: Mapping[tuple[int, int], float], divi
 
 
 def _dot(vehicle: int, place: Point, division: Division | None, ink: Ink, vehicle_type: VehicleType) -> Markup:
-    told = f"vehicle {vehicle}, a {vehicle_type}: {_whereabouts(division, vehicle)}"
+    tip = f"vehicle {vehicle}, a {vehicle_type}: {_connection_text(division, vehicle)}"
     return Markup('<path class="dot {}" d="{}" fill="{}"><title>{}</title></path>').format(
-        look(division, vehicle), _shape(vehicle_type, place), ink.fill, told
+        css_class(division, vehicle), _shape(vehicle_type, place), ink.fill, tip
     )
 
 
 def _shape(vehicle_type: VehicleType, place: Point) -> str:
-    """A copter is a circle, a plane a triangle, a rover a square."""
+    """Return the outline of a vehicle type: a circle for a copter, a triangle for a plane, a square for a rover."""
     x, y = place
     match vehicle_type:
         case "copter":
@@ -209,7 +212,10 @@ def _shape(vehicle_type: VehicleType, place: Point) -> str:
 
 
 def sample(which: str) -> Markup:
-    """For a legend: one of LOOKS, start, end, lost, reboot, the quality of a link as q1, or a type of vehicles."""
+    """Draw a legend sample.
+
+    `which` is one of LOOKS, "start", "end", "lost", "reboot", a link quality such as "q1", or a vehicle type.
+    """
     place = (17.0, 8.0)
     match which:
         case "start":
@@ -230,7 +236,7 @@ def sample(which: str) -> Markup:
 
 
 def frame(to_px: Projection) -> Markup:
-    """A rule and a tick for each round metre, the scale bar, and where north is."""
+    """Draw the grid with labels in metres, the scale bar, and a north arrow."""
     left, top = to_px.left, to_px.top
     right, bottom = left + to_px.width, top + to_px.height
     north, east = to_px.ticks_m()
@@ -265,51 +271,51 @@ def frame(to_px: Projection) -> Markup:
     )
 
 
-def _ways(stretches: Sequence[Stretch], to_px: Projection) -> Markup:
-    """Quiet ones first, so that parts are seen over them."""
-    lines = thinned([[to_px(fix) for fix in stretch.fixes] for stretch in stretches], MAX_POINTS)
-    looks = [look(stretch.division, stretch.vehicle) for stretch in stretches]
-    drawn = sorted(zip(looks, stretches, lines, strict=True), key=lambda way: LOOKS.index(way[0]))
+def _track_paths(segments: Sequence[TrackSegment], to_px: Projection) -> Markup:
+    """Draw the tracks. Tracks in parts are on top of the others."""
+    lines = thin([[to_px(fix) for fix in segment.fixes] for segment in segments], MAX_POINTS)
+    classes = [css_class(segment.division, segment.vehicle) for segment in segments]
+    drawn = sorted(zip(classes, segments, lines, strict=True), key=lambda way: TRACK_CLASSES.index(way[0]))
     return Markup("\n").join(
         Markup('<path class="way {}" d="M{}"><title>{}</title></path>').format(
-            which, "L".join(f"{n(x)} {n(y)}" for x, y in line), _told(stretch)
+            which, "L".join(f"{n(x)} {n(y)}" for x, y in line), _segment_tip(segment)
         )
-        for which, stretch, line in drawn
+        for which, segment, line in drawn
     )
 
 
-def _told(stretch: Stretch) -> str:
-    begin, end = (words.duration(stretch.fixes[at].at_s) for at in (0, -1))
-    return f"vehicle {stretch.vehicle}, {begin} to {end}: {_whereabouts(stretch.division, stretch.vehicle)}"
+def _segment_tip(segment: TrackSegment) -> str:
+    begin, end = (words.duration(segment.fixes[at].at_s) for at in (0, -1))
+    return f"vehicle {segment.vehicle}, {begin} to {end}: {_connection_text(segment.division, segment.vehicle)}"
 
 
-def _whereabouts(division: Division | None, vehicle: int) -> str:
+def _connection_text(division: Division | None, vehicle: int) -> str:
     if division is None:
         return "network not recorded"
-    part, fellows = division.place_of(vehicle)
-    others = listed(fellows - {vehicle})
+    part, reachable_from = division.place_of(vehicle)
+    others = listed(reachable_from - {vehicle})
     if not others:
         return "alone"
     return f"connected to all others: {others}" if part is None else f"part {letter(part)}, with {others}"
 
 
 def _marks(
-    lives: Sequence[Life], reboots: Iterable[tuple[Fix, int]], to_px: Projection, ink: Mapping[int, Ink]
+    flights: Sequence[Flight], reboots: Iterable[tuple[Fix, int]], to_px: Projection, ink: Mapping[int, Ink]
 ) -> Markup:
-    """Starts, reboots and ends, and the vehicles' IDs beside their ends."""
+    """Draw starts, reboots and ends, and tags at the ends."""
     parts = []
-    for life in lives:
-        colours, start, end = ink[life.vehicle], life.start, life.end
-        begins = f"vehicle {life.vehicle} starts at {words.duration(start.at_s)}"
-        ends = f"vehicle {life.vehicle} {'is lost' if life.lost else 'ends'} at {words.duration(end.at_s)}"
+    for flight in flights:
+        colours, start, end = ink[flight.vehicle], flight.start, flight.end
+        begins = f"vehicle {flight.vehicle} starts at {words.duration(start.at_s)}"
+        ends = f"vehicle {flight.vehicle} {'is lost' if flight.lost else 'ends'} at {words.duration(end.at_s)}"
         parts.append(start_mark(to_px(start), begins, colours.fill, colours.stroke))
         parts.append(
-            _cross(to_px(end), ends) if life.lost else end_mark(to_px(end), ends, colours.fill, colours.stroke)
+            _cross(to_px(end), ends) if flight.lost else end_mark(to_px(end), ends, colours.fill, colours.stroke)
         )
     parts += [
         _diamond(to_px(fix), f"agent {vehicle} reboots at {words.duration(fix.at_s)}") for fix, vehicle in reboots
     ]
-    return Markup("").join(parts) + tags([(life.vehicle, to_px(life.end)) for life in lives], [], to_px, ink)
+    return Markup("").join(parts) + tags([(flight.vehicle, to_px(flight.end)) for flight in flights], [], to_px, ink)
 
 
 def start_mark(place: Point, tip: str, fill: str, stroke: str) -> Markup:

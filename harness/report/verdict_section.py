@@ -1,4 +1,4 @@
-"""The six characteristics, and what is judged beside them, as the page says them: verdict, reason and evidence."""
+"""The verdict section of the report: the characteristics and the further checks, with reasons and evidence."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +19,7 @@ STATEMENTS = {
 }
 ICONS = {"good": "✓", "bad": "✗", "unknown": "\u2013"}
 KINDS = {"good": "holds", "bad": "violated", "unknown": "unknown"}
-"""For the style sheet."""
+"""Kind of a verdict -> CSS class."""
 EVIDENCE_KEPT = 200
 
 
@@ -27,16 +27,16 @@ EVIDENCE_KEPT = 200
 class Verdict:
     key: str
     number: str
-    """Empty for what is judged beside the characteristics."""
+    """The number of the characteristic, or "" for a further check."""
     name: str
     statement: str
     verdict: str
     icon: str
     kind: str
-    """One word, for the style sheet."""
+    """CSS class."""
     reason: str
     evidence: list[dict[str, Any]]
-    """What is said of each piece of evidence, by label."""
+    """Label -> value, for each piece of evidence."""
     evidence_left_out: int
 
     @property
@@ -45,17 +45,20 @@ class Verdict:
 
     @property
     def topic(self) -> str:
-        """ "characteristic 6", "steps"."""
+        """ "characteristic 6" or "steps"."""
         return f"characteristic {self.number}" if self.number else self.name
 
     @property
     def title(self) -> str:
-        """ "6. one uniform chain", "steps"."""
+        """ "6. one uniform chain" or "steps"."""
         return f"{self.number}. {self.name}" if self.number else self.name
 
 
 def verdicts(record: RunRecord) -> list[Verdict]:
-    """All of a run that was judged, also on a characteristic whose verdict the record has not; none of another run."""
+    """Return all verdicts of a judged run, including characteristics without a recorded verdict.
+
+    Return none otherwise.
+    """
     if not record.characteristics:
         return []
     judged = record.judgements
@@ -80,7 +83,7 @@ def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None) ->
 
 
 def headline(verdicts: list[Verdict], *, completed: bool) -> tuple[str, str]:
-    """How it went, in a few words, and the kind of verdict that it amounts to: half a run is no success."""
+    """Return a summary of the verdicts and its kind. A run that did not complete is never "holds"."""
     characteristics = [verdict for verdict in verdicts if verdict.number]
     violated, holding = (sum(verdict.kind == kind for verdict in characteristics) for kind in ("violated", "holds"))
     beside = [f"{verdict.name}: {verdict.verdict}" for verdict in verdicts if not verdict.number and verdict.is_bad]

@@ -1,14 +1,14 @@
-"""Where two runs part: the first thing that an agent does in one of them and not in the other.
+"""Find the first difference of two runs: the first handler run of an agent that occurs in only one of them.
 
-Runs are compared agent by agent, handler run by handler run: the life in which it is, handler, branch, trigger with the
-sender's number of the message, the messages sent and the changes of chain, deque and stack. Blocks go by their names,
-such as 4.11, for hashes cover timestamps. Not compared are times, which no two runs of processes share, and the state
-after each run, which follows from its changes. The chains that the runs left are compared block by block.
+Runs are compared agent by agent and handler run by handler run. The comparison covers incarnation, handler, branch,
+trigger with the message number, sent messages, and changes of chain, deque and stack. Blocks are compared by name, such
+as 4.11, because hashes depend on timestamps. Times differ in any two runs of processes, so they are not compared. The
+state after a handler run follows from its changes, so it is not compared either. The exported chains are compared block
+by block.
 
-In virtual time the same seed and scenario give the same run to the last byte. Processes part early, and rightly so:
-which of two messages arrives first is for the kernel to say. Where they part first is still where to begin to look.
-
-`steps` reads a trace line by line, `runs` compares, `keys` says what was asked for differently.
+In virtual time, the same seed and scenario give identical traces. Runs of processes differ early without an error,
+because the kernel decides which of two messages arrives first. The first difference is still the place to start a
+search.
 """
 
 from harness.report.difference._run_difference import (

@@ -1,4 +1,4 @@
-"""Compare two run directories: files, keys, and the steps of their traces."""
+"""Compare two run directories: scenario keys, traces and exported chains."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -17,9 +17,10 @@ from ucp.trigger import Trigger
 
 @dataclass(frozen=True)
 class Step:
-    """A handler run as two runs are compared by it; `t`, in mission seconds, and `line` only say where it is.
+    """A handler run in the form in which runs are compared. `t` (mission seconds) and `line` only locate it.
 
-    `changes` are (operation, block), `sent` are (message, block), and a block is its name, None for no block.
+    `changes` holds (operation, block) and `sent` holds (message, block). A block is given by its name, None for no
+    block.
     """
 
     life: int
@@ -33,7 +34,10 @@ class Step:
 
     @classmethod
     def of(cls, line: Line, names: Mapping[str, str]) -> "Step":
-        """`names` are those of the blocks by hash; one that has none goes by the beginning of its hash."""
+        """Make a step from a line of a trace.
+
+        `names` maps block hashes to names; other blocks get 12 digits of their hash.
+        """
         run = line.parsed()
         return cls(
             line.life,
@@ -52,7 +56,7 @@ def name(block_hash: str, names: Mapping[str, str]) -> str:
 
 
 def completed_blocks(lines: Iterable[Line], agent_id: int) -> dict[str, str]:
-    """Hash -> `<agent>.<ordinal>` of each block that the agent completed, in all its lives."""
+    """Return hash -> `<agent>.<ordinal>` for each block that the agent completed in any incarnation."""
     names: dict[str, str] = {}
     for line in lines:
         if b'"complete"' in line.text:
@@ -64,7 +68,10 @@ def completed_blocks(lines: Iterable[Line], agent_id: int) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class KeyDifference:
-    """A key such as `network.loss` or `timeline.0.at_s`, and its value in either; None also where there is none."""
+    """A key such as `network.loss` or `timeline.0.at_s`, and its value in each run.
+
+    A missing key has the value None.
+    """
 
     key: str
     a: Any
@@ -72,7 +79,7 @@ class KeyDifference:
 
 
 def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
-    """The innermost keys that differ, in the order of `a`. Lists of different lengths differ as a whole."""
+    """Yield the innermost keys that differ, in the order of `a`. Lists of different lengths differ as a whole."""
     if isinstance(a, dict) and isinstance(b, dict):
         pairs = [(name, a.get(name), b.get(name)) for name in {**a, **b}]
     elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
@@ -87,7 +94,7 @@ def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
 
 @dataclass(frozen=True)
 class Parting:
-    """Where the traces of an agent part: at the handler run of this number; None where a trace has ended before."""
+    """The first handler run in which the traces of an agent differ. A trace that ended before has None."""
 
     number: int
     a: Step | None
@@ -95,15 +102,15 @@ class Parting:
 
     @property
     def at_s(self) -> float:
-        """The earlier of both, in mission seconds."""
+        """The earlier time of the two handler runs, in mission seconds."""
         return min(step.t for step in (self.a, self.b) if step is not None)
 
 
 @dataclass(frozen=True)
 class ChainParting:
-    """Where the exported chains of an agent part: the names of the block in this place, which counts from 1.
+    """The first place, counted from 1, at which the exported chains of an agent differ, with the names of both blocks.
 
-    None where a chain has ended before; that of an agent without an export has no block.
+    A chain that ended before has None. An agent without an export has an empty chain.
     """
 
     place: int
@@ -119,14 +126,12 @@ class AgentDifference:
 
 @dataclass(frozen=True)
 class Difference:
-    """What tells two runs apart.
+    """The differences of two runs.
 
-    keys: of the scenario, and `seed`.
-    agents: every agent of the roster; both None for one that does the same in both.
-    handler_runs: how many were the same, of all agents, each counted up to where it parts.
-    programs: who ran what in either run, where not all agents were the harness's own.
-    exact: the traces are the same to the last byte of each handler run.
-    errors: a sentence for each export that could not be used, and for each run without an end.
+    keys: differing keys of the scenario, and `seed`. agents: every agent of the roster. Both fields are None for an
+    agent without a difference. handler_runs: the number of equal handler runs of all agents, up to the first difference
+    of each. programs: the programs of either run, if not all agents were the harness's own. exact: the traces are equal
+    to the last byte. errors: a sentence for each unusable export, and for each run without a recorded end.
     """
 
     keys: list[KeyDifference]
@@ -138,7 +143,7 @@ class Difference:
 
     @property
     def first(self) -> int | None:
-        """The agent that parts first in mission time, the lowest ID of several; None if no trace parts."""
+        """The agent with the first difference in mission time, or None. Ties go to the lowest ID."""
         at_s = {
             agent_id: difference.run.at_s for agent_id, difference in self.agents.items() if difference.run is not None
         }
@@ -146,7 +151,7 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """`identical`, `same but for times`, or `differ`; keys that differ make no difference by themselves."""
+        """`identical`, `same but for times`, or `differ`. Different keys alone do not change the verdict."""
         if any(difference.run or difference.chain for difference in self.agents.values()):
             return "differ"
         return "identical" if self.exact else "same but for times"
@@ -164,7 +169,10 @@ class Difference:
 
 
 def compare(a: Path, b: Path) -> Difference:
-    """Raises RunDirectoryError if the two cannot be compared: no run directory, no trace, another roster or backend."""
+    """Compare two run directories.
+
+    Raises RunDirectoryError if a directory is no run, or if the rosters or backends differ.
+    """
     run_a, run_b = _Run(a), _Run(b)
     _refuse_what_cannot_be_compared(run_a, run_b)
     agents: dict[int, AgentDifference] = {}
@@ -179,7 +187,7 @@ def compare(a: Path, b: Path) -> Difference:
 
 
 class _Run:
-    """One run directory."""
+    """A run directory to compare."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -207,7 +215,7 @@ class _Run:
         yield from self.exports.errors
 
     def asked(self) -> dict[str, Any]:
-        """What the run was to play, as JSON."""
+        """Return the seed and the scenario as JSON."""
         scenario = self.record.scenario
         return {"seed": self.record.seed, **(scenario.model_dump(mode="json", by_alias=True) if scenario else {})}
 
@@ -227,7 +235,7 @@ def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
 
 
 def _compare_traces(a: _Run, b: _Run, agent_id: int) -> tuple[int, bool, Parting | None]:
-    """How many handler runs are the same, whether to the last byte, and where the traces part."""
+    """Return the number of equal handler runs, whether they are equal to the last byte, and the first difference."""
     same, exact = 0, True
     for line_a, line_b in zip_longest(a.archive.trace_lines(agent_id), b.archive.trace_lines(agent_id)):
         if line_a is None or line_b is None or (line_a.life, line_a.text) != (line_b.life, line_b.text):

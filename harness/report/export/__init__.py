@@ -1,8 +1,6 @@
-"""What a run left as files for the tools that people use: MCAP for Foxglove, Lichtblick and PlotJuggler, a
-trace for Perfetto, a bag for ROS 2.
+"""Export a run for other tools: MCAP for Foxglove, Lichtblick and PlotJuggler, a Perfetto trace, or a ROS 2 bag.
 
-`Recording` opens the run, and `samples` are all that happened in it, in order of time; each format is one file that
-writes them down.
+`ExportedRun` opens the run, and its `samples` are all recorded events in time order. One module writes each format.
 """
 
 from harness.report.export._exported_run import Recording

@@ -1,7 +1,7 @@
-"""A run as it is to be exported: its archive, the clock of its mission, and all that is known to have happened.
+"""A run to export: its archive, the clock of its mission, and all its samples.
 
-The run may have broken off, parts of it may be damaged, or it may be a flight that `import` made of field logs: what is
-there is exported, and `problems` are a sentence on each thing that cannot be.
+The run may have been interrupted, some files may be damaged, or `import` may have made it from field logs. The export
+contains everything that can be read. `problems` holds a sentence for each thing that cannot.
 """
 
 from collections.abc import Iterable, Iterator
@@ -51,13 +51,14 @@ if TYPE_CHECKING:
 
 FAULTS, OPERATOR, VERDICTS = "faults", "operator", "verdicts"
 MAX_LINKED = 100
-"""Of so many vehicles the links are told one by one: there are 9900."""
+"""Maximum number of vehicles whose links are exported one by one. 100 vehicles have 9900 links."""
 
 
 class Recording:
-    """Where vehicles were is asked of their events, sealed or not, if nothing else tells: `depot` opens sealed ones.
+    """A run to export. If nothing else records positions, they are read from logged events. `depot` opens sealed
+    events.
 
-    Raises RunDirectoryError if the directory is none of a run, ExportError if there is nothing in it to export.
+    Raises RunDirectoryError if the directory holds no run, and ExportError if it holds nothing to export.
     """
 
     def __init__(self, directory: Path, depot: "Depot | None" = None) -> None:
@@ -81,22 +82,22 @@ class Recording:
 
     @cached_property
     def agents(self) -> list[int]:
-        """All that anything tells of, the lowest ID first."""
+        """IDs of all agents that any file of the run mentions, in ascending order."""
         archive = self.archive
         return sorted({*archive.roster, *archive.traces, *archive.exports.by_agent})
 
     @cached_property
     def block_names(self) -> dict[str, str]:
-        """Block hash -> "4.11"."""
+        """Block hash -> name, such as "4.11"."""
         return name_blocks(self.archive.exports.by_agent)
 
     def block(self, block_hash: str) -> str:
-        """A block's name, or the beginning of its hash if no export has it."""
+        """Return the name of a block, or the first 12 digits of its hash if no export contains it."""
         return self.block_names.get(block_hash, block_hash[:12])
 
     @cached_property
     def history(self) -> History:
-        """What the agents voted on, reconciled and sent."""
+        """Votes, reconciles and messages of the agents."""
         return history_of(self.archive.traces, self.faults, self.end_s)
 
     @cached_property
@@ -113,20 +114,20 @@ class Recording:
 
     @cached_property
     def end_s(self) -> float:
-        """When the last of it happened, in mission seconds."""
+        """The last recorded mission second."""
         told = self.archive.record.mission_s or 0.0
         flown = (fixes[-1].at_s for fixes in self.tracks.by_vehicle.values())
         return max([ends_at(self.archive.traces), *flown, *([told] if 0 <= told <= LATEST_S else [])])
 
     @property
     def problems(self) -> list[str]:
-        """A sentence on each thing that is damaged or missing; of what `samples` read, once they were read."""
+        """A sentence for each damaged or missing file. The list is complete after `samples` is exhausted."""
         archive = self.archive
         sentences = [*archive.problems, *archive.gaps, *self.tracks.problems, *self.network.problems, *self._problems]
         return list(dict.fromkeys(map(archive.within, sentences)))
 
     def add_problem(self, sentence: str) -> None:
-        """Something more that cannot be exported."""
+        """Add a sentence to `problems`."""
         self._problems.append(sentence)
 
     @cached_property
@@ -137,10 +138,8 @@ class Recording:
     def _logs(self) -> list[tuple[str, Path]]:
         return list(log_files(self.directory))
 
-    # All that happened
-
     def samples(self) -> Iterator[Sample]:
-        """Everything, in order of time; telemetry and logs are read as it goes."""
+        """Yield all samples in time order. Telemetry and logs are read on the way."""
         streams: list[Iterable[Sample]] = [
             self.positions(),
             self._losses(),
@@ -158,7 +157,9 @@ class Recording:
         return merge(*streams, key=attrgetter("at_ns"))
 
     def positions(self) -> Iterator[Position]:
-        """Where the vehicles were, by the run's record, else by what they logged."""
+        """Yield the recorded positions of the vehicles, or the positions that agents logged as events if none are
+        recorded.
+        """
         made = self._by_tracks() if self.tracks.by_vehicle else self._by_events()
         return iter(sorted(made, key=attrgetter("at_ns")))
 
@@ -175,7 +176,7 @@ class Recording:
                 yield Position(self.time.at(fix.at_s), vehicle, metres, place)
 
     def _by_events(self) -> Iterator[Position]:
-        """The middle of the field is where the first position was logged."""
+        """Yield logged positions. The first one becomes the centre of the field."""
         if not self.archive.exports.by_agent:
             return
         untimed, field = 0, None
@@ -248,7 +249,7 @@ class Recording:
             yield Reconciled(self.time.at(reconcile.end_s, reconcile.agent), reconcile)
 
     def _told(self) -> Iterator[Said]:
-        """What the run says to people: what was done to it, and at its end the verdicts."""
+        """Yield faults and operator commands, and at the end of the run the verdicts."""
         for state in self.archive.record.network[:1]:
             yield Said(self.time.at(0.0), "info", FAULTS, f"{state.what}: {state.detail}")
         for fault in self.faults:

@@ -1,7 +1,7 @@
-"""The links between vehicles as they move, for whoever draws them.
+"""Lines for the links between moving vehicles.
 
-They are drawn anew when vehicles have moved, at most once a mission second, and of many vehicles more seldom: there are
-as many as pairs.
+Lines are drawn again after vehicles have moved, at most once per mission second. The number of links grows with the
+square of the number of vehicles, so lines of large swarms are drawn less often.
 """
 
 from itertools import combinations
@@ -11,17 +11,17 @@ from harness.archive.connectivity import Link
 from harness.report.export._samples import Metres, Position
 
 FIELD = "field"
-"""The frame of the field: x is east, y north, z up, in metres from its middle."""
+"""The frame of the field: x is east, y north and z up, in metres from its centre."""
 PAIRS_A_SECOND = 100
 
 
 def vehicle_frame(vehicle: int) -> str:
-    """The frame in which a vehicle stands still."""
+    """Return the name of the frame that moves with the vehicle."""
     return f"vehicle_{vehicle}"
 
 
 class Line(NamedTuple):
-    """From one vehicle to another; `loss` is that of the worse direction, less than 1."""
+    """The link between two vehicles. `loss` is the larger loss of both directions, and below 1."""
 
     low: Metres
     high: Metres
@@ -29,12 +29,12 @@ class Line(NamedTuple):
 
     @property
     def colour(self) -> dict[str, float]:
-        """From green, which loses nothing, to red, which is fainter; red, green, blue and opacity, 0 to 1."""
+        """A colour from green (no loss) to faint red, as red, green, blue and opacity from 0 to 1."""
         return {"r": self.loss, "g": 1.0 - self.loss, "b": 0.1, "a": 1.0 - 0.7 * self.loss}
 
 
 class Links:
-    """`losses` are those of the links as they are now."""
+    """The current places of the vehicles and the current `losses` of their links."""
 
     def __init__(self) -> None:
         self.losses: dict[Link, float] = {}
@@ -43,7 +43,10 @@ class Links:
         self._moved_ns = -1
 
     def moved(self, position: Position) -> list[Line] | None:
-        """The links before the vehicle moved, if they are to be drawn anew: all that moved at once have."""
+        """Store the new position. Return the lines before this movement if they are due, or None.
+
+        All movements of one instant belong together, so the lines are complete when the first later movement arrives.
+        """
         at_ns = position.at_ns
         due = at_ns > self._moved_ns and self._are_due(at_ns)
         lines = self._lines() if due else None

@@ -1,7 +1,8 @@
-"""The logs of a run's programs, line by line, at the time that each line begins with.
+"""The logs of a run's programs as samples, each line at the time with which it begins.
 
-A line without a time is of the time of the line before, the first of the mission's start: an agent of another make logs
-as it likes. Which zone the time is of, no log says: the one in which its first line is nearest the mission's start.
+Agents may use any log format. A line without a time gets the time of the previous line, and a first line without a time
+gets the start of the mission. No log states its time zone. The reader assumes the zone in which the first line is
+nearest to the start of the mission.
 """
 
 import math
@@ -25,14 +26,14 @@ _BAD = re.compile(r"\bwarn(ing)?\b", re.IGNORECASE)
 
 
 def log_files(directory: Path) -> Iterator[tuple[str, Path]]:
-    """Whose log each is: of the lab, the rogue node, the agents and the vehicles."""
+    """Yield the name and path of each log: of the lab, the rogue node, the agents and the vehicles."""
     files = chain(directory.glob("*.log"), directory.glob("agents/**/*.log"), directory.glob("vehicles/*/output.log"))
     for path in sorted(islice(files, MAX_FILES)):
         yield str(path.relative_to(directory)).encode("utf-8", "replace").decode(), path
 
 
 def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) -> Iterator[Said]:
-    """The lines of a log; a sentence on what cannot be read is added to `problems`."""
+    """Yield the lines of a log. Add a sentence to `problems` if a part cannot be read."""
     at_ns, zone_s = time.at(0.0), None
     try:
         with Opened(path, MAX_BYTES) as file:
@@ -54,13 +55,17 @@ def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) ->
 
 
 def _zone_s(ahead_s: float) -> float:
-    """Of a log whose first line is so far ahead of the mission's start: none of a mission in virtual time."""
+    """Return the offset of the time zone in seconds, from the difference between the first line and the mission's
+    start.
+
+    Return infinity if no zone matches, as in virtual time.
+    """
     zone_s = round(ahead_s / _ZONE_STEP_S) * _ZONE_STEP_S
     return zone_s if abs(zone_s) <= _FURTHEST_ZONE_S else math.inf
 
 
 def _seconds(timed: re.Match[str]) -> float | None:
-    """As if of the zone UTC; None if there is no such day or hour."""
+    """Return the seconds since the Unix epoch as if the zone were UTC, or None if the text is no valid time."""
     try:
         whole = datetime.fromisoformat(timed[1]).replace(tzinfo=UTC).timestamp()
     except ValueError:

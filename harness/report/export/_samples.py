@@ -1,7 +1,7 @@
-"""Samples of a run, each with its time in nanoseconds since the Unix epoch.
+"""Samples of a run. Each has a time in nanoseconds since the Unix epoch.
 
-Mission second 0 is the epoch that the agents were given: wall time, and in virtual time the Unix epoch itself. At a
-speedup mission time runs ahead of the wall clock, as the timestamps of blocks do.
+Mission second 0 is the epoch that the agents received: wall time, or 0 in virtual time. With a speedup, mission time
+runs faster than the wall clock, like the timestamps of blocks.
 """
 
 from collections import Counter
@@ -25,7 +25,7 @@ Metres = tuple[float, float, float]
 
 
 class Place(NamedTuple):
-    """Degrees, and metres above mean sea level."""
+    """Latitude and longitude in degrees, and altitude in metres above mean sea level."""
 
     lat_deg: float
     lon_deg: float
@@ -34,7 +34,10 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where a vehicle was, seen from the middle of the field; `place` is None if unknown."""
+    """The position of a vehicle relative to the centre of the field.
+
+    `place` is None if the field's location is unknown.
+    """
 
     at_ns: int
     vehicle: int
@@ -44,7 +47,7 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class LossesChanged:
-    """From now on these links lose so much, 0..1; a link is from a sender to a receiver, others are as they were."""
+    """New losses of some links, 0 to 1. A link is a pair (sender, receiver). Other links keep their losses."""
 
     at_ns: int
     losses: Mapping[Link, float]
@@ -52,7 +55,7 @@ class LossesChanged:
 
 @dataclass(frozen=True, slots=True)
 class NetworkChanged:
-    """Who reaches whom, the largest group first, and what the links that there are lose."""
+    """The groups of connected vehicles, the largest first, and the losses of the existing links."""
 
     at_ns: int
     groups: Components
@@ -62,7 +65,7 @@ class NetworkChanged:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A handler ran."""
+    """A handler run."""
 
     at_ns: int
     agent: int
@@ -71,7 +74,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """An agent dropped a datagram, and gave it to no handler."""
+    """A datagram that an agent dropped."""
 
     at_ns: int
     agent: int
@@ -80,7 +83,7 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Broadcast:
-    """A message, when it was sent."""
+    """A message, at the time of sending."""
 
     at_ns: int
     message: Message
@@ -88,7 +91,7 @@ class Broadcast:
 
 @dataclass(frozen=True, slots=True)
 class Voted:
-    """A vote came to its end."""
+    """A vote, at its end."""
 
     at_ns: int
     vote: Vote
@@ -96,7 +99,7 @@ class Voted:
 
 @dataclass(frozen=True, slots=True)
 class Reconciled:
-    """A reconcile came to its end, or was cut short."""
+    """A reconcile, at its end or interruption."""
 
     at_ns: int
     reconcile: Reconcile
@@ -104,7 +107,7 @@ class Reconciled:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """How far the data had spread."""
+    """The replication of the blocks, at the time of a change."""
 
     at_ns: int
     replication: Replication
@@ -112,7 +115,7 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """A MAVLink message of a vehicle, as pymavlink decoded it."""
+    """A MAVLink message of a vehicle, decoded by pymavlink."""
 
     at_ns: int
     vehicle: int
@@ -121,7 +124,7 @@ class Telemetry:
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """A line of a log, a fault, a change of the network, a verdict: `source` says whose."""
+    """A line of a log, a fault, a network change or a verdict. `source` names its origin."""
 
     at_ns: int
     level: Level
@@ -145,41 +148,47 @@ Sample = (
 
 
 MAX_EPOCH_S = 2**31 - 1 - round(LATEST_S)
-"""A later mission would end when ROS has no times left, in 2038."""
+"""Latest start of a mission. A later mission could exceed the last time of ROS, in 2038."""
 MAX_SPEEDUP = 1000.0
 _NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class MissionTime:
-    """`epoch_ns` is mission second 0; that of an agent whose clock was set otherwise is in `by_agent`."""
+    """The clock of the mission.
+
+    `epoch_ns` is mission second 0. `by_agent` holds the epochs of agents with other clocks.
+    """
 
     epoch_ns: int
     speedup: float
     by_agent: Mapping[int, int]
 
     def at(self, mission_s: float, agent: int | None = None) -> int:
-        """The time of a mission second, by the agent's clock if one is named; never before 1970."""
+        """Return the time of a mission second, by the agent's clock if `agent` is given. It is never before 1970."""
         epoch_ns = self.epoch_ns if agent is None else self.by_agent.get(agent, self.epoch_ns)
         return max(0, epoch_ns + round(mission_s * _NS))
 
     def mission_s(self, at_ns: int) -> float:
-        """The mission second of a time."""
+        """Return the mission second of a time."""
         return (at_ns - self.epoch_ns) / _NS
 
     def of_wall(self, wall_s: float) -> int | None:
-        """The time of what the wall clock timed, in seconds since the Unix epoch; None if no mission is as long."""
+        """Return the time of a wall clock value in Unix seconds, or None if it is outside any mission."""
         mission_s = (wall_s - self.epoch_ns / _NS) * self.speedup
         return self.at(mission_s) if abs(mission_s) <= LATEST_S else None
 
     def of_timestamp(self, timestamp_us: int) -> int | None:
-        """The time of a block's or event's timestamp; None if no mission is as long."""
+        """Return the time of a block's or event's timestamp, or None if it is outside any mission."""
         at_ns = timestamp_us * 1000
         return at_ns if abs(self.mission_s(at_ns)) <= LATEST_S else None
 
 
 def mission_time(headers: Mapping[int, Header], record: RunRecord, problems: list[str]) -> MissionTime:
-    """By the headers of the traces, else by the record; a sentence on each clock that cannot be is added."""
+    """Return the clock from the headers of the traces, or else from the record.
+
+    Add a sentence for each invalid clock.
+    """
     epochs = {}
     for agent, header in headers.items():
         epoch_us = header.clock.get("epoch_us")
@@ -203,7 +212,7 @@ def _speedup(headers: Mapping[int, Header], record: RunRecord) -> float:
 
 
 def _began(record: RunRecord) -> int:
-    """When the run was started: of one without a trace nothing is as near its mission's start."""
+    """Return the start time of the run, the best estimate of the mission's start without a trace; 0 in virtual time."""
     try:
         began = datetime.fromisoformat(record.started_at or "")
     except ValueError:

@@ -1,6 +1,6 @@
-"""The swarm in Foxglove's 3D view: a shape for each vehicle, and a line for each link, coloured by what it loses.
+"""The swarm in Foxglove's 3D view: a shape for each vehicle, and a line for each link, coloured by its loss.
 
-A vehicle is drawn once, in a frame of its own that moves; links are drawn anew as it moves.
+Each vehicle is drawn once, in its own moving frame. Links are drawn again after movements.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -22,7 +22,7 @@ _TEXT = Color(r=1.0, g=1.0, b=1.0, a=1.0)
 
 
 def colours_of(vehicles: Iterable[int]) -> dict[int, Any]:
-    """The colours that they have in reports."""
+    """Return the colours that the vehicles have in reports."""
     return {vehicle: _colour(ink.fill) for vehicle, ink in inks(vehicles).items()}
 
 
@@ -32,7 +32,7 @@ def _colour(fill: str) -> Any:
 
 
 class Scene:
-    """The scene along time; `links` knows what they lose now."""
+    """The scene over time. `links` holds the current losses."""
 
     def __init__(self, record: RunRecord, colours: Mapping[int, Any]) -> None:
         self.links = Links()
@@ -40,7 +40,7 @@ class Scene:
         self._drawn: set[int] = set()
 
     def moved(self, position: Position) -> Iterator[Any]:
-        """SceneUpdates, if any are due."""
+        """Yield the SceneUpdates that are due after a movement."""
         if (lines := self.links.moved(position)) is not None:
             yield _drawn_links(position.at_ns, lines)
         if position.vehicle not in self._drawn:

@@ -1,4 +1,4 @@
-"""The vehicles' telemetry logs, read back: MAVLink as it was heard, up to what is damaged and beyond it."""
+"""Read the telemetry logs of the vehicles. Damaged parts of a log are skipped."""
 
 import re
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ _LIFE = re.compile(r"([1-9]\d{0,4})(?:-([1-9]\d{0,3}))?")
 
 
 def telemetry_logs(directory: Path) -> list[tuple[int, Path]]:
-    """The logs of a run's vehicles, each with its vehicle; of a later life in its own directory."""
+    """Return the vehicle and path of each log. Each incarnation of a vehicle has its own directory."""
     logs = []
     for path in islice((directory / "vehicles").glob(f"*/{NAME}"), MAX_FILES):
         if named := _LIFE.fullmatch(path.parent.name):
@@ -25,7 +25,7 @@ def telemetry_logs(directory: Path) -> list[tuple[int, Path]]:
 
 
 def read_telemetry(vehicle: int, path: Path, time: MissionTime, problems: list[str]) -> Iterator[Telemetry]:
-    """The messages of a log; a sentence on what in it was none is added to `problems` at its end."""
+    """Yield the messages of a log. Afterwards add sentences about damaged parts to `problems`."""
     damaged = untimed = 0
     if not path.is_file():
         problems.append(f"{path}: cannot be read: it is not a file")

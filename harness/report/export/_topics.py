@@ -1,7 +1,6 @@
-"""What there is to plot of a run, as topics of JSON objects, each with a JSON Schema: one for each kind of sample.
+"""Samples as topics of JSON objects for plots. Each kind of sample has a topic with a JSON Schema.
 
-A value that is not known has no key: there are no nulls, which plotting tools do not know. Every object has the mission
-second, besides the time of the message.
+An unknown value has no key, because plotting tools do not support null. Each object also contains the mission second.
 """
 
 import math
@@ -31,11 +30,11 @@ Schema = dict[str, Any]
 _NUMBER, _WHOLE, _YES_OR_NO, _TEXT = ({"type": name} for name in ("number", "integer", "boolean", "string"))
 _AGENTS = {"type": "array", "items": _WHOLE}
 _LARGEST = 2**53
-"""Beyond it tools that have floats alone do not tell whole numbers apart."""
+"""Largest whole number that a float represents exactly. Some tools store all numbers as floats."""
 
 
 def schema(**properties: Schema) -> Schema:
-    """Of an object with these keys, any of which may be missing."""
+    """Return the schema of an object with these keys, all of which are optional."""
     return {"type": "object", "properties": {"mission_s": _NUMBER, **properties}}
 
 
@@ -73,7 +72,7 @@ SCHEMAS: dict[str, Schema] = {
 
 
 class Topics:
-    """Makes objects of samples; `schemas` are those of all topics that it uses, by name."""
+    """Convert samples to objects. `schemas` holds the schemas of all used topics, by name."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -83,7 +82,7 @@ class Topics:
         self.schemas["ucp.LinkLosses"] = schema(**links)
 
     def of(self, sample: Sample) -> Iterator[tuple[str, str, Object]]:
-        """Topic, name of its schema, and object, of each that a sample gives."""
+        """Yield topic, schema name and object for each object of a sample."""
         for topic, name, told in self._of(sample):
             known = {key: value for key, value in told.items() if _can_be_told(value)}
             yield topic, name, {"mission_s": round(self._recording.time.mission_s(sample.at_ns), 6), **known}
@@ -174,7 +173,7 @@ class Topics:
 
 
 def _can_be_told(value: Any) -> bool:
-    """Whether it is known, and in JSON."""
+    """Return whether the value is known and can be written as JSON."""
     return math.isfinite(value) if isinstance(value, float) else value is not None
 
 
@@ -195,11 +194,11 @@ def _link(link: Link) -> str:
 
 
 def _whole(number: Any) -> int | None:
-    """None of what no tool can show."""
+    """Return the number, or None if it is no whole number that all tools can show."""
     return number if isinstance(number, int) and abs(number) <= _LARGEST else None
 
 
-# MAVLink, as pymavlink's dialect describes it
+# MAVLink messages, from pymavlink's description of the dialect
 
 
 def _mavlink_schema(message: type[Any]) -> Schema:
@@ -208,7 +207,7 @@ def _mavlink_schema(message: type[Any]) -> Schema:
 
 
 def _lengths(message: type[Any]) -> Iterable[int]:
-    """How many elements each field has, 0 if it is none of several."""
+    """Return the number of elements of each field, or 0 for a field that is no array."""
     in_order: Mapping[str, int] = dict(zip(message.ordered_fieldnames, message.array_lengths, strict=True))
     return [in_order[name] for name in message.fieldnames]
 

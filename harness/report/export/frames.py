@@ -13,14 +13,14 @@ from harness.present.polars import pl
 from ucp.trigger import MessageTrigger, Trigger
 
 BATCH = 20_000
-"""Records that are in memory at the same time."""
+"""Maximum number of records in memory at the same time."""
 
 Record = TypeVar("Record")
 Columns = Mapping[str, tuple[Any, Callable[[Record], Any]]]
-"""Name of a column -> its type, and its value of a record."""
+"""Name of a column -> its type, and a function that returns its value for a record."""
 
 _NAME = pl.Categorical
-"""Text with few different values."""
+"""Text with few distinct values."""
 
 _HANDLER_RUN: Columns[RecordedRun] = {
     "agent": (pl.Int64, lambda each: each.agent_id),
@@ -59,15 +59,18 @@ _BLOCK: Columns[HeldBlock] = {
 def handler_runs_frame(archive: RunArchive) -> pl.DataFrame:
     """Return a table with one row for each handler run of a run.
 
-    `agent`, `life` and `line` say where the run stands: the agent's ID, 1 until its first restart, and the line in its
-    trace. `t_s` is the time in mission seconds. `handler`, `algorithm` (1 to 20) and `branch` say what ran, and
-    `trigger` why: `message`, `event`, `timer`, `local`, `operator` or `boot`. `subject` is the name of the message or
-    timer, the event's ID and so on; `sender` is the agent that sent the message. `operations` and `blocks` are two
-    lists of equal length: each change (`complete`, `chain+`, `deque-` and so on) and the hash of its block. `sent`
-    lists the names of the messages sent. `chain`, `deque` and `stack` are lengths after the run; `reconciling`,
-    `idle` and `top`, the top chain hash, are the state after the run.
+    - `agent`, `life` and `line` locate the row: agent ID, incarnation (from 1), and line number in the trace.
+    - `t_s` is the time in mission seconds.
+    - `handler`, `algorithm` (1 to 20) and `branch` describe the handler run.
+    - `trigger` is `message`, `event`, `timer`, `local`, `operator` or `boot`. `subject` is the name of the message or
+      timer, the ID of the event, and so on. `sender` is the agent that sent the message.
+    - `operations` and `blocks` are lists of equal length: the changes (`complete`, `chain+`, `deque-` and so on) and
+      the hashes of their blocks.
+    - `sent` lists the names of the sent messages.
+    - `chain`, `deque` and `stack` are lengths after the run. `reconciling`, `idle` and `top` (the top chain hash) are
+      the state after the run.
 
-    Raises RunDirectoryError if a trace is damaged, and MachineError without the extra `data`.
+    Raises RunDirectoryError if a trace is damaged, and MachineError if the extra `data` is not installed.
     """
     return _frame(archive.handler_runs(), _HANDLER_RUN)
 
@@ -75,12 +78,13 @@ def handler_runs_frame(archive: RunArchive) -> pl.DataFrame:
 def blocks_frame(archive: RunArchive) -> pl.DataFrame:
     """Return a table with one row for each block that an agent holds at the end of a run.
 
-    `holder` is the agent that holds the block, `place` where it holds it (`chain`, `deque` or `stack`), and `position`
-    counts from 0. `agent` is the agent that completed the block, `timestamp_us` the time of its newest event in
-    microseconds, and `event_bytes` the size of its event data. Hashes are hexadecimal; `chain_hash` is null outside the
-    chain.
+    - `holder` is the agent that holds the block.
+    - `place` is `chain`, `deque` or `stack`, and `position` counts from 0.
+    - `agent` is the agent that completed the block.
+    - `timestamp_us` is the time of its newest event in microseconds, and `event_bytes` the size of its event data.
+    - `block_hash` and `chain_hash` are hexadecimal. `chain_hash` is null outside the chain.
 
-    Raises MachineError without the extra `data`.
+    Raises MachineError if the extra `data` is not installed.
     """
     return _frame(archive.blocks(), _BLOCK)
 

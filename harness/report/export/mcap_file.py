@@ -1,8 +1,8 @@
-"""A run as MCAP: one file that Foxglove, Lichtblick and PlotJuggler open without a plug-in.
+"""Write a run as MCAP. Foxglove, Lichtblick and PlotJuggler open this file without a plug-in.
 
-Where there is a schema of Foxglove's own for something it is used, in protobuf: a position is a LocationFix (for maps)
-and a FrameTransform (for the 3D view), links and vehicles are a SceneUpdate, every line of a log is a Log. All else are
-the JSON topics of `topics`. run.json and the chain exports are attached as they are.
+Where Foxglove has its own schema, the file uses it in protobuf: LocationFix (for maps) and FrameTransform (for the 3D
+view) for positions, SceneUpdate for links and vehicles, Log for lines of logs. Everything else becomes the JSON topics
+of `_topics`. run.json and the chain exports are attached unchanged.
 """
 
 import json
@@ -31,11 +31,11 @@ except ImportError:
 
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _SEVERITIES = (Log.FATAL, Log.FATAL, Log.FATAL, Log.ERROR, Log.WARNING, Log.INFO, Log.INFO, Log.DEBUG)
-"""Of MAV_SEVERITY, from emergency to debug."""
+"""Log levels of MAV_SEVERITY, from emergency to debug."""
 
 
 def write_mcap(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
-    """How many messages were written into a new file. `progress` is told the mission second, now and then.
+    """Write a new file, and return the number of messages. `progress` receives the mission second from time to time.
 
     Raises OSError.
     """
@@ -73,7 +73,7 @@ def _write(recording: Recording, writer: "_Writer", progress: Callable[[float], 
 
 
 class _Writer:
-    """An MCAP file, of which channels are there from their first message on."""
+    """An MCAP file. A channel is registered at its first message."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._writer = Writer(file)
@@ -83,7 +83,7 @@ class _Writer:
         self.messages = 0
 
     def position(self, position: Position, colour: Any) -> None:
-        """On the map, and in the 3D view."""
+        """Write a position for the map and for the 3D view."""
         frame = vehicle_frame(position.vehicle)
         transform = FrameTransform(parent_frame_id=FIELD, child_frame_id=frame)
         transform.timestamp.FromNanoseconds(position.at_ns)
@@ -102,7 +102,7 @@ class _Writer:
         self.message("/log", at_ns, line)
 
     def message(self, topic: str, at_ns: int, message: Any) -> None:
-        """A message in protobuf."""
+        """Write a protobuf message."""
         if topic not in self._channels:
             name = message.DESCRIPTOR.full_name
             if name not in self._schemas:
@@ -123,7 +123,7 @@ class _Writer:
         self.messages += 1
 
     def attach(self, recording: Recording) -> None:
-        """The record and the exports, if they can be read: what is wrong with them is told already."""
+        """Attach run.json and the exports. Unreadable files are skipped, because `problems` already mentions them."""
         begin_ns = recording.time.at(0.0)
         for path in (recording.directory / RUN_FILE, *export_paths(recording.directory)):
             if path.is_file() and path.stat().st_size <= MAX_EXPORT_BYTES:

@@ -1,10 +1,11 @@
-"""A run as a trace for https://ui.perfetto.dev: what every agent did when, and an arrow for each message.
+"""Write a run as a trace for https://ui.perfetto.dev, with an arrow for each message.
 
-Each agent has a group of tracks: its votes, its reconciles with their phases, its handler runs, and as counters what it
-holds. An arrow goes from the handler run that sent a message to each that it triggered. The swarm has counters of
-losses and chains, and a track of what was done to it and what was said.
+Each agent has a group of tracks: votes, reconciles with their phases, handler runs, and counters of its blocks. An
+arrow leads from the handler run that sent a message to each handler run that the message triggered. The swarm has
+counters of losses and chains, and a track of faults and log lines.
 
-It is Perfetto's own protobuf, not Chrome's JSON, whose arrows only find slices that last: a handler run is an instant.
+The format is Perfetto's own protobuf. In Chrome's JSON format, arrows need slices with a duration, but a handler run is
+an instant.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -35,16 +36,17 @@ except ImportError:
 
 SWARM = "swarm"
 MAX_TEXT = 500
-"""More of a line of a log is not shown."""
+"""Maximum length of the shown text of a log line, in characters."""
 _LARGEST = 2**63 - 1
 _SEQUENCE = 1
 
 Event = tuple[int, int, Any]
-"""Time, 1 for what a message triggered and else 0, and the packet: what was sent comes before what was received."""
+"""Time, order at equal times, and packet. The order is 1 for effects of messages, so that sending precedes receiving.
+"""
 
 
 def write_perfetto(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
-    """How many events were written into a new file. `progress` is told the mission second, now and then.
+    """Write a new file, and return the number of events. `progress` receives the mission second from time to time.
 
     Raises OSError.
     """
@@ -71,14 +73,14 @@ def _write(recording: Recording, file: IO[bytes], progress: Callable[[float], No
 
 
 class _Arrows:
-    """The numbers of arrows: one for each message and each agent that received it."""
+    """Numbers of arrows. Each pair of a message and a receiver has its own arrow."""
 
     def __init__(self, messages: Iterable[Message]) -> None:
         numbers = count(1)
         self._from: dict[tuple[int, int, float], list[int]] = {}
         self._to: dict[tuple[int, int, int, float], int] = {}
         self.backwards = 0
-        """Receipts that are earlier than what was sent, by the agents' clocks: no arrow goes back in time."""
+        """Number of receipts that precede their sending according to the agents' clocks. They have no arrow."""
         for message in messages:
             for receiver, at_s in message.receipts:
                 if at_s < message.at_s:
@@ -99,7 +101,7 @@ class _Arrows:
 
 
 class _Trace:
-    """Makes packets of what happened, and of tracks when they are first used."""
+    """Convert samples to packets, and describe each track at its first use."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -117,14 +119,14 @@ class _Trace:
             self._track(group, rank=rank)
 
     def clocks(self) -> Any:
-        """Says that times are wall time."""
+        """Return a packet which states that times are wall time."""
         packet = TracePacket(trusted_packet_sequence_id=_SEQUENCE)
         for clock in (BUILTIN_CLOCK_BOOTTIME, BUILTIN_CLOCK_REALTIME):
             packet.clock_snapshot.clocks.add(clock_id=clock, timestamp=self._recording.time.epoch_ns)
         return packet
 
     def new_tracks(self) -> Iterator[Any]:
-        """Descriptions of the tracks that are used for the first time."""
+        """Yield descriptions of tracks that are used for the first time."""
         new, self._new = self._new, []
         yield from new
 
@@ -203,7 +205,7 @@ class _Trace:
         return at_ns, 0, self._packet(at_ns, _agent(agent), track, TrackEvent.TYPE_SLICE_END)
 
     def _count(self, at_ns: int, group: str, name: str, value: float) -> Iterator[Event]:
-        """If it is another than before."""
+        """Yield a counter event if the value has changed."""
         if self._counters.get((group, name)) != value and abs(value) <= _LARGEST:
             self._counters[group, name] = value
             packet = self._packet(at_ns, group, name, TrackEvent.TYPE_COUNTER)
@@ -219,7 +221,7 @@ class _Trace:
         return packet
 
     def _track(self, group: str, name: str = "", *, rank: int = 0, counter: bool = False) -> int:
-        """The track of that name in a group, or the group's own."""
+        """Return the ID of a track in a group, or of the group itself without a name."""
         if (group, name) not in self._tracks:
             uuid = self._tracks[group, name] = next(self._uuids)
             packet = TracePacket(trusted_packet_sequence_id=_SEQUENCE)

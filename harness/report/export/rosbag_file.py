@@ -1,8 +1,8 @@
-"""A run as a bag of ROS 2, for its tools (ros2 bag, RViz, rqt, PlotJuggler), made without ROS.
+"""Write a run as a ROS 2 bag for ros2 bag, RViz, rqt and PlotJuggler, without ROS.
 
-Positions, transforms, links and logs are messages that every ROS installation knows. The agents' traces and exports are
-on the topics that the adapter for bags reads (`harness.field.adapters.rosbag_adapter`): `ucp-harness import` makes a
-run directory of the bag again. Storage is SQLite, which every ROS 2 from Humble on opens.
+Positions, transforms, links and logs use message types that every ROS installation contains. The agents' traces and
+exports are on the topics that the bag adapter reads (`harness.field.adapters.rosbag_adapter`), so `ucp-harness import`
+can turn the bag into a run directory again. The storage is SQLite, which every ROS 2 since Humble opens.
 """
 
 import sqlite3
@@ -36,21 +36,22 @@ except ImportError:
     raise MachineError("writing ROS bags needs a further package: `pip install ucp-harness[export]`") from None
 
 Timed = tuple[int, str, Any]
-"""Time, topic, and message."""
+"""Time, topic and message."""
 
 METADATA_VERSION: Literal[8] = 8
-"""Of the bag: Humble and all later ones read it."""
+"""Version of the bag format. ROS 2 Humble and later versions read it."""
 LEVELS = {"info": 20, "warning": 30, "error": 40}
-"""rcl_interfaces/Log: INFO, WARN, ERROR."""
+"""Levels of rcl_interfaces/Log: INFO, WARN, ERROR."""
 _LARGEST = 2**32 - 1
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _NS = 1_000_000_000
 
 
 def write_rosbag(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
-    """How many messages were written into a new directory. `progress` is told the mission second, now and then.
+    """Write a new directory, and return the number of messages. `progress` receives the mission second from time to
+    time.
 
-    Raises OSError, and MachineError where the disk refuses.
+    Raises OSError, and MachineError if the database cannot be written.
     """
     try:
         return _write(recording, path, progress)
@@ -75,7 +76,7 @@ def _write(recording: Recording, path: Path, progress: Callable[[float], None]) 
 
 
 class _Messages:
-    """What happened, as messages of ROS."""
+    """The samples of a run as ROS messages."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -83,7 +84,7 @@ class _Messages:
         self._counts: dict[str, float] = {}
 
     def all(self) -> Iterator[Timed]:
-        """In order of time."""
+        """Yield all messages in time order."""
         traces = [self._trace(agent) for agent in self._recording.archive.traces]
         yield from merge(self._of_samples(), *traces, key=itemgetter(0))
         end_ns = self._recording.time.at(self._recording.end_s)
@@ -97,7 +98,7 @@ class _Messages:
             yield end_ns, "/rosout", _log(end_ns, LEVELS["warning"], "export", problem)
 
     def _trace(self, agent: int) -> Iterator[Timed]:
-        """Its lines, as they were written."""
+        """Yield the lines of the agent's trace without changes."""
         time = self._recording.time
         at_ns = time.at(0.0, agent)
         for entry in self._recording.archive.traces[agent].entries():
@@ -135,14 +136,14 @@ class _Messages:
                 yield f"/vehicle_{vehicle}/mavlink", _bytes(bytes(message.get_msgbuf()))
 
     def _count(self, topic: str, kind: str, value: float) -> Iterator[tuple[str, Any]]:
-        """If it is another than before."""
+        """Yield the value if it has changed."""
         if self._counts.get(topic) != value:
             self._counts[topic] = value
             yield topic, _made(f"std_msgs/msg/{kind}", data=value)
 
 
 def _made(name: str, /, **fields: Any) -> Any:
-    """A message of this type."""
+    """Return a message of this type."""
     return _STORE.types[name](**fields)
 
 
@@ -208,7 +209,7 @@ def _transform(position: Position) -> Any:
 
 
 def _markers(at_ns: int, lines: list[Line]) -> Any:
-    """One list of lines; RViz takes none that is empty, so that without any link the old one is deleted."""
+    """Return one list of lines. RViz rejects an empty list, so without links the old marker is deleted."""
     marker: Any = _STORE.types["visualization_msgs/msg/Marker"]
     none = (0.0, 0.0, 0.0)
     made = marker(

@@ -1,6 +1,6 @@
-"""A run to look at: a page in the browser while it goes on, and the same page as a film once it is over.
+"""A web page of a run, live during the run or as a film afterwards.
 
-What a run has taken down (`network.jsonl`, `tracks.jsonl`, the agents' traces) becomes one stream of changes
-(`harness.report.live.feed`). A live run is its files while they grow, a film the same files read to their end: the
-page does not know one from the other. Agents do nothing for it, and a run does not wait for it.
+`harness.report.live.feed` turns the files of a run (`network.jsonl`, `tracks.jsonl`, the agents' traces) into one
+stream of changes. During the run the feed follows the growing files. After the run it reads them to the end. The page
+treats both alike. The agents do no extra work for the page, and the run never waits for it.
 """

@@ -1,8 +1,8 @@
-"""`python -m harness.report.live DIRECTORY PORT`: the server beside a run that goes on, as a process of its own.
+"""`python -m harness.report.live DIRECTORY PORT`: the server of the live page, as a process beside the run.
 
-So it takes no time from the run, and cannot hurt it. What it says to whoever plays the run, and hears from there, is in
-`harness.report.live.server_process`. After the run it stays while a page is open; it ends at once if whoever played
-is gone.
+A separate process takes no time from the run and cannot break it. `harness.report.live.server_process` describes the
+messages between the two processes. After the run the server stays while a page is open. It ends at once if the process
+of the run ends.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ from harness.report.live.projector import tell_live
 from harness.report.live.server import UPDATE_S, Server
 
 LEFT_S = 3.0
-"""After a run, so long without a page is the end: one that is loaded anew comes back."""
+"""Seconds without a page after which the server ends. A page that is reloaded reconnects within this time."""
 
 
 async def main(directory: Path, port: int) -> None:
@@ -48,13 +48,13 @@ def _print(line: str) -> None:
 
 
 def _say(page: int, asked: Any) -> None:
-    """Somebody asks for something."""
+    """Send a page's request to the process of the run."""
     if isinstance(asked, dict):
         _print(json.dumps([page, asked.get("number"), asked]))
 
 
 async def _hear_until_over(reader: asyncio.StreamReader, server: Server, story: Story) -> bool:
-    """Whether the run is over; otherwise whoever played it is gone."""
+    """Read messages until the run is over. Return False if the process of the run ended instead."""
     while line := await reader.readline():
         kind, *rest = json.loads(line)
         if kind == "over":
@@ -76,7 +76,7 @@ async def _tell(directory: Path, story: Story, ended: asyncio.Event) -> None:
         with contextlib.closing(Feed(directory)) as feed:
             await tell_live(feed, story, ended)
     except HarnessError as error:
-        story.tell([["note", str(error)]])  # the run goes on
+        story.tell([["note", str(error)]])  # the run goes on without the page
 
 
 async def _while_looked_at(server: Server) -> None:
@@ -87,7 +87,7 @@ async def _while_looked_at(server: Server) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which tells us when it is over
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C stops the run, and the run then sends "over"
     try:
         asyncio.run(main(Path(sys.argv[1]), int(sys.argv[2])))
     except HarnessError as error:

@@ -1,8 +1,8 @@
-"""What one agent does, from its trace, line by line: what a page shows of it, as changes.
+"""The actions of one agent, read from its trace line by line, as changes for the page.
 
-A change is a list that becomes a line of JSON: its kind, its mission second, and what it is about
-(`harness.report.live.feed`
-has them all). Most lines of a trace only take a message in; those are looked at as text, and no further.
+A change is a list that becomes a line of JSON: its kind, its mission second, and further values.
+`harness.report.live.feed` lists all kinds. Most lines of a trace only receive a message. A regular expression
+recognizes these lines, so that they need no JSON parser.
 """
 
 import re
@@ -18,7 +18,7 @@ from ucp.trigger import MessageTrigger
 Change = list[Any]
 
 KEY_LENGTH = 16
-"""Digits of a block's hash that the page knows it by."""
+"""Number of digits of a block hash that identify the block on the page."""
 
 _TAKES_IN = re.compile(
     rb'\{"t":([\d.]+),"handler":"receive_\w+","algorithm":\d+,'
@@ -29,7 +29,7 @@ _NOTHING_ELSE = b'"changes":[],"sent":[]'
 
 
 class Heard(NamedTuple):
-    """An agent took in message `seq` of `sender`."""
+    """An agent received message `seq` of `sender`."""
 
     t: float
     sender: int
@@ -37,7 +37,7 @@ class Heard(NamedTuple):
 
 
 class Sent(NamedTuple):
-    """An agent broadcast its message `seq`; `block` is the key of the one that it is about, if any."""
+    """An agent broadcast its message `seq`. `block` is the key of the message's block, if it has one."""
 
     t: float
     seq: int
@@ -46,7 +46,7 @@ class Sent(NamedTuple):
 
 
 class Course:
-    """An agent of the run. `changes` are those since somebody took them, `sent` and `heard` likewise."""
+    """The actions of one agent. The caller takes `changes`, `sent` and `heard`, and clears them."""
 
     def __init__(self, agents: Path, agent_id: int) -> None:
         self.agent_id = agent_id
@@ -54,14 +54,14 @@ class Course:
         self.sent: list[Sent] = []
         self.heard: list[Heard] = []
         self.at_s = 0.0
-        """When it did what was read last."""
+        """Mission second of the last entry that was read."""
         self.problem: str | None = None
-        """Why nothing more of it is read, if that is so."""
+        """The reason why the rest of the trace cannot be read, or None."""
         self.takes_in_all = False
-        """Whether it was given something that cannot matter to it: not so in virtual time, unless asked for."""
+        """True if the trace contains a message without effect. Traces of virtual time omit these by default."""
         self._lives = Lives(agents, agent_id)
         self._ahead: Heard | HandlerRun | Dropped | None = None
-        """What was read, and is of later than somebody has asked for."""
+        """An entry that was read, but is later than the requested mission second."""
         self._born = False
         self._held = Held()
         self._completed: dict[str, int] = {}
@@ -70,7 +70,7 @@ class Course:
         self._incarnation = Incarnation(agent_id)
 
     def read(self, until_s: float, at_most: int) -> bool:
-        """Go on until so many lines are read, or all up to then; whether there is more up to then."""
+        """Read up to `until_s`, but at most `at_most` lines. Return whether entries up to `until_s` remain."""
         for _ in range(at_most):
             entry = self._ahead or self._next()
             if entry is None:
@@ -90,14 +90,14 @@ class Course:
 
     @property
     def next_s(self) -> float | None:
-        """When it did what was not asked for yet; None if all that was written by now has been taken in."""
+        """Mission second of the entry that was read ahead, or None."""
         return None if self._ahead is None else self._ahead.t
 
     def close(self) -> None:
         self._lives.close()
 
     def _next(self) -> Heard | HandlerRun | Dropped | None:
-        """The next line that says something and has a possible time."""
+        """Return the next entry with a valid time, or None."""
         while self.problem is None:
             line = self._lives.next()
             if line is None:
@@ -123,7 +123,7 @@ class Course:
         return bool(self._held.not_in_chain) and b'"idle":true' in line
 
     def _begin(self) -> None:
-        """A life begins."""
+        """Begin an incarnation."""
         if self._born:
             self.changes.append(["z", self.at_s, self.agent_id])
         self._born, self._held, self._idle_without = True, Held(), False
@@ -176,7 +176,7 @@ class Course:
         self.changes.append(["s", t, self.agent_id, doing, more])
 
     def _hold_against(self, run: HandlerRun) -> None:
-        """What can be seen at once to be against characteristics 2 and 3, the first time that it is seen."""
+        """Report a violation of characteristic 2 or 3 when it first becomes visible."""
         for operation, block in run.changes:
             if operation.endswith("+") and self._held.copies[block] > 1 and block not in self._twice:
                 self._twice.add(block)

@@ -1,7 +1,8 @@
-"""Follow a growing trace: line by line, through all incarnations of its agent.
+"""Follow a growing trace line by line, through all incarnations of its agent.
 
-An agent as a process writes the trace of each life into a directory of its own (`7.trace.jsonl`, then
-`7-2/7.trace.jsonl`), and at the end of the run all is in the first. One in virtual time writes all lives into one file.
+An agent that is a process writes the trace of each incarnation into its own directory (`7.trace.jsonl`, then
+`7-2/7.trace.jsonl`). At the end of the run, all incarnations are joined in the first file. In virtual time, one file
+holds all incarnations.
 """
 
 import os
@@ -15,9 +16,9 @@ _CHUNK_BYTES = 256 * 1024
 
 
 class GrowingFile:
-    """The whole lines of a file, one after another; one that is not there yet has none so far.
+    """The complete lines of a growing file. A file that does not exist yet has no lines yet.
 
-    `trouble` says why there will be no more of it, if that is so.
+    `trouble` is the reason why no more lines can be read, or None.
     """
 
     def __init__(self, path: Path) -> None:
@@ -28,7 +29,7 @@ class GrowingFile:
         self._begun = b""
 
     def next(self) -> bytes | None:
-        """The next line, its end included; None if it is not written yet."""
+        """Return the next line with its line end, or None if it is not complete yet."""
         while not self._lines:
             if not self._read():
                 return None
@@ -40,7 +41,7 @@ class GrowingFile:
             self._file = None
 
     def _read(self) -> bool:
-        """Whether there was more."""
+        """Read a chunk. Return whether there was one."""
         if self.trouble is not None:
             return False
         try:
@@ -62,7 +63,7 @@ class GrowingFile:
 
 
 class Lives:
-    """The lines of one agent's trace, those of later lives after those of earlier ones."""
+    """The lines of one agent's trace, incarnation by incarnation."""
 
     def __init__(self, agents: Path, agent_id: int) -> None:
         self._agents, self._agent_id = agents, agent_id
@@ -75,17 +76,17 @@ class Lives:
         return self._file.trouble and f"{self._file.path.name} {self._file.trouble}"
 
     def next(self) -> bytes | None:
-        """The next line, its end included; None if it is not written yet."""
+        """Return the next line with its line end, or None if it is not complete yet."""
         while True:
             line = self._file.next()
             if line is None:
                 if not self._later.is_dir():
                     return None
-                line = self._file.next()  # by now this life writes nothing more
+                line = self._file.next()  # the next incarnation has begun, so this one writes nothing more
             elif b'"schema"' in line:
                 self._headers += 1
                 if self._headers > 1 and self._later.is_dir():
-                    line = None  # what follows is of later lives, put together
+                    line = None  # the run has ended: the rest of this file repeats the later incarnations
             if line is not None:
                 return line
             self._file.close()

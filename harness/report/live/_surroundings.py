@@ -1,4 +1,4 @@
-"""What is around the agents of a run: the network with what links lose, faults, and where the vehicles are."""
+"""The network conditions, faults, and positions of the vehicles, as changes for the page."""
 
 from collections.abc import Callable, Collection
 from itertools import combinations
@@ -20,7 +20,7 @@ MAX_DETAIL = 300
 
 class _Told(NetworkLine):
     detail: Any = ""
-    """What it did, for people."""
+    """A description for people."""
     by_hand: bool = False
 
 
@@ -28,20 +28,23 @@ Line = TypeVar("Line", _Told, TrackLine)
 
 
 class _Lines(Generic[Line]):
-    """A file of which each line is what `model` says, and is to be played at its second."""
+    """A growing file of entries with times.
+
+    `model` validates each line, and `play` processes it at its mission second.
+    """
 
     def __init__(self, path: Path, model: type[Line], play: Callable[[Line], None]) -> None:
         self._file = GrowingFile(path)
         self._model: type[Line] = model
         self._play: Callable[[Line], None] = play
         self.ahead: Line | None = None
-        """What was read, and is of later than somebody has asked for."""
+        """An entry that was read, but is later than the requested mission second."""
         self.at_s = 0.0
-        """Of when is what was played last."""
+        """Mission second of the last entry that was played."""
         self.problems: dict[str, None] = {}
 
     def read(self, until_s: float, at_most: int) -> bool:
-        """Go on until so many lines are read, or all up to then; whether there is more up to then."""
+        """Read up to `until_s`, but at most `at_most` lines. Return whether entries up to `until_s` remain."""
         name = self._file.path.name
         for _ in range(at_most):
             entry, self.ahead = self.ahead, None
@@ -70,7 +73,7 @@ class _Lines(Generic[Line]):
 
 
 class Around:
-    """`changes` are those since somebody took them."""
+    """The network and the vehicles. The caller takes `changes` and clears them."""
 
     def __init__(self, directory: Path, vehicles: Collection[int]) -> None:
         self.changes: list[Change] = []
@@ -82,24 +85,27 @@ class Around:
         self._tracks = _Lines(directory / TRACKS_FILE, TrackLine, self._moved)
 
     def read(self, until_s: float, at_most: int) -> bool:
-        """Go on until so many lines of a file are read, or all up to then; whether there is more up to then."""
+        """Read up to `until_s`, but at most `at_most` lines of each file.
+
+        Return whether entries up to `until_s` remain.
+        """
         more = self._conditions.read(until_s, at_most)
         return self._tracks.read(until_s, at_most) or more
 
     @property
     def at_s(self) -> float:
-        """When happened what was read last."""
+        """Mission second of the last entry that was read."""
         return max(self._conditions.at_s, self._tracks.at_s)
 
     @property
     def next_s(self) -> float | None:
-        """When happened what was not asked for yet; None if all that was written by now has been taken in."""
+        """Mission second of the earliest entry that was read ahead, or None."""
         ahead = (self._conditions.ahead, self._tracks.ahead)
         return min((line.at_s for line in ahead if line is not None), default=None)
 
     @property
     def problems(self) -> list[str]:
-        """A sentence on each thing that could not be read."""
+        """A sentence for each file with unreadable parts."""
         return [*self._conditions.problems, *self._tracks.problems]
 
     def close(self) -> None:
@@ -107,7 +113,10 @@ class Around:
         self._tracks.close()
 
     def _changed(self, line: _Told) -> None:
-        """The network, or some agents. Raises ValueError, TypeError, AttributeError or KeyError if it means nothing."""
+        """Process a change of the network or of agents.
+
+        Raises ValueError, TypeError, AttributeError or KeyError if the line is invalid.
+        """
         if not self._parts and line.asked is None:
             raise ValueError("the record begins with conditions")
         network = self._network
@@ -134,7 +143,7 @@ class Around:
 
 
 def _state_after(fault: type[Fault]) -> str:
-    """In what state a fault leaves its agents, in a word; nothing if it leaves them as they are."""
+    """Return the state of agents after a fault in one word, or "" if the fault does not change it."""
     states = {
         "gone": fault.takes_the_vehicle,
         "down": fault.ends_a_life,

@@ -1,6 +1,6 @@
-"""All that a feed has told, for any number of readers: each reads on from where it is, in its own time.
+"""The log of all changes of a feed. Any number of readers read it, each at its own speed.
 
-It lies in a file that has no name, so memory is bounded whatever a run is; and who reads slowly holds up nobody.
+The log is an unnamed temporary file. Memory use is therefore bounded, and a slow reader does not delay the others.
 """
 
 import json
@@ -14,14 +14,14 @@ from harness.report.live._agent_course import Change
 MAX_BYTES = 512 * 1024 * 1024
 CHUNK_BYTES = 256 * 1024
 FAR_BEHIND_BYTES = 4 * 1024 * 1024
-"""Who has so much left to read while a run goes on is given what is needed to follow, and no more."""
+"""A live reader that is further behind skips messages and positions to catch up."""
 _LEFT_OUT = (b'["m"', b'["p"', b'["t"', b'["d"')
 
 _encode = partial(json.dumps, separators=(",", ":"), check_circular=False)
 
 
 class Story:
-    """Changes, a line each. `size` is in bytes."""
+    """Changes, one in a line. `size` is in bytes."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115
@@ -29,7 +29,7 @@ class Story:
         self._full = False
 
     def tell(self, changes: Iterable[Change]) -> None:
-        """Raises OSError if the disk is full."""
+        """Append changes. Raises OSError if the disk is full."""
         lines = "".join([_encode(change) + "\n" for change in changes]).encode()
         if self._full or not lines:
             return
@@ -42,9 +42,9 @@ class Story:
         self.size += len(lines)
 
     def read(self, start: int, *, may_skip: bool = False) -> tuple[int, str]:
-        """Whole lines from `start` on, some at a time, and where they end; none at the end.
+        """Return the end of the next complete lines from `start` on, and these lines; no lines at the end of the log.
 
-        A reader that may skip and is far behind is not given messages and places.
+        With `may_skip`, a reader that is far behind gets no messages and positions.
         """
         skips = may_skip and self.size - start > FAR_BEHIND_BYTES
         data = self._pread(start, FAR_BEHIND_BYTES if skips else CHUNK_BYTES)

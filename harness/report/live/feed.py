@@ -1,22 +1,23 @@
-"""A run directory as one stream of changes, whether the run goes on or is over.
+"""A run directory as one stream of changes, during the run or afterwards.
 
-A change is a list: its kind, its mission second, and more. Blocks go by KEY_LENGTH digits of their hashes.
+A change is a list: its kind, its mission second, and further values. Blocks are identified by `KEY_LENGTH` digits of
+their hashes.
 
-| kind | after the mission second |
+| kind | values after the mission second |
 |---|---|
 | `p` | vehicle -> metres north, east and up |
 | `n` | a change of network or agents: what, detail, agents, their state, [low, high, loss there, loss back] of each
-        pair that changed, the parts that the swarm is in, if they changed, and whether somebody asked for it by hand |
+        changed pair, the parts of the swarm if they changed, and whether it was caused by hand |
 | `b` | a block was completed: key, agent, ordinal |
-| `c` | an agent's blocks moved: agent, [operation, key] of each, top chain hash, how it came to a block |
-| `z` | an agent's life ended, and another begins with nothing: agent |
-| `s` | what an agent is about: agent, word, detail |
-| `m` | a broadcast: agent, message, key or null, mask of who took it in (bit n is the nth of the roster), in hex |
+| `c` | an agent's blocks moved: agent, [operation, key] of each, top chain hash, cause of the commit |
+| `z` | an agent began a new incarnation without blocks: agent |
+| `s` | an agent's activity: agent, word, detail |
+| `m` | a broadcast: agent, message, key or null, receivers as a hexadecimal mask (bit n is the nth of the roster) |
 | `d` | an agent dropped a datagram: agent, reason |
-| `x` | what is against a characteristic at once: agent, number, key |
-| `t` | it is that late |
-| `all` | agents were given all that reached them: who did not take a message in has lost it |
-| `run`, `end`, `note` | no second, but a document: what the run is; how it ended; a sentence on what cannot be shown |
+| `x` | a visible violation of a characteristic: agent, number, key |
+| `t` | the current mission second |
+| `all` | traces contain every received message: a missing receipt means a lost message |
+| `run`, `end`, `note` | a document in place of the second: the run; its outcome; a sentence about unreadable parts |
 """
 
 from collections.abc import Iterator
@@ -41,16 +42,16 @@ from harness.scenario.faults import ASKED_FOR, VehicleFault
 from harness.scenario.verdict_names import kind_of
 
 MAX_VEHICLES = 200
-"""Whose links a page can draw."""
+"""Maximum number of vehicles whose links the page can draw."""
 LINES_AT_ONCE = 500
-"""Of one file, before somebody else has a turn."""
+"""Maximum number of lines that are read from one file before the next file."""
 LOOKS_UNTIL_TOLD = 2
-"""A message is told so many looks after it was first seen: by then whoever took it in has said so."""
+"""Number of polls between the first sight of a message and its change. By then the receivers have recorded it."""
 
 
 @dataclass
 class _Broadcast:
-    """`message` is None while only receivers have told of it."""
+    """A broadcast message. `message` is None while only receivers have recorded it."""
 
     mask: int
     looks: int
@@ -60,9 +61,9 @@ class _Broadcast:
 
 
 class Feed:
-    """What happened in a run directory, look by look.
+    """The changes of a run directory, poll by poll.
 
-    Raises RunDirectoryError if it is none, nothing in it can be shown, or more vehicles than fit on a page.
+    Raises RunDirectoryError if the directory is no run, has nothing to show, or has more than `MAX_VEHICLES` vehicles.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -89,7 +90,7 @@ class Feed:
         self._record_stamp = self._stamp()
 
     def first(self, *, live: bool) -> Change:
-        """What the run is, and whether it goes on."""
+        """Return the change that describes the run. `live` states whether the run is still active."""
         record, scenario = self._record, self._record.scenario
         return [
             "run",
@@ -113,17 +114,17 @@ class Feed:
         ]
 
     def _is_flown(self) -> bool:
-        """Whether the vehicles are programs, which something can befall."""
+        """Return whether the vehicles are programs. Only these can suffer vehicle faults."""
         record, scenario = self._record, self._record.scenario
         has_vehicles = scenario is not None and scenario.vehicles.kind != "none"
         return has_vehicles and record.backend is not None and not in_virtual_time(record.backend)
 
     def look(self, until_s: float = float("inf")) -> tuple[list[Change], bool]:
-        """What is new, up to a mission second; and whether there is more up to then, for which to look again."""
+        """Return new changes up to a mission second, and whether more remain up to then."""
         more = self._around.read(until_s, LINES_AT_ONCE)
         for course in self._courses:
             more |= course.read(until_s, LINES_AT_ONCE)
-        self._looks += not more  # who has more to tell may yet have taken in what was sent
+        self._looks += not more  # an agent with unread lines may still have received older messages
         changes = [*self._take(), *self._messages(told_now=False)]
         changes.sort(key=lambda change: float(change[1]))
         at_s = max(self._around.at_s, *(course.at_s for course in self._courses))
@@ -136,19 +137,19 @@ class Feed:
         return [*changes, *self._notes()], more
 
     def last(self) -> list[Change]:
-        """What is left to say at the end, and how it ended."""
+        """Return the remaining changes and the outcome of the run."""
         changes = [*self._take(), *self._messages(told_now=True)]
         return [*changes, *self._notes(), ["end", self._ending()]]
 
     @property
     def next_s(self) -> float | None:
-        """When happened what nobody has looked at yet; None if all that was written by now was told."""
+        """Mission second of the earliest entry that was read ahead, or None."""
         ahead = (self._around.next_s, *(course.next_s for course in self._courses))
         return min((at_s for at_s in ahead if at_s is not None), default=None)
 
     @property
     def over(self) -> bool:
-        """Whether the run's record says how it ended, and what the verdict is."""
+        """True if the record contains the outcome and the verdicts of the run."""
         stamp = self._stamp()
         if stamp != self._record_stamp:
             self._record_stamp = stamp
@@ -166,7 +167,7 @@ class Feed:
             changes.clear()
 
     def _messages(self, *, told_now: bool) -> Iterator[Change]:
-        """Those that whoever was to take them in has taken in by now."""
+        """Yield the messages whose receivers have had time to record them, or all messages with `told_now`."""
         happened: list[tuple[float, int, int, Sent | Heard]] = []
         for course in self._courses:
             happened += [(sent.t, 0, course.agent_id, sent) for sent in course.sent]
@@ -184,7 +185,7 @@ class Feed:
             key = agent_id, what.seq
             before = self._on_the_air.get(key)
             if before is not None and before.message is not None:
-                yield self._told(agent_id, before)  # its number is used again, in another life
+                yield self._told(agent_id, before)  # another incarnation reuses the number
                 before = None
             mask = before.mask if before else 0
             self._on_the_air[key] = _Broadcast(mask, self._looks, what.t, what.message, what.block)
@@ -198,7 +199,7 @@ class Feed:
         return ["m", broadcast.t, sender, broadcast.message, broadcast.block, f"{broadcast.mask:x}"]
 
     def _notes(self) -> Iterator[Change]:
-        """Sentences that were not said yet."""
+        """Yield sentences about problems that were not reported yet."""
         damaged = (course.problem for course in self._courses)
         for sentence in chain(self._around.problems, damaged):
             if sentence is not None and sentence not in self._told_of:

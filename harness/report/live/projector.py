@@ -1,4 +1,4 @@
-"""Reads a run directory into a story and shows it: a run that goes on look by look, one that is over at once."""
+"""Copy a feed into a change log: at the speed of a live run, or at once after the run."""
 
 import asyncio
 
@@ -7,11 +7,11 @@ from harness.report.live.feed import Feed
 from harness.report.live.server import UPDATE_S
 
 STRIDE_S = 20.0
-"""Mission seconds that are read at once of a run that is over: all agents' traces side by side."""
+"""Mission seconds that are read from all files in one step of a finished run."""
 
 
 async def tell_film(feed: Feed, story: Story) -> None:
-    """The run is over: tell all of it, in order."""
+    """Write all changes of a finished run in time order."""
     until_s = 0.0
     story.tell([feed.first(live=False)])
     while True:
@@ -27,7 +27,7 @@ async def tell_film(feed: Feed, story: Story) -> None:
 
 
 async def tell_live(feed: Feed, story: Story, ended: asyncio.Event) -> None:
-    """The run goes on until its record says that it is over, or `ended` is set: whoever played it is gone."""
+    """Write the changes of a run until its record has an outcome, or `ended` is set because its process ended."""
     story.tell([feed.first(live=True)])
     while True:
         over = feed.over or ended.is_set()

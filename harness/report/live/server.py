@@ -1,8 +1,8 @@
-"""The server of the page: on 127.0.0.1 alone, and for whoever has the address with its token, nobody else.
+"""The web server of the page. It listens on 127.0.0.1 only, and requires the token in the page's address.
 
-What it serves is a table made at its start, so no address leads to any other file. Browsers are told that they may load
-from here and nowhere else. Other pages in the same browser are kept out thrice: they do not know the token, they cannot
-hide where they come from (Origin), and a name of theirs that leads to 127.0.0.1 is not ours (Host).
+The table of served files is made at the start, so no address can reach another file. The Content-Security-Policy lets
+browsers load from this server only. Three checks keep out other pages in the same browser: they do not know the token,
+their origin is visible (Origin), and a host name of theirs that resolves to 127.0.0.1 is rejected (Host).
 """
 
 import asyncio
@@ -28,16 +28,16 @@ _PAGE = Path(__file__).parent / "page"
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 MAX_READERS = 16
 MAX_MESSAGE_BYTES = 4096
-"""Of what a page has to say."""
+"""Maximum size of a message from a page."""
 UPDATE_S = 0.1
 GONE_S = 20.0
-"""A browser that is silent for so long is gone."""
+"""A browser that does not answer for this time counts as gone."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 Ask = Callable[[int, Any], None]
-"""Is told which page asks for what; `Server.answer` brings the answer."""
+"""Receives the number of a page and its request. `Server.answer` sends the answer."""
 MOST_ANSWERS = 32
-"""Of one page that are on their way; it asks faster than it listens, and further ones are lost."""
+"""Maximum number of waiting answers of one page. Further answers replace the oldest."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def _files() -> Mapping[str, _File]:
 
 
 class _Page:
-    """One that is open somewhere."""
+    """An open page."""
 
     def __init__(self, socket: web.WebSocketResponse) -> None:
         self.socket = socket
@@ -64,7 +64,7 @@ class _Page:
 
 
 class Server:
-    """Serves one story. `live` is whether the run that it is of goes on."""
+    """Serve one change log. `live` states whether the run is still active."""
 
     def __init__(self, story: Story, directory: Path, *, live: bool, ask: Ask | None = None) -> None:
         self.live = live
@@ -77,7 +77,10 @@ class Server:
 
     @contextlib.asynccontextmanager
     async def open(self, port: int) -> AsyncIterator[str]:
-        """The address of the page; `port` 0 is a free one. Raises MachineError if the port cannot be had."""
+        """Yield the address of the page.
+
+        Port 0 means any free port. Raises MachineError if the port is not available.
+        """
         application = web.Application(middlewares=[self._guard], client_max_size=MAX_MESSAGE_BYTES)
         application.router.add_get("/{token}/live", self._tell)
         application.router.add_get("/{token}/report.html", self._report)
@@ -104,7 +107,7 @@ class Server:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Nobody without the token, and no other page, comes further."""
+        """Reject requests without the token, and requests from other pages."""
         token = request.path.split("/")[1]
         origin = request.headers.get("Origin")
         strange = request.host not in self._hosts or origin not in (None, *(f"http://{host}" for host in self._hosts))
@@ -137,7 +140,7 @@ class Server:
         )
 
     async def _report(self, request: web.Request) -> web.StreamResponse:
-        """The run's report. It may be of anybody's making: it is shown as if it came from nowhere."""
+        """Return the run's report. Its author is unknown, so the browser treats it as a page without an origin."""
         path = self._directory / "report.html"
         if not path.is_file():
             raise web.HTTPNotFound
@@ -156,7 +159,7 @@ class Server:
         try:
             await self._read_out(page)
         except ConnectionError:
-            pass  # the browser went away
+            pass  # the browser closed the connection
         finally:
             del self._pages[number]
             listening.cancel()
@@ -164,16 +167,16 @@ class Server:
 
     @property
     def readers(self) -> int:
-        """How many pages are open."""
+        """Number of open pages."""
         return len(self._pages)
 
     def answer(self, page: int, answer: Change) -> None:
-        """Tell one page alone, if it is still open."""
+        """Send an answer to one page, if it is still open."""
         if page in self._pages:
             self._pages[page].answers.append(json.dumps(answer) + "\n")
 
     async def _read_out(self, page: _Page) -> None:
-        """Send answers and the story, as fast as the browser takes them and no faster."""
+        """Send answers and changes at the speed of the browser."""
         start, caught_up = 0, False
         while not page.socket.closed:
             if page.answers:
@@ -186,7 +189,7 @@ class Server:
                 await asyncio.sleep(UPDATE_S)
 
     async def _listen(self, page: int, socket: web.WebSocketResponse) -> None:
-        """Hear what the page asks for, and when it closes."""
+        """Receive requests of the page until it closes."""
         async for message in socket:
             if message.type is WSMsgType.TEXT and self._ask is not None and self.live:
                 with contextlib.suppress(ValueError, RecursionError):

@@ -1,7 +1,7 @@
-"""The page of a run that goes on: its server is a process beside the run, started before it and ended after it.
+"""The page of a live run. Its server is a separate process, started before the run and stopped after it.
 
-Between the two go lines of JSON. Down go `["t", mission second]`, `["hand", state]` and answers to what was asked for;
-up comes first the page's address, and then `[page, number, what somebody there asks for]`.
+The two processes exchange lines of JSON. The run sends `["t", mission second]`, `["hand", state]` and answers to
+requests. The server first sends the page's address, and then `[page, number, request]` for each request.
 """
 
 import json
@@ -23,22 +23,22 @@ from harness.play.progress import Progress, Snapshot
 
 STATE_EVERY_S = 0.1
 LAST_LOOK_S = 60.0
-"""Wall time after a run in which the server has read the rest of it, and says whether anybody looks."""
+"""Maximum wall time in which the server reads the rest of a run, and reports the number of open pages."""
 ENDING_S = 5.0
 MOST_WAITING = 10_000
-"""Lines that the server has not taken yet; it hangs, and further ones are lost."""
+"""Maximum number of unsent lines. Further lines are lost, because the server hangs."""
 _LAST_LINES = 20
 _NO_REASON = "it does not say why"
 
 
 class Beside:
-    """The server's process, and what pages ask of the run through it. `address` is that of the page.
+    """The process of the server, and the requests that it forwards from pages. `address` is the address of the page.
 
-    The run waits for none of it: to the server, and to what it says, listen threads of their own.
+    The run never waits for the server. Threads write to the server and read from it.
     """
 
     def __init__(self, directory: Path, port: int, hand: Interventions) -> None:
-        """Raises MachineError if there can be none: a package is missing, or the port cannot be had."""
+        """Start the server. Raises MachineError if a package is missing or the port is not available."""
         require_packages()
         self._hand = hand
         self._process = subprocess.Popen(
@@ -48,7 +48,7 @@ class Beside:
             stderr=subprocess.PIPE,
             encoding="utf-8",
             errors="replace",
-            start_new_session=True,  # Ctrl-C ends the run first
+            start_new_session=True,  # Ctrl-C must reach the run first
         )
         self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
         self._complaining = _thread(self._hear_complaints)
@@ -63,17 +63,17 @@ class Beside:
         self._saying, self._hearing = _thread(self._say_all), _thread(self._hear)
         self._telling_state = _thread(self._tell_state)
         self.problem: str | None = None
-        """Why the page ended before anybody closed it, in a sentence, once the run is over; None if it did not."""
+        """After the run: a sentence about an early end of the server, or None."""
 
     def overhears(self, progress: Progress) -> Progress:
-        """`progress`, of which the page hears."""
+        """Return a progress display that also informs the page."""
         return _Overheard(progress, self)
 
     def shows(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot
 
     def run_is_over(self) -> bool:
-        """Tell the page; whether anybody looks at it."""
+        """Inform the server that the run is over. Return whether a page is open."""
         self._ended.set()
         self._telling_state.join()
         self._say(["over"])
@@ -81,15 +81,15 @@ class Beside:
         if self._hearing.is_alive():
             self.problem = f"the page hung: its server did not answer within {LAST_LOOK_S:g} s after the run"
         elif self._readers is None:
-            from netem.lab import in_words  # which takes its time to import
+            from netem.lab import in_words  # imported late, because the import is slow
 
             end = in_words(self._process.wait())
-            self._complaining.join(ENDING_S)  # it may not have come to the last words yet
+            self._complaining.join(ENDING_S)  # the thread may not have read the last line yet
             self.problem = f"the server of the page ended by itself with {end} ({self._last_words}); the run continued"
         return bool(self._readers)
 
     def wait(self) -> None:
-        """Until nobody looks any more, or Ctrl-C."""
+        """Wait until all pages are closed, or until Ctrl-C."""
         with suppress(KeyboardInterrupt):
             self._process.wait()
 
@@ -116,13 +116,13 @@ class Beside:
         return self._last_lines[-1] if self._last_lines else _NO_REASON
 
     def _hear_complaints(self) -> None:
-        """A pipe that nobody reads would stop whoever writes into it."""
+        """Read the errors of the server. Without a reader, a full pipe would block the server."""
         for line in _of(self._process.stderr):
             if line.strip():
                 self._last_lines.append(line.strip())
 
     def _say(self, what: list[Any]) -> None:
-        """A server that has failed, or hangs, is no affair of the run's."""
+        """Queue a line. A failed or hung server must not affect the run."""
         with suppress(queue.Full):
             self._unsaid.put_nowait(what)
 
@@ -154,7 +154,7 @@ class Beside:
         self._say(["answer", page, number, {"at_s": done.result()} if error is None else {"error": str(error)}])
 
     def _tell_state(self) -> None:
-        """Tell the page how late it is, and what can be asked for, whenever that has changed."""
+        """Send the mission second and the state of the controls whenever they change."""
         before: tuple[Any, ...] = ()
         now_s = -1.0
         while not self._ended.wait(STATE_EVERY_S):
@@ -171,7 +171,7 @@ class Beside:
 
 
 class _Overheard:
-    """A run's progress, which the page is told, too."""
+    """A progress display that also informs the page."""
 
     def __init__(self, progress: Progress, beside: Beside) -> None:
         self._progress, self._beside = progress, beside
@@ -196,7 +196,7 @@ def _of(stream: IO[str] | None) -> IO[str]:
 
 
 def _do(hand: Interventions, asked: dict[str, Any]) -> Future[float]:
-    """Raises ValueError, TypeError, KeyError or AttributeError if nothing of the kind can be asked for."""
+    """Perform a request. Raises ValueError, TypeError, KeyError or AttributeError if the request is invalid."""
     match asked["do"]:
         case "happen":
             return hand.ask(asked["entry"])
@@ -216,7 +216,7 @@ def _do(hand: Interventions, asked: dict[str, Any]) -> Future[float]:
 
 @contextmanager
 def beside(directory: Path, port: int, hand: Interventions) -> Iterator[Beside]:
-    """A server for the run that is about to begin in that directory. Raises MachineError if there can be none."""
+    """Run a server for a run in that directory. Raises MachineError if it cannot start."""
     server = Beside(directory, port, hand)
     try:
         yield server
@@ -225,7 +225,7 @@ def beside(directory: Path, port: int, hand: Interventions) -> Iterator[Beside]:
 
 
 def require_packages() -> None:
-    """Raises MachineError, with the way out, if what the server needs is not installed."""
+    """Raise MachineError with the install command if a package of the server is missing."""
     try:
         import aiohttp  # noqa: F401
     except ImportError:

@@ -1,7 +1,7 @@
-"""What the chains say: the log that a swarm brought home, as text, JSON, GeoJSON and KML.
+"""The logbook: the events in the chains of a swarm, as text, JSON, GeoJSON and KML.
 
-`read` gathers the exports, `text` and `document` tell them chain by chain, `positions` makes tracks of the vehicles'
-positions for maps. Whether the chains are right is the checker's to say.
+`book` gathers the exports, `logbook_text` prints chain by chain, and `positions` and `map_files` make tracks for maps.
+The checker judges whether the chains are correct.
 """
 
 from harness.report.logbook.book import Logbook, read

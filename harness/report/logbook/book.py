@@ -1,4 +1,4 @@
-"""Gathers exports, and what is known of where their events come from."""
+"""Gather exports, and the source of their events."""
 
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -16,10 +16,11 @@ if TYPE_CHECKING:
 
 @dataclass
 class Logbook:
-    """Exports by agent; `names` of their blocks; `errors`, a sentence for each file that could not be used.
+    """Exports by agent.
 
-    `telemetry`: events are those of the source `mavlink`. Exports that came without a run are taken for such.
-    `absent`: a sentence for each agent of the mission that has no export here. `event_data` reads what blocks hold.
+    names: names of the blocks by hash. telemetry: whether the events come from the source `mavlink`, which is assumed
+    for exports without a run. absent: a sentence for each agent of the mission without an export. errors: a sentence
+    for each unusable file. event_data: the reader of events in blocks.
     """
 
     exports: dict[int, Export]
@@ -33,7 +34,10 @@ class Logbook:
         return self.names.get(block_hash, block_hash[:12])
 
     def only(self, agent_id: int) -> "Logbook":
-        """The logbook with one agent's export; blocks keep their names. Raises ExportError if there is none."""
+        """Return a logbook with one agent's export.
+
+        Blocks keep their names. Raises ExportError if there is no export.
+        """
         if agent_id in self.exports:
             return replace(self, exports={agent_id: self.exports[agent_id]}, absent={})
         known = (
@@ -43,9 +47,9 @@ class Logbook:
 
 
 def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
-    """The logbook of an archive; `depot` opens what is sealed.
+    """Return the logbook of an archive. `depot` opens sealed events.
 
-    Raises RunDirectoryError if it has no exports at all, ExportError if nothing here is sealed to this depot.
+    Raises RunDirectoryError if there are no exports, and ExportError if nothing is sealed to this depot.
     """
     exports = archive.exports
     if not exports.by_agent and not exports.errors:
@@ -64,7 +68,10 @@ def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
 
 
 def logged_telemetry(record: RunRecord) -> bool:
-    """Events are random where no vehicle flies; those of exports that came without a run are taken for telemetry."""
+    """Return whether the events are telemetry.
+
+    Without vehicles they are random; without a run record they are telemetry.
+    """
     asked = record.scenario
     if asked is None:
         return True

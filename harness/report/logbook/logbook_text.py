@@ -1,4 +1,4 @@
-"""The logbook for people, line by line, and for programs, as JSON."""
+"""The logbook as text for people, and as JSON for programs."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -15,7 +15,7 @@ _BYTES_SHOWN = 8
 
 
 def lines(logbook: Logbook, decode: bool) -> Iterator[str]:
-    """Each agent's chain, oldest block first; with `decode` each event in words."""
+    """Yield the lines of each agent's chain, oldest block first. With `decode`, each event is described."""
     for agent_id, export in logbook.exports.items():
         yield f"agent {agent_id}: a chain of {_count(len(export.chain), 'block')}, top {_short(export.top_chain_hash)}"
         names = [logbook.name(block.block_hash) for block in export.chain]
@@ -29,7 +29,10 @@ def lines(logbook: Logbook, decode: bool) -> Iterator[str]:
 
 
 def document(logbook: Logbook, decode: bool) -> dict[str, Any]:
-    """The same as a JSON document: data and hashes are hexadecimal, times microseconds; null is unreadable."""
+    """Return the logbook as a JSON document. Data and hashes are hexadecimal, times are microseconds.
+
+    `events` is null for a block whose events are unreadable or sealed.
+    """
     return {
         "source": "mavlink" if logbook.telemetry else "random or scripted",
         "agents": {
@@ -44,7 +47,7 @@ def document(logbook: Logbook, decode: bool) -> dict[str, Any]:
 
 
 def words(event: LoggableEvent, telemetry: bool) -> str:
-    """What an event of this source says."""
+    """Return a description of an event."""
     description = describe(event.event_id, event.data) if telemetry else ""
     if description and description != "unreadable":
         return description
@@ -68,7 +71,7 @@ def _events(block: ExportedBlock, logbook: Logbook) -> Iterator[str]:
         for event in logbook.event_data.events(block):
             yield f"{moment(event.timestamp_us)}  {words(event, logbook.telemetry)}"
     except SealedError:
-        return  # the block's line says so
+        return  # the line of the block already states that it is sealed
     except MalformedEventsError as error:
         yield f"unreadable: {error}"
 

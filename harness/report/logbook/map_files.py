@@ -9,11 +9,11 @@ from ucp.telemetry import describe
 
 
 def geojson(tracks: Iterable[Track]) -> dict[str, Any]:
-    """A FeatureCollection. Altitudes are above mean sea level, as the autopilot's.
+    """Return a FeatureCollection. Altitudes are above mean sea level, like those of the autopilot.
 
-    A LineString's property `times` has the time of each of its positions; a vehicle with a single position has no
-    LineString. An event that is no position is where the vehicle last was, `position_age_s` seconds before; one before
-    the first position is nowhere: its geometry is null.
+    The property `times` of a LineString holds the time of each position. A vehicle with a single position has no
+    LineString. Other events are at the last position of the vehicle, which is `position_age_s` seconds older. An event
+    before the first position has the geometry null.
     """
     return {"type": "FeatureCollection", "features": [feature for track in tracks for feature in _features(track)]}
 
@@ -49,10 +49,10 @@ ElementTree.register_namespace("gx", _GX)
 
 
 def kml(tracks: Iterable[Track]) -> str:
-    """A document with a folder for each vehicle: its track, and a placemark with a time for every other event.
+    """Return a document with a folder for each vehicle: its track, and a placemark with a time for every other event.
 
-    Altitudes are above mean sea level. An event is where the vehicle last was; one before the first position is left
-    out.
+    Altitudes are above mean sea level. An event is at the last position of the vehicle. Events before the first
+    position are left out.
     """
     root = ElementTree.Element(f"{{{_KML}}}kml")
     document = _add(root, "Document")

@@ -1,7 +1,7 @@
-"""Positions of the vehicles over time, from logged events or from the run's own tracks.
+"""Positions of the vehicles over time, from logged events or from the recorded tracks of the run.
 
-A vehicle's events are taken from wherever a copy of its blocks survived: from every chain, deque and reconcile stack of
-the logbook. A vehicle that was lost is on the map as far as others hold its blocks.
+A vehicle's events are taken from every surviving copy of its blocks: from each chain, deque and reconcile stack of the
+logbook. The track of a lost vehicle therefore reaches as far as other agents hold its blocks.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,11 +18,11 @@ from ucp.events import LoggableEvent, MalformedEventsError
 from ucp.telemetry import position_of
 
 LAST_TIMESTAMP_US = 253_402_300_799_999_999
-"""The end of the year 9999: a later time is nobody's, and no map can show it."""
+"""The end of the year 9999. Map programs cannot show later times."""
 
 
 class Whereabouts(Protocol):
-    """A place, in 1e-7 degrees, and in millimetres above mean sea level."""
+    """A position in 1e-7 degrees, and in millimetres above mean sea level."""
 
     @property
     def lat_e7(self) -> int: ...
@@ -34,9 +34,9 @@ class Whereabouts(Protocol):
 
 @dataclass(frozen=True)
 class Entry:
-    """One event in block `block`. `position` is its own, or the vehicle's last before it; None if there is none.
+    """One event in block `block`. `position` is the event's own or the vehicle's last one, or None if there is none.
 
-    `position_age_s` is how much older than the event the position is.
+    `position_age_s` is the age of the position at the time of the event, in seconds.
     """
 
     block: str
@@ -48,7 +48,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Track:
-    """All events of one agent, oldest first; `fixes` are its positions, each with its timestamp in microseconds."""
+    """All events of one agent, oldest first. `fixes` are its positions with their timestamps in microseconds."""
 
     agent_id: int
     entries: list[Entry]
@@ -56,7 +56,7 @@ class Track:
 
 
 def tracks(logbook: Logbook) -> list[Track]:
-    """A track of each agent that logged positions, by agent ID; none if events are no telemetry."""
+    """Return a track of each agent that logged positions, by agent ID; no tracks if the events are not telemetry."""
     if not logbook.telemetry:
         return []
     blocks: dict[int, dict[tuple[int, str], ExportedBlock]] = {}
@@ -68,18 +68,18 @@ def tracks(logbook: Logbook) -> list[Track]:
 
 
 def coordinates(position: Whereabouts) -> tuple[float, float, float]:
-    """Longitude and latitude in degrees, altitude in metres above mean sea level."""
+    """Return longitude and latitude in degrees, and altitude in metres above mean sea level."""
     return position.lon_e7 / 1e7, position.lat_e7 / 1e7, position.alt_mm / 1e3
 
 
 def utc(timestamp_us: int) -> str:
-    """A timestamp up to the year 9999 as RFC 3339 has it, to the millisecond; virtual runs begin in 1970."""
+    """Format a timestamp up to the year 9999 as in RFC 3339, to the millisecond. Virtual runs begin in 1970."""
     at = datetime.fromtimestamp(timestamp_us // 1_000_000, UTC)
     return f"{at:%Y-%m-%dT%H:%M:%S}.{timestamp_us // 1000 % 1000:03d}Z"
 
 
 def _events(logbook: Logbook, blocks: Iterable[ExportedBlock]) -> list[tuple[LoggableEvent, str]]:
-    """Events and the names of their blocks. A block that cannot be read has none."""
+    """Return the events with the names of their blocks. Unreadable blocks are left out."""
     logged = []
     for block in blocks:
         try:
@@ -92,7 +92,7 @@ def _events(logbook: Logbook, blocks: Iterable[ExportedBlock]) -> list[tuple[Log
 
 
 def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> Track:
-    """A track of events, with the names of their blocks, in whatever order; an impossible time is left out."""
+    """Return a track of these events, sorted by time. Events with an impossible time are left out."""
     track = Track(agent_id, [], [])
     possible = [pair for pair in logged if pair[0].timestamp_us <= LAST_TIMESTAMP_US]
     for event, block in sorted(possible, key=lambda pair: pair[0].timestamp_us):
@@ -106,7 +106,7 @@ def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> Trac
 
 
 class Place(NamedTuple):
-    """1e-7 degrees, and millimetres above mean sea level."""
+    """A position in 1e-7 degrees, and in millimetres above mean sea level."""
 
     lat_e7: int
     lon_e7: int
@@ -114,7 +114,7 @@ class Place(NamedTuple):
 
 
 def flown(record: RunRecord, recorded: Tracks) -> list[Track]:
-    """A track without events for each vehicle that is on record, on the field of the scenario's home."""
+    """Return a track without events for each recorded vehicle, around the home of the scenario."""
     if record.scenario is None:
         return []
     home = record.scenario.vehicles.field

@@ -1,5 +1,6 @@
-"""Stories as text: what happens to agents, and below each sentence what they then do, to be read beside the thesis.
+"""Stories: text files with events, and below each event the reactions of the agents. They can be read beside the
+thesis.
 
-`text` reads and rewrites the files, `sentences` says what may happen in them, `telling` makes the answer of the agents'
-traces, with names from `names`. Traces are what any agent writes, so a story is of any agent.
+`story_file` reads and rewrites the files, and `sentences` defines the events. `narration` makes the reactions from the
+agents' traces, with names from `story_names`. Any agent writes traces, so a story can test any agent.
 """

@@ -1,8 +1,8 @@
-"""What agents did, as a story tells it: instant by instant, whatever in an instant is the cause before its effects.
+"""The actions of agents as text of a story: instant by instant, and within an instant causes before effects.
 
-Who of those that are told the same is first, is chance on any real network. So agents are in the order of their IDs,
-what they do is by how far from its beginning it is: a timer ends, and it is asked; all who hear it answer; answers are
-counted. Whoever does the same for the same reason is told in one line.
+In a real network, the order of receivers of one message is random. The text therefore does not depend on it. Within an
+instant, actions are ordered by their distance from the first cause, and then by agent ID: a timer ends and an agent
+asks, all receivers answer, the answers are counted. Agents with equal actions for equal reasons share one line.
 """
 
 from collections import defaultdict
@@ -20,26 +20,26 @@ from ucp.trace import HandlerRun, Sent
 from ucp.trigger import LocalTrigger, MessageTrigger, TimerTrigger
 
 INSTANT_S = 1.5
-"""Mission seconds in which what a message causes is of the instant in which it was sent, and a timer is as good as
-punctual: a machine is late now and then, and more so the faster it plays a mission."""
+"""Maximum delay in mission seconds between a cause and its effect in the same instant. A timer within this delay counts
+as punctual. A slow machine is late more often the faster it plays a mission."""
 
 
 @dataclass
 class Deed:
-    """What an agent did for one reason: a handler run that an input triggered, and those that it triggered locally."""
+    """An action of an agent: a handler run that an input triggered, and the handler runs that it triggered locally."""
 
     agent_id: int
     position: int
-    """In the agent's trace."""
+    """Index in the agent's trace."""
     runs: list[HandlerRun]
     cause: "Deed | None" = None
-    """Whose message it was, if it was one."""
+    """The action that sent the triggering message, if there was one."""
     reached: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
-    """Who heard of each message that it sent, by sequence number."""
+    """Receivers of each sent message, by sequence number."""
     at_s: float = 0.0
-    """When it, or what caused it, began, if everything had been punctual."""
+    """Mission second at which the first cause would have begun without any lateness."""
     distance: int = 0
-    """How many messages it is away from what began in this instant."""
+    """Number of messages between the first action of the instant and this one."""
 
     @property
     def instant(self) -> int:
@@ -52,22 +52,22 @@ class Deed:
 
     @property
     def answer(self) -> MessageTrigger | None:
-        """The trigger, if it is an answer to a question."""
+        """The trigger, if it is an answer to a query or request."""
         trigger = self.runs[0].trigger
         return trigger if isinstance(trigger, MessageTrigger) and trigger.message in ANSWERS else None
 
     def message(self, sequence: int) -> Sent | None:
-        """What it sent under this number."""
+        """Return the sent message with this number."""
         return next((sent for run in self.runs for sent in run.sent if sent.seq == sequence), None)
 
     @property
     def does_something(self) -> bool:
-        """Whether it changed or sent anything."""
+        """True if the action changed the agent's blocks or sent a message."""
         return len(self.runs) > 1 or any(run.changes or run.sent for run in self.runs)
 
     @property
     def is_answer_to_another(self) -> bool:
-        """Whether it is the receipt of an answer that somebody else had asked for, which everybody hears."""
+        """True for the receipt of an answer to another agent. Answers are broadcasts, so all agents receive them."""
         if self.answer is None or self.cause is None:
             return False
         asked_by = self.cause.heard_from
@@ -75,7 +75,7 @@ class Deed:
 
 
 class Telling:
-    """Of the traces of all agents on the roster."""
+    """The story of the traces of all agents on the roster."""
 
     def __init__(self, traces: Mapping[int, Trace], roster: Sequence[int]) -> None:
         self._traces = traces
@@ -87,7 +87,7 @@ class Telling:
         )
 
     def answer(self, section: Section, *, first: bool = False) -> list[str]:
-        """The lines of a section; the first has what came before it, too."""
+        """Return the lines of a section. The first section also contains earlier actions."""
         from_s = 0 if first else section.from_s
         deeds = [deed for deed in self._deeds if from_s <= deed.instant and _before(deed.instant, section.until_s)]
         lines: list[str] = []
@@ -96,7 +96,7 @@ class Telling:
         return [*lines, *(self._chains(section.until_s) if section.shows_chains else [])]
 
     def _instant(self, deeds: Sequence[Deed]) -> Iterator[str]:
-        """Whoever does the same at the same distance is told together."""
+        """Yield the lines of an instant. Agents with equal actions at the same distance share their lines."""
         alike: dict[tuple[int, int, object], list[Deed]] = {}
         for deed in deeds:
             key = deed.distance, deed.agent_id, self._kind(deed)
@@ -110,9 +110,9 @@ class Telling:
             yield from (f"  {_listed(agents):<10}{line}" for line in lines)
 
     def _kind(self, deed: Deed) -> object:
-        """What the deeds of one agent have in common that are told together: they are about the same answer.
+        """Return a key. Actions of one agent with equal keys are merged, because they concern the same answer.
 
-        Which of several comes first, and is the one that counts, is chance.
+        Which of several equal answers arrives first, and therefore counts, is random.
         """
         run = deed.runs[0]
         if deed.cause is None or deed.answer is None:
@@ -121,7 +121,10 @@ class Telling:
         return run.handler, told(sent, self._names) if sent else run.branch
 
     def _lines(self, alike: Sequence[Deed]) -> Iterator[str]:
-        """Algorithm, its name, and what came of it, of each handler run; of answers the branches as they were taken."""
+        """Yield a line for each handler run: algorithm, name, branch, changes and messages.
+
+        For merged answers, the first line lists all branches in order.
+        """
         heard_from = [deed.heard_from for deed in alike if deed.heard_from is not None]
         in_order = sorted(alike, key=lambda deed: deed.position)
         deed = next((deed for deed in in_order if deed.does_something), in_order[0])
@@ -142,13 +145,16 @@ class Telling:
         return f"completes {name}" if operation == "complete" else f"{operation[:-1]} {operation[-1]}{name}"
 
     def _missed(self, deed: Deed, sent: Sent) -> str:
-        """Of an answer it matters to whom it was given."""
+        """Return a note about agents that did not receive the message.
+
+        An answer only matters to the agent that asked.
+        """
         meant = {deed.heard_from} if sent.message in ANSWERS else {*self._roster} - {deed.agent_id}
         missed = sorted(agent for agent in meant - deed.reached[sent.seq] if agent is not None)
         return f", not to {_listed(missed)}" if missed else ""
 
     def _chains(self, until_s: int | None) -> list[str]:
-        """The chains as a tree, and with whom each ends."""
+        """Return the chains as a tree with the agents at the ends."""
         chains: dict[int, list[str]] = {}
         for agent_id, trace in self._traces.items():
             positions = {deed.position: deed.instant for deed in self._deeds if deed.agent_id == agent_id}
@@ -167,7 +173,7 @@ class Telling:
 
 
 def _connected(traces: Mapping[int, Trace]) -> list[Deed]:
-    """All deeds, each with its cause."""
+    """Return all actions, each with its cause."""
     deeds = [deed for agent_id, trace in traces.items() for deed in _deeds(agent_id, trace)]
     sent: dict[tuple[int, int], list[Deed]] = defaultdict(list)
     for deed in deeds:
@@ -175,7 +181,7 @@ def _connected(traces: Mapping[int, Trace]) -> list[Deed]:
             for message in run.sent:
                 sent[deed.agent_id, message.seq].append(deed)
     due: dict[tuple[int, object], float] = {}
-    """When which timer of which agent should end."""
+    """(agent ID, timer) -> the mission second at which the timer should end."""
     for deed in sorted(deeds, key=lambda deed: (deed.runs[0].t, deed.agent_id, deed.position)):
         run = deed.runs[0]
         timer = run.trigger.timer if isinstance(run.trigger, TimerTrigger) else None
@@ -193,7 +199,7 @@ def _connected(traces: Mapping[int, Trace]) -> list[Deed]:
 
 
 def _hear(deed: Deed, sent: Mapping[tuple[int, int], Sequence[Deed]]) -> None:
-    """Find whose message it was that caused this."""
+    """Set the cause of an action that a message triggered."""
     run = deed.runs[0]
     if not isinstance(run.trigger, MessageTrigger):
         return
@@ -207,7 +213,7 @@ def _hear(deed: Deed, sent: Mapping[tuple[int, int], Sequence[Deed]]) -> None:
 
 
 def _deeds(agent_id: int, trace: Trace) -> Iterator[Deed]:
-    """Local events run right after what triggered them."""
+    """Yield the actions of a trace. Local events belong to the action that triggered them."""
     deed: Deed | None = None
     for position, run in enumerate(trace.runs):
         if not in_time(run):
@@ -223,7 +229,7 @@ def _deeds(agent_id: int, trace: Trace) -> Iterator[Deed]:
 
 
 def _tree(chains: Mapping[int, Sequence[str]], indent: str) -> Iterator[str]:
-    """A line for what all have in common, then, further in, one tree for each way on."""
+    """Yield a line for the common beginning of the chains, and an indented tree for each continuation."""
     common = 0
     while all(len(chain) > common for chain in chains.values()) and (
         len({chain[common] for chain in chains.values()}) == 1

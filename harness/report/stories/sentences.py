@@ -1,4 +1,4 @@
-"""The sentences of a story: what happens to the agents, as entries of a scenario's script and timeline."""
+"""The sentences of a story, and their translation into a scenario's script and timeline."""
 
 import re
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from harness.scenario.faults import ASKED_FOR
 from harness.scenario.load import parse_yaml
 
 EVENT_BYTES = 256
-"""What a scripted event has by itself."""
+"""Default size of the data of a scripted event, in bytes."""
 
 _IDS = r"(\d{1,7}(?: \d{1,7})*)"
 _LOGS = re.compile(rf"{_IDS} logs?(?: (\d{{1,7}}) bytes)?")
@@ -26,7 +26,7 @@ SENTENCES = (
 
 
 class Course:
-    """What a story has told by now: `script` of events, `timeline` of all else, and when it was at its end."""
+    """The scenario entries of the sentences so far: `script` for events, `timeline` for the rest, and the end."""
 
     def __init__(self) -> None:
         self.script: list[dict[str, Any]] = []
@@ -34,7 +34,7 @@ class Course:
         self.ends_at_s: int | None = None
 
     def tell(self, at_s: int, sentence: str) -> None:
-        """Raises ScenarioError for a sentence that is none."""
+        """Add a sentence. Raises ScenarioError if its form is unknown."""
         if sentence == "end":
             self.ends_at_s = at_s
         elif sentence == "heal":

@@ -1,7 +1,6 @@
-"""A story's file: a scenario's keys, then sentences, each with the second at which it happens; below them, indented,
-what agents then do.
+"""The file of a story: scenario keys, then sentences with their seconds, and below them the indented reactions.
 
-    # Figure 3.8: what becomes of a vote.
+    # Figure 3.8: the course of a vote.
     agents: 3
     1 s: 1 logs
 
@@ -10,7 +9,8 @@ what agents then do.
     ...
     30 s: end
 
-What is indented is the answer, up to the next sentence that comes later: it is compared, and can be written anew.
+The indented text is called the answer. It covers the time up to the next later sentence. A test compares it, and can
+write it anew.
 """
 
 import re
@@ -32,12 +32,12 @@ _ENTRY = re.compile(r"(`?)(timeline|events\.script)\.(\d+)(?:\.|: )")
 INDENT = "    "
 DELAY_S = 0.02
 SPEEDUP = 10.0
-"""Of processes: a machine takes some milliseconds to change a network, and sentences may be a second apart."""
+"""Speedup of processes. Sentences may be one second apart, and changing a network takes some milliseconds."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """From `from_s` to `until_s` mission seconds, what is answered at the line numbered `line`, which counts from 0."""
+    """The answer after line `line` (from 0), for mission seconds from `from_s` to `until_s`."""
 
     line: int
     from_s: int
@@ -47,7 +47,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Story:
-    """`lines` are those of the file without the answers; each of `sections` comes after one of them."""
+    """A story file. `lines` are its lines without the answers. Each section follows one of them."""
 
     path: Path
     text: str
@@ -57,14 +57,14 @@ class Story:
 
     @property
     def in_virtual_time(self) -> Scenario:
-        """The scenario where messages take equally long, as in a real lab none overtakes another of the same sender."""
+        """The scenario with a constant message delay. It keeps the order of each sender's messages."""
         if self.scenario.network.delay:
             return self.scenario
         network = self.scenario.network.model_copy(update={"delay": DELAY_S})
         return self.scenario.model_copy(update={"network": network})
 
     def with_answers(self, answers: Sequence[Sequence[str]]) -> str:
-        """The file's text with these answers, one of each section."""
+        """Return the file's text with these answers, one for each section."""
         after = {section.line: answer for section, answer in zip(self.sections, answers, strict=True)}
         lines: list[str] = []
         for number, line in enumerate(self.lines):
@@ -78,7 +78,7 @@ class Story:
 
 
 def is_story(path: Path) -> bool:
-    """Whether any line of the file is a sentence: other tools have files of that suffix, too."""
+    """Return whether a line of the file is a sentence. Other tools use the same suffix."""
     try:
         with path.open(encoding="utf-8") as file:
             return any(_SENTENCE.fullmatch(line.rstrip("\n")) for line in islice(file, MAX_LINES))
@@ -87,7 +87,7 @@ def is_story(path: Path) -> bool:
 
 
 def read_story(path: Path) -> Story:
-    """Raises ScenarioError: one sentence that names the file and the line."""
+    """Read a story. Raises ScenarioError with the file and the line."""
     try:
         if not path.is_file() or path.stat().st_size > MAX_BYTES:
             raise ScenarioError(f"{path}: not a file, or too large for a story")
@@ -106,11 +106,11 @@ def _parsed(path: Path, text: str) -> Story:
     begins = next((number for number, line in enumerate(given) if _SENTENCE.fullmatch(line)), None)
     if begins is None:
         raise ScenarioError("it has no sentence, such as `1 s: 1 logs`")
-    while begins and given[begins - 1].startswith("#"):  # a remark on the first sentence
+    while begins and given[begins - 1].startswith("#"):  # the comment above the first sentence
         begins -= 1
     lines, course = [*given[:begins], ""], Course()
-    told: list[tuple[int, int, bool]] = []  # line, second, whether chains are asked for
-    told_in: dict[str, list[int]] = {"events.script": [], "timeline": []}  # the line of each entry
+    told: list[tuple[int, int, bool]] = []  # line, second, whether chains are shown
+    told_in: dict[str, list[int]] = {"events.script": [], "timeline": []}  # entry -> its line in the file
     for number, line in enumerate(given[begins:], begins + 1):
         if line.startswith((" ", "\t")) or not line.strip():
             continue
@@ -147,18 +147,18 @@ def _parsed(path: Path, text: str) -> Story:
 
 
 def _in_its_line(problem: str, told_in: Mapping[str, Sequence[int]]) -> str:
-    """What is wrong with a scenario's entry, as that of the sentence which told it."""
+    """Replace the name of a scenario entry in an error message by the line of its sentence."""
     entry = _ENTRY.match(problem)
     return f"line {told_in[entry[2]][int(entry[3])]}: {entry[1]}{problem[entry.end() :]}" if entry else problem
 
 
 def _gap(lines: Sequence[str]) -> list[str]:
-    """Remarks stand apart from the sentence before them."""
+    """Return an empty line if the last line is a sentence, so that a comment stands apart from it."""
     return [""] if _SENTENCE.fullmatch(lines[-1]) else []
 
 
 def _sections(told: Sequence[tuple[int, int, bool]]) -> list[Section]:
-    """Of sentences of one second the last is answered."""
+    """Return one section for each second, after the last sentence of that second."""
     last = {at_s: (line, any(chains for _, other_s, chains in told if other_s == at_s)) for line, at_s, _ in told}
     seconds = [*last]
     return [

@@ -25,11 +25,11 @@ from ucp.trace import HandlerRun, Sent
 
 INCEPTION = "inception"
 SPELT_OUT = 4
-"""Longer chains are named by their ends."""
+"""Maximum length of a chain that is written in full. Longer chains are named by their first and last blocks."""
 
 
 class LocalChain:
-    """An agent's chain as its trace has it grow: hashes of its blocks, and the chain hash of each, the oldest first."""
+    """The chain of an agent, replayed from its trace: block hashes and chain hashes, oldest first."""
 
     def __init__(self, trace: Trace) -> None:
         try:
@@ -40,7 +40,7 @@ class LocalChain:
         self.blocks: list[str] = []
 
     def replay(self, run: HandlerRun) -> None:
-        """The changes of the next run. What cannot be, such as a block that goes without being on top, is as it may."""
+        """Apply the changes of the next handler run. Impossible changes are ignored."""
         for operation, block in run.changes:
             if operation == "chain+":
                 self.blocks.append(block)
@@ -51,7 +51,7 @@ class LocalChain:
 
 
 def _digest(block_hash: str) -> bytes:
-    """Of what is no hash, none: nobody else has named a chain with it."""
+    """Return the bytes of the hash, or no bytes if the text is no hash."""
     try:
         return bytes.fromhex(block_hash)
     except ValueError:
@@ -59,7 +59,7 @@ def _digest(block_hash: str) -> bytes:
 
 
 class Names:
-    """Blocks are named as in the thesis's figures, chains by their blocks."""
+    """Names of blocks as in the figures of the thesis, and names of chains by their blocks."""
 
     def __init__(self, traces: Mapping[int, Trace]) -> None:
         self._blocks = {
@@ -77,19 +77,19 @@ class Names:
                     self._chains.setdefault(chain.chain_hashes[-1], self.of(chain.blocks))
 
     def block(self, block_hash: str) -> str:
-        """ "1.1"."""
+        """Return a name such as "1.1"."""
         return self._blocks.get(block_hash, "an unknown block")
 
     def of(self, block_hashes: Sequence[str]) -> list[str]:
         return [self.block(block_hash) for block_hash in block_hashes]
 
     def chain(self, chain_hash: bytes) -> str:
-        """ "1.1 2.1", or "1.1 .. 4.2" of a long one."""
+        """Return "1.1 2.1", or "1.1 .. 4.2" for a long chain."""
         blocks = self._chains.get(chain_hash)
         return "an unknown chain" if blocks is None else _spelt(blocks)
 
     def chain_below(self, chain_hash: bytes) -> str:
-        """The chain that the top block of this one went on top of."""
+        """Return the name of the chain without its top block."""
         blocks = self._chains.get(chain_hash)
         return "an unknown chain" if not blocks else _spelt(blocks[:-1])
 
@@ -101,7 +101,7 @@ def _spelt(blocks: Sequence[str]) -> str:
 
 
 class Naming(Protocol):
-    """What knows how blocks and chains are called."""
+    """A source of names for blocks and chains."""
 
     def block(self, block_hash: str) -> str: ...
 
@@ -113,7 +113,7 @@ class Naming(Protocol):
 ANSWERS = frozenset(
     message.NAME for message in (BlockAddResponse, ChainContainResponse, NextInSequenceResponse, BlockResponse)
 )
-"""They are for whoever asked."""
+"""Names of messages that answer one agent."""
 
 _SAYS: dict[type[Message], Callable[[Any, Naming], str]] = {
     BlockAddRequest: lambda message, names: (
@@ -140,7 +140,7 @@ _SAYS: dict[type[Message], Callable[[Any, Naming], str]] = {
 
 
 def told(sent: Sent, names: Names) -> str:
-    """A message that an agent's trace has."""
+    """Return the text of a message that a trace contains."""
     if sent.datagram is None:
         return f"{sent.message} (not recorded)"
     try:
@@ -151,5 +151,5 @@ def told(sent: Sent, names: Names) -> str:
 
 
 def in_words(message: Message, names: Naming) -> str:
-    """ "Chain Contain Query (1.1 2.1)"."""
+    """Return a text such as "Chain Contain Query (1.1 2.1)"."""
     return f"{message.NAME} ({_SAYS[type(message)](message, names)})"

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.archive.exports import name_blocks
-from harness.report._chain_tree_layout import CHARACTER_WIDTH, Layout, Placed, lay_out
+from harness.report._chain_tree_layout import CHARACTER_WIDTH, Layout, PlacedMark, lay_out
 from harness.report.chain_tree import chain_tree, marks
 from tests.harness.report.runs import Chains, exports
 
@@ -23,7 +23,7 @@ def layout(chains: Chains, *, abridged: bool = True) -> Layout:
     return lay_out(marks(chain_tree(read), name_blocks(read), abridged=abridged))
 
 
-def box(placed: Placed) -> Box:
+def box(placed: PlacedMark) -> Box:
     return placed.x - placed.width / 2, placed.y, placed.x + placed.width / 2, placed.y + placed.height
 
 
@@ -32,8 +32,8 @@ def overlap(one: Box, other: Box) -> bool:
 
 
 def assert_readable(drawn: Layout) -> None:
-    everything = list(drawn.root.walk())
-    boxes = [box(placed) for placed in everything]
+    placed_marks = list(drawn.root.walk())
+    boxes = [box(placed) for placed in placed_marks]
     for one, other in itertools.combinations(boxes, 2):
         assert not overlap(one, other)
     for left, top, right, bottom in boxes:
@@ -41,7 +41,7 @@ def assert_readable(drawn: Layout) -> None:
         assert top >= 0
         assert right <= drawn.width
         assert bottom <= drawn.height
-    for below in everything:
+    for below in placed_marks:
         crossings: list[Box] = []
         for child in below.children:
             assert child.y + child.height < below.y, "time goes up"

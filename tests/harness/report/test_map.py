@@ -13,8 +13,8 @@ from harness.archive.connectivity import NETWORK_FILE, Topology, read_connectivi
 from harness.archive.tracks import TRACKS_FILE, read_tracks
 from harness.present.colours import Ink, inks
 from harness.report import _map_section, write_report
-from harness.report._map_section import Section
-from harness.report.map_parts import divisions, letter, longest
+from harness.report._map_section import MapSection
+from harness.report.map_parts import divisions, letter, longest_divisions
 from harness.scenario import Scenario
 from sitl.vehicle import VehicleType
 from tests.harness.report.flights import Way, split_and_rejoin, still, write_flight, write_lines
@@ -30,20 +30,20 @@ def scenario(range_m: float = 250.0, **more: Any) -> Scenario:
     return Scenario.model_validate({"name": "split", "duration_s": 1200, "network": network} | more)
 
 
-def drawn(run_dir: Path, seconds: int = 600, ways: dict[int, Way] | None = None, **more: Any) -> Section:
-    ways = ways or {vehicle: split_and_rejoin(vehicle) for vehicle in FIVE}
-    write_flight(run_dir, scenario(agents=len(ways), **more), ways, seconds)
-    section = section_of(run_dir, inks(ways))
+def drawn(run_dir: Path, seconds: int = 600, tracks: dict[int, Way] | None = None, **more: Any) -> MapSection:
+    tracks = tracks or {vehicle: split_and_rejoin(vehicle) for vehicle in FIVE}
+    write_flight(run_dir, scenario(agents=len(tracks), **more), tracks, seconds)
+    section = section_of(run_dir, inks(tracks))
     assert section is not None
     return section
 
 
-def section_of(run_dir: Path, ink: dict[int, Ink]) -> Section | None:
+def section_of(run_dir: Path, ink: dict[int, Ink]) -> MapSection | None:
     network = read_connectivity(run_dir / NETWORK_FILE, ink)
     return _map_section.section(read_tracks(run_dir / TRACKS_FILE, ink), network, ink, {})
 
 
-def paths(section: Section) -> list[tuple[str, str, list[tuple[float, float]]]]:
+def paths(section: MapSection) -> list[tuple[str, str, list[tuple[float, float]]]]:
     """Class, tooltip and points of all ways on the map."""
     found = []
     for path in ElementTree.fromstring(str(section.tracks)).iter(f"{SVG}path"):  # noqa: S314 - ours
@@ -53,7 +53,7 @@ def paths(section: Section) -> list[tuple[str, str, list[tuple[float, float]]]]:
     return found  # type: ignore[return-value]
 
 
-def said(section: Section) -> list[str]:
+def said(section: MapSection) -> list[str]:
     return [" ".join(filter(None, (one.at, one.what, one.network))).replace("\u00a0", " ") for one in section.moments]
 
 
@@ -64,12 +64,12 @@ def state(at_s: float, *components: set[int]) -> Topology:
 def test_a_split_and_a_rejoin_are_on_the_map_in_their_parts(tmp_path: Path) -> None:
     section = drawn(tmp_path)
     assert [which for _, which in section.legend] == ["connected to all others", "part A", "part B", "start", "end"]
-    ways = paths(section)
-    assert sum(which == "part0" for which, _, _ in ways) == 3
-    assert sum(which == "part1" for which, _, _ in ways) == 2
-    (second,) = [tip for which, tip, _ in ways if which == "part0" and tip.startswith("vehicle 2")]
+    tracks = paths(section)
+    assert sum(which == "part0" for which, _, _ in tracks) == 3
+    assert sum(which == "part1" for which, _, _ in tracks) == 2
+    (second,) = [tip for which, tip, _ in tracks if which == "part0" and tip.startswith("vehicle 2")]
     assert second.endswith("part A, with 1, 3")
-    assert all("connected to all others" in tip for which, tip, _ in ways if which == "whole")
+    assert all("connected to all others" in tip for which, tip, _ in tracks if which == "whole")
 
 
 def test_the_moments_are_begin_changes_and_end_with_the_live_links(tmp_path: Path) -> None:
@@ -127,8 +127,8 @@ def test_a_known_track_gives_the_known_path(tmp_path: Path) -> None:
 
 
 def test_a_vehicle_that_leaves_all_is_alone_from_where_it_left(tmp_path: Path) -> None:
-    ways = {1: still(0, 0), 2: still(10, 0), 3: lambda at_s: (0.0, 2 * at_s)}
-    section = drawn(tmp_path, 200, ways)
+    tracks = {1: still(0, 0), 2: still(10, 0), 3: lambda at_s: (0.0, 2 * at_s)}
+    section = drawn(tmp_path, 200, tracks)
     ((_, tip, points),) = [way for way in paths(section) if way[0] == "alone"]
     assert tip.replace("\u00a0", " ") == "vehicle 3, 126 s to 200 s: alone"
     ((_, _, before),) = [way for way in paths(section) if way[0] == "whole" and way[1].startswith("vehicle 3")]
@@ -139,8 +139,8 @@ def test_a_vehicle_that_leaves_all_is_alone_from_where_it_left(tmp_path: Path) -
 
 def test_a_track_changes_its_colour_between_two_looks_where_the_vehicle_then_was(tmp_path: Path) -> None:
     timeline = [{"at_s": 50.25, "partition": [[1]]}, {"at_s": 50.75, "heal": True}]
-    ways: dict[int, Way] = {1: lambda at_s: (at_s, 0.0), 2: lambda at_s: (0.0, at_s)}
-    flown = paths(drawn(tmp_path, 100, ways, timeline=timeline))
+    tracks: dict[int, Way] = {1: lambda at_s: (at_s, 0.0), 2: lambda at_s: (0.0, at_s)}
+    flown = paths(drawn(tmp_path, 100, tracks, timeline=timeline))
     (alone,) = [points for which, tip, points in flown if which == "alone" and tip.startswith("vehicle 1")]
     before, after = [points for which, tip, points in flown if which == "whole" and tip.startswith("vehicle 1")]
     assert (alone[0], alone[-1]) == (before[-1], after[0])
@@ -159,8 +159,8 @@ def test_a_lost_vehicle_ends_in_a_cross_and_its_successor_begins_at_home(tmp_pat
     def killed(at_s: float) -> tuple[float, float]:
         return (min(at_s, 50.0), 0.0) if at_s <= 101 else (0.0, at_s - 102)
 
-    ways: dict[int, Way] = {1: still(0, 5), 2: killed}
-    section = drawn(tmp_path, 150, ways, timeline=timeline)
+    tracks: dict[int, Way] = {1: still(0, 5), 2: killed}
+    section = drawn(tmp_path, 150, tracks, timeline=timeline)
     tips = [tip.replace("\u00a0", " ") for tip in re.findall("<title>([^<]*)</title>", str(section.tracks))]
     assert "vehicle 2 is lost at 50 s" in tips
     assert "vehicle 2 starts at 102 s" in tips
@@ -199,8 +199,8 @@ def test_parts_keep_their_letters_while_most_of_them_stay() -> None:
 
 def test_of_too_many_changes_those_that_lasted_longest_are_kept() -> None:
     found = divisions([state(at_s, {1, 2}, {3 + at}) for at, at_s in enumerate((0, 1, 10, 12, 30))])
-    assert [one.at_s for one in longest(found, 40, 3)] == [0, 12, 30]
-    assert longest(found, 40, 5) == found
+    assert [one.at_s for one in longest_divisions(found, 40, 3)] == [0, 12, 30]
+    assert longest_divisions(found, 40, 5) == found
 
 
 def test_at_most_six_moments_are_shown_the_longest_among_them(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from harness.archive.connectivity import read_connectivity
 from harness.archive.run_record import RunRecord
-from harness.report._network_section import ground_station, happened, strip
+from harness.report._network_section import event_rows, ground_station, strip
 
 
 def drawn(path: Path, *lines: dict[str, Any]) -> list[str]:
@@ -96,16 +96,16 @@ def test_what_was_asked_for_by_hand_stands_among_what_was_scheduled() -> None:
             },
         }
     )
-    rows = [[cell.replace("\u00a0", " ") for cell in row] for row in happened(record)]
+    rows = [[cell.replace("\u00a0", " ") for cell in row] for row in event_rows(record)]
     assert rows == [
         ["60 s", "kill", "agent 2; caused by hand"],
         ["125.5 s", "operator", "vehicles 1 3: MAV_CMD_DO_SET_MODE; param1 1, param2 6; 3 times until 130 s"],
         ["300 s", "heal", "loss 0 %; fully connected: yes"],
         ["later", "operator", "4 more commands, which are not recorded"],
     ]
-    told = (
+    rows_text = (
         "Ground station at 127.0.0.1:14550: 12\u202f345 datagrams were sent to it, 9 datagrams came from it, and 2 "
         "were dropped."
     )
-    assert ground_station(record) == told
+    assert ground_station(record) == rows_text
     assert ground_station(RunRecord()) is None

@@ -145,7 +145,7 @@ def test_a_long_restless_run_is_thinned_and_says_so() -> None:
     voters = {agent for agent in range(1, 51) if f"agent {agent}: vote" in picture.drawing}
     assert voters == set(range(1, 51)), "no agent is left out for another"
     assert len(picture.drawing) < 4_000_000
-    groups = _timeline_lanes.gathered(commits, 200.0)
+    groups = _timeline_lanes.group_commits(commits, 200.0)
     assert len(groups) <= _timeline_lanes.MAX_COMMITS
     assert sum(map(len, groups)) == len(commits), "no commit is lost, only drawn together"
     assert all(len({commit.agent for commit in group}) == 1 for group in groups)
@@ -153,7 +153,7 @@ def test_a_long_restless_run_is_thinned_and_says_so() -> None:
 
 def test_charts_are_thinned_to_what_can_be_told_apart_but_keep_the_worst() -> None:
     spreads = [Replication(float(at_s), 9 - 9 * (at_s == 777), 9, 1, 1, 1.0) for at_s in range(5000)]
-    kept = _timeline_charts.thinned(spreads, 5000.0)
+    kept = _timeline_charts.thin_states(spreads, 5000.0)
     assert len(kept) <= _timeline_charts.MAX_MOMENTS
     assert spreads[777] in kept
     assert kept[-1] == spreads[-1]

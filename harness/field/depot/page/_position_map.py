@@ -16,7 +16,7 @@ from harness.present import text
 from harness.present.colours import Ink
 from harness.present.svg import FONT, n
 from harness.report.logbook.positions import Entry, Track, Whereabouts
-from harness.report.map_parts import Point, Projection, extent, thinned
+from harness.report.map_parts import Point, Projection, extent, thin
 from harness.report.map_svg import end_mark, frame, start_mark, tags
 from ucp.telemetry import describe
 
@@ -106,7 +106,7 @@ def _ways(
 ) -> Markup:
     pieces = [(track, gap, piece) for track in tracks for gap, piece in _pieces(track, ways[track.agent_id], lost)]
     every = sum(map(len, ways.values())) // MAX_FIXES + 1  # thinning looks at each point many times
-    lines = thinned([[to_px(fix) for fix in (*piece[:-1:every], piece[-1])] for _, _, piece in pieces], MAX_POINTS)
+    lines = thin([[to_px(fix) for fix in (*piece[:-1:every], piece[-1])] for _, _, piece in pieces], MAX_POINTS)
     drawn = []
     for (track, gap, _), line in zip(pieces, lines, strict=True):
         path = "M" + "L".join(f"{n(x)} {n(y)}" for x, y in line)
