@@ -155,6 +155,14 @@ def late_joiner(run: Simulated, seed: int) -> None:
     assert distinct(run) == 1
 
 
+def shared_channel(run: Simulated, seed: int) -> None:
+    channel = run.played.channel
+    assert channel is not None
+    assert all(count > 100 for count in channel["lost"]["collision"].values())
+    assert len(channel["lost"]["collision"]) == 20
+    assert distinct(run) == 1
+
+
 def asymmetric_links(run: Simulated, seed: int) -> None:
     unheard, *others = chains(run).values()
     assert all(chain == others[0] for chain in others)
@@ -336,6 +344,7 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
         late_joiner,
         asymmetric_links,
         flapping,
+        shared_channel,
         attrition,
         forced_tie,
         large_divergence,
