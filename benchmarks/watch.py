@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 import aiohttp
 
 from harness.play.progress import Silent
-from harness.report.live.change_log import Story
+from harness.report.live.change_log import ChangeLog
 from harness.report.live.feed import Feed
 from harness.report.live.server import UPDATE_S, Server
 from harness.run.run import run
@@ -49,13 +49,13 @@ def written(directory: Path) -> Written:
 
 async def serve(directory: Path, lines: Written, speedup: float, ready: multiprocessing.Queue[object]) -> None:
     """Let the files grow, and read them. The time to write them is not counted."""
-    with closing(Feed(directory)) as feed, closing(Story()) as story:
-        async with Server(story, directory, live=True).open(0) as address:
+    with closing(Feed(directory)) as feed, closing(ChangeLog()) as log:
+        async with Server(log, directory, live=True).open(0) as address:
             ready.put(address)
-            story.tell([feed.first(live=True)])
+            log.append([feed.run_change(live=True)])
             files = {path: (directory / path).open("ab", buffering=0) for _, path, _ in lines}
             spent = time.process_time()
-            at, end_s, now_s, looks = 0, lines[-1][0], 0.0, 0
+            at, end_s, now_s, polls = 0, lines[-1][0], 0.0, 0
             while now_s < end_s:
                 now_s += UPDATE_S * speedup
                 growing = time.process_time()
@@ -65,12 +65,12 @@ async def serve(directory: Path, lines: Written, speedup: float, ready: multipro
                 spent += time.process_time() - growing
                 more = True
                 while more:
-                    changes, more = feed.look()
-                    story.tell(changes)
-                looks += 1
-                await asyncio.sleep(UPDATE_S if looks % 10 == 0 else 0.002)
+                    changes, more = feed.poll()
+                    log.append(changes)
+                polls += 1
+                await asyncio.sleep(UPDATE_S if polls % 10 == 0 else 0.002)
             cost = time.process_time() - spent
-            ready.put((cost, looks, story.size, at))
+            ready.put((cost, polls, log.size, at))
 
 
 def read(address: str) -> None:
@@ -107,10 +107,10 @@ def main() -> None:
         server.start()
         browser = multiprocessing.Process(target=read, args=(ready.get(),), daemon=True)
         browser.start()
-        cost, looks, told, count = ready.get()  # type: ignore[misc]
+        cost, polls, told, count = ready.get()  # type: ignore[misc]
         server.join()
         browser.terminate()
-    live_s = looks * UPDATE_S
+    live_s = polls * UPDATE_S
     print(  # noqa: T201
         f"{asked.agents} vehicles at {asked.speedup:g}x, {count} lines in {live_s:.0f} s of wall time at 10 updates "
         f"a second: {cost:.1f} s of processor time, {cost / live_s:.1%} of a core; "

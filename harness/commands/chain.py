@@ -13,7 +13,7 @@ from harness.errors import WRONG_REQUEST, ExportError
 from harness.report import logbook
 from harness.report.logbook.logbook_text import document, lines
 from harness.report.logbook.map_files import geojson, kml
-from harness.report.logbook.positions import Track, flown, tracks
+from harness.report.logbook.positions import Track, recorded_tracks, tracks
 
 
 def chain_command(
@@ -35,7 +35,7 @@ def chain_command(
     shown = whole if agent is None else whole.only(agent)
     if geojson_file is not None or kml_file is not None:
         record = archive.origin
-        recorded = flown(record, archive.tracks(record.known_agents))
+        recorded = recorded_tracks(record, archive.tracks(record.known_agents))
         made = tracks(shown) or [track for track in recorded if agent in (None, track.agent_id)]
         _write_maps(made, shown, geojson_file, kml_file)
     elif as_json:

@@ -13,7 +13,7 @@ from rich.text import Text
 from harness.archive.archive import RunArchive
 from harness.commands.terminal import complain, print_json
 from harness.report.agent_programs import in_sentence
-from harness.report.difference import AgentDifference, Difference, Parting, Step, compare
+from harness.report.difference import AgentDifference, ComparedStep, Difference, FirstDifference, compare
 from harness.run.provenance import differing_versions
 from ucp.trigger import MessageTrigger, Trigger
 
@@ -76,9 +76,9 @@ def _programs(difference: Difference) -> Iterator[str]:
 def _differences(difference: Difference) -> Iterator[str]:
     first = difference.first
     if first is not None:
-        parting = difference.agents[first].run
-        assert parting is not None, "it is what makes it the first"
-        yield f"the runs differ first at {parting.at_s:.3f} s, at agent {first}"
+        first_difference = difference.agents[first].run
+        assert first_difference is not None, "it is what makes it the first"
+        yield f"the runs differ first at {first_difference.at_s:.3f} s, at agent {first}"
     for agent_id, agent_difference in difference.agents.items():
         yield f"agent {agent_id}: {'the same' if agent_difference == AgentDifference(None, None) else ''}".rstrip()
         if agent_difference.run is not None:
@@ -89,15 +89,15 @@ def _differences(difference: Difference) -> Iterator[str]:
             yield f"  block {agent_difference.chain.place} of its chain: {a} in A, {b} in B"
 
 
-def _both(parting: Parting) -> tuple[str, str]:
+def _both(first_difference: FirstDifference) -> tuple[str, str]:
     """What the agent does in either run; changes and messages only if they differ."""
-    a, b = parting.a, parting.b
+    a, b = first_difference.a, first_difference.b
     changes = a is None or b is None or a.changes != b.changes
     sent = a is None or b is None or a.sent != b.sent
     return _step(a, changes, sent), _step(b, changes, sent)
 
 
-def _step(step: Step | None, changes: bool, sent: bool) -> str:
+def _step(step: ComparedStep | None, changes: bool, sent: bool) -> str:
     if step is None:
         return "nothing more"
     life = f"life {step.life}, " if step.life > 1 else ""

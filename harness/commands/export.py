@@ -10,9 +10,9 @@ from rich.console import Console
 from harness.commands._shared_options import DepotKey, depot_of, newly, refuse_existing
 from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
-from harness.report.export import Recording
+from harness.report.export import ExportedRun
 
-Write = Callable[[Recording, Path, Callable[[float], None]], int]
+Write = Callable[[ExportedRun, Path, Callable[[float], None]], int]
 
 
 def export_command(
@@ -39,7 +39,7 @@ def export_command(
         raise ExportError("no output is named: add --mcap FILE, --perfetto FILE or --rosbag DIR")
     refuse_existing([path for path, _, _ in asked])
     writers = [(path, counted, writer()) for path, counted, writer in asked]
-    recording = Recording(run, depot_of(depot_key))
+    recording = ExportedRun(run, depot_of(depot_key))
     with Console(stderr=True).status(f"reading {run}") as status:
         for path, counted, write in writers:
 

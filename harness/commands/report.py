@@ -117,14 +117,14 @@ def watch_command(
 
 
 async def _show(feed: "Feed", run: Path, port: int) -> None:
-    from harness.report.live.change_log import Story
-    from harness.report.live.projector import tell_film
+    from harness.report.live.change_log import ChangeLog
+    from harness.report.live.feed_to_log import copy_finished_run
     from harness.report.live.server import Server
 
-    with closing(Story()) as story:
-        async with Server(story, run, live=False).open(port) as address:
+    with closing(ChangeLog()) as log:
+        async with Server(log, run, live=False).open(port) as address:
             show_address(Console(), address)
-            await tell_film(feed, story)
+            await copy_finished_run(feed, log)
             await asyncio.Event().wait()
 
 

@@ -23,7 +23,7 @@ from harness.play.backends import BACKENDS
 from harness.play.interventions import Interventions
 from harness.play.machine.uml_kernel import OUT, Kernel, run_inside
 from harness.report.facts import gaps
-from harness.report.live.server_process import beside
+from harness.report.live.server_process import live_page
 from harness.run.run import Run, run
 from harness.scenario import Scenario
 from harness.scenario.agent_options import in_words
@@ -148,11 +148,11 @@ def run_command(
     virtual = BACKENDS[backend].virtual_time
     told = watch or by_hand
     hand = Interventions(request, virtual_time=virtual, factor=request.speedup, paused=by_hand) if told else None
-    with beside(directory, watch_port, hand) if watch and hand is not None else nullcontext() as page:
+    with live_page(directory, watch_port, hand) if watch and hand is not None else nullcontext() as page:
         if page is not None:
             show_address(console, page.address)
         shown = progress.for_console(console)
-        heard = shown if page is None else page.overhears(shown)
+        heard = shown if page is None else page.tee(shown)
         try:
             all_heard = watch and virtual  # the page shows who heard what
             finished = run(request, chosen_seed, directory, heard, backend, delivers_all=all_heard, interventions=hand)

@@ -14,7 +14,7 @@ from harness.errors import MachineError, RunDirectoryError, ScenarioError
 from harness.play.machine.running_runs import running, way_into
 from harness.play.machine.uml_kernel import enter, runs_inside
 from harness.play.request_socket import ask_run
-from harness.report.stories.sentences import VERBS, Course
+from harness.report.stories.sentences import VERBS, StoryEntries
 from harness.scenario.scenario_file import in_a_line
 
 _TIME: list[tuple[re.Pattern[str], str, str | None]] = [
@@ -63,16 +63,16 @@ def _requests(sentence: str) -> list[dict[str, Any]]:
     for pattern, command, key in _TIME:
         if said := pattern.fullmatch(sentence):
             return [{"command": command, **({key: float(said[1])} if key else {})}]
-    course = Course()
+    parsed = StoryEntries()
     try:
-        course.tell(0, sentence)
+        parsed.add(0, sentence)
     except ScenarioError:
-        course.timeline.clear()
-    if not course.timeline:
+        parsed.timeline.clear()
+    if not parsed.timeline:
         raise ScenarioError(f"{sentence[:80]!r} is not a command: use {_WHAT_THERE_IS}")
     return [
         {"command": "happen", "entry": {key: value for key, value in entry.items() if key != "at_s"}}
-        for entry in course.timeline
+        for entry in parsed.timeline
     ]
 
 

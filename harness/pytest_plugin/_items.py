@@ -17,7 +17,7 @@ from harness.pytest_plugin._fixtures import play
 from harness.pytest_plugin._judged_run import Trial, discard, new_directory, one_sentence
 from harness.pytest_plugin._options import Options
 from harness.pytest_plugin._stash import TRIAL
-from harness.report.stories.narration import Telling
+from harness.report.stories.narration import Narrator
 from harness.report.stories.story_file import Story, read_story
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.expect import Expect
@@ -131,8 +131,8 @@ class StoryItem(pytest.Item):
 
     def _told(self, archive: RunArchive) -> str:
         """The story as played."""
-        telling = Telling(archive.traces, self._story.scenario.roster)
-        answers = [telling.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
+        narrator = Narrator(archive.traces, self._story.scenario.roster)
+        answers = [narrator.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
         return self._story.with_answers(answers)
 
     def _unknown_word(self, archive: RunArchive) -> str | None:

@@ -13,12 +13,20 @@ search.
 
 from harness.report.difference._run_difference import (
     AgentDifference,
-    ChainParting,
+    ChainDifference,
+    ComparedStep,
     Difference,
+    FirstDifference,
     KeyDifference,
-    Parting,
-    Step,
     compare,
 )
 
-__all__ = ["AgentDifference", "ChainParting", "Difference", "KeyDifference", "Parting", "Step", "compare"]
+__all__ = [
+    "AgentDifference",
+    "ChainDifference",
+    "ComparedStep",
+    "Difference",
+    "FirstDifference",
+    "KeyDifference",
+    "compare",
+]

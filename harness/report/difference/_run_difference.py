@@ -16,7 +16,7 @@ from ucp.trigger import Trigger
 
 
 @dataclass(frozen=True)
-class Step:
+class ComparedStep:
     """A handler run in the form in which runs are compared. `t` (mission seconds) and `line` only locate it.
 
     `changes` holds (operation, block) and `sent` holds (message, block). A block is given by its name, None for no
@@ -33,7 +33,7 @@ class Step:
     line: int = field(compare=False)
 
     @classmethod
-    def of(cls, line: Line, names: Mapping[str, str]) -> "Step":
+    def of(cls, line: Line, names: Mapping[str, str]) -> "ComparedStep":
         """Make a step from a line of a trace.
 
         `names` maps block hashes to names; other blocks get 12 digits of their hash.
@@ -93,12 +93,12 @@ def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
 
 
 @dataclass(frozen=True)
-class Parting:
+class FirstDifference:
     """The first handler run in which the traces of an agent differ. A trace that ended before has None."""
 
     number: int
-    a: Step | None
-    b: Step | None
+    a: ComparedStep | None
+    b: ComparedStep | None
 
     @property
     def at_s(self) -> float:
@@ -107,7 +107,7 @@ class Parting:
 
 
 @dataclass(frozen=True)
-class ChainParting:
+class ChainDifference:
     """The first place, counted from 1, at which the exported chains of an agent differ, with the names of both blocks.
 
     A chain that ended before has None. An agent without an export has an empty chain.
@@ -120,8 +120,8 @@ class ChainParting:
 
 @dataclass(frozen=True)
 class AgentDifference:
-    run: Parting | None
-    chain: ChainParting | None
+    run: FirstDifference | None
+    chain: ChainDifference | None
 
 
 @dataclass(frozen=True)
@@ -174,14 +174,15 @@ def compare(a: Path, b: Path) -> Difference:
     Raises RunDirectoryError if a directory is no run, or if the rosters or backends differ.
     """
     run_a, run_b = _Run(a), _Run(b)
-    _refuse_what_cannot_be_compared(run_a, run_b)
+    _check_comparable(run_a, run_b)
     agents: dict[int, AgentDifference] = {}
     handler_runs, exact = 0, True
     for agent_id in run_a.roster:
-        same, to_the_byte, parting = _compare_traces(run_a, run_b, agent_id)
-        handler_runs, exact = handler_runs + same, exact and to_the_byte
-        agents[agent_id] = AgentDifference(parting, _compare_chains(run_a.chain(agent_id), run_b.chain(agent_id)))
-    keys = [*differing_keys(run_a.asked(), run_b.asked())]
+        equal, to_the_byte, first_difference = _compare_traces(run_a, run_b, agent_id)
+        handler_runs, exact = handler_runs + equal, exact and to_the_byte
+        chains = _compare_chains(run_a.chain(agent_id), run_b.chain(agent_id))
+        agents[agent_id] = AgentDifference(first_difference, chains)
+    keys = [*differing_keys(run_a.requested(), run_b.requested())]
     ran: dict[Literal["a", "b"], list[Program]] = {"a": programs(run_a.record), "b": programs(run_b.record)}
     return Difference(keys, ran, agents, handler_runs, exact, [*run_a.problems(), *run_b.problems()])
 
@@ -214,13 +215,13 @@ class _Run:
         yield from self.archive.record_problems
         yield from self.exports.errors
 
-    def asked(self) -> dict[str, Any]:
+    def requested(self) -> dict[str, Any]:
         """Return the seed and the scenario as JSON."""
         scenario = self.record.scenario
         return {"seed": self.record.seed, **(scenario.model_dump(mode="json", by_alias=True) if scenario else {})}
 
 
-def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
+def _check_comparable(a: _Run, b: _Run) -> None:
     for run in (a, b):
         if not run.roster:
             raise RunDirectoryError(f"{run.path / RUN_FILE}: it names no agents; play the run again")
@@ -234,21 +235,21 @@ def _refuse_what_cannot_be_compared(a: _Run, b: _Run) -> None:
         )
 
 
-def _compare_traces(a: _Run, b: _Run, agent_id: int) -> tuple[int, bool, Parting | None]:
+def _compare_traces(a: _Run, b: _Run, agent_id: int) -> tuple[int, bool, FirstDifference | None]:
     """Return the number of equal handler runs, whether they are equal to the last byte, and the first difference."""
-    same, exact = 0, True
+    equal, exact = 0, True
     for line_a, line_b in zip_longest(a.archive.trace_lines(agent_id), b.archive.trace_lines(agent_id)):
         if line_a is None or line_b is None or (line_a.life, line_a.text) != (line_b.life, line_b.text):
             exact = False
-            step_a, step_b = line_a and Step.of(line_a, a.names), line_b and Step.of(line_b, b.names)
+            step_a, step_b = line_a and ComparedStep.of(line_a, a.names), line_b and ComparedStep.of(line_b, b.names)
             if step_a != step_b:
-                return same, exact, Parting(same + 1, step_a, step_b)
-        same += 1
-    return same, exact, None
+                return equal, exact, FirstDifference(equal + 1, step_a, step_b)
+        equal += 1
+    return equal, exact, None
 
 
-def _compare_chains(a: list[str], b: list[str]) -> ChainParting | None:
+def _compare_chains(a: list[str], b: list[str]) -> ChainDifference | None:
     for place, (block_a, block_b) in enumerate(zip_longest(a, b), 1):
         if block_a != block_b:
-            return ChainParting(place, block_a, block_b)
+            return ChainDifference(place, block_a, block_b)
     return None

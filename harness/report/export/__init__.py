@@ -3,6 +3,6 @@
 `ExportedRun` opens the run, and its `samples` are all recorded events in time order. One module writes each format.
 """
 
-from harness.report.export._exported_run import Recording
+from harness.report.export._exported_run import ExportedRun
 
-__all__ = ["Recording"]
+__all__ = ["ExportedRun"]

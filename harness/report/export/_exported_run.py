@@ -23,20 +23,20 @@ from harness.errors import ExportError, RunDirectoryError
 from harness.report import logbook
 from harness.report.export._logs import log_files, read_log
 from harness.report.export._samples import (
-    Broadcast,
+    DropSample,
+    HandlerRunSample,
     Level,
-    LossesChanged,
+    LogLine,
+    LossSample,
+    MessageSample,
     MissionTime,
-    NetworkChanged,
+    NetworkSample,
     Place,
     Position,
-    Reconciled,
-    Refused,
-    Said,
+    ReconcileSample,
+    ReplicationSample,
     Sample,
-    Spread,
-    Step,
-    Voted,
+    VoteSample,
     mission_time,
 )
 from harness.report.export._telemetry import read_telemetry, telemetry_logs
@@ -54,7 +54,7 @@ MAX_LINKED = 100
 """Maximum number of vehicles whose links are exported one by one. 100 vehicles have 9900 links."""
 
 
-class Recording:
+class ExportedRun:
     """A run to export. If nothing else records positions, they are read from logged events. `depot` opens sealed
     events.
 
@@ -115,9 +115,11 @@ class Recording:
     @cached_property
     def end_s(self) -> float:
         """The last recorded mission second."""
-        told = self.archive.record.mission_s or 0.0
+        recorded_end_s = self.archive.record.mission_s or 0.0
         flown = (fixes[-1].at_s for fixes in self.tracks.by_vehicle.values())
-        return max([ends_at(self.archive.traces), *flown, *([told] if 0 <= told <= LATEST_S else [])])
+        return max(
+            [ends_at(self.archive.traces), *flown, *([recorded_end_s] if 0 <= recorded_end_s <= LATEST_S else [])]
+        )
 
     @property
     def problems(self) -> list[str]:
@@ -148,9 +150,9 @@ class Recording:
             self._messages(),
             self._votes(),
             self._reconciles(),
-            self._told(),
-            *map(self._steps, self.archive.traces),
-            *map(self._refused, self.archive.traces),
+            self._log_lines(),
+            *map(self._handler_runs, self.archive.traces),
+            *map(self._drops, self.archive.traces),
             *(read_telemetry(vehicle, path, self.time, self._problems) for vehicle, path in self._telemetry),
             *(read_log(source, path, self.time, self._problems) for source, path in self._logs),
         ]
@@ -160,8 +162,8 @@ class Recording:
         """Yield the recorded positions of the vehicles, or the positions that agents logged as events if none are
         recorded.
         """
-        made = self._by_tracks() if self.tracks.by_vehicle else self._by_events()
-        return iter(sorted(made, key=attrgetter("at_ns")))
+        positions = self._by_tracks() if self.tracks.by_vehicle else self._by_events()
+        return iter(sorted(positions, key=attrgetter("at_ns")))
 
     def _by_tracks(self) -> Iterator[Position]:
         scenario = self.archive.record.scenario
@@ -196,7 +198,7 @@ class Recording:
         if untimed:
             self._problems.append(f"{untimed} logged positions with an impossible time are left out")
 
-    def _losses(self) -> Iterator[LossesChanged]:
+    def _losses(self) -> Iterator[LossSample]:
         if len(self.agents) > MAX_LINKED:
             self._problems.append(
                 f"single links are exported for up to {MAX_LINKED} vehicles only, and this run has more"
@@ -204,64 +206,64 @@ class Recording:
             return
         for at_s, losses in self.archive.link_losses(self.agents):
             if at_s <= LATEST_S:
-                yield LossesChanged(self.time.at(at_s), losses)
+                yield LossSample(self.time.at(at_s), losses)
 
-    def _network(self) -> Iterator[NetworkChanged]:
+    def _network(self) -> Iterator[NetworkSample]:
         def at(change: Topology | Losses) -> float:
             return change.at_s
 
         groups: Components = ()
         losses = Losses(0.0, 0.0, 0.0)
         changes: list[Topology | Losses] = [*self.network.states, *self.network.losses]
-        for at_s, at_once in groupby(sorted(changes, key=at), at):
-            for change in at_once:
+        for at_s, simultaneous in groupby(sorted(changes, key=at), at):
+            for change in simultaneous:
                 if isinstance(change, Losses):
                     losses = change
                 else:
                     groups = change.components
             if at_s <= LATEST_S:
-                yield NetworkChanged(self.time.at(at_s), groups, losses.mean, losses.worst)
+                yield NetworkSample(self.time.at(at_s), groups, losses.mean, losses.worst)
 
-    def _spread(self) -> Iterator[Spread]:
+    def _spread(self) -> Iterator[ReplicationSample]:
         for replication in replication_of(self.archive.traces, self.faults):
-            yield Spread(self.time.at(replication.at_s), replication)
+            yield ReplicationSample(self.time.at(replication.at_s), replication)
 
-    def _steps(self, agent: int) -> Iterator[Step]:
+    def _handler_runs(self, agent: int) -> Iterator[HandlerRunSample]:
         for run in self.archive.traces[agent].runs:
             if in_time(run):
-                yield Step(self.time.at(run.t, agent), agent, run)
+                yield HandlerRunSample(self.time.at(run.t, agent), agent, run)
 
-    def _refused(self, agent: int) -> Iterator[Refused]:
+    def _drops(self, agent: int) -> Iterator[DropSample]:
         for _, aside in self.archive.traces[agent].asides:
             if isinstance(aside, Dropped) and 0 <= aside.t <= LATEST_S:
-                yield Refused(self.time.at(aside.t, agent), agent, aside.dropped)
+                yield DropSample(self.time.at(aside.t, agent), agent, aside.dropped)
 
-    def _messages(self) -> Iterator[Broadcast]:
+    def _messages(self) -> Iterator[MessageSample]:
         for message in self.history.messages or ():
-            yield Broadcast(self.time.at(message.at_s, message.sender), message)
+            yield MessageSample(self.time.at(message.at_s, message.sender), message)
 
-    def _votes(self) -> Iterator[Voted]:
+    def _votes(self) -> Iterator[VoteSample]:
         for vote in sorted(self.history.votes, key=attrgetter("end_s")):
-            yield Voted(self.time.at(vote.end_s, vote.agent), vote)
+            yield VoteSample(self.time.at(vote.end_s, vote.agent), vote)
 
-    def _reconciles(self) -> Iterator[Reconciled]:
+    def _reconciles(self) -> Iterator[ReconcileSample]:
         for reconcile in sorted(self.history.reconciles, key=attrgetter("end_s")):
-            yield Reconciled(self.time.at(reconcile.end_s, reconcile.agent), reconcile)
+            yield ReconcileSample(self.time.at(reconcile.end_s, reconcile.agent), reconcile)
 
-    def _told(self) -> Iterator[Said]:
+    def _log_lines(self) -> Iterator[LogLine]:
         """Yield faults and operator commands, and at the end of the run the verdicts."""
         for state in self.archive.record.network[:1]:
-            yield Said(self.time.at(0.0), "info", FAULTS, f"{state.what}: {state.detail}")
+            yield LogLine(self.time.at(0.0), "info", FAULTS, f"{state.what}: {state.detail}")
         for fault in self.faults:
-            yield Said(self.time.at(fault.at_s), "warning", FAULTS, f"{fault.what}: {fault.detail}")
+            yield LogLine(self.time.at(fault.at_s), "warning", FAULTS, f"{fault.what}: {fault.detail}")
         record = self.archive.record
         for command in record.ground_station.commands if record.ground_station else ():
-            who = f"vehicle{'s' if len(command.vehicles) > 1 else ''} {' '.join(map(str, command.vehicles))}"
-            told = f"{command.command or command.message} to {who}"
-            yield Said(self.time.at(command.at_s), "warning", OPERATOR, told)
+            vehicles = f"vehicle{'s' if len(command.vehicles) > 1 else ''} {' '.join(map(str, command.vehicles))}"
+            recorded_end_s = f"{command.command or command.message} to {vehicles}"
+            yield LogLine(self.time.at(command.at_s), "warning", OPERATOR, recorded_end_s)
         for sentence in record.unmatched_fates:
-            yield Said(self.time.at(self.end_s), "warning", FAULTS, sentence)
+            yield LogLine(self.time.at(self.end_s), "warning", FAULTS, sentence)
         for key, judgement in self.archive.record.judgements.items():
             level: Level = "error" if kind_of(judgement.verdict) == "bad" else "info"
             sentence = f"{key} {judgement.name}: {judgement.verdict}: {judgement.reason}"
-            yield Said(self.time.at(self.end_s), level, VERDICTS, sentence)
+            yield LogLine(self.time.at(self.end_s), level, VERDICTS, sentence)

@@ -20,7 +20,7 @@ def vehicle_frame(vehicle: int) -> str:
     return f"vehicle_{vehicle}"
 
 
-class Line(NamedTuple):
+class LinkLine(NamedTuple):
     """The link between two vehicles. `loss` is the larger loss of both directions, and below 1."""
 
     low: Metres
@@ -42,7 +42,7 @@ class Links:
         self._drawn_ns: int | None = None
         self._moved_ns = -1
 
-    def moved(self, position: Position) -> list[Line] | None:
+    def move(self, position: Position) -> list[LinkLine] | None:
         """Store the new position. Return the lines before this movement if they are due, or None.
 
         All movements of one instant belong together, so the lines are complete when the first later movement arrives.
@@ -60,10 +60,10 @@ class Links:
         every_ns = max(1.0, pairs / PAIRS_A_SECOND) * 1e9
         return bool(self.losses and pairs) and (self._drawn_ns is None or at_ns - self._drawn_ns >= every_ns)
 
-    def _lines(self) -> list[Line]:
+    def _lines(self) -> list[LinkLine]:
         lines = []
         for low, high in combinations(sorted(self._places), 2):
             loss = max(self.losses.get((low, high), 1.0), self.losses.get((high, low), 1.0))
             if loss < 1.0:
-                lines.append(Line(self._places[low], self._places[high], loss))
+                lines.append(LinkLine(self._places[low], self._places[high], loss))
         return lines

@@ -13,7 +13,7 @@ from itertools import chain, islice
 from pathlib import Path
 
 from harness.archive.bounded_file import Opened
-from harness.report.export._samples import Level, MissionTime, Said
+from harness.report.export._samples import Level, LogLine, MissionTime
 
 MAX_BYTES = 32 * 1024 * 1024
 MAX_LINE_BYTES = 64 * 1024
@@ -32,7 +32,7 @@ def log_files(directory: Path) -> Iterator[tuple[str, Path]]:
         yield str(path.relative_to(directory)).encode("utf-8", "replace").decode(), path
 
 
-def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) -> Iterator[Said]:
+def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) -> Iterator[LogLine]:
     """Yield the lines of a log. Add a sentence to `problems` if a part cannot be read."""
     at_ns, zone_s = time.at(0.0), None
     try:
@@ -47,7 +47,7 @@ def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) ->
                     at_ns = at_ns if moment is None else moment
                     text = text[timed.end() :]
                 if text:
-                    yield Said(at_ns, _level(text), source, text)
+                    yield LogLine(at_ns, _level(text), source, text)
             if file.trouble:
                 problems.append(f"{path}: {file.trouble}")
     except OSError as error:

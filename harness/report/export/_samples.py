@@ -46,7 +46,7 @@ class Position:
 
 
 @dataclass(frozen=True, slots=True)
-class LossesChanged:
+class LossSample:
     """New losses of some links, 0 to 1. A link is a pair (sender, receiver). Other links keep their losses."""
 
     at_ns: int
@@ -54,7 +54,7 @@ class LossesChanged:
 
 
 @dataclass(frozen=True, slots=True)
-class NetworkChanged:
+class NetworkSample:
     """The groups of connected vehicles, the largest first, and the losses of the existing links."""
 
     at_ns: int
@@ -64,7 +64,7 @@ class NetworkChanged:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class HandlerRunSample:
     """A handler run."""
 
     at_ns: int
@@ -73,7 +73,7 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
+class DropSample:
     """A datagram that an agent dropped."""
 
     at_ns: int
@@ -82,7 +82,7 @@ class Refused:
 
 
 @dataclass(frozen=True, slots=True)
-class Broadcast:
+class MessageSample:
     """A message, at the time of sending."""
 
     at_ns: int
@@ -90,7 +90,7 @@ class Broadcast:
 
 
 @dataclass(frozen=True, slots=True)
-class Voted:
+class VoteSample:
     """A vote, at its end."""
 
     at_ns: int
@@ -98,7 +98,7 @@ class Voted:
 
 
 @dataclass(frozen=True, slots=True)
-class Reconciled:
+class ReconcileSample:
     """A reconcile, at its end or interruption."""
 
     at_ns: int
@@ -106,7 +106,7 @@ class Reconciled:
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class ReplicationSample:
     """The replication of the blocks, at the time of a change."""
 
     at_ns: int
@@ -123,7 +123,7 @@ class Telemetry:
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class LogLine:
     """A line of a log, a fault, a network change or a verdict. `source` names its origin."""
 
     at_ns: int
@@ -134,16 +134,16 @@ class Said:
 
 Sample = (
     Position
-    | LossesChanged
-    | NetworkChanged
-    | Step
-    | Refused
-    | Broadcast
-    | Voted
-    | Reconciled
-    | Spread
+    | LossSample
+    | NetworkSample
+    | HandlerRunSample
+    | DropSample
+    | MessageSample
+    | VoteSample
+    | ReconcileSample
+    | ReplicationSample
     | Telemetry
-    | Said
+    | LogLine
 )
 
 
@@ -198,24 +198,26 @@ def mission_time(headers: Mapping[int, Header], record: RunRecord, problems: lis
             problems.append(
                 f"agent {agent}: the start of its mission is not in its trace; the start of the other agents is used"
             )
-    epoch_ns = Counter(epochs.values()).most_common(1)[0][0] if epochs else _began(record)
+    epoch_ns = Counter(epochs.values()).most_common(1)[0][0] if epochs else _start_ns(record)
     return MissionTime(epoch_ns, _speedup(headers, record), epochs)
 
 
 def _speedup(headers: Mapping[int, Header], record: RunRecord) -> float:
-    told = [header.clock.get("speedup") for header in headers.values()]
-    asked = [record.scenario.speedup] if record.scenario else []
+    recorded = [header.clock.get("speedup") for header in headers.values()]
+    planned = [record.scenario.speedup] if record.scenario else []
     possible = (
-        float(speedup) for speedup in (*told, *asked) if isinstance(speedup, int | float) and 0 < speedup <= MAX_SPEEDUP
+        float(speedup)
+        for speedup in (*recorded, *planned)
+        if isinstance(speedup, int | float) and 0 < speedup <= MAX_SPEEDUP
     )
     return next(possible, 1.0)
 
 
-def _began(record: RunRecord) -> int:
+def _start_ns(record: RunRecord) -> int:
     """Return the start time of the run, the best estimate of the mission's start without a trace; 0 in virtual time."""
     try:
-        began = datetime.fromisoformat(record.started_at or "")
+        start = datetime.fromisoformat(record.started_at or "")
     except ValueError:
         return 0
-    seconds = round((began if began.tzinfo else began.replace(tzinfo=UTC)).timestamp())
+    seconds = round((start if start.tzinfo else start.replace(tzinfo=UTC)).timestamp())
     return seconds * _NS if 0 <= seconds <= MAX_EPOCH_S and record.backend != "sim" else 0

@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from harness.archive.run_record import RunRecord
 from harness.present.colours import inks
-from harness.report.export._links import FIELD, Line, Links, vehicle_frame
+from harness.report.export._links import FIELD, LinkLine, Links, vehicle_frame
 from harness.report.export._samples import Position
 
 _SIZE_M = 2.0
@@ -39,25 +39,25 @@ class Scene:
         self._record, self._colours = record, colours
         self._drawn: set[int] = set()
 
-    def moved(self, position: Position) -> Iterator[Any]:
+    def move(self, position: Position) -> Iterator[Any]:
         """Yield the SceneUpdates that are due after a movement."""
-        if (lines := self.links.moved(position)) is not None:
+        if (lines := self.links.move(position)) is not None:
             yield _drawn_links(position.at_ns, lines)
         if position.vehicle not in self._drawn:
             self._drawn.add(position.vehicle)
             yield self._vehicle(position)
 
     def _vehicle(self, position: Position) -> Any:
-        told = self._record.vehicles.get(str(position.vehicle), {})
+        vehicle_record = self._record.vehicles.get(str(position.vehicle), {})
         update = SceneUpdate()
         entity = update.entities.add(id=vehicle_frame(position.vehicle), frame_locked=True)
         entity.frame_id = entity.id
         entity.timestamp.FromNanoseconds(position.at_ns)
-        shapes = entity.cubes if told.get("type") == "rover" else entity.spheres
+        shapes = entity.cubes if vehicle_record.get("type") == "rover" else entity.spheres
         shape = shapes.add(color=self._colours[position.vehicle])
         shape.pose.orientation.w = 1.0
         shape.size.x = shape.size.y = shape.size.z = _SIZE_M
-        if told.get("type") == "plane":
+        if vehicle_record.get("type") == "plane":
             shape.size.y = 4 * _SIZE_M
         name = entity.texts.add(
             billboard=True, font_size=_TEXT_PX, scale_invariant=True, color=_TEXT, text=str(position.vehicle)
@@ -67,7 +67,7 @@ class Scene:
         return update
 
 
-def _drawn_links(at_ns: int, links: Iterable[Line]) -> Any:
+def _drawn_links(at_ns: int, links: Iterable[LinkLine]) -> Any:
     update = SceneUpdate()
     entity = update.entities.add(id="links", frame_id=FIELD)
     entity.timestamp.FromNanoseconds(at_ns)

@@ -8,18 +8,18 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from harness.archive.connectivity import Link
-from harness.report.export._exported_run import Recording
+from harness.report.export._exported_run import ExportedRun
 from harness.report.export._samples import (
-    Broadcast,
-    LossesChanged,
-    NetworkChanged,
-    Reconciled,
-    Refused,
+    DropSample,
+    HandlerRunSample,
+    LossSample,
+    MessageSample,
+    NetworkSample,
+    ReconcileSample,
+    ReplicationSample,
     Sample,
-    Spread,
-    Step,
     Telemetry,
-    Voted,
+    VoteSample,
 )
 from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
@@ -74,7 +74,7 @@ SCHEMAS: dict[str, Schema] = {
 class Topics:
     """Convert samples to objects. `schemas` holds the schemas of all used topics, by name."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: ExportedRun) -> None:
         self._recording = recording
         self._state: dict[int, Any] = {}
         self.schemas = dict(SCHEMAS)
@@ -83,29 +83,29 @@ class Topics:
 
     def of(self, sample: Sample) -> Iterator[tuple[str, str, Object]]:
         """Yield topic, schema name and object for each object of a sample."""
-        for topic, name, told in self._of(sample):
-            known = {key: value for key, value in told.items() if _can_be_told(value)}
+        for topic, name, values in self._of(sample):
+            known = {key: value for key, value in values.items() if _is_plottable(value)}
             yield topic, name, {"mission_s": round(self._recording.time.mission_s(sample.at_ns), 6), **known}
 
     def _of(self, sample: Sample) -> Iterator[tuple[str, str, Object]]:
         match sample:
-            case Step(agent=agent, run=run):
+            case HandlerRunSample(agent=agent, run=run):
                 yield f"/agents/{agent}/handler_runs", "ucp.HandlerRun", self._run(run)
                 yield from self._chain(agent, run)
                 if self._state.get(agent) != run.state:
                     self._state[agent] = run.state
                     yield f"/agents/{agent}/state", "ucp.AgentState", _state(run)
-            case Refused(agent=agent, reason=reason):
+            case DropSample(agent=agent, reason=reason):
                 yield f"/agents/{agent}/refused", "ucp.RefusedDatagram", {"reason": reason}
-            case Broadcast(message=message):
+            case MessageSample(message=message):
                 receivers = sorted({agent for agent, _ in message.receipts})
-                told = {"sender": message.sender, "message": message.name, **self._block(message.block)}
-                yield "/messages", "ucp.Message", told | {"received_by": receivers, "receivers": len(receivers)}
-            case Voted(vote=vote):
-                told = {"start_s": vote.start_s, "duration_s": vote.end_s - vote.start_s, "outcome": vote.outcome}
-                yield f"/agents/{vote.agent}/votes", "ucp.Vote", self._block(vote.block) | told
-            case Reconciled(reconcile=reconcile):
-                told = {
+                values = {"sender": message.sender, "message": message.name, **self._block(message.block)}
+                yield "/messages", "ucp.Message", values | {"received_by": receivers, "receivers": len(receivers)}
+            case VoteSample(vote=vote):
+                values = {"start_s": vote.start_s, "duration_s": vote.end_s - vote.start_s, "outcome": vote.outcome}
+                yield f"/agents/{vote.agent}/votes", "ucp.Vote", self._block(vote.block) | values
+            case ReconcileSample(reconcile=reconcile):
+                values = {
                     "start_s": reconcile.start_s,
                     "duration_s": reconcile.end_s - reconcile.start_s,
                     "reason": reconcile.reason,
@@ -115,27 +115,27 @@ class Topics:
                         for phase in reconcile.phases
                     ],
                 }
-                yield f"/agents/{reconcile.agent}/reconciles", "ucp.Reconcile", told
-            case NetworkChanged(groups=groups):
-                told = {
+                yield f"/agents/{reconcile.agent}/reconciles", "ucp.Reconcile", values
+            case NetworkSample(groups=groups):
+                values = {
                     "groups": len(groups),
                     "largest_group": max(map(len, groups), default=0),
                     "connected": " | ".join(" ".join(map(str, sorted(group))) for group in groups),
                     "mean_loss": sample.mean_loss,
                     "worst_loss": sample.worst_loss,
                 }
-                yield "/network/state", "ucp.Network", told
-            case LossesChanged(losses=losses):
+                yield "/network/state", "ucp.Network", values
+            case LossSample(losses=losses):
                 yield "/network/losses", "ucp.LinkLosses", {_link(link): loss for link, loss in losses.items()}
-            case Spread(replication=replication):
-                told = {
+            case ReplicationSample(replication=replication):
+                values = {
                     "mutual_chain": replication.mutual_chain,
                     "longest_chain": replication.longest_chain,
                     "distinct_chains": replication.distinct_chains,
                     "copies_min": replication.copies_min,
                     "copies_mean": replication.copies_mean,
                 }
-                yield "/swarm/replication", "ucp.Replication", told
+                yield "/swarm/replication", "ucp.Replication", values
             case Telemetry(vehicle=vehicle, message=message):
                 kind = message.get_type()
                 name = f"mavlink.{kind}"
@@ -145,15 +145,15 @@ class Topics:
 
     def _run(self, run: HandlerRun) -> Object:
         trigger, name = next(iter(run.trigger.to_json().items()), (None, None))
-        heard = run.trigger if isinstance(run.trigger, MessageTrigger) else None
+        received = run.trigger if isinstance(run.trigger, MessageTrigger) else None
         return {
             "handler": run.handler,
             "algorithm": _whole(run.algorithm),
             "branch": run.branch,
             "trigger": trigger,
             "trigger_name": None if name is None else str(name),
-            "sender": _whole(heard and heard.sender),
-            "seq": _whole(heard and heard.sequence),
+            "sender": _whole(received and received.sender),
+            "seq": _whole(received and received.sequence),
             "changes": [{"operation": operation, **self._block(block)} for operation, block in run.changes],
             "sent": [
                 {"message": sent.message, "seq": _whole(sent.seq), **self._block(sent.block)} for sent in run.sent
@@ -165,14 +165,14 @@ class Topics:
         length = run.state.chain - sum(1 if operation == "chain+" else -1 for operation, _ in changes)
         for operation, block in changes:
             length += 1 if operation == "chain+" else -1
-            told = {"length": _whole(length), "operation": "added" if operation == "chain+" else "taken off"}
-            yield f"/agents/{agent}/chain", "ucp.ChainChange", told | self._block(block) | {"handler": run.handler}
+            values = {"length": _whole(length), "operation": "added" if operation == "chain+" else "taken off"}
+            yield f"/agents/{agent}/chain", "ucp.ChainChange", values | self._block(block) | {"handler": run.handler}
 
     def _block(self, block_hash: str | None) -> Object:
         return {"block": self._recording.block(block_hash), "block_hash": block_hash} if block_hash else {}
 
 
-def _can_be_told(value: Any) -> bool:
+def _is_plottable(value: Any) -> bool:
     """Return whether the value is known and can be written as JSON."""
     return math.isfinite(value) if isinstance(value, float) else value is not None
 

@@ -12,9 +12,9 @@ from typing import IO, Any
 
 from harness.archive.exports import MAX_EXPORT_BYTES, RUN_FILE, export_paths
 from harness.errors import MachineError
-from harness.report.export._exported_run import Recording
+from harness.report.export._exported_run import ExportedRun
 from harness.report.export._links import FIELD, vehicle_frame
-from harness.report.export._samples import LossesChanged, Position, Said, Telemetry
+from harness.report.export._samples import LogLine, LossSample, Position, Telemetry
 from harness.report.export._topics import Topics
 
 try:
@@ -34,7 +34,7 @@ _SEVERITIES = (Log.FATAL, Log.FATAL, Log.FATAL, Log.ERROR, Log.WARNING, Log.INFO
 """Log levels of MAV_SEVERITY, from emergency to debug."""
 
 
-def write_mcap(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
+def write_mcap(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
     """Write a new file, and return the number of messages. `progress` receives the mission second from time to time.
 
     Raises OSError.
@@ -43,7 +43,7 @@ def write_mcap(recording: Recording, path: Path, progress: Callable[[float], Non
         return _write(recording, _Writer(file), progress)
 
 
-def _write(recording: Recording, writer: "_Writer", progress: Callable[[float], None]) -> int:
+def _write(recording: ExportedRun, writer: "_Writer", progress: Callable[[float], None]) -> int:
     colours = colours_of(recording.agents)
     topics, scene = Topics(recording), Scene(recording.archive.record, colours)
     for sample in recording.samples():
@@ -51,17 +51,17 @@ def _write(recording: Recording, writer: "_Writer", progress: Callable[[float], 
         match sample:
             case Position():
                 writer.position(sample, colours[sample.vehicle])
-                for update in scene.moved(sample):
+                for update in scene.move(sample):
                     writer.message("/scene", at_ns, update)
-            case LossesChanged(losses=losses):
+            case LossSample(losses=losses):
                 scene.links.losses |= losses
-            case Said(level=level, source=source, text=text):
+            case LogLine(level=level, source=source, text=text):
                 writer.log(at_ns, _LEVELS[level], source, text)
             case Telemetry(vehicle=vehicle, message=message) if message.get_type() == "STATUSTEXT":
                 severity = _SEVERITIES[min(message.severity, len(_SEVERITIES) - 1)]
                 writer.log(at_ns, severity, f"vehicle {vehicle}", message.text)
-        for topic, name, told in topics.of(sample):
-            writer.json(topic, at_ns, name, topics.schemas[name], told)
+        for topic, name, values in topics.of(sample):
+            writer.json(topic, at_ns, name, topics.schemas[name], values)
         if writer.messages % 1024 == 0:
             progress(recording.time.mission_s(at_ns))
     end_ns = recording.time.at(recording.end_s)
@@ -110,19 +110,19 @@ class _Writer:
             self._channels[topic] = self._writer.register_channel(topic, MessageEncoding.Protobuf, self._schemas[name])
         self._add(topic, at_ns, message.SerializeToString())
 
-    def json(self, topic: str, at_ns: int, name: str, schema: dict[str, Any], told: dict[str, Any]) -> None:
+    def json(self, topic: str, at_ns: int, name: str, schema: dict[str, Any], values: dict[str, Any]) -> None:
         if topic not in self._channels:
             if name not in self._schemas:
                 data = json.dumps({"title": name, **schema}).encode()
                 self._schemas[name] = self._writer.register_schema(name, SchemaEncoding.JSONSchema, data)
             self._channels[topic] = self._writer.register_channel(topic, MessageEncoding.JSON, self._schemas[name])
-        self._add(topic, at_ns, json.dumps(told, separators=(",", ":"), allow_nan=False).encode())
+        self._add(topic, at_ns, json.dumps(values, separators=(",", ":"), allow_nan=False).encode())
 
     def _add(self, topic: str, at_ns: int, data: bytes) -> None:
         self._writer.add_message(self._channels[topic], log_time=at_ns, data=data, publish_time=at_ns)
         self.messages += 1
 
-    def attach(self, recording: Recording) -> None:
+    def attach(self, recording: ExportedRun) -> None:
         """Attach run.json and the exports. Unreadable files are skipped, because `problems` already mentions them."""
         begin_ns = recording.time.at(0.0)
         for path in (recording.directory / RUN_FILE, *export_paths(recording.directory)):

@@ -17,8 +17,8 @@ from typing import IO, Any
 
 from harness.archive.history import Message
 from harness.errors import MachineError
-from harness.report.export._exported_run import Recording
-from harness.report.export._samples import NetworkChanged, Position, Said, Sample, Spread, Step
+from harness.report.export._exported_run import ExportedRun
+from harness.report.export._samples import HandlerRunSample, LogLine, NetworkSample, Position, ReplicationSample, Sample
 from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
@@ -45,7 +45,7 @@ Event = tuple[int, int, Any]
 """
 
 
-def write_perfetto(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
+def write_perfetto(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
     """Write a new file, and return the number of events. `progress` receives the mission second from time to time.
 
     Raises OSError.
@@ -54,7 +54,7 @@ def write_perfetto(recording: Recording, path: Path, progress: Callable[[float],
         return _write(recording, file, progress)
 
 
-def _write(recording: Recording, file: IO[bytes], progress: Callable[[float], None]) -> int:
+def _write(recording: ExportedRun, file: IO[bytes], progress: Callable[[float], None]) -> int:
     trace = _Trace(recording)
     builder = StreamingTraceProtoBuilder(file)
     if recording.time.epoch_ns:
@@ -103,7 +103,7 @@ class _Arrows:
 class _Trace:
     """Convert samples to packets, and describe each track at its first use."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: ExportedRun) -> None:
         self._recording = recording
         self._arrows = _Arrows(recording.history.messages or ())
         if self._arrows.backwards:
@@ -137,22 +137,22 @@ class _Trace:
     def _of(self, sample: Sample) -> Iterator[Event]:
         at_ns = sample.at_ns
         match sample:
-            case Step(agent=agent, run=run):
+            case HandlerRunSample(agent=agent, run=run):
                 yield self._step(at_ns, agent, run)
                 held = {"chain": run.state.chain, "deque": run.state.deque, "stack": run.state.stack}
                 for name, blocks in held.items():
                     yield from self._count(at_ns, _agent(agent), f"{name} (blocks)", blocks)
             case Position(vehicle=vehicle, metres=metres):
                 yield from self._count(at_ns, _agent(vehicle), "altitude (m)", metres[2])
-            case NetworkChanged():
+            case NetworkSample():
                 yield from self._count(at_ns, SWARM, "mean loss (%)", 100 * sample.mean_loss)
                 yield from self._count(at_ns, SWARM, "worst loss (%)", 100 * sample.worst_loss)
                 yield from self._count(at_ns, SWARM, "connected groups", len(sample.groups))
-            case Spread(replication=replication):
+            case ReplicationSample(replication=replication):
                 yield from self._count(at_ns, SWARM, "longest chain (blocks)", replication.longest_chain)
                 yield from self._count(at_ns, SWARM, "mutual chain (blocks)", replication.mutual_chain)
                 yield from self._count(at_ns, SWARM, "distinct chains", replication.distinct_chains)
-            case Said(source=source, text=text):
+            case LogLine(source=source, text=text):
                 packet = self._packet(at_ns, SWARM, source, TrackEvent.TYPE_INSTANT, text[:MAX_TEXT])
                 yield at_ns, 0, packet
 
@@ -166,11 +166,11 @@ class _Trace:
         _annotate(event, "trigger", f"{trigger[0]}: {trigger[1]}")
         _annotate(event, "branch", run.branch)
         block = self._recording.block
-        told = {
+        details = {
             "changes": [f"{operation} {block(block_hash)}" for operation, block_hash in run.changes],
             "sent": [sent.message + (f" of {block(sent.block)}" if sent.block else "") for sent in run.sent],
         }
-        for name, parts in told.items():
+        for name, parts in details.items():
             if parts:
                 _annotate(event, name, ", ".join(parts))
         return at_ns, int(isinstance(run.trigger, MessageTrigger)), packet
@@ -193,10 +193,10 @@ class _Trace:
                     yield self._end(agent, "reconciles", phase.end_s)
                 yield self._end(agent, "reconciles", reconcile.end_s)
 
-    def _begin(self, agent: int, track: str, at_s: float, name: str, **told: str) -> Event:
+    def _begin(self, agent: int, track: str, at_s: float, name: str, **details: str) -> Event:
         at_ns = self._recording.time.at(at_s, agent)
         packet = self._packet(at_ns, _agent(agent), track, TrackEvent.TYPE_SLICE_BEGIN, name)
-        for key, value in told.items():
+        for key, value in details.items():
             _annotate(packet.track_event, key, value)
         return at_ns, 0, packet
 

@@ -15,16 +15,16 @@ from typing import Any, Literal
 from harness.archive.history import LATEST_S
 from harness.archive.traces import Gap, Header
 from harness.errors import MachineError
-from harness.report.export._exported_run import Recording
-from harness.report.export._links import FIELD, Line, Links, vehicle_frame
+from harness.report.export._exported_run import ExportedRun
+from harness.report.export._links import FIELD, LinkLine, Links, vehicle_frame
 from harness.report.export._samples import (
-    LossesChanged,
+    HandlerRunSample,
+    LogLine,
+    LossSample,
     Metres,
-    NetworkChanged,
+    NetworkSample,
     Position,
-    Said,
     Sample,
-    Step,
     Telemetry,
 )
 
@@ -47,7 +47,7 @@ _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _NS = 1_000_000_000
 
 
-def write_rosbag(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
+def write_rosbag(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
     """Write a new directory, and return the number of messages. `progress` receives the mission second from time to
     time.
 
@@ -59,7 +59,7 @@ def write_rosbag(recording: Recording, path: Path, progress: Callable[[float], N
         raise MachineError(f"{path} cannot be written: {error}") from None
 
 
-def _write(recording: Recording, path: Path, progress: Callable[[float], None]) -> int:
+def _write(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
     bag = _Messages(recording)
     written = 0
     with Writer(path, version=METADATA_VERSION, storage_plugin=StoragePlugin.SQLITE3) as writer:
@@ -78,7 +78,7 @@ def _write(recording: Recording, path: Path, progress: Callable[[float], None]) 
 class _Messages:
     """The samples of a run as ROS messages."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: ExportedRun) -> None:
         self._recording = recording
         self._links = Links()
         self._counts: dict[str, float] = {}
@@ -92,7 +92,7 @@ class _Messages:
             yield (
                 end_ns,
                 f"/ucp/{agent}/chain",
-                _made("std_msgs/msg/String", data=export.model_dump_json(by_alias=True)),
+                _message("std_msgs/msg/String", data=export.model_dump_json(by_alias=True)),
             )
         for problem in self._recording.problems:
             yield end_ns, "/rosout", _log(end_ns, LEVELS["warning"], "export", problem)
@@ -105,7 +105,7 @@ class _Messages:
             if not isinstance(entry, Gap | Header) and 0 <= entry.t <= LATEST_S:
                 at_ns = time.at(entry.t, agent)
             if not isinstance(entry, Gap):
-                yield at_ns, f"/ucp/{agent}/trace", _made("std_msgs/msg/String", data=entry.to_line().rstrip("\n"))
+                yield at_ns, f"/ucp/{agent}/trace", _message("std_msgs/msg/String", data=entry.to_line().rstrip("\n"))
 
     def _of_samples(self) -> Iterator[Timed]:
         for sample in self._recording.samples():
@@ -116,21 +116,21 @@ class _Messages:
         at_ns = sample.at_ns
         match sample:
             case Position(vehicle=vehicle):
-                if (lines := self._links.moved(sample)) is not None:
+                if (lines := self._links.move(sample)) is not None:
                     yield "/links", _markers(at_ns, lines)
                 yield "/tf", _transform(sample)
                 if sample.place is not None:
                     yield f"/vehicle_{vehicle}/fix", _fix(sample)
-            case LossesChanged(losses=losses):
+            case LossSample(losses=losses):
                 self._links.losses |= losses
-            case NetworkChanged(mean_loss=mean, worst_loss=worst):
+            case NetworkSample(mean_loss=mean, worst_loss=worst):
                 yield from self._count("/network/mean_loss", "Float64", mean)
                 yield from self._count("/network/worst_loss", "Float64", worst)
-            case Step(agent=agent, run=run):
+            case HandlerRunSample(agent=agent, run=run):
                 held = {"chain": run.state.chain, "deque": run.state.deque, "stack": run.state.stack}
                 for name, blocks in held.items():
                     yield from self._count(f"/agent_{agent}/{name}", "UInt32", min(max(blocks, 0), _LARGEST))
-            case Said(level=level, source=source, text=text):
+            case LogLine(level=level, source=source, text=text):
                 yield "/rosout", _log(at_ns, LEVELS[level], source, text)
             case Telemetry(vehicle=vehicle, message=message):
                 yield f"/vehicle_{vehicle}/mavlink", _bytes(bytes(message.get_msgbuf()))
@@ -139,24 +139,24 @@ class _Messages:
         """Yield the value if it has changed."""
         if self._counts.get(topic) != value:
             self._counts[topic] = value
-            yield topic, _made(f"std_msgs/msg/{kind}", data=value)
+            yield topic, _message(f"std_msgs/msg/{kind}", data=value)
 
 
-def _made(name: str, /, **fields: Any) -> Any:
+def _message(name: str, /, **fields: Any) -> Any:
     """Return a message of this type."""
     return _STORE.types[name](**fields)
 
 
 def _stamp(at_ns: int) -> Any:
-    return _made("builtin_interfaces/msg/Time", sec=at_ns // _NS, nanosec=at_ns % _NS)
+    return _message("builtin_interfaces/msg/Time", sec=at_ns // _NS, nanosec=at_ns % _NS)
 
 
 def _header(at_ns: int, frame: str) -> Any:
-    return _made("std_msgs/msg/Header", stamp=_stamp(at_ns), frame_id=frame)
+    return _message("std_msgs/msg/Header", stamp=_stamp(at_ns), frame_id=frame)
 
 
 def _log(at_ns: int, level: int, name: str, text: str) -> Any:
-    return _made(
+    return _message(
         "rcl_interfaces/msg/Log",
         stamp=_stamp(at_ns),
         level=level,
@@ -169,17 +169,17 @@ def _log(at_ns: int, level: int, name: str, text: str) -> Any:
 
 
 def _bytes(data: bytes) -> Any:
-    layout = _made("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
-    return _made("std_msgs/msg/UInt8MultiArray", layout=layout, data=numpy.frombuffer(data, numpy.uint8))
+    layout = _message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    return _message("std_msgs/msg/UInt8MultiArray", layout=layout, data=numpy.frombuffer(data, numpy.uint8))
 
 
 def _fix(position: Position) -> Any:
     assert position.place is not None
     lat_deg, lon_deg, alt_m = position.place
-    return _made(
+    return _message(
         "sensor_msgs/msg/NavSatFix",
         header=_header(position.at_ns, vehicle_frame(position.vehicle)),
-        status=_made("sensor_msgs/msg/NavSatStatus", status=0, service=1),
+        status=_message("sensor_msgs/msg/NavSatStatus", status=0, service=1),
         latitude=lat_deg,
         longitude=lon_deg,
         altitude=alt_m,
@@ -189,50 +189,50 @@ def _fix(position: Position) -> Any:
 
 
 def _vector(kind: str, metres: Metres) -> Any:
-    return _made(f"geometry_msgs/msg/{kind}", **dict(zip("xyz", metres, strict=True)))
+    return _message(f"geometry_msgs/msg/{kind}", **dict(zip("xyz", metres, strict=True)))
 
 
 def _quaternion() -> Any:
-    return _made("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    return _message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
 
 
 def _transform(position: Position) -> Any:
-    transform = _made(
+    transform = _message(
         "geometry_msgs/msg/TransformStamped",
         header=_header(position.at_ns, FIELD),
         child_frame_id=vehicle_frame(position.vehicle),
-        transform=_made(
+        transform=_message(
             "geometry_msgs/msg/Transform", translation=_vector("Vector3", position.metres), rotation=_quaternion()
         ),
     )
-    return _made("tf2_msgs/msg/TFMessage", transforms=[transform])
+    return _message("tf2_msgs/msg/TFMessage", transforms=[transform])
 
 
-def _markers(at_ns: int, lines: list[Line]) -> Any:
+def _markers(at_ns: int, lines: list[LinkLine]) -> Any:
     """Return one list of lines. RViz rejects an empty list, so without links the old marker is deleted."""
     marker: Any = _STORE.types["visualization_msgs/msg/Marker"]
-    none = (0.0, 0.0, 0.0)
-    made = marker(
+    origin = (0.0, 0.0, 0.0)
+    marker_message = marker(
         header=_header(at_ns, FIELD),
         ns="links",
         id=0,
         type=marker.LINE_LIST,
         action=marker.ADD if lines else marker.DELETE,
-        pose=_made("geometry_msgs/msg/Pose", position=_vector("Point", none), orientation=_quaternion()),
+        pose=_message("geometry_msgs/msg/Pose", position=_vector("Point", origin), orientation=_quaternion()),
         scale=_vector("Vector3", (1.0, 0.0, 0.0)),
-        color=_made("std_msgs/msg/ColorRGBA", r=0.0, g=1.0, b=0.0, a=1.0),
-        lifetime=_made("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        color=_message("std_msgs/msg/ColorRGBA", r=0.0, g=1.0, b=0.0, a=1.0),
+        lifetime=_message("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
         frame_locked=False,
         points=[_vector("Point", end) for line in lines for end in (line.low, line.high)],
-        colors=[_made("std_msgs/msg/ColorRGBA", **line.colour) for line in lines for _ in range(2)],
+        colors=[_message("std_msgs/msg/ColorRGBA", **line.colour) for line in lines for _ in range(2)],
         texture_resource="",
-        texture=_made(
+        texture=_message(
             "sensor_msgs/msg/CompressedImage", header=_header(at_ns, FIELD), format="", data=numpy.zeros(0, numpy.uint8)
         ),
         uv_coordinates=[],
         text="",
         mesh_resource="",
-        mesh_file=_made("visualization_msgs/msg/MeshFile", filename="", data=numpy.zeros(0, numpy.uint8)),
+        mesh_file=_message("visualization_msgs/msg/MeshFile", filename="", data=numpy.zeros(0, numpy.uint8)),
         mesh_use_embedded_materials=False,
     )
-    return _made("visualization_msgs/msg/MarkerArray", markers=[made])
+    return _message("visualization_msgs/msg/MarkerArray", markers=[marker_message])

@@ -15,45 +15,45 @@ from typing import Any
 
 from harness.archive.exports import RUN_FILE
 from harness.errors import HarnessError
-from harness.report.live.change_log import Story
+from harness.report.live.change_log import ChangeLog
 from harness.report.live.feed import Feed
-from harness.report.live.projector import tell_live
+from harness.report.live.feed_to_log import copy_live_run
 from harness.report.live.server import UPDATE_S, Server
 
-LEFT_S = 3.0
+MAX_UNWATCHED_S = 3.0
 """Seconds without a page after which the server ends. A page that is reloaded reconnects within this time."""
 
 
 async def main(directory: Path, port: int) -> None:
     reader = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
-    story, ended = Story(), asyncio.Event()
-    server = Server(story, directory, live=True, ask=_say)
+    log, ended = ChangeLog(), asyncio.Event()
+    server = Server(log, directory, live=True, on_request=_send_request)
     async with server.open(port) as address:
         _print(address)
-        telling = asyncio.create_task(_tell(directory, story, ended))
-        if not await _hear_until_over(reader, server, story):
+        following = asyncio.create_task(_follow_run(directory, log, ended))
+        if not await _read_until_over(reader, server, log):
             return
         ended.set()
-        await telling
+        await following
         server.live = False
         _print(str(server.readers))
-        staying = asyncio.create_task(_while_looked_at(server))
-        left = asyncio.create_task(reader.read(1))
-        await asyncio.wait({staying, left}, return_when=asyncio.FIRST_COMPLETED)
+        page_open = asyncio.create_task(_wait_until_unwatched(server))
+        run_process_ended = asyncio.create_task(reader.read(1))
+        await asyncio.wait({page_open, run_process_ended}, return_when=asyncio.FIRST_COMPLETED)
 
 
 def _print(line: str) -> None:
     print(line, flush=True)  # noqa: T201
 
 
-def _say(page: int, asked: Any) -> None:
+def _send_request(page: int, request: Any) -> None:
     """Send a page's request to the process of the run."""
-    if isinstance(asked, dict):
-        _print(json.dumps([page, asked.get("number"), asked]))
+    if isinstance(request, dict):
+        _print(json.dumps([page, request.get("number"), request]))
 
 
-async def _hear_until_over(reader: asyncio.StreamReader, server: Server, story: Story) -> bool:
+async def _read_until_over(reader: asyncio.StreamReader, server: Server, log: ChangeLog) -> bool:
     """Read messages until the run is over. Return False if the process of the run ended instead."""
     while line := await reader.readline():
         kind, *rest = json.loads(line)
@@ -63,27 +63,27 @@ async def _hear_until_over(reader: asyncio.StreamReader, server: Server, story: 
             page, number, answer = rest
             server.answer(page, ["answer", number, answer])
         else:
-            story.tell([[kind, *rest]])
+            log.append([[kind, *rest]])
     return False
 
 
-async def _tell(directory: Path, story: Story, ended: asyncio.Event) -> None:
+async def _follow_run(directory: Path, log: ChangeLog, ended: asyncio.Event) -> None:
     while not (directory / RUN_FILE).exists():
         if ended.is_set():
             return
         await asyncio.sleep(UPDATE_S)
     try:
         with contextlib.closing(Feed(directory)) as feed:
-            await tell_live(feed, story, ended)
+            await copy_live_run(feed, log, ended)
     except HarnessError as error:
-        story.tell([["note", str(error)]])  # the run goes on without the page
+        log.append([["note", str(error)]])  # the run goes on without the page
 
 
-async def _while_looked_at(server: Server) -> None:
-    alone_s = LEFT_S if server.readers == 0 else 0.0
-    while alone_s < LEFT_S:
+async def _wait_until_unwatched(server: Server) -> None:
+    unwatched_s = MAX_UNWATCHED_S if server.readers == 0 else 0.0
+    while unwatched_s < MAX_UNWATCHED_S:
         await asyncio.sleep(UPDATE_S)
-        alone_s = 0.0 if server.readers else alone_s + UPDATE_S
+        unwatched_s = 0.0 if server.readers else unwatched_s + UPDATE_S
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from harness.archive.history import COMMITTED_BY, LATEST_S, Begun, Incarnation, Reconcile, Tie, Vote
 from harness.archive.traces import Header, Held, parsed
-from harness.report.live._live_trace import Lives
+from harness.report.live._live_trace import AgentTrace
 from ucp.trace import Commanded, Dropped, Entry, HandlerRun
 from ucp.trigger import MessageTrigger
 
@@ -20,15 +20,15 @@ Change = list[Any]
 KEY_LENGTH = 16
 """Number of digits of a block hash that identify the block on the page."""
 
-_TAKES_IN = re.compile(
+_RECEIPT_LINE = re.compile(
     rb'\{"t":([\d.]+),"handler":"receive_\w+","algorithm":\d+,'
     rb'"trigger":\{"message":"[\w ]+","from":(\d+),"seq":(\d+)\}'
 )
-_CANNOT_MATTER = b'"branch":"no vote running"'
-_NOTHING_ELSE = b'"changes":[],"sent":[]'
+_NO_EFFECT = b'"branch":"no vote running"'
+_NO_CHANGES = b'"changes":[],"sent":[]'
 
 
-class Heard(NamedTuple):
+class Receipt(NamedTuple):
     """An agent received message `seq` of `sender`."""
 
     t: float
@@ -36,7 +36,7 @@ class Heard(NamedTuple):
     seq: int
 
 
-class Sent(NamedTuple):
+class SentMessage(NamedTuple):
     """An agent broadcast its message `seq`. `block` is the key of the message's block, if it has one."""
 
     t: float
@@ -45,28 +45,28 @@ class Sent(NamedTuple):
     block: str | None
 
 
-class Course:
+class AgentCourse:
     """The actions of one agent. The caller takes `changes`, `sent` and `heard`, and clears them."""
 
     def __init__(self, agents: Path, agent_id: int) -> None:
         self.agent_id = agent_id
         self.changes: list[Change] = []
-        self.sent: list[Sent] = []
-        self.heard: list[Heard] = []
+        self.sent: list[SentMessage] = []
+        self.receipts: list[Receipt] = []
         self.at_s = 0.0
         """Mission second of the last entry that was read."""
         self.problem: str | None = None
         """The reason why the rest of the trace cannot be read, or None."""
-        self.takes_in_all = False
+        self.has_messages_without_effect = False
         """True if the trace contains a message without effect. Traces of virtual time omit these by default."""
-        self._lives = Lives(agents, agent_id)
-        self._ahead: Heard | HandlerRun | Dropped | None = None
+        self._trace = AgentTrace(agents, agent_id)
+        self._ahead: Receipt | HandlerRun | Dropped | None = None
         """An entry that was read, but is later than the requested mission second."""
-        self._born = False
+        self._has_started = False
         self._held = Held()
         self._completed: dict[str, int] = {}
-        self._twice: set[str] = set()
-        self._idle_without = False
+        self._duplicates: set[str] = set()
+        self._idle_too_early = False
         self._incarnation = Incarnation(agent_id)
 
     def read(self, until_s: float, at_most: int) -> bool:
@@ -80,10 +80,10 @@ class Course:
                 return False
             self._ahead = None
             self.at_s = max(self.at_s, entry.t)
-            if isinstance(entry, Heard):
-                self.heard.append(entry)
+            if isinstance(entry, Receipt):
+                self.receipts.append(entry)
             elif isinstance(entry, HandlerRun):
-                self._ran(entry)
+                self._handler_run(entry)
             else:
                 self.changes.append(["d", entry.t, self.agent_id, str(entry.dropped)[:80]])
         return True
@@ -94,19 +94,19 @@ class Course:
         return None if self._ahead is None else self._ahead.t
 
     def close(self) -> None:
-        self._lives.close()
+        self._trace.close()
 
-    def _next(self) -> Heard | HandlerRun | Dropped | None:
+    def _next(self) -> Receipt | HandlerRun | Dropped | None:
         """Return the next entry with a valid time, or None."""
         while self.problem is None:
-            line = self._lives.next()
+            line = self._trace.next()
             if line is None:
-                self.problem = self._lives.trouble
+                self.problem = self._trace.trouble
                 return None
-            self.takes_in_all = self.takes_in_all or _CANNOT_MATTER in line
-            if _NOTHING_ELSE in line and (taken := _TAKES_IN.match(line)) and not self._may_be_idle_too_early(line):
-                t, sender, seq = taken.groups()
-                entry: Heard | Header | Entry = Heard(float(t), int(sender), int(seq))
+            self.has_messages_without_effect = self.has_messages_without_effect or _NO_EFFECT in line
+            if _NO_CHANGES in line and (match := _RECEIPT_LINE.match(line)) and not self._may_be_idle_too_early(line):
+                t, sender, seq = match.groups()
+                entry: Receipt | Header | Entry = Receipt(float(t), int(sender), int(seq))
             else:
                 try:
                     entry = parsed(line)
@@ -124,24 +124,24 @@ class Course:
 
     def _begin(self) -> None:
         """Begin an incarnation."""
-        if self._born:
+        if self._has_started:
             self.changes.append(["z", self.at_s, self.agent_id])
-        self._born, self._held, self._idle_without = True, Held(), False
+        self._has_started, self._held, self._idle_too_early = True, Held(), False
         self._incarnation = Incarnation(self.agent_id)
-        self._twice.clear()
+        self._duplicates.clear()
 
-    def _ran(self, run: HandlerRun) -> None:
+    def _handler_run(self, run: HandlerRun) -> None:
         trigger = run.trigger
         if isinstance(trigger, MessageTrigger):
-            self.heard.append(Heard(run.t, trigger.sender, trigger.sequence))
+            self.receipts.append(Receipt(run.t, trigger.sender, trigger.sequence))
         for sent in run.sent:
-            self.sent.append(Sent(run.t, sent.seq, sent.message[:80], sent.block and sent.block[:KEY_LENGTH]))
+            self.sent.append(SentMessage(run.t, sent.seq, sent.message[:80], sent.block and sent.block[:KEY_LENGTH]))
         if run.changes:
-            self._changed(run)
-        self._does(run)
-        self._hold_against(run)
+            self._report_changes(run)
+        self._report_activity(run)
+        self._report_violations(run)
 
-    def _changed(self, run: HandlerRun) -> None:
+    def _report_changes(self, run: HandlerRun) -> None:
         self._held.replay(run)
         moves = []
         for operation, block in run.changes:
@@ -155,34 +155,34 @@ class Course:
             how = COMMITTED_BY.get(run.handler, "")
             self.changes.append(["c", run.t, self.agent_id, moves, run.state.top[:KEY_LENGTH], how])
 
-    def _does(self, run: HandlerRun) -> None:
+    def _report_activity(self, run: HandlerRun) -> None:
         """Report the votes, reconciles and phases that the handler run began or ended."""
         for step in self._incarnation.take(run):
             match step:
                 case Begun("vote"):
-                    self._say(run.t, "voting", step.detail[:KEY_LENGTH])
+                    self._add_activity(run.t, "voting", step.detail[:KEY_LENGTH])
                 case Begun("reconcile"):
-                    self._say(run.t, "reconciling", step.detail)
+                    self._add_activity(run.t, "reconciling", step.detail)
                 case Begun():
-                    self._say(run.t, step.detail, "")
+                    self._add_activity(run.t, step.detail, "")
                 case Vote():
-                    self._say(run.t, "voted", step.outcome[:80])
+                    self._add_activity(run.t, "voted", step.outcome[:80])
                 case Reconcile():
-                    self._say(run.t, "reconciled", "")
+                    self._add_activity(run.t, "reconciled", "")
                 case Tie():
-                    self._say(run.t, "tie", step.branch[:80])
+                    self._add_activity(run.t, "tie", step.branch[:80])
 
-    def _say(self, t: float, doing: str, more: str) -> None:
-        self.changes.append(["s", t, self.agent_id, doing, more])
+    def _add_activity(self, t: float, activity: str, detail: str) -> None:
+        self.changes.append(["s", t, self.agent_id, activity, detail])
 
-    def _hold_against(self, run: HandlerRun) -> None:
+    def _report_violations(self, run: HandlerRun) -> None:
         """Report a violation of characteristic 2 or 3 when it first becomes visible."""
         for operation, block in run.changes:
-            if operation.endswith("+") and self._held.copies[block] > 1 and block not in self._twice:
-                self._twice.add(block)
+            if operation.endswith("+") and self._held.copies[block] > 1 and block not in self._duplicates:
+                self._duplicates.add(block)
                 self.changes.append(["x", run.t, self.agent_id, 3, block[:KEY_LENGTH]])
-        idle_without = run.state.idle and bool(self._held.not_in_chain)
-        if idle_without and not self._idle_without:
+        idle_too_early = run.state.idle and bool(self._held.not_in_chain)
+        if idle_too_early and not self._idle_too_early:
             first = next(iter(self._held.not_in_chain))
             self.changes.append(["x", run.t, self.agent_id, 2, first[:KEY_LENGTH]])
-        self._idle_without = idle_without
+        self._idle_too_early = idle_too_early

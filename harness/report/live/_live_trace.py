@@ -26,7 +26,7 @@ class GrowingFile:
         self.trouble: str | None = None
         self._file: int | None = None
         self._lines: deque[bytes] = deque()
-        self._begun = b""
+        self._partial_line = b""
 
     def next(self) -> bytes | None:
         """Return the next line with its line end, or None if it is not complete yet."""
@@ -55,19 +55,19 @@ class GrowingFile:
             return False
         if not data:
             return False
-        *whole, self._begun = (self._begun + data).split(b"\n")
-        self._lines.extend(line + b"\n" for line in whole)
-        if len(self._begun) > MAX_LINE_BYTES:
-            self.trouble, self._begun = f"has a line of more than {MAX_LINE_BYTES // 1024 // 1024} MiB", b""
+        *complete, self._partial_line = (self._partial_line + data).split(b"\n")
+        self._lines.extend(line + b"\n" for line in complete)
+        if len(self._partial_line) > MAX_LINE_BYTES:
+            self.trouble, self._partial_line = f"has a line of more than {MAX_LINE_BYTES // 1024 // 1024} MiB", b""
         return True
 
 
-class Lives:
+class AgentTrace:
     """The lines of one agent's trace, incarnation by incarnation."""
 
     def __init__(self, agents: Path, agent_id: int) -> None:
         self._agents, self._agent_id = agents, agent_id
-        self._life = 1
+        self._incarnation = 1
         self._headers = 0
         self._file = GrowingFile(agents / f"{agent_id}{SUFFIX}")
 
@@ -91,11 +91,11 @@ class Lives:
                 return line
             self._file.close()
             self._file = GrowingFile(self._later / self._file.path.name)
-            self._life, self._headers = self._life + 1, 0
+            self._incarnation, self._headers = self._incarnation + 1, 0
 
     @property
     def _later(self) -> Path:
-        return self._agents / f"{self._agent_id}-{self._life + 1}"
+        return self._agents / f"{self._agent_id}-{self._incarnation + 1}"
 
     def close(self) -> None:
         self._file.close()

@@ -18,26 +18,26 @@ from harness.scenario.faults.fault import PAUSED, Fault
 MAX_DETAIL = 300
 
 
-class _Told(NetworkLine):
+class _NetworkEntry(NetworkLine):
     detail: Any = ""
     """A description for people."""
     by_hand: bool = False
 
 
-Line = TypeVar("Line", _Told, TrackLine)
+TimedLine = TypeVar("TimedLine", _NetworkEntry, TrackLine)
 
 
-class _Lines(Generic[Line]):
+class _TimedFile(Generic[TimedLine]):
     """A growing file of entries with times.
 
     `model` validates each line, and `play` processes it at its mission second.
     """
 
-    def __init__(self, path: Path, model: type[Line], play: Callable[[Line], None]) -> None:
+    def __init__(self, path: Path, model: type[TimedLine], play: Callable[[TimedLine], None]) -> None:
         self._file = GrowingFile(path)
-        self._model: type[Line] = model
-        self._play: Callable[[Line], None] = play
-        self.ahead: Line | None = None
+        self._model: type[TimedLine] = model
+        self._play: Callable[[TimedLine], None] = play
+        self.ahead: TimedLine | None = None
         """An entry that was read, but is later than the requested mission second."""
         self.at_s = 0.0
         """Mission second of the last entry that was played."""
@@ -72,7 +72,7 @@ class _Lines(Generic[Line]):
         self._file.close()
 
 
-class Around:
+class Surroundings:
     """The network and the vehicles. The caller takes `changes` and clears them."""
 
     def __init__(self, directory: Path, vehicles: Collection[int]) -> None:
@@ -81,8 +81,8 @@ class Around:
         self._network = Network(vehicles)
         self._losses: dict[Pair, tuple[float, float]] = {}
         self._parts: tuple[frozenset[int], ...] = ()
-        self._conditions = _Lines(directory / NETWORK_FILE, _Told, self._changed)
-        self._tracks = _Lines(directory / TRACKS_FILE, TrackLine, self._moved)
+        self._conditions = _TimedFile(directory / NETWORK_FILE, _NetworkEntry, self._play_network_entry)
+        self._tracks = _TimedFile(directory / TRACKS_FILE, TrackLine, self._play_positions)
 
     def read(self, until_s: float, at_most: int) -> bool:
         """Read up to `until_s`, but at most `at_most` lines of each file.
@@ -112,7 +112,7 @@ class Around:
         self._conditions.close()
         self._tracks.close()
 
-    def _changed(self, line: _Told) -> None:
+    def _play_network_entry(self, line: _NetworkEntry) -> None:
         """Process a change of the network or of agents.
 
         Raises ValueError, TypeError, AttributeError or KeyError if the line is invalid.
@@ -137,7 +137,7 @@ class Around:
             ["n", line.at_s, what, detail, agents, _state_after(fault), changed, named_parts, line.by_hand]
         )
 
-    def _moved(self, line: TrackLine) -> None:
+    def _play_positions(self, line: TrackLine) -> None:
         places = {str(vehicle): place for vehicle, place in line.places.items() if vehicle in self._known}
         self.changes.append(["p", line.at_s, places])
 

@@ -20,7 +20,7 @@ _LEFT_OUT = (b'["m"', b'["p"', b'["t"', b'["d"')
 _encode = partial(json.dumps, separators=(",", ":"), check_circular=False)
 
 
-class Story:
+class ChangeLog:
     """Changes, one in a line. `size` is in bytes."""
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class Story:
         self.size = 0
         self._full = False
 
-    def tell(self, changes: Iterable[Change]) -> None:
+    def append(self, changes: Iterable[Change]) -> None:
         """Append changes. Raises OSError if the disk is full."""
         lines = "".join([_encode(change) + "\n" for change in changes]).encode()
         if self._full or not lines:

@@ -36,8 +36,8 @@ from harness.errors import RunDirectoryError
 from harness.play.backends import in_virtual_time
 from harness.present.colours import inks
 from harness.report.facts import link_qualities
-from harness.report.live._agent_course import Change, Course, Heard, Sent
-from harness.report.live._surroundings import Around
+from harness.report.live._agent_course import AgentCourse, Change, Receipt, SentMessage
+from harness.report.live._surroundings import Surroundings
 from harness.scenario.faults import ASKED_FOR, VehicleFault
 from harness.scenario.verdict_names import kind_of
 
@@ -45,7 +45,7 @@ MAX_VEHICLES = 200
 """Maximum number of vehicles whose links the page can draw."""
 LINES_AT_ONCE = 500
 """Maximum number of lines that are read from one file before the next file."""
-LOOKS_UNTIL_TOLD = 2
+POLLS_UNTIL_REPORTED = 2
 """Number of polls between the first sight of a message and its change. By then the receivers have recorded it."""
 
 
@@ -54,7 +54,7 @@ class _Broadcast:
     """A broadcast message. `message` is None while only receivers have recorded it."""
 
     mask: int
-    looks: int
+    polls: int
     t: float = 0.0
     message: str | None = None
     block: str | None = None
@@ -79,17 +79,17 @@ class Feed:
             )
         agents = agents_directory(directory)
         self._bit = {agent_id: 1 << number for number, agent_id in enumerate(self._roster)}
-        self._courses = [Course(agents, agent_id) for agent_id in self._roster]
-        self._around = Around(directory, self._roster)
-        self._on_the_air: dict[tuple[int, int], _Broadcast] = {}
-        self._looks = 0
-        self._told_s = 0.0
-        self._told_of: set[str] = set()
+        self._courses = [AgentCourse(agents, agent_id) for agent_id in self._roster]
+        self._surroundings = Surroundings(directory, self._roster)
+        self._broadcasts: dict[tuple[int, int], _Broadcast] = {}
+        self._polls = 0
+        self._reported_s = 0.0
+        self._reported_problems: set[str] = set()
         self._record = archive.record
-        self._all_heard = self._record.backend is not None and not in_virtual_time(self._record.backend)
+        self._all_receipts_recorded = self._record.backend is not None and not in_virtual_time(self._record.backend)
         self._record_stamp = self._stamp()
 
-    def first(self, *, live: bool) -> Change:
+    def run_change(self, *, live: bool) -> Change:
         """Return the change that describes the run. `live` states whether the run is still active."""
         record, scenario = self._record, self._record.scenario
         return [
@@ -107,7 +107,7 @@ class Feed:
                 "backend": record.backend,
                 "seed": record.seed,
                 "live": live,
-                "all_heard": self._all_heard,
+                "all_heard": self._all_receipts_recorded,
                 "flown": self._is_flown(),
                 "troubles": [[kind.what, kind.unless_told] for kind in ASKED_FOR if issubclass(kind, VehicleFault)],
             },
@@ -119,32 +119,32 @@ class Feed:
         has_vehicles = scenario is not None and scenario.vehicles.kind != "none"
         return has_vehicles and record.backend is not None and not in_virtual_time(record.backend)
 
-    def look(self, until_s: float = float("inf")) -> tuple[list[Change], bool]:
+    def poll(self, until_s: float = float("inf")) -> tuple[list[Change], bool]:
         """Return new changes up to a mission second, and whether more remain up to then."""
-        more = self._around.read(until_s, LINES_AT_ONCE)
+        more = self._surroundings.read(until_s, LINES_AT_ONCE)
         for course in self._courses:
             more |= course.read(until_s, LINES_AT_ONCE)
-        self._looks += not more  # an agent with unread lines may still have received older messages
-        changes = [*self._take(), *self._messages(told_now=False)]
+        self._polls += not more  # an agent with unread lines may still have received older messages
+        changes = [*self._take_changes(), *self._messages(report_all=False)]
         changes.sort(key=lambda change: float(change[1]))
-        at_s = max(self._around.at_s, *(course.at_s for course in self._courses))
-        if at_s > self._told_s:
-            self._told_s = at_s
+        at_s = max(self._surroundings.at_s, *(course.at_s for course in self._courses))
+        if at_s > self._reported_s:
+            self._reported_s = at_s
             changes.append(["t", round(at_s, 3)])
-        if not self._all_heard and any(course.takes_in_all for course in self._courses):
-            self._all_heard = True
-            changes.append(["all", self._told_s])
+        if not self._all_receipts_recorded and any(course.has_messages_without_effect for course in self._courses):
+            self._all_receipts_recorded = True
+            changes.append(["all", self._reported_s])
         return [*changes, *self._notes()], more
 
-    def last(self) -> list[Change]:
+    def final_changes(self) -> list[Change]:
         """Return the remaining changes and the outcome of the run."""
-        changes = [*self._take(), *self._messages(told_now=True)]
+        changes = [*self._take_changes(), *self._messages(report_all=True)]
         return [*changes, *self._notes(), ["end", self._ending()]]
 
     @property
     def next_s(self) -> float | None:
         """Mission second of the earliest entry that was read ahead, or None."""
-        ahead = (self._around.next_s, *(course.next_s for course in self._courses))
+        ahead = (self._surroundings.next_s, *(course.next_s for course in self._courses))
         return min((at_s for at_s in ahead if at_s is not None), default=None)
 
     @property
@@ -157,53 +157,53 @@ class Feed:
         return self._record.outcome == "failed" or bool(self._record.characteristics)
 
     def close(self) -> None:
-        self._around.close()
+        self._surroundings.close()
         for course in self._courses:
             course.close()
 
-    def _take(self) -> Iterator[Change]:
-        for changes in (self._around.changes, *(course.changes for course in self._courses)):
+    def _take_changes(self) -> Iterator[Change]:
+        for changes in (self._surroundings.changes, *(course.changes for course in self._courses)):
             yield from changes
             changes.clear()
 
-    def _messages(self, *, told_now: bool) -> Iterator[Change]:
+    def _messages(self, *, report_all: bool) -> Iterator[Change]:
         """Yield the messages whose receivers have had time to record them, or all messages with `told_now`."""
-        happened: list[tuple[float, int, int, Sent | Heard]] = []
+        happened: list[tuple[float, int, int, SentMessage | Receipt]] = []
         for course in self._courses:
             happened += [(sent.t, 0, course.agent_id, sent) for sent in course.sent]
-            happened += [(heard.t, 1, course.agent_id, heard) for heard in course.heard]
+            happened += [(receipts.t, 1, course.agent_id, receipts) for receipts in course.receipts]
             course.sent.clear()
-            course.heard.clear()
+            course.receipts.clear()
         happened.sort(key=itemgetter(0, 1))
         for _, _, agent_id, what in happened:
-            if isinstance(what, Heard):
+            if isinstance(what, Receipt):
                 key = what.sender, what.seq
-                if key not in self._on_the_air:
-                    self._on_the_air[key] = _Broadcast(0, self._looks)
-                self._on_the_air[key].mask |= self._bit[agent_id]
+                if key not in self._broadcasts:
+                    self._broadcasts[key] = _Broadcast(0, self._polls)
+                self._broadcasts[key].mask |= self._bit[agent_id]
                 continue
             key = agent_id, what.seq
-            before = self._on_the_air.get(key)
+            before = self._broadcasts.get(key)
             if before is not None and before.message is not None:
-                yield self._told(agent_id, before)  # another incarnation reuses the number
+                yield self._message_change(agent_id, before)  # another incarnation reuses the number
                 before = None
             mask = before.mask if before else 0
-            self._on_the_air[key] = _Broadcast(mask, self._looks, what.t, what.message, what.block)
-        old = self._looks if told_now else self._looks - LOOKS_UNTIL_TOLD
-        for key in [key for key, broadcast in self._on_the_air.items() if broadcast.looks <= old]:
-            broadcast = self._on_the_air.pop(key)
+            self._broadcasts[key] = _Broadcast(mask, self._polls, what.t, what.message, what.block)
+        old = self._polls if report_all else self._polls - POLLS_UNTIL_REPORTED
+        for key in [key for key, broadcast in self._broadcasts.items() if broadcast.polls <= old]:
+            broadcast = self._broadcasts.pop(key)
             if broadcast.message is not None:
-                yield self._told(key[0], broadcast)
+                yield self._message_change(key[0], broadcast)
 
-    def _told(self, sender: int, broadcast: _Broadcast) -> Change:
+    def _message_change(self, sender: int, broadcast: _Broadcast) -> Change:
         return ["m", broadcast.t, sender, broadcast.message, broadcast.block, f"{broadcast.mask:x}"]
 
     def _notes(self) -> Iterator[Change]:
         """Yield sentences about problems that were not reported yet."""
         damaged = (course.problem for course in self._courses)
-        for sentence in chain(self._around.problems, damaged):
-            if sentence is not None and sentence not in self._told_of:
-                self._told_of.add(sentence)
+        for sentence in chain(self._surroundings.problems, damaged):
+            if sentence is not None and sentence not in self._reported_problems:
+                self._reported_problems.add(sentence)
                 yield ["note", sentence]
 
     def _ending(self) -> dict[str, Any]:

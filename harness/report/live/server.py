@@ -22,7 +22,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 from harness.errors import MachineError
 from harness.report.html import PALETTE
 from harness.report.live._agent_course import Change
-from harness.report.live.change_log import Story
+from harness.report.live.change_log import ChangeLog
 
 _PAGE = Path(__file__).parent / "page"
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
@@ -34,7 +34,7 @@ GONE_S = 20.0
 """A browser that does not answer for this time counts as gone."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-Ask = Callable[[int, Any], None]
+RequestHandler = Callable[[int, Any], None]
 """Receives the number of a page and its request. `Server.answer` sends the answer."""
 MOST_ANSWERS = 32
 """Maximum number of waiting answers of one page. Further answers replace the oldest."""
@@ -66,9 +66,11 @@ class _Page:
 class Server:
     """Serve one change log. `live` states whether the run is still active."""
 
-    def __init__(self, story: Story, directory: Path, *, live: bool, ask: Ask | None = None) -> None:
+    def __init__(
+        self, log: ChangeLog, directory: Path, *, live: bool, on_request: RequestHandler | None = None
+    ) -> None:
         self.live = live
-        self._story, self._directory, self._ask = story, directory, ask
+        self._log, self._directory, self._on_request = log, directory, on_request
         self._token = secrets.token_urlsafe(24)
         self._files = _files()
         self._hosts: tuple[str, ...] = ()
@@ -82,7 +84,7 @@ class Server:
         Port 0 means any free port. Raises MachineError if the port is not available.
         """
         application = web.Application(middlewares=[self._guard], client_max_size=MAX_MESSAGE_BYTES)
-        application.router.add_get("/{token}/live", self._tell)
+        application.router.add_get("/{token}/live", self._stream)
         application.router.add_get("/{token}/report.html", self._report)
         application.router.add_get("/{token}/{name:.*}", self._file)
         runner = web.AppRunner(application, access_log=None, shutdown_timeout=1.0, handle_signals=False)
@@ -92,9 +94,9 @@ class Server:
             try:
                 await site.start()
             except OSError as error:
-                why = os.strerror(error.errno or 0)
+                reason = os.strerror(error.errno or 0)
                 raise MachineError(
-                    f"port {port} of 127.0.0.1 is not available: {why}; choose another port, or 0 for a free one"
+                    f"port {port} of 127.0.0.1 is not available: {reason}; choose another port, or 0 for a free one"
                 ) from None
             bound = runner.addresses[0][1]
             self._hosts = f"127.0.0.1:{bound}", f"localhost:{bound}"
@@ -110,8 +112,8 @@ class Server:
         """Reject requests without the token, and requests from other pages."""
         token = request.path.split("/")[1]
         origin = request.headers.get("Origin")
-        strange = request.host not in self._hosts or origin not in (None, *(f"http://{host}" for host in self._hosts))
-        if strange or not hmac.compare_digest(token.encode(), self._token.encode()):
+        foreign = request.host not in self._hosts or origin not in (None, *(f"http://{host}" for host in self._hosts))
+        if foreign or not hmac.compare_digest(token.encode(), self._token.encode()):
             return web.Response(status=403, text="This page needs the full address that ucp-harness printed.\n")
         try:
             response = await handler(request)
@@ -127,9 +129,9 @@ class Server:
         file = self._files.get(request.match_info["name"] or "index.html")
         if file is None:
             raise web.HTTPNotFound
-        here = " ".join(f"ws://{host}" for host in self._hosts)
+        web_sockets = " ".join(f"ws://{host}" for host in self._hosts)
         policy = (
-            f"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self' {here}; "
+            f"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self' {web_sockets}; "
             "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
         )
         return web.Response(
@@ -147,7 +149,7 @@ class Server:
         policy = "sandbox allow-scripts allow-popups; frame-ancestors 'none'"
         return web.FileResponse(path, headers={"Content-Security-Policy": policy, "Content-Type": "text/html"})
 
-    async def _tell(self, request: web.Request) -> web.WebSocketResponse:
+    async def _stream(self, request: web.Request) -> web.WebSocketResponse:
         if self.readers >= MAX_READERS:
             raise web.HTTPServiceUnavailable(reason=f"{MAX_READERS} pages are open, which is the maximum: close one")
         socket = web.WebSocketResponse(heartbeat=GONE_S, max_msg_size=MAX_MESSAGE_BYTES, compress=False)
@@ -157,7 +159,7 @@ class Server:
         self._pages[number] = page
         listening = asyncio.create_task(self._listen(number, socket))
         try:
-            await self._read_out(page)
+            await self._send_changes(page)
         except ConnectionError:
             pass  # the browser closed the connection
         finally:
@@ -175,23 +177,23 @@ class Server:
         if page in self._pages:
             self._pages[page].answers.append(json.dumps(answer) + "\n")
 
-    async def _read_out(self, page: _Page) -> None:
+    async def _send_changes(self, page: _Page) -> None:
         """Send answers and changes at the speed of the browser."""
         start, caught_up = 0, False
         while not page.socket.closed:
             if page.answers:
                 await page.socket.send_str(page.answers.popleft())
-            start, lines = self._story.read(start, may_skip=self.live and caught_up)
+            start, lines = self._log.read(start, may_skip=self.live and caught_up)
             if lines:
                 await page.socket.send_str(lines)
-            elif start >= self._story.size:
+            elif start >= self._log.size:
                 caught_up = True
                 await asyncio.sleep(UPDATE_S)
 
     async def _listen(self, page: int, socket: web.WebSocketResponse) -> None:
         """Receive requests of the page until it closes."""
         async for message in socket:
-            if message.type is WSMsgType.TEXT and self._ask is not None and self.live:
+            if message.type is WSMsgType.TEXT and self._on_request is not None and self.live:
                 with contextlib.suppress(ValueError, RecursionError):
-                    self._ask(page, json.loads(message.data))
+                    self._on_request(page, json.loads(message.data))
         await socket.close()

@@ -25,22 +25,22 @@ STATE_EVERY_S = 0.1
 LAST_LOOK_S = 60.0
 """Maximum wall time in which the server reads the rest of a run, and reports the number of open pages."""
 ENDING_S = 5.0
-MOST_WAITING = 10_000
+MAX_OUTGOING = 10_000
 """Maximum number of unsent lines. Further lines are lost, because the server hangs."""
 _LAST_LINES = 20
 _NO_REASON = "it does not say why"
 
 
-class Beside:
+class LivePage:
     """The process of the server, and the requests that it forwards from pages. `address` is the address of the page.
 
     The run never waits for the server. Threads write to the server and read from it.
     """
 
-    def __init__(self, directory: Path, port: int, hand: Interventions) -> None:
+    def __init__(self, directory: Path, port: int, interventions: Interventions) -> None:
         """Start the server. Raises MachineError if a package is missing or the port is not available."""
         require_packages()
-        self._hand = hand
+        self._interventions = interventions
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "harness.report.live", str(directory), str(port)],
             stdin=subprocess.PIPE,
@@ -51,41 +51,41 @@ class Beside:
             start_new_session=True,  # Ctrl-C must reach the run first
         )
         self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
-        self._complaining = _thread(self._hear_complaints)
-        self.address = _of(self._process.stdout).readline().strip()
+        self._error_reader = _thread(self._read_errors)
+        self.address = _required(self._process.stdout).readline().strip()
         if not self.address:
             self.close()
-            raise MachineError(self._last_words)
+            raise MachineError(self._last_error)
         self._ended = threading.Event()
-        self._unsaid: queue.Queue[list[Any] | None] = queue.Queue(MOST_WAITING)
+        self._outgoing: queue.Queue[list[Any] | None] = queue.Queue(MAX_OUTGOING)
         self._readers: int | None = None
         self._snapshot: Snapshot | None = None
-        self._saying, self._hearing = _thread(self._say_all), _thread(self._hear)
-        self._telling_state = _thread(self._tell_state)
+        self._writer, self._reader = _thread(self._write_lines), _thread(self._read_requests)
+        self._state_sender = _thread(self._send_state)
         self.problem: str | None = None
         """After the run: a sentence about an early end of the server, or None."""
 
-    def overhears(self, progress: Progress) -> Progress:
+    def tee(self, progress: Progress) -> Progress:
         """Return a progress display that also informs the page."""
-        return _Overheard(progress, self)
+        return _ProgressTee(progress, self)
 
-    def shows(self, snapshot: Snapshot) -> None:
+    def set_snapshot(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot
 
     def run_is_over(self) -> bool:
         """Inform the server that the run is over. Return whether a page is open."""
         self._ended.set()
-        self._telling_state.join()
-        self._say(["over"])
-        self._hearing.join(LAST_LOOK_S)
-        if self._hearing.is_alive():
+        self._state_sender.join()
+        self._send(["over"])
+        self._reader.join(LAST_LOOK_S)
+        if self._reader.is_alive():
             self.problem = f"the page hung: its server did not answer within {LAST_LOOK_S:g} s after the run"
         elif self._readers is None:
             from netem.lab import in_words  # imported late, because the import is slow
 
             end = in_words(self._process.wait())
-            self._complaining.join(ENDING_S)  # the thread may not have read the last line yet
-            self.problem = f"the server of the page ended by itself with {end} ({self._last_words}); the run continued"
+            self._error_reader.join(ENDING_S)  # the thread may not have read the last line yet
+            self.problem = f"the server of the page ended by itself with {end} ({self._last_error}); the run continued"
         return bool(self._readers)
 
     def wait(self) -> None:
@@ -100,50 +100,50 @@ class Beside:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._complaining.join()
+        self._error_reader.join()
         if self.address:
             self._ended.set()
-            self._telling_state.join()
-            self._unsaid.put(None)
-            self._saying.join()
-            self._hearing.join()
+            self._state_sender.join()
+            self._outgoing.put(None)
+            self._writer.join()
+            self._reader.join()
         for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
             with suppress(OSError):
-                _of(stream).close()
+                _required(stream).close()
 
     @property
-    def _last_words(self) -> str:
+    def _last_error(self) -> str:
         return self._last_lines[-1] if self._last_lines else _NO_REASON
 
-    def _hear_complaints(self) -> None:
+    def _read_errors(self) -> None:
         """Read the errors of the server. Without a reader, a full pipe would block the server."""
-        for line in _of(self._process.stderr):
+        for line in _required(self._process.stderr):
             if line.strip():
                 self._last_lines.append(line.strip())
 
-    def _say(self, what: list[Any]) -> None:
+    def _send(self, what: list[Any]) -> None:
         """Queue a line. A failed or hung server must not affect the run."""
         with suppress(queue.Full):
-            self._unsaid.put_nowait(what)
+            self._outgoing.put_nowait(what)
 
-    def _say_all(self) -> None:
-        to = _of(self._process.stdin)
-        while (what := self._unsaid.get()) is not None:
+    def _write_lines(self) -> None:
+        to = _required(self._process.stdin)
+        while (what := self._outgoing.get()) is not None:
             with suppress(OSError, ValueError):
                 to.write(json.dumps(what) + "\n")
                 to.flush()
 
-    def _hear(self) -> None:
-        for line in _of(self._process.stdout):
-            heard = json.loads(line)
-            if isinstance(heard, int):
-                self._readers = heard
+    def _read_requests(self) -> None:
+        for line in _required(self._process.stdout):
+            message = json.loads(line)
+            if isinstance(message, int):
+                self._readers = message
                 return
-            page, number, asked = heard
+            page, number, request = message
             try:
-                answer = _do(self._hand, asked)
+                answer = _perform(self._interventions, request)
             except (ValueError, TypeError, KeyError, AttributeError):
-                self._say(["answer", page, number, {"error": "that cannot be asked for"}])
+                self._send(["answer", page, number, {"error": "that cannot be asked for"}])
                 continue
             answer.add_done_callback(partial(self._answer, page, number))
 
@@ -151,33 +151,39 @@ class Beside:
         error = done.exception()
         if error is not None and not isinstance(error, HarnessError):
             error = MachineError(_NO_REASON)
-        self._say(["answer", page, number, {"at_s": done.result()} if error is None else {"error": str(error)}])
+        self._send(["answer", page, number, {"at_s": done.result()} if error is None else {"error": str(error)}])
 
-    def _tell_state(self) -> None:
+    def _send_state(self) -> None:
         """Send the mission second and the state of the controls whenever they change."""
         before: tuple[Any, ...] = ()
         now_s = -1.0
         while not self._ended.wait(STATE_EVERY_S):
-            hand, snapshot = self._hand, self._snapshot
+            interventions, snapshot = self._interventions, self._snapshot
             stage = snapshot.stage if snapshot else "starting"
-            state = hand.pace is not None, hand.paused, hand.factor, hand.closed, stage
+            state = (
+                interventions.pace is not None,
+                interventions.paused,
+                interventions.factor,
+                interventions.closed,
+                stage,
+            )
             if state != before:
                 before = state
                 keys = ("virtual", "paused", "factor", "closed", "stage")
-                self._say(["hand", dict(zip(keys, state, strict=True))])
+                self._send(["hand", dict(zip(keys, state, strict=True))])
             if snapshot is not None and snapshot.mission_s > now_s:
                 now_s = snapshot.mission_s
-                self._say(["t", round(now_s, 3)])
+                self._send(["t", round(now_s, 3)])
 
 
-class _Overheard:
+class _ProgressTee:
     """A progress display that also informs the page."""
 
-    def __init__(self, progress: Progress, beside: Beside) -> None:
-        self._progress, self._beside = progress, beside
+    def __init__(self, progress: Progress, live_page: LivePage) -> None:
+        self._progress, self._page = progress, live_page
 
     def show(self, snapshot: Snapshot) -> None:
-        self._beside.shows(snapshot)
+        self._page.set_snapshot(snapshot)
         self._progress.show(snapshot)
 
     def close(self) -> None:
@@ -190,34 +196,34 @@ def _thread(run: Callable[[], None]) -> threading.Thread:
     return thread
 
 
-def _of(stream: IO[str] | None) -> IO[str]:
+def _required(stream: IO[str] | None) -> IO[str]:
     assert stream is not None, "we asked for a pipe"
     return stream
 
 
-def _do(hand: Interventions, asked: dict[str, Any]) -> Future[float]:
+def _perform(interventions: Interventions, request: dict[str, Any]) -> Future[float]:
     """Perform a request. Raises ValueError, TypeError, KeyError or AttributeError if the request is invalid."""
-    match asked["do"]:
+    match request["do"]:
         case "happen":
-            return hand.ask(asked["entry"])
+            return interventions.ask(request["entry"])
         case "pause":
-            return hand.pause()
+            return interventions.pause()
         case "go on":
-            return hand.go_on()
+            return interventions.go_on()
         case "step":
-            return hand.step(float(asked["seconds"]))
+            return interventions.step(float(request["seconds"]))
         case "next run":
-            return hand.step_to_next_run()
+            return interventions.step_to_next_run()
         case "speed":
-            return hand.set_factor(None if asked["factor"] is None else float(asked["factor"]))
+            return interventions.set_factor(None if request["factor"] is None else float(request["factor"]))
         case _:
             raise ValueError("the request is unknown")
 
 
 @contextmanager
-def beside(directory: Path, port: int, hand: Interventions) -> Iterator[Beside]:
+def live_page(directory: Path, port: int, interventions: Interventions) -> Iterator[LivePage]:
     """Run a server for a run in that directory. Raises MachineError if it cannot start."""
-    server = Beside(directory, port, hand)
+    server = LivePage(directory, port, interventions)
     try:
         yield server
     finally:

@@ -53,8 +53,8 @@ def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
     """
     exports = archive.exports
     if not exports.by_agent and not exports.errors:
-        why = f"holds no exports (*{SUFFIX}), so there are no chains"
-        raise RunDirectoryError(f"{archive.directory}: {why}")
+        reason = f"holds no exports (*{SUFFIX}), so there are no chains"
+        raise RunDirectoryError(f"{archive.directory}: {reason}")
     record = archive.origin
     absent = sorted({*record.roster} - {*exports.by_agent})
     return Logbook(
@@ -72,12 +72,14 @@ def logged_telemetry(record: RunRecord) -> bool:
 
     Without vehicles they are random; without a run record they are telemetry.
     """
-    asked = record.scenario
-    if asked is None:
+    scenario = record.scenario
+    if scenario is None:
         return True
-    return asked.events.source == "mavlink" and asked.vehicles.kind != "none" and not in_virtual_time(record.backend)
+    return (
+        scenario.events.source == "mavlink" and scenario.vehicles.kind != "none" and not in_virtual_time(record.backend)
+    )
 
 
 def _absent(agent_id: int, agent: AgentRecord | None) -> str:
-    why = f" ({agent.outcome})" if agent is not None and agent.outcome != "exported" else ""
-    return f"agent {agent_id} has no export here{why}"
+    reason = f" ({agent.outcome})" if agent is not None and agent.outcome != "exported" else ""
+    return f"agent {agent_id} has no export here{reason}"

@@ -24,8 +24,8 @@ def lines(logbook: Logbook, decode: bool) -> Iterator[str]:
             yield f"  {name:<{width}}  {_block(block, logbook.event_data)}"
             if decode:
                 yield from (f"    {line}" for line in _events(block, logbook))
-        if beside := _beside(export):
-            yield f"  beside the chain: {beside}"
+        if outside := _outside_chain(export):
+            yield f"  beside the chain: {outside}"
 
 
 def document(logbook: Logbook, decode: bool) -> dict[str, Any]:
@@ -76,7 +76,7 @@ def _events(block: ExportedBlock, logbook: Logbook) -> Iterator[str]:
         yield f"unreadable: {error}"
 
 
-def _beside(export: Export) -> str:
+def _outside_chain(export: Export) -> str:
     waiting, stacked = len(export.blocks_to_be_committed), len(export.reconcile_stack)
     parts = (
         f"{_count(waiting, 'block')} to be committed" if waiting else "",

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 from xml.etree import ElementTree
 
-from harness.report.logbook.positions import Entry, Track, Whereabouts, coordinates, utc
+from harness.report.logbook.positions import GlobalPosition, LogEntry, Track, coordinates, utc
 from ucp.telemetry import describe
 
 
@@ -28,11 +28,11 @@ def _features(track: Track) -> Iterator[dict[str, Any]]:
         yield {"type": "Feature", "geometry": _point(entry), "properties": _properties(track, entry)}
 
 
-def _point(entry: Entry) -> dict[str, Any] | None:
+def _point(entry: LogEntry) -> dict[str, Any] | None:
     return {"type": "Point", "coordinates": coordinates(entry.position)} if entry.position else None
 
 
-def _properties(track: Track, entry: Entry) -> dict[str, Any]:
+def _properties(track: Track, entry: LogEntry) -> dict[str, Any]:
     return {
         "agent": track.agent_id,
         "block": entry.block,
@@ -80,7 +80,7 @@ def _track(folder: ElementTree.Element, track: Track) -> None:
         coord.text = _numbers(position, " ")
 
 
-def _placemark(folder: ElementTree.Element, entry: Entry) -> None:
+def _placemark(folder: ElementTree.Element, entry: LogEntry) -> None:
     if entry.position is None:
         return
     placemark = _add(folder, "Placemark")
@@ -92,7 +92,7 @@ def _placemark(folder: ElementTree.Element, entry: Entry) -> None:
     _add(point, "coordinates", _numbers(entry.position, ","))
 
 
-def _numbers(position: Whereabouts, separator: str) -> str:
+def _numbers(position: GlobalPosition, separator: str) -> str:
     lon, lat, alt = coordinates(position)
     return f"{lon:.7f}{separator}{lat:.7f}{separator}{alt:.3f}"
 

@@ -21,7 +21,7 @@ LAST_TIMESTAMP_US = 253_402_300_799_999_999
 """The end of the year 9999. Map programs cannot show later times."""
 
 
-class Whereabouts(Protocol):
+class GlobalPosition(Protocol):
     """A position in 1e-7 degrees, and in millimetres above mean sea level."""
 
     @property
@@ -33,7 +33,7 @@ class Whereabouts(Protocol):
 
 
 @dataclass(frozen=True)
-class Entry:
+class LogEntry:
     """One event in block `block`. `position` is the event's own or the vehicle's last one, or None if there is none.
 
     `position_age_s` is the age of the position at the time of the event, in seconds.
@@ -42,7 +42,7 @@ class Entry:
     block: str
     event: LoggableEvent
     is_position: bool
-    position: Whereabouts | None
+    position: GlobalPosition | None
     position_age_s: float | None
 
 
@@ -51,8 +51,8 @@ class Track:
     """All events of one agent, oldest first. `fixes` are its positions with their timestamps in microseconds."""
 
     agent_id: int
-    entries: list[Entry]
-    fixes: list[tuple[int, Whereabouts]]
+    entries: list[LogEntry]
+    fixes: list[tuple[int, GlobalPosition]]
 
 
 def tracks(logbook: Logbook) -> list[Track]:
@@ -63,11 +63,11 @@ def tracks(logbook: Logbook) -> list[Track]:
     for export in logbook.exports.values():
         for block in export.blocks():
             blocks.setdefault(block.agent_id, {})[block.timestamp_us, block.event_data] = block
-    made = (track_of(agent_id, _events(logbook, blocks[agent_id].values())) for agent_id in sorted(blocks))
-    return [track for track in made if track.fixes]
+    all_tracks = (track_of(agent_id, _events(logbook, blocks[agent_id].values())) for agent_id in sorted(blocks))
+    return [track for track in all_tracks if track.fixes]
 
 
-def coordinates(position: Whereabouts) -> tuple[float, float, float]:
+def coordinates(position: GlobalPosition) -> tuple[float, float, float]:
     """Return longitude and latitude in degrees, and altitude in metres above mean sea level."""
     return position.lon_e7 / 1e7, position.lat_e7 / 1e7, position.alt_mm / 1e3
 
@@ -101,11 +101,11 @@ def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> Trac
             track.fixes.append((event.timestamp_us, own))
         at_us, position = track.fixes[-1] if track.fixes else (None, None)
         age_s = None if at_us is None else (event.timestamp_us - at_us) / 1e6
-        track.entries.append(Entry(block, event, own is not None, position, age_s))
+        track.entries.append(LogEntry(block, event, own is not None, position, age_s))
     return track
 
 
-class Place(NamedTuple):
+class RoundedPosition(NamedTuple):
     """A position in 1e-7 degrees, and in millimetres above mean sea level."""
 
     lat_e7: int
@@ -113,7 +113,7 @@ class Place(NamedTuple):
     alt_mm: int
 
 
-def flown(record: RunRecord, recorded: Tracks) -> list[Track]:
+def recorded_tracks(record: RunRecord, recorded: Tracks) -> list[Track]:
     """Return a track without events for each recorded vehicle, around the home of the scenario."""
     if record.scenario is None:
         return []
@@ -122,9 +122,11 @@ def flown(record: RunRecord, recorded: Tracks) -> list[Track]:
 
 
 def _track(vehicle: int, fixes: Sequence[Fix], home: Home) -> Track:
-    return Track(vehicle, [], [(round(fix.at_s * 1e6), _place(fix, home)) for fix in fixes])
+    return Track(vehicle, [], [(round(fix.at_s * 1e6), _rounded_position(fix, home)) for fix in fixes])
 
 
-def _place(fix: Fix, home: Home) -> Place:
-    there = home.offset(fix.north_m, fix.east_m)
-    return Place(round(there.lat_deg * 1e7), round(there.lon_deg * 1e7), round((there.alt_m + fix.up_m) * 1e3))
+def _rounded_position(fix: Fix, home: Home) -> RoundedPosition:
+    position = home.offset(fix.north_m, fix.east_m)
+    return RoundedPosition(
+        round(position.lat_deg * 1e7), round(position.lon_deg * 1e7), round((position.alt_m + fix.up_m) * 1e3)
+    )

@@ -14,7 +14,7 @@ from math import floor, inf, isfinite
 from harness.archive.history import in_time
 from harness.archive.traces import Trace
 from harness.report.stories.story_file import Section
-from harness.report.stories.story_names import ANSWERS, INCEPTION, LocalChain, Names, told
+from harness.report.stories.story_names import ANSWERS, INCEPTION, LocalChain, Names, message_text
 from ucp.agent import HANDLERS
 from ucp.trace import HandlerRun, Sent
 from ucp.trigger import LocalTrigger, MessageTrigger, TimerTrigger
@@ -25,16 +25,16 @@ as punctual. A slow machine is late more often the faster it plays a mission."""
 
 
 @dataclass
-class Deed:
+class Action:
     """An action of an agent: a handler run that an input triggered, and the handler runs that it triggered locally."""
 
     agent_id: int
     position: int
     """Index in the agent's trace."""
     runs: list[HandlerRun]
-    cause: "Deed | None" = None
+    cause: "Action | None" = None
     """The action that sent the triggering message, if there was one."""
-    reached: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
+    receivers: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
     """Receivers of each sent message, by sequence number."""
     at_s: float = 0.0
     """Mission second at which the first cause would have begun without any lateness."""
@@ -46,7 +46,7 @@ class Deed:
         return floor(self.at_s)
 
     @property
-    def heard_from(self) -> int | None:
+    def sender(self) -> int | None:
         trigger = self.runs[0].trigger
         return trigger.sender if isinstance(trigger, MessageTrigger) else None
 
@@ -61,103 +61,107 @@ class Deed:
         return next((sent for run in self.runs for sent in run.sent if sent.seq == sequence), None)
 
     @property
-    def does_something(self) -> bool:
+    def has_effect(self) -> bool:
         """True if the action changed the agent's blocks or sent a message."""
         return len(self.runs) > 1 or any(run.changes or run.sent for run in self.runs)
 
     @property
-    def is_answer_to_another(self) -> bool:
+    def answers_another_agent(self) -> bool:
         """True for the receipt of an answer to another agent. Answers are broadcasts, so all agents receive them."""
         if self.answer is None or self.cause is None:
             return False
-        asked_by = self.cause.heard_from
-        return asked_by is not None and asked_by != self.agent_id and not self.does_something
+        asked_by = self.cause.sender
+        return asked_by is not None and asked_by != self.agent_id and not self.has_effect
 
 
-class Telling:
+class Narrator:
     """The story of the traces of all agents on the roster."""
 
     def __init__(self, traces: Mapping[int, Trace], roster: Sequence[int]) -> None:
         self._traces = traces
         self._roster = roster
         self._names = Names(traces)
-        self._deeds = sorted(
-            (deed for deed in _connected(traces) if not deed.is_answer_to_another),
-            key=lambda deed: (deed.instant, deed.distance, deed.agent_id, deed.heard_from or 0, deed.position),
+        self._actions = sorted(
+            (action for action in _actions_with_causes(traces) if not action.answers_another_agent),
+            key=lambda action: (action.instant, action.distance, action.agent_id, action.sender or 0, action.position),
         )
 
     def answer(self, section: Section, *, first: bool = False) -> list[str]:
         """Return the lines of a section. The first section also contains earlier actions."""
         from_s = 0 if first else section.from_s
-        deeds = [deed for deed in self._deeds if from_s <= deed.instant and _before(deed.instant, section.until_s)]
+        actions = [
+            action for action in self._actions if from_s <= action.instant and _before(action.instant, section.until_s)
+        ]
         lines: list[str] = []
-        for instant, of_instant in groupby(deeds, key=lambda deed: deed.instant):
+        for instant, of_instant in groupby(actions, key=lambda action: action.instant):
             lines += [f"at {instant} s", *self._instant([*of_instant])]
         return [*lines, *(self._chains(section.until_s) if section.shows_chains else [])]
 
-    def _instant(self, deeds: Sequence[Deed]) -> Iterator[str]:
+    def _instant(self, actions: Sequence[Action]) -> Iterator[str]:
         """Yield the lines of an instant. Agents with equal actions at the same distance share their lines."""
-        alike: dict[tuple[int, int, object], list[Deed]] = {}
-        for deed in deeds:
-            key = deed.distance, deed.agent_id, self._kind(deed)
-            if deed.does_something and any(other.does_something for other in alike.get(key, ())):
-                key = deed.distance, deed.agent_id, deed.position
-            alike.setdefault(key, []).append(deed)
+        equal: dict[tuple[int, int, object], list[Action]] = {}
+        for action in actions:
+            key = action.distance, action.agent_id, self._kind(action)
+            if action.has_effect and any(other.has_effect for other in equal.get(key, ())):
+                key = action.distance, action.agent_id, action.position
+            equal.setdefault(key, []).append(action)
         together: dict[tuple[int, tuple[str, ...]], list[int]] = {}
-        for (distance, agent_id, _), alikes in alike.items():
-            together.setdefault((distance, tuple(self._lines(alikes))), []).append(agent_id)
+        for (distance, agent_id, _), equals in equal.items():
+            together.setdefault((distance, tuple(self._lines(equals))), []).append(agent_id)
         for (_, lines), agents in together.items():
             yield from (f"  {_listed(agents):<10}{line}" for line in lines)
 
-    def _kind(self, deed: Deed) -> object:
+    def _kind(self, action: Action) -> object:
         """Return a key. Actions of one agent with equal keys are merged, because they concern the same answer.
 
         Which of several equal answers arrives first, and therefore counts, is random.
         """
-        run = deed.runs[0]
-        if deed.cause is None or deed.answer is None:
-            return deed.position
-        sent = deed.cause.message(deed.answer.sequence)
-        return run.handler, told(sent, self._names) if sent else run.branch
+        run = action.runs[0]
+        if action.cause is None or action.answer is None:
+            return action.position
+        sent = action.cause.message(action.answer.sequence)
+        return run.handler, message_text(sent, self._names) if sent else run.branch
 
-    def _lines(self, alike: Sequence[Deed]) -> Iterator[str]:
+    def _lines(self, equal: Sequence[Action]) -> Iterator[str]:
         """Yield a line for each handler run: algorithm, name, branch, changes and messages.
 
         For merged answers, the first line lists all branches in order.
         """
-        heard_from = [deed.heard_from for deed in alike if deed.heard_from is not None]
-        in_order = sorted(alike, key=lambda deed: deed.position)
-        deed = next((deed for deed in in_order if deed.does_something), in_order[0])
-        branches = ", ".join(dict.fromkeys(deed.runs[0].branch for deed in in_order))
-        for number, run in enumerate(deed.runs):
+        sender = [action.sender for action in equal if action.sender is not None]
+        in_order = sorted(equal, key=lambda action: action.position)
+        action = next((action for action in in_order if action.has_effect), in_order[0])
+        branches = ", ".join(dict.fromkeys(action.runs[0].branch for action in in_order))
+        for number, run in enumerate(action.runs):
             handler = HANDLERS.get(run.handler)
             title = handler.title.partition(" ")[2] if handler else run.handler
-            if number == 0 and heard_from:
-                title += f" from {_listed(heard_from)}"
+            if number == 0 and sender:
+                title += f" from {_listed(sender)}"
             rest = [branches if number == 0 else run.branch]
             if run.changes:
                 rest.append(", ".join(self._change(operation, block) for operation, block in run.changes))
-            rest[-1] += "".join(f" -> {told(sent, self._names)}{self._missed(deed, sent)}" for sent in run.sent)
+            rest[-1] += "".join(
+                f" -> {message_text(sent, self._names)}{self._missing_receivers(action, sent)}" for sent in run.sent
+            )
             yield f" {run.algorithm:>2}  {title}: {'; '.join(rest)}"
 
     def _change(self, operation: str, block: str) -> str:
         name = self._names.block(block)
         return f"completes {name}" if operation == "complete" else f"{operation[:-1]} {operation[-1]}{name}"
 
-    def _missed(self, deed: Deed, sent: Sent) -> str:
+    def _missing_receivers(self, action: Action, sent: Sent) -> str:
         """Return a note about agents that did not receive the message.
 
         An answer only matters to the agent that asked.
         """
-        meant = {deed.heard_from} if sent.message in ANSWERS else {*self._roster} - {deed.agent_id}
-        missed = sorted(agent for agent in meant - deed.reached[sent.seq] if agent is not None)
+        meant = {action.sender} if sent.message in ANSWERS else {*self._roster} - {action.agent_id}
+        missed = sorted(agent for agent in meant - action.receivers[sent.seq] if agent is not None)
         return f", not to {_listed(missed)}" if missed else ""
 
     def _chains(self, until_s: int | None) -> list[str]:
         """Return the chains as a tree with the agents at the ends."""
         chains: dict[int, list[str]] = {}
         for agent_id, trace in self._traces.items():
-            positions = {deed.position: deed.instant for deed in self._deeds if deed.agent_id == agent_id}
+            positions = {action.position: action.instant for action in self._actions if action.agent_id == agent_id}
             chain, instant = LocalChain(trace), 0
             for position, run in enumerate(trace.runs):
                 instant = positions.get(position, instant)
@@ -172,60 +176,60 @@ class Telling:
         return ["chains", *_tree({agent_id: [INCEPTION, *chain] for agent_id, chain in chains.items()}, "  ")]
 
 
-def _connected(traces: Mapping[int, Trace]) -> list[Deed]:
+def _actions_with_causes(traces: Mapping[int, Trace]) -> list[Action]:
     """Return all actions, each with its cause."""
-    deeds = [deed for agent_id, trace in traces.items() for deed in _deeds(agent_id, trace)]
-    sent: dict[tuple[int, int], list[Deed]] = defaultdict(list)
-    for deed in deeds:
-        for run in deed.runs:
+    actions = [action for agent_id, trace in traces.items() for action in _actions(agent_id, trace)]
+    sent: dict[tuple[int, int], list[Action]] = defaultdict(list)
+    for action in actions:
+        for run in action.runs:
             for message in run.sent:
-                sent[deed.agent_id, message.seq].append(deed)
+                sent[action.agent_id, message.seq].append(action)
     due: dict[tuple[int, object], float] = {}
     """(agent ID, timer) -> the mission second at which the timer should end."""
-    for deed in sorted(deeds, key=lambda deed: (deed.runs[0].t, deed.agent_id, deed.position)):
-        run = deed.runs[0]
+    for action in sorted(actions, key=lambda action: (action.runs[0].t, action.agent_id, action.position)):
+        run = action.runs[0]
         timer = run.trigger.timer if isinstance(run.trigger, TimerTrigger) else None
-        timer_ends_s = due.get((deed.agent_id, timer), -inf)
-        deed.at_s = timer_ends_s if run.t - timer_ends_s < INSTANT_S else run.t
-        if deed.heard_from is not None:
-            _hear(deed, sent)
-        for run in deed.runs:
+        timer_ends_s = due.get((action.agent_id, timer), -inf)
+        action.at_s = timer_ends_s if run.t - timer_ends_s < INSTANT_S else run.t
+        if action.sender is not None:
+            _set_cause(action, sent)
+        for run in action.runs:
             due |= {
-                (deed.agent_id, timer): deed.at_s + lasts_s
+                (action.agent_id, timer): action.at_s + lasts_s
                 for timer, lasts_s in (run.started or {}).items()
                 if isfinite(lasts_s)
             }
-    return deeds
+    return actions
 
 
-def _hear(deed: Deed, sent: Mapping[tuple[int, int], Sequence[Deed]]) -> None:
+def _set_cause(action: Action, sent: Mapping[tuple[int, int], Sequence[Action]]) -> None:
     """Set the cause of an action that a message triggered."""
-    run = deed.runs[0]
+    run = action.runs[0]
     if not isinstance(run.trigger, MessageTrigger):
         return
     sender, sequence = run.trigger.sender, run.trigger.sequence
     earlier = [cause for cause in sent.get((sender, sequence), ()) if cause.runs[0].t < run.t]
     if earlier:
-        cause = deed.cause = max(earlier, key=lambda cause: cause.runs[0].t)
-        cause.reached[sequence].add(deed.agent_id)
+        cause = action.cause = max(earlier, key=lambda cause: cause.runs[0].t)
+        cause.receivers[sequence].add(action.agent_id)
         if run.t - cause.runs[0].t < INSTANT_S:
-            deed.at_s, deed.distance = cause.at_s, cause.distance + 1
+            action.at_s, action.distance = cause.at_s, cause.distance + 1
 
 
-def _deeds(agent_id: int, trace: Trace) -> Iterator[Deed]:
+def _actions(agent_id: int, trace: Trace) -> Iterator[Action]:
     """Yield the actions of a trace. Local events belong to the action that triggered them."""
-    deed: Deed | None = None
+    action: Action | None = None
     for position, run in enumerate(trace.runs):
         if not in_time(run):
             continue
-        if isinstance(run.trigger, LocalTrigger) and deed is not None:
-            deed.runs.append(run)
+        if isinstance(run.trigger, LocalTrigger) and action is not None:
+            action.runs.append(run)
             continue
-        if deed is not None:
-            yield deed
-        deed = Deed(agent_id, position, [run])
-    if deed is not None:
-        yield deed
+        if action is not None:
+            yield action
+        action = Action(agent_id, position, [run])
+    if action is not None:
+        yield action
 
 
 def _tree(chains: Mapping[int, Sequence[str]], indent: str) -> Iterator[str]:
@@ -238,11 +242,11 @@ def _tree(chains: Mapping[int, Sequence[str]], indent: str) -> Iterator[str]:
     ends = [agent_id for agent_id, chain in chains.items() if len(chain) == common]
     blocks = next(iter(chains.values()))[:common]
     yield f"{indent}{' '.join(blocks)}{f'  ({_listed(ends)})' if ends else ''}"
-    further: dict[str, dict[int, Sequence[str]]] = {}
+    branches: dict[str, dict[int, Sequence[str]]] = {}
     for agent_id, chain in chains.items():
         if len(chain) > common:
-            further.setdefault(chain[common], {})[agent_id] = chain[common:]
-    for branch in further.values():
+            branches.setdefault(chain[common], {})[agent_id] = chain[common:]
+    for branch in branches.values():
         yield from _tree(branch, indent + "  ")
 
 

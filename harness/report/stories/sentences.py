@@ -25,7 +25,7 @@ SENTENCES = (
 )
 
 
-class Course:
+class StoryEntries:
     """The scenario entries of the sentences so far: `script` for events, `timeline` for the rest, and the end."""
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Course:
         self.timeline: list[dict[str, Any]] = []
         self.ends_at_s: int | None = None
 
-    def tell(self, at_s: int, sentence: str) -> None:
+    def add(self, at_s: int, sentence: str) -> None:
         """Add a sentence. Raises ScenarioError if its form is unknown."""
         if sentence == "end":
             self.ends_at_s = at_s
@@ -42,45 +42,45 @@ class Course:
         elif sentence.startswith("{"):
             self.timeline.append({"at_s": at_s, **_entry(sentence)})
         elif sentence != "chains" and not any(
-            tell(at_s, told) for pattern, tell in self._patterns() if (told := pattern.fullmatch(sentence))
+            add(at_s, match) for pattern, add in self._patterns() if (match := pattern.fullmatch(sentence))
         ):
             raise ScenarioError(f"{sentence[:80]!r} is not a sentence of a story: use {SENTENCES}")
 
     def _patterns(self) -> list[tuple[re.Pattern[str], Callable[[int, re.Match[str]], bool]]]:
         return [
-            (_LOGS, self._logs),
-            (_CUT, self._cuts),
-            (_JOINED, self._joins),
-            (_PARTITION, self._parts),
-            (_VERB, self._strikes),
+            (_LOGS, self._log_events),
+            (_CUT, self._cut_links),
+            (_JOINED, self._join_links),
+            (_PARTITION, self._partition),
+            (_VERB, self._fault),
         ]
 
-    def _logs(self, at_s: int, told: re.Match[str]) -> bool:
-        data_bytes = int(told[2] or EVENT_BYTES)
-        self.script += [{"at_s": at_s, "agent": agent, "bytes": data_bytes} for agent in _ids(told[1])]
+    def _log_events(self, at_s: int, match: re.Match[str]) -> bool:
+        data_bytes = int(match[2] or EVENT_BYTES)
+        self.script += [{"at_s": at_s, "agent": agent, "bytes": data_bytes} for agent in _ids(match[1])]
         return True
 
-    def _cuts(self, at_s: int, told: re.Match[str]) -> bool:
-        return self._links(at_s, told, 1.0)
+    def _cut_links(self, at_s: int, match: re.Match[str]) -> bool:
+        return self._set_links(at_s, match, 1.0)
 
-    def _joins(self, at_s: int, told: re.Match[str]) -> bool:
-        return self._links(at_s, told, 0.0)
+    def _join_links(self, at_s: int, match: re.Match[str]) -> bool:
+        return self._set_links(at_s, match, 0.0)
 
-    def _links(self, at_s: int, told: re.Match[str], loss: float) -> bool:
-        link = {"from": _ids(told[1]), "to": _ids(told[2]), "loss": loss}
+    def _set_links(self, at_s: int, match: re.Match[str], loss: float) -> bool:
+        link = {"from": _ids(match[1]), "to": _ids(match[2]), "loss": loss}
         self.timeline.append({"at_s": at_s, "network": {"links": [link]}})
         return True
 
-    def _parts(self, at_s: int, told: re.Match[str]) -> bool:
+    def _partition(self, at_s: int, match: re.Match[str]) -> bool:
         self.timeline.append(
-            {"at_s": at_s, "partition": [_ids(group) for group in told[0].removeprefix("partition").split("|")]}
+            {"at_s": at_s, "partition": [_ids(group) for group in match[0].removeprefix("partition").split("|")]}
         )
         return True
 
-    def _strikes(self, at_s: int, told: re.Match[str]) -> bool:
-        if told[1] not in VERBS:
+    def _fault(self, at_s: int, match: re.Match[str]) -> bool:
+        if match[1] not in VERBS:
             return False
-        self.timeline.append({"at_s": at_s, told[1]: _ids(told[2])})
+        self.timeline.append({"at_s": at_s, match[1]: _ids(match[2])})
         return True
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.errors import ScenarioError
-from harness.report.stories.sentences import Course
+from harness.report.stories.sentences import StoryEntries
 from harness.scenario import Scenario
 from harness.scenario.load import parse, parse_yaml
 
@@ -71,7 +71,7 @@ class Story:
             if line or (lines and lines[-1]):  # one empty line is enough
                 lines.append(line)
             if after.get(number):
-                lines += ["", *(f"{INDENT}{told}" for told in after[number]), ""]
+                lines += ["", *(f"{INDENT}{text}" for text in after[number]), ""]
         while not lines[-1]:
             lines.pop()
         return "\n".join(lines) + "\n"
@@ -102,16 +102,16 @@ def read_story(path: Path) -> Story:
 
 
 def _parsed(path: Path, text: str) -> Story:
-    given = text.splitlines()
-    begins = next((number for number, line in enumerate(given) if _SENTENCE.fullmatch(line)), None)
-    if begins is None:
+    file_lines = text.splitlines()
+    first = next((number for number, line in enumerate(file_lines) if _SENTENCE.fullmatch(line)), None)
+    if first is None:
         raise ScenarioError("it has no sentence, such as `1 s: 1 logs`")
-    while begins and given[begins - 1].startswith("#"):  # the comment above the first sentence
-        begins -= 1
-    lines, course = [*given[:begins], ""], Course()
-    told: list[tuple[int, int, bool]] = []  # line, second, whether chains are shown
-    told_in: dict[str, list[int]] = {"events.script": [], "timeline": []}  # entry -> its line in the file
-    for number, line in enumerate(given[begins:], begins + 1):
+    while first and file_lines[first - 1].startswith("#"):  # the comment above the first sentence
+        first -= 1
+    lines, parsed = [*file_lines[:first], ""], StoryEntries()
+    sentences: list[tuple[int, int, bool]] = []  # line, second, whether chains are shown
+    entry_lines: dict[str, list[int]] = {"events.script": [], "timeline": []}  # entry -> its line in the file
+    for number, line in enumerate(file_lines[first:], first + 1):
         if line.startswith((" ", "\t")) or not line.strip():
             continue
         if line.startswith("#"):
@@ -123,33 +123,34 @@ def _parsed(path: Path, text: str) -> Story:
                 f"line {number}: {line[:80]!r} is not a sentence: start it with its mission second, such as `12 s: `"
             )
         at_s, words = int(sentence[1]), sentence[2].rstrip()
-        if told and at_s < told[-1][1]:
+        if sentences and at_s < sentences[-1][1]:
             raise ScenarioError(
-                f"line {number}: {at_s} s is before {told[-1][1]} s of an earlier sentence: order the sentences by time"
+                f"line {number}: {at_s} s is before {sentences[-1][1]} s of an earlier sentence: "
+                "order the sentences by time"
             )
-        if course.ends_at_s is not None:
+        if parsed.ends_at_s is not None:
             raise ScenarioError(f"line {number}: a sentence follows the end")
         try:
-            course.tell(at_s, words)
+            parsed.add(at_s, words)
         except ScenarioError as error:
             raise ScenarioError(f"line {number}: {error}") from None
-        for entries, of in zip((course.script, course.timeline), told_in.values(), strict=True):
+        for entries, of in zip((parsed.script, parsed.timeline), entry_lines.values(), strict=True):
             of += [number] * (len(entries) - len(of))
         lines.append(line)
-        told.append((len(lines) - 1, at_s, words in ("chains", "end")))
-    if course.ends_at_s is None:
+        sentences.append((len(lines) - 1, at_s, words in ("chains", "end")))
+    if parsed.ends_at_s is None:
         raise ScenarioError("it has no end: add a last sentence such as `60 s: end`")
     try:
-        scenario = _scenario(path, given[:begins], course)
+        scenario = _scenario(path, file_lines[:first], parsed)
     except ScenarioError as error:
-        raise ScenarioError(_in_its_line(str(error), told_in)) from None
-    return Story(path, text, lines, scenario, _sections(told))
+        raise ScenarioError(_in_its_line(str(error), entry_lines)) from None
+    return Story(path, text, lines, scenario, _sections(sentences))
 
 
-def _in_its_line(problem: str, told_in: Mapping[str, Sequence[int]]) -> str:
+def _in_its_line(problem: str, entry_lines: Mapping[str, Sequence[int]]) -> str:
     """Replace the name of a scenario entry in an error message by the line of its sentence."""
     entry = _ENTRY.match(problem)
-    return f"line {told_in[entry[2]][int(entry[3])]}: {entry[1]}{problem[entry.end() :]}" if entry else problem
+    return f"line {entry_lines[entry[2]][int(entry[3])]}: {entry[1]}{problem[entry.end() :]}" if entry else problem
 
 
 def _gap(lines: Sequence[str]) -> list[str]:
@@ -157,9 +158,11 @@ def _gap(lines: Sequence[str]) -> list[str]:
     return [""] if _SENTENCE.fullmatch(lines[-1]) else []
 
 
-def _sections(told: Sequence[tuple[int, int, bool]]) -> list[Section]:
+def _sections(sentences: Sequence[tuple[int, int, bool]]) -> list[Section]:
     """Return one section for each second, after the last sentence of that second."""
-    last = {at_s: (line, any(chains for _, other_s, chains in told if other_s == at_s)) for line, at_s, _ in told}
+    last = {
+        at_s: (line, any(chains for _, other_s, chains in sentences if other_s == at_s)) for line, at_s, _ in sentences
+    }
     seconds = [*last]
     return [
         Section(line, at_s, until_s, chains)
@@ -167,7 +170,7 @@ def _sections(told: Sequence[tuple[int, int, bool]]) -> list[Section]:
     ]
 
 
-def _scenario(path: Path, header: Sequence[str], course: Course) -> Scenario:
+def _scenario(path: Path, header: Sequence[str], parsed: StoryEntries) -> Scenario:
     try:
         keys = parse_yaml("\n".join(header)) or {}
     except ScenarioError as error:
@@ -181,8 +184,8 @@ def _scenario(path: Path, header: Sequence[str], course: Course) -> Scenario:
         "vehicles": {"kind": "none"},
         "speedup": SPEEDUP,
         **keys,
-        "events": {"source": "scripted", "script": course.script},
-        "timeline": course.timeline,
-        "duration_s": course.ends_at_s,
+        "events": {"source": "scripted", "script": parsed.script},
+        "timeline": parsed.timeline,
+        "duration_s": parsed.ends_at_s,
     }
     return parse(document)

@@ -24,7 +24,7 @@ from ucp.messages import (
 from ucp.trace import HandlerRun, Sent
 
 INCEPTION = "inception"
-SPELT_OUT = 4
+MAX_FULL_CHAIN = 4
 """Maximum length of a chain that is written in full. Longer chains are named by their first and last blocks."""
 
 
@@ -86,21 +86,21 @@ class Names:
     def chain(self, chain_hash: bytes) -> str:
         """Return "1.1 2.1", or "1.1 .. 4.2" for a long chain."""
         blocks = self._chains.get(chain_hash)
-        return "an unknown chain" if blocks is None else _spelt(blocks)
+        return "an unknown chain" if blocks is None else _chain_text(blocks)
 
     def chain_below(self, chain_hash: bytes) -> str:
         """Return the name of the chain without its top block."""
         blocks = self._chains.get(chain_hash)
-        return "an unknown chain" if not blocks else _spelt(blocks[:-1])
+        return "an unknown chain" if not blocks else _chain_text(blocks[:-1])
 
 
-def _spelt(blocks: Sequence[str]) -> str:
+def _chain_text(blocks: Sequence[str]) -> str:
     if not blocks:
         return INCEPTION
-    return " ".join(blocks) if len(blocks) <= SPELT_OUT else f"{blocks[0]} .. {blocks[-1]}"
+    return " ".join(blocks) if len(blocks) <= MAX_FULL_CHAIN else f"{blocks[0]} .. {blocks[-1]}"
 
 
-class Naming(Protocol):
+class NameSource(Protocol):
     """A source of names for blocks and chains."""
 
     def block(self, block_hash: str) -> str: ...
@@ -115,7 +115,7 @@ ANSWERS = frozenset(
 )
 """Names of messages that answer one agent."""
 
-_SAYS: dict[type[Message], Callable[[Any, Naming], str]] = {
+_FORMATS: dict[type[Message], Callable[[Any, NameSource], str]] = {
     BlockAddRequest: lambda message, names: (
         f"{names.block(message.block_hash.hex())} on {names.chain(message.chain_hash)}"
     ),
@@ -139,7 +139,7 @@ _SAYS: dict[type[Message], Callable[[Any, Naming], str]] = {
 }
 
 
-def told(sent: Sent, names: Names) -> str:
+def message_text(sent: Sent, names: Names) -> str:
     """Return the text of a message that a trace contains."""
     if sent.datagram is None:
         return f"{sent.message} (not recorded)"
@@ -150,6 +150,6 @@ def told(sent: Sent, names: Names) -> str:
     return in_words(message, names)
 
 
-def in_words(message: Message, names: Naming) -> str:
+def in_words(message: Message, names: NameSource) -> str:
     """Return a text such as "Chain Contain Query (1.1 2.1)"."""
-    return f"{message.NAME} ({_SAYS[type(message)](message, names)})"
+    return f"{message.NAME} ({_FORMATS[type(message)](message, names)})"

@@ -12,7 +12,7 @@ import pytest
 
 from harness.errors import RunDirectoryError
 from harness.play.progress import Silent
-from harness.report.difference import AgentDifference, ChainParting, KeyDifference, compare
+from harness.report.difference import AgentDifference, ChainDifference, KeyDifference, compare
 from harness.report.difference._run_difference import differing_keys
 from harness.run.run import run
 from harness.scenario import load_scenario
@@ -63,7 +63,7 @@ def test_one_lost_commit_is_where_the_runs_part(tmp_path: Path) -> None:
     assert [(one.key, one.b) for one in found.keys] == [("fates", [])]
     parted = found.agents.pop(2)
     assert set(found.agents.values()) == {SAME}
-    assert parted.chain == ChainParting(4, None, "4.2")
+    assert parted.chain == ChainDifference(4, None, "4.2")
     assert parted.run is not None and parted.run.a is None and parted.run.b is not None
     assert (parted.run.b.handler, parted.run.b.branch) == ("receive_commit_block", "committed")
     assert parted.run.b.trigger.to_json()["from"] == 4
@@ -89,8 +89,8 @@ def test_as_json_it_says_the_same(a: Path, b: Path) -> None:
     found = json.loads(done.stdout)
     assert (found["verdict"], found["first"], found["keys"]) == ("differ", 2, [])
     assert found["agents"]["1"] == {"run": None, "chain": None}
-    parting = found["agents"]["2"]["run"]
-    assert (parting["number"], parting["a"]["line"], parting["b"]["branch"]) == (5, 6, "another")
+    first = found["agents"]["2"]["run"]
+    assert (first["number"], first["a"]["line"], first["b"]["branch"]) == (5, 6, "another")
 
 
 def test_other_times_and_other_hashes_of_the_same_blocks_are_no_difference(a: Path, b: Path) -> None:
@@ -149,9 +149,9 @@ def test_another_life_of_an_agent_is_a_difference_even_if_it_does_the_same(a: Pa
     trace(b).write_text("".join([*lines[:4], lines[0], *lines[4:]]))
     found = compare(a, b)
     assert found.first == 2
-    parting = found.agents[2].run
-    assert parting is not None and parting.a is not None and parting.b is not None
-    assert (parting.number, parting.a.life, parting.b.life, parting.b.line) == (4, 1, 2, 6)
+    first = found.agents[2].run
+    assert first is not None and first.a is not None and first.b is not None
+    assert (first.number, first.a.life, first.b.life, first.b.line) == (4, 1, 2, 6)
 
 
 def test_half_a_last_line_is_what_a_killed_agent_leaves(a: Path, b: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from harness.archive.archive import RunArchive
 from harness.play.progress import Silent
-from harness.report.stories.narration import Telling
+from harness.report.stories.narration import Narrator
 from harness.report.stories.story_file import Story, read_story
 from harness.run.run import run
 from ucp.agent import HANDLERS
@@ -31,8 +31,8 @@ IN_NO_FIGURE = {
 def told(story: Story, directory: Path, seed: int = 1) -> str:
     """The story as it is played in virtual time."""
     run(story.in_virtual_time, seed, directory, Silent(), "sim", delivers_all=True)
-    telling = Telling(RunArchive(directory).traces, story.scenario.roster)
-    return story.with_answers([telling.answer(section) for section in story.sections])
+    narrator = Narrator(RunArchive(directory).traces, story.scenario.roster)
+    return story.with_answers([narrator.answer(section) for section in story.sections])
 
 
 def test_each_figure_has_a_story_and_the_page_names_it() -> None:

@@ -15,7 +15,7 @@ from harness.archive.tracks import Fix
 from harness.present import text
 from harness.present.colours import Ink
 from harness.present.svg import FONT, n
-from harness.report.logbook.positions import Entry, Track, Whereabouts
+from harness.report.logbook.positions import GlobalPosition, LogEntry, Track
 from harness.report.map_parts import Point, Projection, extent, thin
 from harness.report.map_svg import end_mark, frame, start_mark, tags
 from ucp.telemetry import describe
@@ -89,7 +89,7 @@ class _Field:
         self._first_us = min(at_us for track in tracks for at_us, _ in track.fixes)
         self.far = 0
 
-    def fix(self, at_us: int, position: Whereabouts) -> Fix:
+    def fix(self, at_us: int, position: GlobalPosition) -> Fix:
         north_m = (position.lat_e7 / 1e7 - self._lat) * METRES_PER_DEGREE
         east_m = ((position.lon_e7 / 1e7 - self._lon + 180) % 360 - 180) * self._east
         self.far += max(abs(north_m), abs(east_m)) > FARTHEST_M
@@ -140,7 +140,7 @@ def _ordinal(name: str) -> int | None:
     return int(ordinal) if ordinal.isdecimal() else None
 
 
-def _logged(track: Track, alone: set[str]) -> Iterable[tuple[bool, int, Entry]]:
+def _logged(track: Track, alone: set[str]) -> Iterable[tuple[bool, int, LogEntry]]:
     """Each event but positions, and positions that one vehicle alone has: whether it is one of these, and whose."""
     for entry in track.entries:
         rare = entry.block in alone
@@ -148,7 +148,7 @@ def _logged(track: Track, alone: set[str]) -> Iterable[tuple[bool, int, Entry]]:
             yield rare, track.agent_id, entry
 
 
-def _mark(place: Point, entry: Entry, rare: bool, ink: Ink) -> Markup:
+def _mark(place: Point, entry: LogEntry, rare: bool, ink: Ink) -> Markup:
     tip = [
         describe(entry.event.event_id, entry.event.data),
         text.moment(entry.event.timestamp_us),

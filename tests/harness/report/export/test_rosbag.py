@@ -46,9 +46,9 @@ def test_vehicles_and_links_are_where_they_were(run: Path, messages: Messages) -
     at_ns, fix = messages["/vehicle_1/fix"][-1]
     assert at_ns == round(last.at_s * 1e9) == fix.header.stamp.sec * 10**9 + fix.header.stamp.nanosec
     assert -90 <= fix.latitude <= 90 and fix.header.frame_id == "vehicle_1"
-    moved = [told.transforms[0] for at, told in messages["/tf"] if at == at_ns]
+    move = [told.transforms[0] for at, told in messages["/tf"] if at == at_ns]
     assert (last.east_m, last.north_m) in [
-        (told.transform.translation.x, told.transform.translation.y) for told in moved
+        (told.transform.translation.x, told.transform.translation.y) for told in move
     ]
     ends = {at // 10**9: len(told.markers[0].points) for at, told in messages["/links"]}
     assert (ends[45], ends[75]) == (6, 2)

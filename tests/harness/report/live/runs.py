@@ -29,16 +29,16 @@ def played(directory: Path, **keys: Any) -> Path:
 def film(directory: Path, stride_s: float = 20.0) -> list[Change]:
     """All that a feed says of a run that is over, read `stride_s` mission seconds at a time."""
     feed = Feed(directory)
-    told, until_s = [feed.first(live=False)], 0.0
+    told, until_s = [feed.run_change(live=False)], 0.0
     while True:
-        changes, more = feed.look(until_s)
+        changes, more = feed.poll(until_s)
         told += changes
         if more:
             continue
         if (next_s := feed.next_s) is None:
             break
         until_s = max(until_s, next_s) + stride_s
-    told += feed.last()
+    told += feed.final_changes()
     feed.close()
     return told
 

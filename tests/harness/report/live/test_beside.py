@@ -8,7 +8,7 @@ import pytest
 from harness.errors import MachineError
 from harness.play.interventions import Interventions
 from harness.report.live import server_process as module
-from harness.report.live.server_process import beside
+from harness.report.live.server_process import live_page
 from harness.scenario import Scenario
 
 HAND = Interventions(Scenario(name="watched"), virtual_time=True)
@@ -27,7 +27,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_one_that_says_much_and_dies_is_told_of_after_the_run(server: Path, tmp_path: Path) -> None:
     server.write_text(f"#!/bin/sh\n{MUCH}\necho http://here/\n{MUCH}\necho 'no more memory' >&2\nkill -9 $$\n")
-    with beside(tmp_path, 0, HAND) as page:
+    with live_page(tmp_path, 0, HAND) as page:
         assert page.address == "http://here/"
         assert not page.run_is_over()
         assert page.problem == "the server of the page ended by itself with SIGKILL (no more memory); the run continued"
@@ -37,14 +37,14 @@ def test_one_that_hangs_ends_with_the_run(server: Path, tmp_path: Path, monkeypa
     monkeypatch.setattr(module, "LAST_LOOK_S", 0.1)
     monkeypatch.setattr(module, "ENDING_S", 0.1)
     server.write_text("#!/bin/sh\ntrap '' TERM\necho http://here/\nexec sleep 1000\n")
-    with beside(tmp_path, 0, HAND) as page:
-        for _ in range(module.MOST_WAITING):  # more than a pipe holds
-            page._say(["t", 100.0])
+    with live_page(tmp_path, 0, HAND) as page:
+        for _ in range(module.MAX_OUTGOING):  # more than a pipe holds
+            page._send(["t", 100.0])
         assert not page.run_is_over()
         assert page.problem == "the page hung: its server did not answer within 0.1 s after the run"
 
 
 def test_one_that_cannot_begin_says_why(server: Path, tmp_path: Path) -> None:
     server.write_text(f"#!/bin/sh\n{MUCH}\necho 'port 80 of 127.0.0.1 cannot be had' >&2\nexit 3\n")
-    with pytest.raises(MachineError, match=r"port 80 of 127\.0\.0\.1 cannot be had"), beside(tmp_path, 0, HAND):
+    with pytest.raises(MachineError, match=r"port 80 of 127\.0\.0\.1 cannot be had"), live_page(tmp_path, 0, HAND):
         pass

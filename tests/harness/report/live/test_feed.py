@@ -12,8 +12,8 @@ from harness.archive.history import ends_at, history_of
 from harness.archive.traces import SUFFIX, Trace
 from harness.errors import RunDirectoryError
 from harness.report.live import feed as feeds
-from harness.report.live._agent_course import KEY_LENGTH, Change, Course
-from harness.report.live.change_log import FAR_BEHIND_BYTES, Story
+from harness.report.live._agent_course import KEY_LENGTH, AgentCourse, Change
+from harness.report.live.change_log import FAR_BEHIND_BYTES, ChangeLog
 from harness.report.live.feed import Feed
 from tests.harness.archive.test_history import a_run, a_trace
 from tests.harness.report.live.runs import film, of_kind, played
@@ -93,8 +93,8 @@ def test_a_live_run_is_its_files_while_they_grow(run: Path, tmp_path: Path) -> N
     for share in range(0, 101, 7):
         for path, data in content.items():
             (growing / path.relative_to(run)).write_bytes(data[: len(data) * share // 98])
-        told += feed.look()[0]
-    told += feed.last()
+        told += feed.poll()[0]
+    told += feed.final_changes()
     feed.close()
     assert chains_of(told) == chains_of(film(run))
     assert len(of_kind("m", told)) == len(of_kind("m", film(run)))
@@ -198,7 +198,7 @@ def reconcile_during_a_vote(directory: Path) -> tuple[list[Change], Trace]:
     trace = a_trace(1, runs)
     lines = [trace.header.to_line(), *(run.to_line() for run in runs)]
     (directory / f"1{SUFFIX}").write_text("".join(lines))
-    course = Course(directory, 1)
+    course = AgentCourse(directory, 1)
     course.read(100.0, 100)
     course.close()
     return course.changes, trace
@@ -211,15 +211,15 @@ def test_feed_and_report_agree_on_a_reconcile_during_a_vote(tmp_path: Path) -> N
 
 
 def test_a_slow_reader_of_a_live_run_is_not_given_all_of_it() -> None:
-    story = Story()
-    story.tell([["c", number, 1, [], "", ""] for number in range(100)])
-    story.tell([["m", 0.0, 1, "x" * 1000, None, "0"] for _ in range(FAR_BEHIND_BYTES // 1000)])
-    story.tell([["c", 100, 1, [], "", ""]])
+    log = ChangeLog()
+    log.append([["c", number, 1, [], "", ""] for number in range(100)])
+    log.append([["m", 0.0, 1, "x" * 1000, None, "0"] for _ in range(FAR_BEHIND_BYTES // 1000)])
+    log.append([["c", 100, 1, [], "", ""]])
 
     def read(**how: bool) -> list[str]:
         start, lines = 0, ""
-        while start < story.size:
-            start, more = story.read(start, **how)
+        while start < log.size:
+            start, more = log.read(start, **how)
             assert len(more) <= FAR_BEHIND_BYTES
             lines += more
         return [json.loads(line)[0] for line in lines.splitlines()]
@@ -227,4 +227,4 @@ def test_a_slow_reader_of_a_live_run_is_not_given_all_of_it() -> None:
     assert Counter(read())["m"] == FAR_BEHIND_BYTES // 1000
     assert Counter(read(may_skip=True))["c"] == 101
     assert Counter(read(may_skip=True))["m"] < 1000
-    story.close()
+    log.close()

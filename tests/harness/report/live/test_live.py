@@ -37,7 +37,7 @@ class Page:
         self._socket = socket
         self._unread: list[list[Any]] = []
         self._number = 0
-        self.hand: dict[str, Any] | None = None
+        self.interventions: dict[str, Any] | None = None
         """What can be asked for, as it was last told: that may be before the run is."""
 
     async def next(self, kind: str) -> list[Any]:
@@ -47,14 +47,14 @@ class Page:
                 while self._unread:
                     change = self._unread.pop(0)
                     if change[0] == "hand":
-                        self.hand = change[1]
+                        self.interventions = change[1]
                     if change[0] == kind:
                         return change
                 self._unread = [json.loads(line) for line in (await self._socket.receive_str()).splitlines()]
 
-    async def ask(self, **asked: Any) -> dict[str, Any]:
+    async def on_request(self, **request: Any) -> dict[str, Any]:
         self._number += 1
-        await self._socket.send_str(json.dumps({"number": self._number, **asked}))
+        await self._socket.send_str(json.dumps({"number": self._number, **request}))
         _, number, answer = await self.next("answer")
         assert number == self._number
         return answer
@@ -65,20 +65,20 @@ def test_what_a_page_asks_for_happens_and_is_on_record(tmp_path: Path) -> None:
         async with aiohttp.ClientSession() as client, client.ws_connect(f"{address}live", max_msg_size=0) as socket:
             page = Page(socket)
             assert (await page.next("run"))[1]["live"] is True
-            while page.hand is None or page.hand["closed"] is not None:
+            while page.interventions is None or page.interventions["closed"] is not None:
                 await page.next("hand")
-            held_s = (await page.ask(do="pause"))["at_s"]
-            assert (await page.ask(do="step", seconds=10))["at_s"] >= held_s + 10
-            parted_s = (await page.ask(do="happen", entry={"partition": [[1, 2], [3, 4]]}))["at_s"]
+            held_s = (await page.on_request(do="pause"))["at_s"]
+            assert (await page.on_request(do="step", seconds=10))["at_s"] >= held_s + 10
+            parted_s = (await page.on_request(do="happen", entry={"partition": [[1, 2], [3, 4]]}))["at_s"]
             assert parted_s >= held_s + 10
-            assert "error" in await page.ask(do="happen", entry={"partition": [[1, 2, 99], [3, 4]]})
-            assert "error" in await page.ask(do="happen", entry={"kill": [1, 2, 3, 4]})
-            assert await page.ask(do="fly") == {"error": "that cannot be asked for"}
-            assert await page.ask(do="step", seconds="soon") == {"error": "that cannot be asked for"}
-            assert "at_s" in await page.ask(do="happen", entry={"kill": [4]})
+            assert "error" in await page.on_request(do="happen", entry={"partition": [[1, 2, 99], [3, 4]]})
+            assert "error" in await page.on_request(do="happen", entry={"kill": [1, 2, 3, 4]})
+            assert await page.on_request(do="fly") == {"error": "that cannot be asked for"}
+            assert await page.on_request(do="step", seconds="soon") == {"error": "that cannot be asked for"}
+            assert "at_s" in await page.on_request(do="happen", entry={"kill": [4]})
             await socket.send_str("[[[")
             await socket.send_str("7")
-            assert "at_s" in await page.ask(do="next run")
+            assert "at_s" in await page.on_request(do="next run")
 
     out = tmp_path / "run"
     with page_of("run", scenario(tmp_path), "--backend", "sim", "--watch", "--out", out) as (process, address):
@@ -121,8 +121,8 @@ def test_what_befalls_vehicles_by_hand(browser: Browser, tmp_path: Path) -> None
         browser.evaluate(f"{button('Befall')}.click()")
 
     out = tmp_path / "run"
-    asked = write_scenario(tmp_path, agents=2, duration_s=100_000, speedup=10, vehicles={"kind": "embedded"})
-    with page_of("run", asked, "--watch", "--out", out) as (process, address):
+    request = write_scenario(tmp_path, agents=2, duration_s=100_000, speedup=10, vehicles={"kind": "embedded"})
+    with page_of("run", request, "--watch", "--out", out) as (process, address):
         browser.show(address, width=1280, scheme="light")
         until(browser, f"watch.hand && !{button('Heal')}.disabled")
         befall(1, "battery")

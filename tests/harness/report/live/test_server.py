@@ -13,15 +13,15 @@ import pytest
 
 from harness.errors import MachineError
 from harness.report.live import server as servers
-from harness.report.live.change_log import Story
+from harness.report.live.change_log import ChangeLog
 from harness.report.live.server import Server
 
 HOSTILE = "</script><img src=x onerror=alert(1)>"
 
 
 @asynccontextmanager
-async def served(directory: Path, story: Story | None = None) -> AsyncIterator[tuple[aiohttp.ClientSession, str]]:
-    async with Server(story or Story(), directory, live=True).open(0) as address, aiohttp.ClientSession() as client:
+async def served(directory: Path, log: ChangeLog | None = None) -> AsyncIterator[tuple[aiohttp.ClientSession, str]]:
+    async with Server(log or ChangeLog(), directory, live=True).open(0) as address, aiohttp.ClientSession() as client:
         yield client, address
 
 
@@ -94,14 +94,14 @@ def test_the_report_is_shown_as_if_it_came_from_nowhere(tmp_path: Path) -> None:
 
 
 def test_a_page_hears_all_from_the_beginning_and_then_what_is_new(tmp_path: Path) -> None:
-    story = Story()
-    story.tell([["run", {"name": HOSTILE}], ["t", 1.0]])
+    log = ChangeLog()
+    log.append([["run", {"name": HOSTILE}], ["t", 1.0]])
 
     async def visit() -> None:
-        async with served(tmp_path, story) as (client, address), client.ws_connect(f"{address}live") as socket:
+        async with served(tmp_path, log) as (client, address), client.ws_connect(f"{address}live") as socket:
             first = (await socket.receive_str()).splitlines()
             assert [json.loads(line) for line in first] == [["run", {"name": HOSTILE}], ["t", 1.0]]
-            story.tell([["t", 2.0]])
+            log.append([["t", 2.0]])
             assert json.loads(await socket.receive_str()) == ["t", 2.0]
             await socket.send_str("x" * (servers.MAX_MESSAGE_BYTES + 1))
             assert (await socket.receive()).type is aiohttp.WSMsgType.CLOSE, "who says too much is not listened to"
@@ -110,10 +110,10 @@ def test_a_page_hears_all_from_the_beginning_and_then_what_is_new(tmp_path: Path
 
 
 def test_a_browser_that_does_not_read_holds_up_nobody(tmp_path: Path) -> None:
-    story = Story()
+    log = ChangeLog()
 
     async def visit() -> None:
-        server = Server(story, tmp_path, live=True)
+        server = Server(log, tmp_path, live=True)
         async with server.open(0) as address, aiohttp.ClientSession() as client:
             port, path = urlsplit(address).port, urlsplit(address).path
             key = "dGhlIHNhbXBsZSBub25jZQ=="
@@ -125,10 +125,10 @@ def test_a_browser_that_does_not_read_holds_up_nobody(tmp_path: Path) -> None:
             assert b"101" in await slow.readline()
             began = time.process_time()
             for _ in range(40):  # 40 MB, of which it reads nothing
-                story.tell([["note", "x" * 1_000_000]])
+                log.append([["note", "x" * 1_000_000]])
             async with client.ws_connect(f"{address}live", max_msg_size=0) as socket:
                 received = 0
-                while received < story.size:
+                while received < log.size:
                     received += len(await socket.receive_str())
             assert server.readers >= 1
             assert time.process_time() - began < 30
@@ -163,7 +163,7 @@ def test_a_port_that_is_in_use_is_said_in_a_sentence(tmp_path: Path) -> None:
             port = urlsplit(address).port
             assert port is not None
             with pytest.raises(MachineError, match=f"port {port} of 127.0.0.1 is not available: .*use"):
-                async with Server(Story(), tmp_path, live=False).open(port):
+                async with Server(ChangeLog(), tmp_path, live=False).open(port):
                     pass
 
     asyncio.run(visit())

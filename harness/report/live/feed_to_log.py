@@ -2,7 +2,7 @@
 
 import asyncio
 
-from harness.report.live.change_log import Story
+from harness.report.live.change_log import ChangeLog
 from harness.report.live.feed import Feed
 from harness.report.live.server import UPDATE_S
 
@@ -10,30 +10,30 @@ STRIDE_S = 20.0
 """Mission seconds that are read from all files in one step of a finished run."""
 
 
-async def tell_film(feed: Feed, story: Story) -> None:
+async def copy_finished_run(feed: Feed, log: ChangeLog) -> None:
     """Write all changes of a finished run in time order."""
     until_s = 0.0
-    story.tell([feed.first(live=False)])
+    log.append([feed.run_change(live=False)])
     while True:
-        changes, more = feed.look(until_s)
-        story.tell(changes)
+        changes, more = feed.poll(until_s)
+        log.append(changes)
         await asyncio.sleep(0)
         if more:
             continue
         if (next_s := feed.next_s) is None:
             break
         until_s = max(until_s, next_s) + STRIDE_S
-    story.tell(feed.last())
+    log.append(feed.final_changes())
 
 
-async def tell_live(feed: Feed, story: Story, ended: asyncio.Event) -> None:
+async def copy_live_run(feed: Feed, log: ChangeLog, ended: asyncio.Event) -> None:
     """Write the changes of a run until its record has an outcome, or `ended` is set because its process ended."""
-    story.tell([feed.first(live=True)])
+    log.append([feed.run_change(live=True)])
     while True:
         over = feed.over or ended.is_set()
-        changes, more = feed.look()
-        story.tell(changes)
+        changes, more = feed.poll()
+        log.append(changes)
         if over and not more:
             break
         await asyncio.sleep(0 if more else UPDATE_S)
-    story.tell(feed.last())
+    log.append(feed.final_changes())
