@@ -10,7 +10,16 @@ from pathlib import Path
 from docs.generate.matrix_thesis import BEGIN, END, put_between_markers
 from harness.present import text
 from harness.sweep.matrix._growth_picture import draw_growth
-from harness.sweep.matrix._growth_table import GROWN, SIZED, SYMBOLS, grown, in_one_line, label, law_row, size_row
+from harness.sweep.matrix._growth_table import (
+    LAW_METRICS,
+    SIZE_METRICS,
+    SYMBOLS,
+    growth_tables,
+    in_one_line,
+    label,
+    law_row,
+    size_row,
+)
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from ucp.agent_files import write_atomically
 
@@ -29,16 +38,16 @@ def _sizes(record: MatrixRecord) -> str:
     length = sorted(record.matrix.lengths)[len(record.matrix.lengths) // 2]
     body = [
         [text.percent(cell.loss), f"{cell.agents}", *size_row(cell)]
-        for part in grown(record)
+        for part in growth_tables(record)
         for cell in part.cells
         if cell.duration_s in (length, None)
     ]
-    return _markdown([f"loss, {text.duration(length)}", "N", *_labels(SIZED)], body)
+    return _markdown([f"loss, {text.duration(length)}", "N", *_labels(SIZE_METRICS)], body)
 
 
 def _exponents(record: MatrixRecord) -> str:
     body = []
-    for part in grown(record):
+    for part in growth_tables(record):
         for name, variable, laws in part.laws:
             if name.startswith("both"):
                 fields = (
@@ -47,7 +56,7 @@ def _exponents(record: MatrixRecord) -> str:
                 )
                 load = name.removeprefix("both").removeprefix(", load").strip() or "any"
                 body.append([part.name.removesuffix(" loss"), load, SYMBOLS[variable], *fields])
-    return _markdown(["loss", "load", "exponent of", *_labels(GROWN)], body)
+    return _markdown(["loss", "load", "exponent of", *_labels(LAW_METRICS)], body)
 
 
 def _labels(names: Iterable[str]) -> Iterable[str]:

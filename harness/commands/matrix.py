@@ -12,7 +12,7 @@ from harness.run.parallel import cores
 from harness.sweep import matrix
 from harness.sweep.matrix import matrix_outputs, matrix_summary, matrix_table
 from harness.sweep.matrix import nights as nights_of_matrix
-from harness.sweep.matrix.matrix_run import compared, on_cluster, on_cores
+from harness.sweep.matrix.matrix_run import compare_with, on_cluster, on_cores
 from harness.sweep.matrix.nights import load_baseline
 
 
@@ -63,7 +63,7 @@ def matrix_command(
         spread = on_cluster(request, scheduler, shown=True)
     finished = matrix.run_matrix(request, directory, spread, covers=coverage)
     if baseline is not None:
-        finished = compared(finished, baseline, str(against))
+        finished = compare_with(finished, baseline, str(against))
     earlier = None
     if kept is not None:
         nights_of_matrix.keep(finished.record, kept)
@@ -74,5 +74,5 @@ def matrix_command(
     if finished.record.outcome == "interrupted":
         complain(f"to continue, repeat the command with --out {directory}")
     if finished.record.tried is not None and not as_json:
-        print_lines(matrix_summary.tried_in_words(finished.record.tried))
+        print_lines(matrix_summary.describe_coverage(finished.record.tried))
     end_sweep(finished.record, None if as_json else matrix_table.render(finished.record), directory / "report.html")

@@ -1,4 +1,4 @@
-"""What the command line says of an exploration: while it goes on, and at its end."""
+"""The output of the command `explore`, during an exploration and at its end."""
 
 import contextlib
 import time
@@ -19,7 +19,10 @@ CLEAR_LINE = "\r\x1b[2K"
 
 @contextlib.contextmanager
 def watching(console: Console) -> Iterator[Watcher]:
-    """Says what is found, and how shrinking goes: on one line of a terminal, else in a line now and then."""
+    """Yield functions that print violations and the progress of shrinking.
+
+    On a terminal, the progress is one line that is redrawn. Elsewhere it is a line every ten seconds.
+    """
     every_s = REDRAW_EVERY_S if console.is_terminal else LINE_EVERY_S
     last = 0.0
 

@@ -91,7 +91,7 @@ class Explored:
 
 @dataclass(frozen=True)
 class Watcher:
-    """Functions that report progress. `on_step` receives the number of runs so far, and the size in words."""
+    """Functions that report progress. `on_step` receives the number of runs so far, and the size as text."""
 
     on_violation: Callable[[Violation], None] = field(default=lambda violation: None)
     on_step: Callable[[int, str], None] = field(default=lambda runs, words: None)
@@ -154,7 +154,9 @@ def smallest_of(
     max_runs: int,
     on_step: Callable[[int, str], None],
 ) -> tuple[Document, str, bool]:
-    """Return the smallest document for which `still` is true, the steps in words, and whether Ctrl-C ended it."""
+    """Return the smallest document for which `still` is true, a description of the shrinking, and whether Ctrl-C ended
+    it.
+    """
     interrupted = False
     shrinker = Shrinker(
         original,

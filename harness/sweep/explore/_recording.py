@@ -1,8 +1,9 @@
-"""What happened in a run by chance, taken down: the events that agents logged, and the messages that were lost.
+"""Record the random parts of a run: the events that agents logged, and the messages that were lost.
 
-A scenario that scripts them plays the very same run again: a sender's lots for latency are drawn for every broadcast,
-and in their own stream, whatever becomes of it. Not so where messages also come twice: netem draws for the second copy
-too, and a fate loses all copies of a message or none. What does not replay is not offered (`explore.shrink`).
+A scenario that scripts these parts plays the same run again. This works because the random draws for the latency of a
+sender come from a stream of their own, and are made for every broadcast, even for a lost one. It does not work for
+networks that duplicate messages. Netem also draws a latency for the second copy, whereas a scripted fate drops either
+all copies or none. `_smaller.shrink` therefore checks that a recording reproduces the violation.
 """
 
 from collections import Counter
@@ -25,7 +26,7 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True, slots=True)
 class Logged:
-    """An event of an agent; `completes`: with it a block was full."""
+    """A logged event of an agent. `completes` is true if it filled a block."""
 
     at_s: float
     agent: int
@@ -35,9 +36,9 @@ class Logged:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """A message that did not reach `receiver`: the `count`th of its type from `sender`, sent at `at_s`.
+    """A message that `receiver` did not receive: message number `count` of its type from `sender`, sent at `at_s`.
 
-    `by_quirk`: it came, and the receiver ignored it.
+    `by_quirk` is true if the message arrived and the receiver ignored it.
     """
 
     at_s: float
@@ -51,7 +52,7 @@ class Lost:
 
 @dataclass(frozen=True)
 class Recording:
-    """A run, taken down, with its verdict. In the order of time."""
+    """A recorded run with its verdict. Events and lost messages are in time order."""
 
     result: Result
     logged: list[Logged]
@@ -59,10 +60,10 @@ class Recording:
 
 
 def record(scenario: Scenario, seed: int) -> Recording:
-    """Of a run that an agent ended, up to there."""
+    """Play and record a run. If an agent crashes or hangs, the recording ends there."""
     tape = _Recorder()
     try:
-        result = simulate_in_memory(tape, scenario, seed, fate_script=partial(_Listening, tape=tape)).result
+        result = simulate_in_memory(tape, scenario, seed, fate_script=partial(_RecordingScript, tape=tape)).result
     except AgentFailedError as error:
         result = ended_by(error)
     return Recording(result, tape.events, sorted(tape.lost, key=lambda lost: lost.at_s))
@@ -74,7 +75,7 @@ class _Recorder(InMemory):
         self.events: list[Logged] = []
         self.lost: list[Lost] = []
         self.sent: dict[tuple[int, int], Lost] = {}
-        """(sender, sequence) of each Commit Block -> how it would be lost."""
+        """(sender, sequence) of each Commit Block -> its entry in `lost`, should a receiver ignore it."""
         self._last_of: dict[int, int] = {}
         self._counts: Counter[int] = Counter()
 
@@ -103,8 +104,8 @@ class _Recorder(InMemory):
                     )
 
 
-class _Listening(FateScript):
-    """Decides what the script says, and takes down what is lost, whether by script or by chance."""
+class _RecordingScript(FateScript):
+    """A fate script that also records the messages that are lost by script or by chance."""
 
     def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _Recorder) -> None:
         super().__init__(fates, roster, name_of)

@@ -1,7 +1,7 @@
-"""A scenario as a document that can be cut to pieces: what its YAML says, without what is as by default.
+"""A scenario as a document that can be reduced: its YAML keys without defaults.
 
-Every function makes a new document and leaves the old one as it is. The result need not be a scenario that can be
-played; who tries it finds out.
+Each function returns a new document, and leaves the old one unchanged. The result may be an invalid scenario. The
+caller finds out by playing it.
 """
 
 from collections.abc import Callable, Collection
@@ -16,11 +16,11 @@ from harness.sweep.explore._recording import Logged, Lost
 Document = dict[str, Any]
 
 UNPLAYED = ("about", "speedup", "expect")
-"""Keys that change nothing in virtual time, or that are of a run that is not smaller."""
+"""Keys that have no effect in virtual time, or that only fit the original run."""
 FLIGHT = ("vehicles", "flight", "network.radio")
-"""Keys that say which messages are lost to distance, and nothing else in virtual time."""
+"""Keys that determine which messages are lost by distance, and have no other effect in virtual time."""
 NEVER_IN_BURSTS = {"p": 0.0, "r": 1.0}
-"""Loss in bursts that never come: nothing is lost, and lots are drawn as with bursts that do."""
+"""A burst model that never loses a message. It makes the same random draws as one that does."""
 
 
 def document_of(scenario: Scenario) -> Document:
@@ -32,7 +32,7 @@ def document_of(scenario: Scenario) -> Document:
 
 
 def with_key(document: Document, key: str, value: Any) -> Document:
-    """`key` is a path with dots; a value that is empty, or None, takes the key out."""
+    """Set the value at a path with dots. An empty value or None removes the key."""
     first, _, rest = key.partition(".")
     if rest:
         value = with_key(document.get(first, {}), rest, value)
@@ -41,15 +41,15 @@ def with_key(document: Document, key: str, value: Any) -> Document:
 
 
 def at(document: Document, key: str) -> Any:
-    """What stands at the path; None if nothing does."""
+    """Return the value at the path, or None."""
     value: Any = document
     for part in key.split("."):
         value = value.get(part) if isinstance(value, dict) else None
     return value
 
 
-def scripted(document: Document, logged: list[Logged], drops: list[Document]) -> Document:
-    """With these events and no others, and nothing lost but by these drops."""
+def with_script(document: Document, logged: list[Logged], drops: list[Document]) -> Document:
+    """Replace all random parts: exactly these events are logged, and exactly these drops lose messages."""
     script = [event_of(event) for event in logged]
     document = _without_flight(document)
     network = _without_loss(document.get("network", {}))
@@ -63,7 +63,7 @@ def scripted(document: Document, logged: list[Logged], drops: list[Document]) ->
 
 
 def with_drops(document: Document, drops: list[Document]) -> Document:
-    """With these drops instead of its own; what else it scripts stays."""
+    """Replace the drops of the document. Its other fates stay."""
     others = [fate for fate in document.get("fates", []) if "drop" not in fate]
     return with_key(document, "fates", [*drops, *others])
 
@@ -84,7 +84,10 @@ def fate_by_count(lost: Lost) -> Document:
 
 
 def fate_by_time(lost: Lost, slack_s: float) -> Document:
-    """Whatever the sender says of this type at about that time: it stays the same when other messages go."""
+    """Return a drop of all messages of this type from this sender at about this time.
+
+    It stays valid when other messages disappear from the run.
+    """
     window = {"from_s": max(0.0, round(lost.at_s - slack_s, 3)), "until_s": round(lost.at_s + slack_s, 3)}
     return {"message": lost.message, "sender": lost.sender, "receiver": lost.receiver, **window, "drop": True}
 
@@ -113,7 +116,7 @@ def _silent(layer: Document) -> Document:
 
 
 def _silent_change(change: Document) -> Document:
-    """Of a timeline entry, or what a schedule repeats."""
+    """Remove the loss from a timeline entry or from the repeated part of a schedule."""
     silent = {**change, **_silent(change)}
     return {**silent, "network": _without_loss(change["network"])} if "network" in change else silent
 
@@ -131,15 +134,15 @@ def _with_networks(ramp: Document, change: Callable[[Document], Document]) -> Do
     return {**ramp, "network": [change(network) for network in ramp["network"]]} if "network" in ramp else ramp
 
 
-def with_agents(document: Document, kept: Collection[int]) -> Document:
-    """Without the other agents, and all that is said of them."""
+def keep_agents(document: Document, kept: Collection[int]) -> Document:
+    """Keep only these agents, and remove everything that refers to others."""
     document = {**document, "agents": sorted(kept)}
     document = with_key(document, "events.script", [event for event in script(document) if event["agent"] in kept])
-    document = with_key(document, "fates", [fate for fate in document.get("fates", []) if _named_in(fate) <= {*kept}])
+    document = with_key(document, "fates", [fate for fate in document.get("fates", []) if _agents_in(fate) <= {*kept}])
     document = with_key(document, "timeline", [*filter(None, (_entry(entry, kept) for entry in timeline(document)))])
     schedules = [_schedule(schedule, kept) for schedule in document.get("schedule", [])]
     document = with_key(document, "schedule", [schedule for schedule in schedules if schedule])
-    flights = [_of(flight, ("vehicles",), kept) for flight in document.get("flight", [])]
+    flights = [_filter_lists(flight, ("vehicles",), kept) for flight in document.get("flight", [])]
     document = with_key(document, "flight", [flight for flight in flights if flight["vehicles"]])
     quirks = {name: _of_kept(value, kept) for name, value in document.get("quirks", {}).items()}
     document = with_key(document, "quirks", {name: value for name, value in quirks.items() if value is not None})
@@ -147,24 +150,24 @@ def with_agents(document: Document, kept: Collection[int]) -> Document:
     document = with_key(document, "datagrams", [datagram for datagram in datagrams if datagram["reaches"]])
     for key in ("clocks", "lateness", "vehicles.types", "agent_command"):
         named = at(document, key) or {}
-        if isinstance(named, list):  # of all agents
+        if isinstance(named, list):  # the list applies to all agents
             continue
         document = with_key(document, key, {name: value for name, value in named.items() if int(name) in kept})
     return with_key(document, "network", _network(document.get("network", {}), kept))
 
 
 def _network(network: Document, kept: Collection[int]) -> Document:
-    """What it says of all, and of these agents."""
+    """Keep what applies to all agents or to the kept ones."""
     receivers = {name: value for name, value in network.get("receivers", {}).items() if int(name) in kept}
-    links = [_of(link, ("from", "to"), kept) for link in network.get("links", [])]
+    links = [_filter_lists(link, ("from", "to"), kept) for link in network.get("links", [])]
     network = with_key(network, "receivers", receivers)
     return with_key(network, "links", [link for link in links if link["from"] and link["to"]])
 
 
 def _schedule(schedule: Document, kept: Collection[int]) -> Document | None:
-    """A schedule that speaks of these agents only; None if nothing is left of it."""
+    """Reduce a schedule to the kept agents. Return None if nothing is left."""
     if "repeat" in schedule:
-        repeat = _disturbance(schedule["repeat"], kept)
+        repeat = _keep_network_change(schedule["repeat"], kept)
         return {**schedule, "repeat": repeat} if repeat else None
     if "network" not in schedule.get("ramp", {}):
         return schedule
@@ -173,47 +176,47 @@ def _schedule(schedule: Document, kept: Collection[int]) -> Document | None:
     return {**schedule, "ramp": ramp} if ramp else None
 
 
-def _disturbance(change: Document, kept: Collection[int]) -> Document:
-    """What a timeline entry or a schedule makes of the network, among these agents."""
+def _keep_network_change(change: Document, kept: Collection[int]) -> Document:
+    """Reduce a network change of a timeline entry or schedule to the kept agents."""
     groups = [[agent for agent in group if agent in kept] for group in change.get("partition", [])]
     change = with_key(change, "partition", [group for group in groups if group])
     return with_key(change, "network", _network(change.get("network", {}), kept))
 
 
-def _named_in(fate: Document) -> set[int]:
+def _agents_in(fate: Document) -> set[int]:
     named = (fate.get("sender"), fate.get("receiver"), fate.get("block", "").partition(".")[0])
     return {int(agent) for agent in named if agent}
 
 
 def _entry(entry: Document, kept: Collection[int]) -> Document | None:
-    """A timeline entry that speaks of these agents only; None if nothing is left of it."""
+    """Reduce a timeline entry to the kept agents. Return None if nothing is left."""
     if "partition" in entry or "network" in entry:
-        entry = _disturbance(entry, kept)
+        entry = _keep_network_change(entry, kept)
         return entry if "partition" in entry or "network" in entry else None
     named = {sender for name in INJECTIONS if (sender := at(entry, f"{name}.sender")) is not None}
     if not named.union(at(entry, "lie.receivers") or ()) <= {*kept}:
         return None
     faults = [kind.what for kind in ASKED_FOR]
-    entry = _of(entry, faults, kept)
+    entry = _filter_lists(entry, faults, kept)
     return entry if all(entry.get(fault) != [] for fault in faults) else None
 
 
 def _datagram(datagram: Document, kept: Collection[int]) -> Document:
-    """One that reaches these agents only; nobody, if it is from another."""
+    """Keep only receivers that remain, or no receivers if the source is removed."""
     from_kept = datagram["source"] in kept
     reaches = {agent: at_s for agent, at_s in datagram["reaches"].items() if from_kept and int(agent) in kept}
     return {**datagram, "reaches": reaches}
 
 
 def _of_kept(quirk: Any, kept: Collection[int]) -> Any:
-    """A quirk of all agents, or of those that are left; None if none of its agents is."""
+    """Reduce a quirk to the kept agents. Return None if none is left."""
     if not isinstance(quirk, dict):
         return quirk
-    quirk = _of(quirk, ("agents",), kept)
+    quirk = _filter_lists(quirk, ("agents",), kept)
     return quirk if quirk["agents"] else None
 
 
-def _of(entry: Document, keys: Collection[str], kept: Collection[int]) -> Document:
+def _filter_lists(entry: Document, keys: Collection[str], kept: Collection[int]) -> Document:
     lists = {key: [agent for agent in entry[key] if agent in kept] for key in keys if entry.get(key)}
     return {**entry, **lists}
 
@@ -228,18 +231,18 @@ def timeline(document: Document) -> list[Document]:
     return entries
 
 
-def instants(document: Document) -> list[float]:
-    """When anything is logged or changed, or a change of the network passes, in order."""
+def event_times(document: Document) -> list[float]:
+    """Return the times of all events, changes and ends of changes, in order."""
     passes = {entry["at_s"] + entry["for_s"] for entry in timeline(document) if "for_s" in entry}
     return sorted({entry["at_s"] for entry in (*script(document), *timeline(document))} | passes)
 
 
 def cut_after(document: Document, last_s: float) -> Document:
-    """Over at `last_s`, and without what would come later."""
+    """End the mission at `last_s`, and remove everything later."""
     document = {**document, "duration_s": max(1.0, last_s)}
     for key in ("events.script", "timeline"):
         before = [entry for entry in at(document, key) or [] if entry["at_s"] <= last_s]
-        document = with_key(document, key, [_over_by(entry, last_s) for entry in before])
+        document = with_key(document, key, [_limit_duration(entry, last_s) for entry in before])
     schedules = [schedule for schedule in document.get("schedule", []) if schedule.get("from_s", 0.0) < last_s]
     clipped = [
         {**schedule, "until_s": min(schedule["until_s"], last_s)} if "until_s" in schedule else schedule
@@ -248,32 +251,34 @@ def cut_after(document: Document, last_s: float) -> Document:
     return with_key(document, "schedule", clipped)
 
 
-def _over_by(entry: Document, last_s: float) -> Document:
-    """What would pass later stays to the end."""
+def _limit_duration(entry: Document, last_s: float) -> Document:
+    """Make a change permanent if it would end after `last_s`."""
     lasts = "for_s" in entry and entry["at_s"] + entry["for_s"] > last_s
     return with_key(entry, "for_s", None) if lasts else entry
 
 
-def moved(document: Document, to: Callable[[float], float]) -> Document:
-    """Everything that happens happens at another time."""
+def move_times(document: Document, to: Callable[[float], float]) -> Document:
+    """Move all times of the document with the function `to`."""
     for key in ("events.script", "timeline"):
-        document = with_key(document, key, [_moved(entry, to) for entry in at(document, key) or []])
-    document = with_key(document, "fates", [_moved_fate(fate, to) for fate in document.get("fates", [])])
-    document = with_key(document, "datagrams", [_moved_datagram(heard, to) for heard in document.get("datagrams", [])])
+        document = with_key(document, key, [_move_entry_times(entry, to) for entry in at(document, key) or []])
+    document = with_key(document, "fates", [_move_fate_times(fate, to) for fate in document.get("fates", [])])
+    document = with_key(
+        document, "datagrams", [_move_datagram_times(datagram, to) for datagram in document.get("datagrams", [])]
+    )
     return {**document, "duration_s": max(1.0, to(document.get("duration_s", 1200.0)))}
 
 
-def _moved_fate(fate: Document, to: Callable[[float], float]) -> Document:
-    """Of fates those whose messages arrive at given times; the windows of others are as they are."""
+def _move_fate_times(fate: Document, to: Callable[[float], float]) -> Document:
+    """Move the arrival times of a fate. Fates without arrival times keep their time windows."""
     if "arrivals" not in fate:
         return fate
     return {**fate, "arrivals": in_text(((number, to(at_s)) for number, at_s in numbered(fate["arrivals"])), "@")}
 
 
-def _moved_datagram(datagram: Document, to: Callable[[float], float]) -> Document:
+def _move_datagram_times(datagram: Document, to: Callable[[float], float]) -> Document:
     return {**datagram, "reaches": {agent: to(at_s) for agent, at_s in datagram["reaches"].items()}}
 
 
-def _moved(entry: Document, to: Callable[[float], float]) -> Document:
+def _move_entry_times(entry: Document, to: Callable[[float], float]) -> Document:
     lasts = {"for_s": round(to(entry["at_s"] + entry["for_s"]) - to(entry["at_s"]), 6)} if "for_s" in entry else {}
     return {**entry, "at_s": to(entry["at_s"]), **lasts}

@@ -1,7 +1,7 @@
 """Shrink a document by delta debugging, and write the smallest scenario that still fails.
 
-What is tried, and how it ends, is the same however many processes try: candidates count in their order, and what
-others found out meanwhile about later ones is forgotten.
+The result does not depend on the number of processes. Candidates count in their order: results for candidates after the
+first success are discarded.
 """
 
 import json
@@ -21,15 +21,18 @@ from harness.sweep.explore._scenario_document import Document, at
 T = TypeVar("T")
 
 WORTH_FORKING_S = 0.03
-"""Runs that are shorter take less time than to have another process play them."""
+"""Minimum duration of a run for parallel play. For shorter runs, starting processes takes longer than the runs."""
 
 
 class BudgetSpentError(Exception):
-    """As many runs were played as may be."""
+    """The maximum number of runs has been played."""
 
 
 class Shrinker:
-    """`best` is the smallest document so far of which `violates` is true; `adopted` is called with each better one."""
+    """Searches for smaller documents.
+
+    `best` is the smallest document so far for which `violates` is true. `adopted` is called for each new one.
+    """
 
     def __init__(
         self,
@@ -46,11 +49,11 @@ class Shrinker:
         self._jobs = jobs
         self._max_runs = max_runs
         self._adopted = adopted
-        self._in_vain: set[str] = set()
+        self._rejected: set[str] = set()
         self._pace_s = 1.0
 
     def first(self, candidates: Iterable[Document]) -> int | None:
-        """Take the first candidate that violates; its index, or None. Raises BudgetSpentError."""
+        """Adopt the first candidate that violates. Return its index, or None. Raises BudgetSpentError."""
         if self.runs >= self._max_runs:
             raise BudgetSpentError
         jobs = self._jobs if self._pace_s > WORTH_FORKING_S else 1
@@ -59,11 +62,11 @@ class Shrinker:
             with sweep(self._new(candidates), lambda task: self._violates(task[1]), jobs) as outcomes:
                 for (index, _, document), violates in outcomes:
                     self.runs += 1
-                    if violates is True:  # a run that failed is none
+                    if violates is True:  # a failed run shows no violation
                         self.best = document
                         self._adopted(self)
                         return index
-                    self._in_vain.add(_key(document))
+                    self._rejected.add(_key(document))
                     if self.runs >= self._max_runs:
                         raise BudgetSpentError
         finally:
@@ -72,11 +75,11 @@ class Shrinker:
         return None
 
     def _new(self, candidates: Iterable[Document]) -> Iterator[tuple[int, Scenario, Document]]:
-        """Those that are scenarios, smaller or not, and have not been tried."""
+        """Yield candidates that are valid scenarios and were not tried before."""
         seen = {_key(self.best)}
         for index, document in enumerate(candidates):
             key = _key(document)
-            if key in seen or key in self._in_vain:
+            if key in seen or key in self._rejected:
                 continue
             seen.add(key)
             try:
@@ -85,7 +88,7 @@ class Shrinker:
                 continue
 
     def fewest(self, items: Sequence[T], with_items: Callable[[Sequence[T]], Document]) -> None:
-        """Zeller's ddmin: leave out ever smaller parts of `items`, until none can be left out."""
+        """Leave out ever smaller parts of `items` until no part can be left out (ddmin, Zeller 2002)."""
         kept = list(items)
         if not kept or self.first([with_items([])]) is not None:
             return
@@ -102,7 +105,10 @@ class Shrinker:
 
 
 def _leaving_out(items: Sequence[T], parts: int) -> Iterator[list[T]]:
-    """All of `items` but one part, for each of `parts` parts; the last first, on which the least depends."""
+    """Yield `items` without one part, for each of `parts` parts.
+
+    The last part comes first, because least depends on it.
+    """
     bounds = [len(items) * part // parts for part in range(parts + 1)]
     for part in reversed(range(parts)):
         yield [*islice(items, bounds[part]), *islice(items, bounds[part + 1], None)]
@@ -113,7 +119,10 @@ def _key(document: Document) -> str:
 
 
 def file_of(document: Document, header: list[str], recording: Recording) -> str:
-    """`recording` of this very document says when each message was sent that a fate is about."""
+    """Return the text of a scenario file.
+
+    `recording` belongs to this document, and supplies sending times for comments.
+    """
     sent: dict[Any, Lost] = {(lost.message, lost.sender, lost.receiver, lost.count): lost for lost in recording.lost}
 
     def remark(entry: Document) -> str | None:

@@ -1,7 +1,7 @@
-"""What smaller means, in the order in which it pays: first what makes runs short, then what makes them simple.
+"""The steps of shrinking, in order of benefit: first steps that shorten runs, then steps that simplify the scenario.
 
-Fates are tried in two forms. By time, a fate still means the same message when others are no longer sent; by count it
-means the same when everything comes earlier. After each change of form all that is left out again is tried once more.
+Fates have two forms. A fate by time still hits the same message when other messages disappear. A fate by count still
+hits the same message when everything happens earlier. After each change of form, all steps are tried again.
 """
 
 import math
@@ -16,16 +16,16 @@ from harness.sweep.explore._scenario_document import (
     at,
     cut_after,
     event_of,
+    event_times,
     fate_by_count,
     fate_by_time,
-    instants,
-    moved,
+    keep_agents,
+    move_times,
     script,
-    scripted,
     timeline,
-    with_agents,
     with_drops,
     with_key,
+    with_script,
 )
 from harness.sweep.explore._shrink import Shrinker
 from ucp.events import EVENT_HEADER_BYTES
@@ -33,81 +33,81 @@ from ucp.settings import Settings
 
 MAX_ROUNDS = 8
 MAX_PAIRED = 12
-"""Among more agents there are too many pairs to try."""
+"""Maximum number of agents for which all pairs of agents are tried."""
 DELAY_S = 0.02
 SLACKS_S = (0.3, 0.03)
 GAPS_S = (1, 2, 5, 10, 11, 15, 20, 30, 60)
-"""Whole seconds between two things that happen, the smallest first."""
+"""Whole seconds between two successive events, the smallest first."""
 
 Record = Callable[[Document], Recording]
 
 
 def shrink(shrinker: Shrinker, record: Record) -> None:
-    """Until nothing can be left out. Raises BudgetSpentError."""
+    """Shrink until nothing can be left out. Raises BudgetSpentError."""
     for _ in range(MAX_ROUNDS):
         before = shrinker.best
-        for express in (_by_time, _by_count):
+        for express in (_fates_by_time, _fates_by_count):
             express(shrinker, record)
-            for step in (_less_time, _no_final_reconcile, _fewer_agents, _fewer_of_each, _plainer):
+            for step in (_shorten_mission, _remove_final_reconcile, _fewer_agents, _fewer_of_each, _use_defaults):
                 step(shrinker)
             _blocks_of_one_event(shrinker, record)
         _round_times(shrinker)
-        _closer_together(shrinker)
+        _reduce_gaps(shrinker)
         if shrinker.best == before:
             return
 
 
 def replays(document: Document, recording: Recording) -> Iterator[Document]:
-    """What could play the recorded run again without chance; the last is `document` itself, chance and all."""
+    """Yield candidates that may reproduce the recorded run without chance. The last one is `document` itself."""
     lost = [loss for loss in recording.lost if not loss.by_quirk]
-    everything = scripted(document, recording.logged, [fate_by_count(loss) for loss in recording.lost])
+    everything = with_script(document, recording.logged, [fate_by_count(loss) for loss in recording.lost])
     ignored = at(document, "quirks.ignore_commit")
     if ignored:
         yield with_key(everything, "quirks.ignore_commit", None)
-    faithful = scripted(document, recording.logged, [fate_by_count(loss) for loss in lost])
+    faithful = with_script(document, recording.logged, [fate_by_count(loss) for loss in lost])
     yield faithful
     yield with_key(faithful, "network.delay", DELAY_S)
     yield {**document, "events": {"source": "scripted", "script": [event_of(event) for event in recording.logged]}}
     yield document
 
 
-def _by_time(shrinker: Shrinker, record: Record) -> None:
+def _fates_by_time(shrinker: Shrinker, record: Record) -> None:
     document, lost = shrinker.best, record(shrinker.best).lost
     if document.get("fates"):
         shrinker.first(with_drops(document, [fate_by_time(loss, slack) for loss in lost]) for slack in SLACKS_S)
 
 
-def _by_count(shrinker: Shrinker, record: Record) -> None:
+def _fates_by_count(shrinker: Shrinker, record: Record) -> None:
     document, lost = shrinker.best, record(shrinker.best).lost
     if document.get("fates"):
         shrinker.first([with_drops(document, [fate_by_count(loss) for loss in lost])])
 
 
-def _less_time(shrinker: Shrinker) -> None:
-    """End the mission as soon as possible; then not later than the last thing happens."""
-    moments = instants(shrinker.best)
-    low, high = -1, len(moments) - 1  # it is not known to violate up to `low`, and does up to `high`
+def _shorten_mission(shrinker: Shrinker) -> None:
+    """End the mission as early as possible, then close to the last event."""
+    moments = event_times(shrinker.best)
+    low, high = -1, len(moments) - 1  # a violation is known up to `high`, none up to `low`
     while high - low > 1:
         middle = (low + high) // 2
         if shrinker.first([cut_after(shrinker.best, moments[middle])]) is not None:
             high = middle
         else:
             low = middle
-    last = max(instants(shrinker.best), default=0.0)
+    last = max(event_times(shrinker.best), default=0.0)
     now = shrinker.best.get("duration_s", 1200.0)
     ends = [max(1.0, last), *(last + gap for gap in GAPS_S)]
     shrinker.first({**shrinker.best, "duration_s": float(math.ceil(end))} for end in ends if math.ceil(end) < now)
 
 
-def _no_final_reconcile(shrinker: Shrinker) -> None:
+def _remove_final_reconcile(shrinker: Shrinker) -> None:
     shrinker.first([with_key(shrinker.best, "final_reconcile", None)])
 
 
 def _fewer_agents(shrinker: Shrinker) -> None:
     document = shrinker.best
-    for delay in (at(document, "network.delay"), DELAY_S):  # with fewer agents chance gives others their latencies
+    for delay in (at(document, "network.delay"), DELAY_S):  # fewer agents draw other latencies
         base = with_key(document, "network.delay", delay)
-        shrinker.fewest(document["agents"], lambda kept, base=base: with_agents(base, kept))  # type: ignore[misc]
+        shrinker.fewest(document["agents"], lambda kept, base=base: keep_agents(base, kept))  # type: ignore[misc]
         while _two_agents_fewer(shrinker, delay):
             pass
         if len(shrinker.best["agents"]) < len(document["agents"]):
@@ -115,13 +115,13 @@ def _fewer_agents(shrinker: Shrinker) -> None:
 
 
 def _two_agents_fewer(shrinker: Shrinker, delay: Any) -> bool:
-    """Two at a time keep an even number of voters even."""
+    """Remove two agents at once, so that an even number of voters stays even."""
     base = with_key(shrinker.best, "network.delay", delay)
     agents = set(base["agents"])
     if len(agents) > MAX_PAIRED:
         return False
     pairs = combinations(reversed(base["agents"]), 2)
-    return shrinker.first(with_agents(base, agents - {*pair}) for pair in pairs) is not None
+    return shrinker.first(keep_agents(base, agents - {*pair}) for pair in pairs) is not None
 
 
 def _fewer_of_each(shrinker: Shrinker) -> None:
@@ -136,8 +136,8 @@ def _fewer_of_each(shrinker: Shrinker) -> None:
         shrinker.fewest(list(named.items()), lambda kept, d=document, k=key: with_key(d, k, dict(kept)))  # type: ignore[misc]
 
 
-def _plainer(shrinker: Shrinker) -> None:
-    """What can be as by default; and if not, one latency for all messages."""
+def _use_defaults(shrinker: Shrinker) -> None:
+    """Replace keys by defaults, or at least use one latency for all messages."""
     for key in (
         "initial_data",
         "lateness",
@@ -158,7 +158,7 @@ def _plainer(shrinker: Shrinker) -> None:
 
 
 def _blocks_of_one_event(shrinker: Shrinker, record: Record) -> None:
-    """The same blocks at the same times, each of the one event that completed it."""
+    """Build the same blocks at the same times from one event each, namely the event that completed the block."""
     document = shrinker.best
     largest = at(document, "settings.max_event_bytes") or Settings().max_event_bytes
     if at(document, "settings.max_block_bytes") == largest or not script(document):
@@ -171,28 +171,33 @@ def _blocks_of_one_event(shrinker: Shrinker, record: Record) -> None:
 
 def _round_times(shrinker: Shrinker) -> None:
     document = shrinker.best
-    shrinker.first(moved(document, lambda at_s, digits=digits: float(round(at_s, digits))) for digits in (0, 1, 2, 3))  # type: ignore[misc]
+
+    def rounded(digits: int) -> Document:
+        return move_times(document, lambda at_s: float(round(at_s, digits)))
+
+    shrinker.first(map(rounded, (0, 1, 2, 3)))
 
 
-def _closer_together(shrinker: Shrinker) -> None:
-    """Less time between one thing that happens and the next."""
-    for index in range(len(instants(shrinker.best))):
-        moments = instants(shrinker.best)
+def _reduce_gaps(shrinker: Shrinker) -> None:
+    """Reduce the time between successive events."""
+    for index in range(len(event_times(shrinker.best))):
+        moments = event_times(shrinker.best)
         if index >= len(moments):
             return
         moment, before = moments[index], moments[index - 1] if index else 0.0
         gap = moment - before
         gaps = [*(float(shorter) for shorter in GAPS_S if shorter < gap), float(math.ceil(gap))]
-        shrinker.first(moved(shrinker.best, _bring(moment, before + shorter)) for shorter in gaps if shorter != gap)
+        shifts = [_time_shift(moment, before + shorter) for shorter in gaps if shorter != gap]
+        shrinker.first(move_times(shrinker.best, shift) for shift in shifts)
 
 
-def _bring(moment: float, earlier: float) -> Callable[[float], float]:
-    """Move `moment`, and all after it."""
+def _time_shift(moment: float, earlier: float) -> Callable[[float], float]:
+    """Return a function that moves `moment` and all later times to an earlier time."""
     return lambda at_s: round(at_s - moment + earlier, 6) if at_s >= moment else at_s
 
 
 def size(document: Document) -> str:
-    """In words: "5 agents, 203 events, 61 fates"."""
+    """Return the size as text: "5 agents, 203 events, 61 fates"."""
     counts = {
         "agent": len(document["agents"]),
         "event": len(script(document)),

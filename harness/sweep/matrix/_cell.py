@@ -1,4 +1,4 @@
-"""Runs, and all runs at one point of the matrix summed up."""
+"""The result of one run, and the summary of all runs at one point of the matrix."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ from harness.sweep.matrix._estimate import BEFORE_FINAL_RECONCILE, METRICS, Esti
 from harness.sweep.matrix._matrix_file import Point, Task
 
 
-class Placed(BaseModel):
-    """What belongs to one point of the matrix."""
+class AtPoint(BaseModel):
+    """Base class of everything that belongs to one point of the matrix."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -28,10 +28,10 @@ class Placed(BaseModel):
         return Point(self.loss, self.agents, self.backend, self.duration_s)
 
 
-class Run(Placed):
-    """What one run leaves here: figures, and the verdicts by number or key.
+class Run(AtPoint):
+    """The result of one run: figures, and verdicts by number or key.
 
-    Or why it has none: it `failed`, or an agent said that what it needs is `unsupported`.
+    A run without a verdict has a reason: in `failed` for an error, or in `unsupported` if an agent lacks a feature.
     """
 
     seed: int
@@ -40,7 +40,7 @@ class Run(Placed):
     failed: str | None = None
     unsupported: str | None = None
     reached: Annotated[Any, Field(exclude=True)] = None
-    """Of a run that was just played, and watched: a `harness.proof.coverage.Reached`. It is not written."""
+    """A `harness.proof.coverage.Reached` if coverage of this run was measured. It is not written to files."""
 
     @property
     def judged(self) -> bool:
@@ -51,7 +51,7 @@ class Run(Placed):
         return Task(self.point, self.seed)
 
 
-class Cell(Placed):
+class Cell(AtPoint):
     """The runs at one point of a matrix. `failed` and `unsupported` count the runs without figures.
 
     `estimates` has an estimate for each metric. `verdicts` counts the verdicts of each check. `violated` has the seeds
@@ -68,10 +68,10 @@ class Cell(Placed):
 
     @property
     def finished(self) -> Estimate:
-        """The share of the runs whose swarm finished, of those that tell."""
-        told = self.verdicts.get("liveness", {})
-        finished = told.get("finished", 0)
-        return estimate_share(finished, finished + told.get("not finished", 0) + told.get("never finishes", 0))
+        """The share of runs whose swarm became idle, among runs with a verdict about it."""
+        counts = self.verdicts.get("liveness", {})
+        finished = counts.get("finished", 0)
+        return estimate_share(finished, finished + counts.get("not finished", 0) + counts.get("never finishes", 0))
 
 
 def is_wrong(verdict: Verdict) -> bool:

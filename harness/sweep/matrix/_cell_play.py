@@ -1,4 +1,4 @@
-"""One run of a matrix: in the simulation, or as processes or containers in a run directory of its own."""
+"""Play one run of a matrix in the simulation, or as processes or containers in its own run directory."""
 
 import shutil
 from collections.abc import Callable, Iterable
@@ -21,18 +21,18 @@ from harness.sweep.matrix._growth_metrics import growth_figures
 from harness.sweep.matrix._matrix_file import Matrix, Point, Task
 
 Judge = Callable[[Scenario, int], tuple[RunOutcome, Result]]
-"""Plays a scenario with a seed, and judges it."""
+"""Plays a scenario with a seed and judges the run."""
 
 
 class RunFailedError(HarnessError):
-    """A run did not end normally, or an agent crashed or hung in it."""
+    """A run did not complete, or one of its agents crashed or hung."""
 
     exit_status = VIOLATED
 
 
 @gc_paused()
 def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> tuple[RunOutcome, Result]:
-    """Play in virtual time. Every step is judged if `tracing`."""
+    """Play in virtual time. Every step is judged if `tracing` is true."""
     from harness.run.simulate import simulate
 
     run = simulate(scenario, seed, tracing=tracing)
@@ -40,8 +40,8 @@ def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> tuple[R
 
 
 @gc_paused()
-def watched(scenario: Scenario, seed: int, reached: Reached) -> tuple[RunOutcome, Result]:
-    """Play as `simulated` does with traces, and add to what was reached."""
+def play_with_coverage(scenario: Scenario, seed: int, reached: Reached) -> tuple[RunOutcome, Result]:
+    """Play in virtual time with traces, and add the coverage of the run to `reached`."""
     watcher = Watcher()
     run = simulate_watched(scenario, seed, watcher.step)
     reached.add(watcher.reached)
@@ -56,13 +56,13 @@ def _same_twice(scenario: Scenario, seed: int) -> None:
 
 @dataclass(frozen=True)
 class Player:
-    """Plays any run of `matrix`; processes leave their run directories in `directory`. `judge` is for virtual time."""
+    """Plays any run of `matrix`. Processes leave run directories in `directory`. `judge` plays runs in virtual time."""
 
     matrix: Matrix
     directory: Path
     judge: Judge = simulated
     covers: bool = False
-    """Whether to watch what runs reach. Of virtual time these are judged by no other `judge`."""
+    """True to measure the coverage of each run. In virtual time, `judge` is not used then."""
 
     def __call__(self, task: Task) -> Run:
         scenario = self.matrix.scenario_at(task.point)
@@ -72,9 +72,9 @@ class Player:
                 _same_twice(scenario, task.seed)
             reached = Reached() if self.covers else None
             if not in_memory:
-                played, result = self._for_real(scenario, task, reached)
+                played, result = self._play_with_processes(scenario, task, reached)
             elif reached is not None:
-                played, result = watched(scenario, task.seed, reached)
+                played, result = play_with_coverage(scenario, task.seed, reached)
             else:
                 played, result = self.judge(scenario, task.seed)
         except UnsupportedError as error:
@@ -86,17 +86,22 @@ class Player:
         return Run(**task.point._asdict(), seed=task.seed, figures=figures, verdicts=verdicts, reached=reached)
 
     def refuse(self, points: Iterable[Point]) -> None:
-        """Raises HarnessError if a backend, or this machine, cannot play these: before hours of others have gone by."""
+        """Check all points before the first run.
+
+        Raises HarnessError if a backend or this machine cannot play one of them.
+        """
         for point in points:
             BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))
 
-    def _for_real(self, scenario: Scenario, task: Task, reached: Reached | None) -> tuple[RunOutcome, Result]:
-        """Raises UnsupportedError, or RunFailedError, which names the run directory."""
+    def _play_with_processes(
+        self, scenario: Scenario, task: Task, reached: Reached | None
+    ) -> tuple[RunOutcome, Result]:
+        """Play as processes or containers. Raises UnsupportedError, or RunFailedError with the run directory."""
         directory = self.directory / directory_name(task)
-        shutil.rmtree(directory, ignore_errors=True)  # of a run that was broken off
+        shutil.rmtree(directory, ignore_errors=True)  # remains of an interrupted run
         try:
             finished = run(scenario, task.seed, directory, Silent(), task.point.backend)
-        except HarnessError as error:  # what every run would meet has been refused
+        except HarnessError as error:  # errors that every run would have were found by `refuse`
             raise RunFailedError(f"{error}; see {directory}") from None
         if finished.played.outcome == "interrupted":
             raise InterruptedRunError(f"the run in {directory} was interrupted")

@@ -1,4 +1,4 @@
-"""cells/*.yaml: the scenario of each loss and number of agents, with which `ucp-harness run` plays a run again."""
+"""Write cells/*.yaml, the scenario of each cell. `ucp-harness run` can play each run again with them."""
 
 from pathlib import Path
 
@@ -11,12 +11,12 @@ DIRECTORY = "cells"
 
 
 def scenario_file(point: Point) -> str:
-    """In the matrix's directory."""
+    """Return the path of the point's scenario, relative to the matrix's directory."""
     return f"{DIRECTORY}/{point.file_name}.yaml"
 
 
 def write_scenarios(matrix: Matrix, directory: Path) -> None:
-    """Raises OSError if the disk refuses."""
+    """Write the scenarios of all points. Raises OSError if a file cannot be written."""
     (directory / DIRECTORY).mkdir(exist_ok=True)
     for path, point in {scenario_file(point): point for point in matrix.points}.items():
         scenario = matrix.scenario_at(point).model_dump(mode="json", exclude_defaults=True)

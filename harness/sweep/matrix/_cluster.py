@@ -1,7 +1,7 @@
-"""Many tasks on a Dask cluster: outcomes as they end, as `harness.run.parallel` has them of one machine.
+"""Play many tasks on a Dask cluster. The interface equals that of `harness.run.parallel` for one machine.
 
-Dask hands a lost worker's tasks to others. Each task is one future, so its outcome comes once, however often it had to
-be worked on.
+Dask gives the tasks of a lost worker to other workers. Each task is one future, so it has exactly one outcome, even if
+it was started several times.
 """
 
 import asyncio
@@ -21,18 +21,20 @@ R = TypeVar("R")
 
 CONNECT_S = 10.0
 SAME_VERSIONS = ("dask", "distributed", "ucp-harness")
-"""Packages that must be the same here, on the scheduler and on every worker."""
+"""Packages whose versions must be equal here, on the scheduler and on each worker."""
 
 
 @contextlib.contextmanager
 def cluster(
     tasks: Sequence[T], work: Callable[[T], R], address: str, *, what: str | None = None
 ) -> Iterator[Iterator[tuple[T, R | Failed]]]:
-    """Each task with its outcome, as they end, from the workers of the scheduler at `address`, tcp://host:port.
+    """Yield each task with its outcome, in order of completion, from the scheduler at `address` (tcp://host:port).
 
-    Outcomes, errors and interrupts as `harness.run.parallel.sweep` has them; `work` has to be importable on the
-    workers. Raises MachineError if there is no such scheduler, it has no workers, its versions differ, or it is lost;
-    HarnessError for an address that is none. Leaving the block takes back what has not been worked on.
+    Outcomes, errors and interrupts are as in `harness.run.parallel.sweep`. The workers must be able to import `work`.
+    At the end of the block, unfinished tasks are cancelled.
+
+    Raises HarnessError for an invalid address. Raises MachineError if no scheduler answers, if it has no workers or
+    other versions, or if the connection is lost.
     """
     with terminated_is_interrupted(), shown(what, len(tasks)) as count, _connected(address) as client:
         yield _outcomes(client, tasks, work, address, count)
@@ -49,10 +51,10 @@ def _connected(address: str) -> Iterator[Any]:
             "--scheduler needs Dask, which is not installed here: pip install 'ucp-harness[cluster]'"
         ) from None
     for name in ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong we say ourselves
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # we report errors ourselves
     try:
         versions = asyncio.run(asyncio.wait_for(_versions(address), CONNECT_S))
-    except Exception as error:  # whatever another version, or no Dask at all, makes of our greeting
+    except Exception as error:  # another version or another program may raise any exception here
         raise MachineError(
             f"no Dask scheduler answers at {address} ({type(error).__name__}): start `dask scheduler` there, of "
             f"version {distributed.__version__}"
@@ -69,7 +71,7 @@ def _connected(address: str) -> Iterator[Any]:
 
 
 async def _versions(address: str) -> dict[str, dict[str, str | None]]:
-    """The packages of SAME_VERSIONS: here, on the scheduler, and on each worker."""
+    """Return the versions of the packages in SAME_VERSIONS: here, on the scheduler, and on each worker."""
     from distributed import rpc
     from distributed.versions import get_versions
 
@@ -100,12 +102,12 @@ def _outcomes(
 
     if not tasks:
         return
-    # As a task of its own, `work` goes to each worker once, and is made again if a worker is lost with it.
+    # `work` is a task of its own, so each worker receives it once. Dask recreates it if its worker is lost.
     shared = client.submit(_same, work, pure=False)
     futures = client.map(outcome_of, [shared] * len(tasks), tasks, pure=False)
     task_of = dict(zip(futures, tasks, strict=True))
     ended = as_completed(futures, loop=client.loop)
-    del futures  # so that an outcome is kept no longer than we need it
+    del futures  # the references would keep all outcomes in memory
     for future in ended:
         task = task_of.pop(future)
         try:

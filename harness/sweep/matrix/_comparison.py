@@ -1,17 +1,17 @@
-"""Tonight's cells beside an earlier night's: which figures changed by more than chance explains.
+"""Compare the cells of a matrix with those of an earlier night: which figures changed by more than chance explains?
 
-A figure changed if its two 95 % intervals have nothing in common. Its metric says which direction is worse.
+A figure changed if its two 95 % intervals do not overlap. The metric states which direction is worse.
 """
 
 from collections.abc import Iterator, Sequence
 
 from pydantic import BaseModel
 
-from harness.sweep.matrix._cell import Cell, Placed
+from harness.sweep.matrix._cell import AtPoint, Cell
 from harness.sweep.matrix._estimate import BY_NAME, Estimate
 
 
-class Change(Placed):
+class Change(AtPoint):
     """A changed figure: `metric` was `before` and is `now`. The two 95 % intervals do not overlap."""
 
     metric: str
@@ -33,7 +33,7 @@ class Comparison(BaseModel):
 
 
 def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
-    """What changed, in the order of `now`; cells that only one of them has are left out."""
+    """Yield the changes in the order of `now`. Cells that exist in only one of the matrices are left out."""
     earlier = {cell.point: cell for cell in before}
     for cell in now:
         if cell.point not in earlier:
@@ -50,7 +50,7 @@ def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
 
 
 def _moved(before: Estimate, now: Estimate) -> str | None:
-    """Where to, if the intervals are apart; a figure without an interval tells nothing."""
+    """Return the direction of the change if the intervals do not overlap. Without both intervals, return None."""
     if before.low is None or before.high is None or now.low is None or now.high is None:
         return None
     if now.high < before.low:

@@ -1,7 +1,7 @@
 """The metrics of a run, and their means and shares with 95 % intervals.
 
-A share of runs has Wilson's interval, which stays honest at 0 and 100 %; a mean has Student's. One run has none: it
-tells nothing about the spread of others.
+A share of runs has Wilson's interval, which is also valid near 0 and 100 %. A mean has Student's interval. A single run
+has no interval, because it contains no information about the spread.
 """
 
 import math
@@ -17,8 +17,10 @@ CONFIDENCE = 0.95
 
 
 class Estimate(BaseModel):
-    """The mean of `n` runs. `low` and `high` are the limits of its 95 % interval, null for a single run. Without runs,
-    all are null."""
+    """The mean of `n` runs.
+
+    `low` and `high` are the limits of its 95 % interval, null for a single run. Without runs, all are null.
+    """
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
@@ -38,7 +40,7 @@ def estimate_mean(values: Sequence[float]) -> Estimate:
 
 
 def estimate_share(count: int, n: int) -> Estimate:
-    """The share of `n` runs that `count` of them are (E. B. Wilson, 1927)."""
+    """Return the share `count` / `n` with its interval (E. B. Wilson, 1927)."""
     if n < 2:
         return Estimate(n=n, mean=float(count) if n else None)
     z = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
@@ -51,9 +53,9 @@ def estimate_share(count: int, n: int) -> Estimate:
 
 @lru_cache
 def student_quantile(probability: float, degrees: int) -> float:
-    """Where Student's t distribution of so many degrees of freedom reaches `probability`, above 0.5.
+    """Return the quantile of Student's t distribution with `degrees` degrees of freedom; `probability` is above 0.5.
 
-    Bisection in angle = atan(t / sqrt(degrees)), in which the distribution is a finite sum.
+    The method is bisection in angle = atan(t / sqrt(degrees)), in which the distribution is a finite sum.
     """
     low, high = 0.0, math.pi / 2
     while (middle := (low + high) / 2) not in (low, high):
@@ -65,7 +67,7 @@ def student_quantile(probability: float, degrees: int) -> float:
 
 
 def _within(angle: float, degrees: int) -> float:
-    """How much of Student's distribution lies within +-t (Abramowitz and Stegun, 26.7.3 and 26.7.4)."""
+    """Return the probability of Student's distribution between -t and t (Abramowitz and Stegun, 26.7.3 and 26.7.4)."""
     cosine = math.cos(angle)
     first = degrees % 2
     term, total = (cosine if first else 1.0), 0.0
@@ -82,9 +84,9 @@ Figures = Mapping[str, float | int | None]
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """`of` is None for a run that does not tell. `unit`: a share of the runs, a share in each run, or a number.
+    """A metric of a run. `of` returns its value, or None if the run does not determine it.
 
-    `worse`: which direction is, None if neither.
+    `unit` is a share of the runs, a share in each run, or a number. `worse` is the worse direction, None if neither is.
     """
 
     name: str
@@ -143,5 +145,5 @@ BEFORE_FINAL_RECONCILE = (
         worse="lower",
     ),
 )
-"""Known only where the scenario has a final reconcile, after which the others say little of the network."""
+"""Metrics for scenarios with a final reconcile. After it, the other metrics depend little on the network."""
 BY_NAME = {metric.name: metric for metric in METRICS + BEFORE_FINAL_RECONCILE}

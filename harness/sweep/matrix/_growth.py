@@ -1,7 +1,7 @@
-"""How the figures of a matrix grow with the number of agents, and with the number of blocks.
+"""Fit laws of growth of the figures with the number of agents and the number of blocks.
 
-A mission's length is not a variable of its own: a longer mission costs more because it has more blocks. The laws
-"over blocks" therefore compare missions of several lengths.
+The mission's length is no variable of its own, because a longer mission costs more only through its larger number of
+blocks. The laws "over blocks" therefore compare missions of several lengths.
 """
 
 from collections.abc import Iterable, Sequence
@@ -36,7 +36,7 @@ class Growth(BaseModel):
 
 
 def overloaded(cell: Cell) -> bool:
-    """Whether agents complete blocks faster than they can commit them."""
+    """Return whether agents complete blocks faster than they can commit them."""
     load = cell.estimates["load"].mean if "load" in cell.estimates else None
     return load is not None and load >= 1
 

@@ -1,7 +1,7 @@
-"""growth.svg: small panels on logarithmic axes, where a power law is a straight line.
+"""Draw growth.svg: small panels on logarithmic axes, where a power law is a straight line.
 
-A dot is the mean of a cell. A line is the law fitted to the cells' runs, and its exponent stands beside it. Lines
-differ by colour and dashes. The legend names the lines over agents, and each exponent over blocks names its line.
+A dot is the mean of a cell. A line is the law fitted to the cells' runs, with its exponent beside it. Lines differ by
+colour and dashes. The legend names the lines over agents, and each exponent over blocks names its line.
 """
 
 import math
@@ -25,8 +25,8 @@ from harness.sweep.matrix.matrix_record import MatrixRecord
 
 COLUMNS = 3
 HEAD, PANEL_HEIGHT, FOOT = 96, 236, 26
-MOST = 4
-"""Number of lines that a reader can tell apart in a panel. Of more lines, the panel shows these many, evenly chosen."""
+MAX_LINES = 4
+"""Maximum number of lines in a panel. Of more lines, the panel shows an even selection."""
 TICK_WIDTH = 24.0
 
 
@@ -55,7 +55,7 @@ ALSO_OVER_BLOCKS = ("messages", "bytes")
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class LineKey:
     """The axes that are the same along a line; None for the axis along which the line runs."""
 
     backend: BackendName
@@ -65,7 +65,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class PanelLine:
     """A line of a panel, with the number of its colour."""
 
     number: int
@@ -154,7 +154,7 @@ def _legend(record: MatrixRecord) -> Markup:
     return Markup("").join(parts)
 
 
-def _lines(record: MatrixRecord, panel: Panel) -> list[Line]:
+def _lines(record: MatrixRecord, panel: Panel) -> list[PanelLine]:
     """Return the lines of a panel.
 
     A line over agents has one mission length. A line over blocks has one number of agents; beside lines over agents,
@@ -162,7 +162,7 @@ def _lines(record: MatrixRecord, panel: Panel) -> list[Line]:
     """
     matrix, over_agents = record.matrix, panel.over == "agents"
     losses = matrix.loss if over_agents or not matrix.grows_with_agents else [max(matrix.loss)]
-    by_place: dict[Place, list[Cell]] = {}
+    by_place: dict[LineKey, list[Cell]] = {}
     for cell in record.cells:
         if cell.loss in losses:
             by_place.setdefault(_place_of(cell, panel), []).append(cell)
@@ -172,9 +172,9 @@ def _lines(record: MatrixRecord, panel: Panel) -> list[Line]:
         if (growth.metric, growth.over, growth.load) == (panel.metric, (panel.over,), "any")
     }
     places = [*by_place]
-    chosen = dict.fromkeys(round(at * (len(places) - 1) / (MOST - 1)) for at in range(MOST)) if places else ()
+    chosen = dict.fromkeys(round(at * (len(places) - 1) / (MAX_LINES - 1)) for at in range(MAX_LINES)) if places else ()
     return [
-        Line(
+        PanelLine(
             number,
             _name(matrix, losses, places[at]),
             sorted(by_place[places[at]], key=lambda cell: (cell.agents, cell.duration_s or 0.0)),
@@ -184,13 +184,13 @@ def _lines(record: MatrixRecord, panel: Panel) -> list[Line]:
     ]
 
 
-def _place_of(item: Cell | Growth, panel: Panel) -> Place:
+def _place_of(item: Cell | Growth, panel: Panel) -> LineKey:
     along = panel.over == "agents"
-    return Place(item.backend, item.loss, None if along else item.agents, item.duration_s if along else None)
+    return LineKey(item.backend, item.loss, None if along else item.agents, item.duration_s if along else None)
 
 
-def _name(matrix: Matrix, losses: Sequence[float], place: Place) -> str:
-    """Name the axes that tell lines apart."""
+def _name(matrix: Matrix, losses: Sequence[float], place: LineKey) -> str:
+    """Name the values in which lines differ."""
     return ", ".join(
         [
             *([f"{words.percent(place.loss)} loss"] if len(losses) > 1 else []),
@@ -220,7 +220,7 @@ def _panel(record: MatrixRecord, panel: Panel, area: Area) -> Markup:
     return Markup('<g class="panel">{}{}</g>\n').format(frame, Markup("").join(drawn))
 
 
-def _line(panel: Panel, line: Line, across: Axis, up: Axis) -> Markup:
+def _line(panel: Panel, line: PanelLine, across: Axis, up: Axis) -> Markup:
     """Draw the law, or straight lines between the dots if there is none; and the dots with tooltips."""
     points = [(x, y, cell) for cell in line.cells if (x := _x(panel, cell)) and (y := _y(panel, cell)) is not None]
     ends = _ends(panel, line) or [(x, y) for x, y, _ in points]
@@ -231,7 +231,7 @@ def _line(panel: Panel, line: Line, across: Axis, up: Axis) -> Markup:
     return Markup('<g class="series {}">{}</g>').format(svg.CLASSES[line.number], Markup("").join(parts))
 
 
-def _power(panel: Panel, line: Line, law: Law, prefix: str, x: float, y: float) -> Markup:
+def _power(panel: Panel, line: PanelLine, law: Law, prefix: str, x: float, y: float) -> Markup:
     """Write the exponent of a law into the corner that growth leaves empty."""
     value, margin = say_exponent(law.exponents[panel.over]).split("\u00b1")
     text = Markup('{}{}<tspan dy="-4" font-size="10">{}</tspan><tspan dy="4" font-size="10"> \u00b1{}</tspan>').format(
@@ -242,7 +242,7 @@ def _power(panel: Panel, line: Line, law: Law, prefix: str, x: float, y: float) 
     )
 
 
-def _ends(panel: Panel, line: Line) -> list[tuple[float, float]]:
+def _ends(panel: Panel, line: PanelLine) -> list[tuple[float, float]]:
     """The ends of a law's line: its values at the first and the last dot."""
     xs = [x for cell in line.cells if (x := _x(panel, cell)) and _y(panel, cell)]
     if not line.law or not xs:
@@ -251,7 +251,7 @@ def _ends(panel: Panel, line: Line) -> list[tuple[float, float]]:
     return [(x, line.law.factor * x**power) for x in (min(xs), max(xs))]
 
 
-def _across(panel: Panel, lines: Sequence[Line], area: Area) -> Axis:
+def _across(panel: Panel, lines: Sequence[PanelLine], area: Area) -> Axis:
     """Return the horizontal axis. Over agents, the ticks are their numbers as far as there is room."""
     xs = sorted({x for line in lines for cell in line.cells if (x := _x(panel, cell))}) or [1.0, 10.0]
     if panel.over == "blocks":
@@ -264,7 +264,7 @@ def _across(panel: Panel, lines: Sequence[Line], area: Area) -> Axis:
     return replace(axis, ticks=ticks)
 
 
-def _up(panel: Panel, lines: Sequence[Line], area: Area) -> Axis:
+def _up(panel: Panel, lines: Sequence[PanelLine], area: Area) -> Axis:
     if panel.shares:
         return svg.share_axis(area.up)
     ys = [y for line in lines for cell in line.cells if (y := _y(panel, cell))]

@@ -1,4 +1,4 @@
-"""Growth in tables for the terminal, the page and Markdown: the means of each size, and the exponents of laws."""
+"""Tables of growth for the terminal, the page and Markdown: means of each size, and exponents of laws."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,11 +18,11 @@ from harness.sweep.matrix.matrix_record import MatrixRecord
 
 SYMBOLS: dict[Variable, str] = {"agents": "N", "blocks": "B"}
 UNKNOWN = "\u2013"
-SIZED = (
+SIZE_METRICS = (
     "blocks", "load", "uniform", "finished", "committed_per_minute", "reconciles_per_block", "messages_per_block",
     "messages", "bytes",
 )  # fmt: skip
-GROWN = ("messages", "bytes", "messages_per_block", "messages_per_minute", "uniform_after_s")
+LAW_METRICS = ("messages", "bytes", "messages_per_block", "messages_per_minute", "uniform_after_s")
 EXPLANATION = (
     "load: blocks completed while one vote lasts; from load 1 on, agents complete blocks faster than they can commit "
     "them. Exponents of N agents and B blocks: least squares in logarithms, a point for each run, with 95\u00a0% "
@@ -31,15 +31,15 @@ EXPLANATION = (
 
 
 @dataclass(frozen=True, slots=True)
-class Grown:
-    """Growth at one loss and backend: its cells, and a row of laws by metric for each group of runs and variable."""
+class GrowthTables:
+    """The growth at one loss and backend: cells, and a row of laws by metric for each group of runs and variable."""
 
     name: str
     cells: list[Cell]
     laws: list[tuple[str, Variable, dict[str, Law]]]
 
 
-def grown(record: MatrixRecord) -> Iterator[Grown]:
+def growth_tables(record: MatrixRecord) -> Iterator[GrowthTables]:
     """Yield growth at each backend and loss at which a run has ended; nothing if the matrix does not grow."""
     for backend in record.matrix.backend if record.matrix.grows else ():
         for loss in record.matrix.loss:
@@ -47,7 +47,7 @@ def grown(record: MatrixRecord) -> Iterator[Grown]:
             laws = [growth for growth in record.growths if (growth.backend, growth.loss) == (backend, loss)]
             name = f"{words.percent(loss)} loss" + (f", {backend}" if len(record.matrix.backend) > 1 else "")
             if cells:
-                yield Grown(name, cells, _rows(laws))
+                yield GrowthTables(name, cells, _rows(laws))
 
 
 def _rows(growths: Iterable[Growth]) -> list[tuple[str, Variable, dict[str, Law]]]:
@@ -84,32 +84,32 @@ def in_one_line(label: str) -> str:
 
 
 def size_row(cell: Cell) -> list[str]:
-    """The means of a cell, in the order of `SIZED`."""
+    """Return the means of a cell, in the order of `SIZED`."""
     share = Metric("finished", "", lambda _: None, "share of runs")
     return [
         say(share, cell.finished) if name == "finished" else say(BY_NAME[name], cell.estimates.get(name, Estimate(n=0)))
-        for name in SIZED
+        for name in SIZE_METRICS
     ]
 
 
 def law_row(variable: Variable, laws: dict[str, Law]) -> list[tuple[str, str]]:
-    """The exponents of `variable` in the order of `GROWN`, each with the quality of its law."""
+    """Return the exponents of `variable` in the order of `GROWN`, each with the quality of its law."""
     return [
         (say_exponent(law.exponents[variable]), say_quality(law)) if (law := laws.get(name)) else (UNKNOWN, "")
-        for name in GROWN
+        for name in LAW_METRICS
     ]
 
 
 def render(record: MatrixRecord) -> Iterator[RenderableType]:
-    """The tables for the terminal."""
-    for part in grown(record):
+    """Yield the tables for the terminal."""
+    for part in growth_tables(record):
         yield Text(f"Growth at {part.name}", style="bold")
-        sizes = _table(["s", "N", *map(label, SIZED)])
+        sizes = _table(["s", "N", *map(label, SIZE_METRICS)])
         for cell in part.cells:
             sizes.add_row(*place(record, cell), *size_row(cell))
         yield sizes
         if part.laws:
-            exponents = _table(["exponent of", *map(label, GROWN)])
+            exponents = _table(["exponent of", *map(label, LAW_METRICS)])
             for name, variable, laws in part.laws:
                 cells = law_row(variable, laws)
                 exponents.add_row(f"{SYMBOLS[variable]} {name}".rstrip(), *(exponent for exponent, _ in cells))
@@ -121,18 +121,18 @@ def render(record: MatrixRecord) -> Iterator[RenderableType]:
 
 
 def place(record: MatrixRecord, cell: Cell) -> list[str]:
-    """A cell's mission length in seconds and number of agents."""
+    """Return a cell's mission length in seconds and its number of agents."""
     return [f"{record.matrix.scenario_at(cell.point).duration_s:g}", str(cell.agents)]
 
 
 def say_exponent(exponent: Exponent) -> str:
-    """An exponent and the half of its interval."""
+    """Format an exponent with half the width of its interval."""
     margin = (exponent.high - exponent.low) / 2
     return f"{exponent.value:.2f}\u00b1" + (f"{margin:.2f}".lstrip("0") if margin < 0.995 else f"{margin:.2g}")
 
 
 def say_quality(law: Law) -> str:
-    """The share of the variance that a law explains, and the number of its points if runs were left out."""
+    """Format the explained share of the variance, and the number of points if runs were left out."""
     explained = "" if law.r_squared is None else f"R\u00b2\u00a0{law.r_squared:.2f}".replace("0.", ".")
     return explained + (f" n\u00a0{law.n}" if law.left_out else "")
 
@@ -144,7 +144,7 @@ def say(metric: Metric, estimate: Estimate) -> str:
 
 
 def say_number(value: float) -> str:
-    """Three significant digits: 0.012, 7.3, 482, 40.4k, 225M."""
+    """Format with three significant digits: 0.012, 7.3, 482, 40.4k, 225M."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     for factor, unit in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):

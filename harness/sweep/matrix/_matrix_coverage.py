@@ -1,4 +1,4 @@
-"""How much of the protocol a matrix has tried, if somebody asks: in all, and in each cell."""
+"""The coverage of the protocol by the runs of a matrix: in total, and in each cell. It is measured on request."""
 
 from collections import defaultdict
 from typing import Any
@@ -8,14 +8,14 @@ from pydantic import BaseModel
 from harness.proof import Bounds
 from harness.proof.coverage import Reached, existing, to_json
 from harness.proof.coverage.reached import BRANCHES
-from harness.sweep.matrix._cell import Placed
+from harness.sweep.matrix._cell import AtPoint
 from harness.sweep.matrix._matrix_file import Matrix, Point
 
 MOST_AGENTS, MOST_BLOCKS = 3, 3
-"""Shares are of what exists within these bounds."""
+"""Bounds of the states that coverage is compared with: numbers of agents and blocks."""
 
 
-class CellTried(Placed):
+class CellCoverage(AtPoint):
     """Coverage by the runs of one cell that this command played."""
 
     local_states: int
@@ -23,16 +23,16 @@ class CellTried(Placed):
     branches: int
 
 
-class Tried(BaseModel):
+class MatrixCoverage(BaseModel):
     """Coverage by all examined runs. `all_cells` is a `ucp-coverage/1` document."""
 
     runs: int
     all_cells: dict[str, Any]
-    cells: list[CellTried]
+    cells: list[CellCoverage]
 
 
-class Tally:
-    """Adds up what runs have reached."""
+class CoverageTally:
+    """Adds up the coverage of runs."""
 
     def __init__(self) -> None:
         self._runs = 0
@@ -44,17 +44,20 @@ class Tally:
         self._reached.add(reached)
         self._by_point[point].add(reached)
 
-    def tried(self, matrix: Matrix, runs: int) -> Tried:
-        """`runs` are all that there are: of those that an earlier command played nothing is known."""
+    def tried(self, matrix: Matrix, runs: int) -> MatrixCoverage:
+        """Return the coverage.
+
+        `runs` counts all runs, including those of earlier commands, whose coverage is unknown.
+        """
         if runs > self._runs:
             self._reached.untold = f"an earlier command played {runs - self._runs} of {runs} runs"
         scenario = matrix.scenario_at(matrix.points[0])
         there = existing(Bounds(min(MOST_AGENTS, len(scenario.roster)), MOST_BLOCKS))
-        return Tried(
+        return MatrixCoverage(
             runs=self._runs,
             all_cells=to_json(self._reached, there),
             cells=[
-                CellTried(
+                CellCoverage(
                     **point._asdict(),
                     local_states=len(reached.states),
                     pairs=len(reached.pairs),

@@ -1,8 +1,8 @@
-"""matrix.svg: how the swarm fares as the loss grows, six small panels side by side over the same axis.
+"""Draw matrix.svg: six panels side by side, with the loss as horizontal axis.
 
-With several numbers of agents, mission lengths or backends, six panels for each of them, one below the other. Lines
-are means, bands their 95 % intervals, and dots the losses that were measured. Two lines in a panel also differ by their
-dashes, and their names stand beside them.
+Each number of agents, mission length and backend has six panels, one series below the other. Lines are means, bands are
+95 % intervals, and dots are the measured losses. Two lines in one panel also have different dashes, and their names
+beside them.
 """
 
 import math
@@ -25,7 +25,7 @@ HEAD, SERIES_HEAD, PANEL_HEIGHT, FOOT = 74, 26, 218, 26
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """What one panel shows: metrics with the names of their lines."""
+    """The contents of a panel: metrics with the names of their lines."""
 
     title: str
     lines: tuple[tuple[str, str], ...]
@@ -47,7 +47,7 @@ PANELS = (
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """An estimate somewhere along a line, and what its tooltip says."""
+    """An estimate at a position on a line, and its tooltip."""
 
     x: float
     estimate: Estimate
@@ -55,8 +55,8 @@ class Dot:
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
-    """A panel in the picture: the `id` of its drawing, and where in the picture it is."""
+class PlacedPanel:
+    """A panel with the `id` of its drawing and its area in the picture."""
 
     id: str
     panel: Panel
@@ -65,30 +65,30 @@ class Placed:
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """`name` is empty if there is only one; it stands above its panels, at `top`."""
+    """The panels of one series. `name` is empty if there is only one series. It stands at `top`, above the panels."""
 
     name: str
     cells: list[Cell]
     top: float
-    panels: list[Placed]
+    panels: list[PlacedPanel]
 
 
 def series_of(record: MatrixRecord) -> list[Series]:
-    """What the picture is made of, from top to bottom."""
+    """Return the series of the picture from top to bottom."""
     top: float = HEAD
     made = []
     for number, cells in enumerate(_series(record)):
         name, begins = _name(record, cells), top
         top += SERIES_HEAD if name else 0
         areas = svg.grid(len(PANELS), COLUMNS, top, PANEL_HEIGHT)
-        panels = [Placed(f"panel-{number}-{at}", panel, areas[at]) for at, panel in enumerate(PANELS)]
+        panels = [PlacedPanel(f"panel-{number}-{at}", panel, areas[at]) for at, panel in enumerate(PANELS)]
         made.append(Series(name, cells, begins, panels))
         top += math.ceil(len(PANELS) / COLUMNS) * PANEL_HEIGHT
     return made
 
 
 def draw(record: MatrixRecord) -> str:
-    """A file of its own."""
+    """Return the picture as an SVG file."""
     rows = series_of(record)
     parts = []
     for row in rows:
@@ -106,17 +106,17 @@ def _heading(name: str, top: float) -> Markup:
 
 
 def _series(record: MatrixRecord) -> list[list[Cell]]:
-    """By ascending loss; one series without cells if no run has ended."""
+    """Return the series, each sorted by loss. If no run has ended, return one series without cells."""
     return [sorted(cells, key=lambda cell: cell.loss) for cells in series(record)] or [[]]
 
 
 def _name(record: MatrixRecord, cells: Sequence[Cell]) -> str:
-    """What tells a series from others; nothing if there are none."""
+    """Return the values in which this series differs from others, or an empty text."""
     return ", ".join(series_name(record.matrix, cells[0].point)) if cells else ""
 
 
 def description(record: MatrixRecord) -> str:
-    """What the picture shows, in words."""
+    """Return a text alternative for the picture."""
     if not record.cells:
         return "No run has ended."
     parts = []
@@ -149,7 +149,7 @@ def _legend(record: MatrixRecord) -> str:
     return f"Over packet loss at each receiver. Dots and lines: means of {runs} runs; bands: their 95 % intervals."
 
 
-def _panel(placed: Placed, cells: Sequence[Cell]) -> Markup:
+def _panel(placed: PlacedPanel, cells: Sequence[Cell]) -> Markup:
     panel, area = placed.panel, placed.area
     across, up = _loss_axis([cell.loss for cell in cells], area), _value_axis(panel, cells, area)
     frame = svg.frame(
@@ -164,7 +164,7 @@ def _panel(placed: Placed, cells: Sequence[Cell]) -> Markup:
 
 
 def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axis, up: Axis) -> Markup:
-    """With its name beside its middle."""
+    """Draw a line, and its name beside its middle."""
     known = [
         Dot(cell.loss, cell.estimates[name], f"{text.percent(cell.loss)} loss: {_say(name, cell)}") for cell in cells
     ]
@@ -178,7 +178,10 @@ def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axi
 
 
 def curve(number: int, dots: Sequence[Dot], across: Axis, up: Axis) -> tuple[Markup, list[tuple[float, float]]]:
-    """A panel's so-many-th line with its band of intervals, and the places of its dots; unknown means are left out."""
+    """Draw line `number` of a panel with its band of intervals, and return it with its points.
+
+    Unknown means are left out.
+    """
     known = [dot for dot in dots if dot.estimate.mean is not None]
     bounded = [(dot.x, dot.estimate.low, dot.estimate.high) for dot in known]
     upper = [f"{n(across(x))} {n(up(high))}" for x, _, high in bounded if high is not None]
@@ -205,7 +208,7 @@ def _loss_axis(losses: Sequence[float], area: Area) -> Axis:
 
 
 def _value_axis(panel: Panel, cells: Sequence[Cell], area: Area) -> Axis:
-    """From 0 to the next tick above all means, and above all intervals but for a sliver; shares to 100 %."""
+    """Return an axis from 0 to the first tick above all means and (up to 2 %) all intervals. Shares end at 100 %."""
     if panel.shares:
         return svg.share_axis(area.up)
     estimates = [cell.estimates[name] for name, _ in panel.lines for cell in cells]

@@ -17,11 +17,11 @@ from harness.sweep.matrix._estimate import CONFIDENCE, student_quantile
 Variable = Literal["agents", "blocks"]
 MAX_INFLATION = 100.0
 """Largest factor by which a second variable may inflate the variance of an exponent, 1 / (1 - r^2). Above it the two
-variables cannot be told apart."""
+variables cannot be separated."""
 
 
 class Exponent(BaseModel):
-    """`value` with its 95 % interval."""
+    """An exponent with its 95 % interval."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -50,7 +50,7 @@ def fit(names: Sequence[Variable], points: Iterable[tuple[Sequence[float], float
     """Fit a law of one or two variables to points (values of the variables, y).
 
     Return None if there are no more points than unknowns, if a variable does not vary, or if two variables cannot be
-    told apart (`MAX_INFLATION`).
+    separated (`MAX_INFLATION`).
     """
     everything = list(points)
     usable = [([*map(math.log, xs)], math.log(y)) for xs, y in everything if y > 0 and min(xs) > 0]

@@ -1,6 +1,7 @@
-"""results.jsonl: each run of a matrix as soon as it has ended, so that an interrupted matrix can go on.
+"""Read and write results.jsonl, which holds each finished run of a matrix. An interrupted matrix can therefore
+continue.
 
-The first line has the matrix as resolved; each further line one run. Lines are only ever appended.
+The first line is the resolved matrix. Each further line is one run. Lines are only appended.
 """
 
 import contextlib
@@ -24,14 +25,14 @@ SCHEMA = "ucp-matrix-results/1"
 
 
 class Results:
-    """The runs that have ended, of which there is one for each task at most."""
+    """The finished runs, at most one for each task."""
 
     def __init__(self, directory: Path, started_at: str, runs: dict[Task, Run], file: BinaryIO) -> None:
         self.directory, self.started_at, self.runs = directory, started_at, runs
         self._file = file
 
     def add(self, run: Run) -> None:
-        """Write it down at once. Raises MachineError if the disk refuses."""
+        """Append a run. Raises MachineError if the file cannot be written."""
         line = _line(run.model_dump(mode="json"))
         try:
             if self._file.write(line) < len(line):
@@ -46,9 +47,9 @@ class Results:
 
 @contextlib.contextmanager
 def opened(directory: Path, matrix: Matrix) -> Iterator[Results]:
-    """What `directory` has of `matrix`: a new or empty one nothing yet.
+    """Open the results of `matrix` in `directory`. A new or empty directory has no results yet.
 
-    Raises RunDirectoryError if it holds anything else, or another command works on it.
+    Raises RunDirectoryError if the directory holds other files, or if another command uses it.
     """
     path = directory / FILE
     with contextlib.ExitStack() as stack:
@@ -64,9 +65,10 @@ def opened(directory: Path, matrix: Matrix) -> Iterator[Results]:
         except BlockingIOError:
             raise RunDirectoryError(f"another command works on the matrix in {directory}: wait for its end") from None
         content = file.read()
-        whole = content.rfind(b"\n") + 1  # half a last line is of a run that was broken off in mid-write
+        # an incomplete last line remains of a command that was interrupted while writing
+        whole = content.rfind(b"\n") + 1
         first, *lines = content[:whole].splitlines() or [b""]
-        started_at = _begun(first, matrix, directory)
+        started_at = _start_time(first, matrix, directory)
         file.truncate(whole)
         file.seek(whole)
         yield Results(directory, started_at, _read(lines, matrix, path), file)
@@ -77,8 +79,8 @@ def _header(matrix: Matrix) -> dict[str, Any]:
     return {"schema": SCHEMA, "started_at": now, "matrix": matrix.model_dump(mode="json")}
 
 
-def _begun(line: bytes, matrix: Matrix, directory: Path) -> str:
-    """When the matrix in `directory` was begun, if it is this one."""
+def _start_time(line: bytes, matrix: Matrix, directory: Path) -> str:
+    """Return the start time of the matrix in `directory`. Raises RunDirectoryError if it is another matrix."""
     try:
         header = json.loads(line)
     except (ValueError, RecursionError):

@@ -20,12 +20,13 @@ _TYPES = {
 def matrix_frame(finished: Finished) -> pl.DataFrame:
     """Return a table with one row for each run of a matrix, with the columns of `runs.csv`.
 
-    `loss` (0 to 1), `agents`, `backend` and `seed` say which run it is. So does `duration_s`, if it is an axis of the
-    matrix. The figures of run.json follow, such as `mutual_chain`, `distinct_chains` and `messages`; a figure that is
-    not known is null. `characteristic_1` to `characteristic_6`, `steps`, `records` and `liveness` are verdicts. A run
-    without a verdict has the reason in `failed` or `unsupported`.
+    - `loss` (0 to 1), `agents`, `backend` and `seed` identify the run, and `duration_s` if it is an axis of the matrix.
+    - The figures of run.json follow, such as `mutual_chain`, `distinct_chains` and `messages`. Unknown figures are
+      null.
+    - `characteristic_1` to `characteristic_6`, `steps`, `records` and `liveness` are verdicts.
+    - `failed` or `unsupported` is the reason why a run has no verdict.
 
-    Raises MachineError without the extra `data`.
+    Raises MachineError if the extra `data` is not installed.
     """
     rows = list(run_rows(finished.runs))
     names = dict.fromkeys(name for row in rows for name in row)

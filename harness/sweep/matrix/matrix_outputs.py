@@ -1,16 +1,16 @@
-"""The files of a matrix, among them junit.xml.
+"""Write the output files of a matrix.
 
-matrix.json   all of it, schema `ucp-matrix/1`
-matrix.csv    one row a cell
-runs.csv      one row a run: loss, agents, backend, mission length if it is an axis, seed, figures, verdicts
+matrix.json   the complete results, schema `ucp-matrix/1`
+matrix.csv    one row for each cell
+runs.csv      one row for each run: loss, agents, backend, mission length if it is an axis, seed, figures, verdicts
 matrix.svg    the picture
-growth.svg    how figures grow with the swarm or the mission, if the matrix has three sizes of one of them
-report.html   all of it for people, one file
+growth.svg    growth with the swarm or the mission, if the matrix has three sizes of one of them
+report.html   a page for people, one file
 summary.md    table and findings in Markdown
-junit.xml     a test case a cell
+junit.xml     one test case for each cell
 
-results.jsonl, from which all of it is made, is written while runs end (_results_file.py); runs/ has the run
-directories that were kept of runs as processes, cells/ the scenarios with which any run can be played again.
+All of them are made from results.jsonl, which is written during the runs (`_results_file`). runs/ holds the kept run
+directories of processes. cells/ holds the scenarios, with which any run can be played again.
 """
 
 import csv
@@ -38,8 +38,11 @@ from ucp.agent_files import write_atomically, write_json_atomically
 
 
 def to_junit(record: MatrixRecord) -> str:
-    """A cell fails if a run of it violated a characteristic or failed, or if it is worse than the baseline; a cell
-    without all its runs is skipped, and one that an agent does not support."""
+    """Return the matrix as JUnit XML.
+
+    A cell fails if one of its runs failed or has a bad verdict, or if it is worse than the baseline. A cell with
+    missing or unsupported runs is skipped.
+    """
     return to_xml(record.matrix.name, "matrix", record.started_at, record.wall_s, _cases(record))
 
 
@@ -59,7 +62,7 @@ def _cases(record: MatrixRecord) -> Iterator[Case]:
 
 
 def write(finished: Finished, directory: Path, nights: Nights | None = None) -> None:
-    """`nights` are for the trend. Raises MachineError if the disk refuses."""
+    """Write all files. `nights` are drawn as a trend. Raises MachineError if a file cannot be written."""
     record = finished.record
     try:
         write_json_atomically(directory / "matrix.json", record.to_json())
@@ -95,7 +98,7 @@ def _place(point: Point) -> dict[str, Any]:
 
 
 def run_rows(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
-    """Yield a row of `runs.csv` for each run: point, seed, figures, verdicts, and why it has none."""
+    """Yield a row of `runs.csv` for each run: point, seed, figures and verdicts, or the reason for their absence."""
     figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
     for run in runs:
         yield {
@@ -110,7 +113,7 @@ def run_rows(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
 
 
 def to_csv(rows: Iterable[dict[str, Any]]) -> str:
-    """Unknown is an empty field."""
+    """Return the rows as CSV. An unknown value is an empty field."""
     file = io.StringIO()
     writer: csv.DictWriter[str] | None = None
     for row in rows:

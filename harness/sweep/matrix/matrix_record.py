@@ -1,5 +1,7 @@
-"""The record of a matrix: matrix.json, schema `ucp-matrix/1`. Later versions may add keys, but remove or rename
-none."""
+"""The record of a matrix: matrix.json, schema `ucp-matrix/1`.
+
+Later versions may add keys, but never remove or rename one.
+"""
 
 from typing import Any, Literal
 
@@ -7,16 +9,16 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
 from harness.errors import CANNOT_HERE, INCOMPLETE, INTERRUPTED, VIOLATED
-from harness.sweep.matrix._cell import Cell, Placed
+from harness.sweep.matrix._cell import AtPoint, Cell
 from harness.sweep.matrix._comparison import Comparison
 from harness.sweep.matrix._growth import Growth
-from harness.sweep.matrix._matrix_coverage import Tried
+from harness.sweep.matrix._matrix_coverage import MatrixCoverage
 from harness.sweep.matrix._matrix_file import Matrix
 
 SCHEMA = "ucp-matrix/1"
 
 
-class RunWithoutResult(Placed):
+class RunWithoutResult(AtPoint):
     """A run without a result, with the reason."""
 
     seed: int
@@ -45,7 +47,7 @@ class MatrixRecord(BaseModel):
     unsupported: list[RunWithoutResult] = []
     """Runs in which an agent did not support a needed feature."""
     against: Comparison | None = None
-    tried: Tried | None = None
+    tried: MatrixCoverage | None = None
     """Coverage of the protocol by the runs, if requested."""
     growths: list[Growth] = []
     """Power laws, if the matrix has several sizes of swarm or mission."""

@@ -1,4 +1,4 @@
-"""The matrix's runs: each point with each seed, spread over cores or a cluster, and summed up."""
+"""Play all runs of a matrix on the cores of this machine or on a cluster, and summarize each cell."""
 
 import time
 from collections import defaultdict
@@ -18,14 +18,14 @@ from harness.sweep.matrix._cell_play import Judge, Player, simulated
 from harness.sweep.matrix._cluster import cluster
 from harness.sweep.matrix._comparison import Comparison, compare
 from harness.sweep.matrix._growth import growths
-from harness.sweep.matrix._matrix_coverage import Tally
+from harness.sweep.matrix._matrix_coverage import CoverageTally
 from harness.sweep.matrix._matrix_file import Matrix, Point, Task
 from harness.sweep.matrix._results_file import Results, opened
 from harness.sweep.matrix.matrix_record import MatrixRecord, RunWithoutResult
 
 Outcomes = Iterator[tuple[Task, Run | Failed]]
 Spread = Callable[[Sequence[Task], Callable[[Task], Run]], AbstractContextManager[Outcomes]]
-"""Hands out tasks, and brings their outcomes as they end."""
+"""Distributes tasks, and yields their outcomes in order of completion."""
 
 
 @dataclass(frozen=True)
@@ -37,14 +37,17 @@ class Finished:
 
 
 def on_cores(matrix: Matrix, jobs: int, *, shown: bool = False) -> Spread:
-    """So many runs at the same time; with processes among them, no more than there are cores."""
+    """Distribute the runs over `jobs` processes of this machine; runs of processes over at most one for each core."""
     if matrix.needs_processes:
         jobs = min(jobs, cores())
     return partial(sweep, jobs=jobs, what="runs" if shown else None, in_order=False)
 
 
 def on_cluster(matrix: Matrix, address: str, *, shown: bool = False) -> Spread:
-    """On the workers of the Dask scheduler at `address`. Raises ScenarioError for processes."""
+    """Distribute the runs over the workers of the Dask scheduler at `address`.
+
+    Raises ScenarioError for runs of processes.
+    """
     if matrix.needs_processes:
         raise ScenarioError(
             "--scheduler is for virtual time: runs as processes leave their directories here, so play them without it, "
@@ -80,10 +83,10 @@ def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge,
     started = time.monotonic()
     play = Player(matrix, results.directory / "runs", judge, covers)
     tasks = [task for task in matrix.tasks if task not in results.runs]
-    if matrix.grows:  # the longest first, so that at the end no core waits for another's long run
+    if matrix.grows:  # the longest runs first, so that no core waits for a long run at the end
         tasks.sort(key=lambda task: _effort(matrix.scenario_at(task.point)), reverse=True)
     play.refuse(dict.fromkeys(task.point for task in tasks))
-    interrupted, tally = False, Tally() if covers else None
+    interrupted, tally = False, CoverageTally() if covers else None
     try:
         with spread(tasks, play) as outcomes:
             for task, run in outcomes:
@@ -113,15 +116,15 @@ def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge,
     return Finished(record, runs)
 
 
-def compared(finished: Finished, baseline: MatrixRecord, path: str) -> Finished:
-    """With what changed since the matrix of `baseline`, which is from `path`."""
+def compare_with(finished: Finished, baseline: MatrixRecord, path: str) -> Finished:
+    """Add the changes since the matrix `baseline`, which was read from `path`."""
     changes = list(compare(baseline.cells, finished.record.cells))
     comparison = Comparison(baseline=path, started_at=baseline.started_at, changes=changes)
     return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
 
 
 def _effort(scenario: Scenario) -> float:
-    """Estimate the cost of a run, in no unit. All agents hear each other, and many agents settle slowly."""
+    """Estimate the relative cost of a run. All agents receive each other's messages, and large swarms settle slowly."""
     agents = len(scenario.roster)
     return agents**2 * (scenario.duration_s + min(scenario.settle.limit_s, 30 * agents))
 

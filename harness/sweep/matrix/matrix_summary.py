@@ -1,4 +1,4 @@
-"""summary.md: the matrix in Markdown, for a job's summary on GitHub or a message to the team."""
+"""Write summary.md, the matrix in Markdown, for the summary of a CI job or a message to a team."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ from harness.present.text import escaped, row
 from harness.report.agent_programs import asked_for, in_sentence
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._estimate import METRICS
-from harness.sweep.matrix._matrix_coverage import Tried
+from harness.sweep.matrix._matrix_coverage import MatrixCoverage
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import (
     axes,
@@ -29,7 +29,7 @@ def to_markdown(record: MatrixRecord) -> str:
     if findings := [*troubles_of_all(record), *unsupported_of_all(record), *improvements(record)]:
         lines += [*(f"- {escaped(sentence)}" for sentence in findings), ""]
     if record.tried is not None:
-        lines += [*map(escaped, tried_in_words(record.tried)), ""]
+        lines += [*map(escaped, describe_coverage(record.tried)), ""]
     if ran := in_sentence(asked_for(record.matrix.scenario_at(record.matrix.points[-1]))):
         lines += [escaped(ran), ""]
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
@@ -37,7 +37,7 @@ def to_markdown(record: MatrixRecord) -> str:
     return "\n".join(lines) + "\n"
 
 
-def tried_in_words(tried: Tried) -> Iterator[str]:
+def describe_coverage(tried: MatrixCoverage) -> Iterator[str]:
     """Yield sentences on how much of the protocol the runs reached."""
     every, branches = tried.all_cells, tried.all_cells["branches"]
     yield (

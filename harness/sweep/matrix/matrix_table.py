@@ -1,4 +1,4 @@
-"""The matrix on the terminal: the means of each cell above their 95 % intervals, then growth, then what went wrong."""
+"""The matrix on the terminal: means and 95 % intervals of each cell, then growth, then failures."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -16,7 +16,7 @@ from harness.sweep.matrix._matrix_file import Matrix, Point
 from harness.sweep.matrix.matrix_record import MatrixRecord
 
 NAMED = 5
-"""More runs of a cell than these are counted, not named; matrix.json names them all."""
+"""Maximum number of runs of a cell that are named. Further runs are only counted here; matrix.json names all."""
 
 
 def render(record: MatrixRecord) -> RenderableType:
@@ -56,8 +56,10 @@ def series(record: MatrixRecord) -> list[list[Cell]]:
 
 
 def axes(matrix: Matrix) -> dict[str, Callable[[Point], str]]:
-    """Return the axes that tell cells apart (the loss, and all axes with several values), each as a function that names
-    a point's value."""
+    """Return the loss and all other axes with several values.
+
+    Each axis comes with a function that formats the value of a point.
+    """
     named: dict[str, Callable[[Point], str]] = {"loss": lambda point: words.percent(point.loss)}
     if len(matrix.agents or ()) > 1:
         named["agents"] = lambda point: str(point.agents)
@@ -69,12 +71,12 @@ def axes(matrix: Matrix) -> dict[str, Callable[[Point], str]]:
 
 
 def name_of(matrix: Matrix, point: Point) -> str:
-    """A cell's name: 15 % loss; 15 % loss, 10 agents, process."""
+    """Return a cell's name: "15 % loss" or "15 % loss, 10 agents, process"."""
     return ", ".join([f"{words.percent(point.loss)} loss", *series_name(matrix, point)])
 
 
 def series_name(matrix: Matrix, point: Point) -> list[str]:
-    """What else than its loss tells a cell apart."""
+    """Return the values other than the loss that identify a cell."""
     named = axes(matrix)
     return [
         *([f"{point.agents} agents"] if "agents" in named else []),
@@ -83,12 +85,12 @@ def series_name(matrix: Matrix, point: Point) -> list[str]:
 
 
 def say_lengths(matrix: Matrix) -> str:
-    """The mission lengths: "600 s, 1200 s"."""
+    """Format the mission lengths: "600 s, 1200 s"."""
     return ", ".join(map(words.duration, matrix.lengths))
 
 
 def say(metric: Metric, estimate: Estimate) -> str:
-    """Mean and interval on one line."""
+    """Format mean and interval on one line."""
     interval = say_interval(metric, estimate)
     return f"{say_mean(metric, estimate)} ({interval})" if interval else say_mean(metric, estimate)
 
@@ -100,7 +102,7 @@ def say_mean(metric: Metric, estimate: Estimate) -> str:
 
 
 def say_interval(metric: Metric, estimate: Estimate) -> str:
-    """The bounds of a share's interval, which is lopsided; of a mean's, what to add and to take off."""
+    """Format the interval: both limits for a share of runs, whose interval is asymmetric; otherwise the margin."""
     if estimate.low is None or estimate.high is None:
         return ""
     if metric.unit == "share of runs":
@@ -118,7 +120,7 @@ def explanation(record: MatrixRecord) -> str:
 
 
 def unjudged(record: MatrixRecord) -> str:
-    """A sentence if there are characteristics that no run could judge."""
+    """Return a sentence about the characteristics that no run could judge, or an empty text."""
     judged = {
         number for cell in record.cells for number, counts in cell.verdicts.items() if set(counts) - {"not applicable"}
     }
@@ -129,12 +131,12 @@ def unjudged(record: MatrixRecord) -> str:
 
 
 def violated(cell: Cell) -> int:
-    """Runs that violated a characteristic, or what is judged beside them."""
+    """Return the number of runs with a bad verdict."""
     return len({seed for seeds in cell.violated.values() for seed in seeds})
 
 
 def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
-    """A sentence for each thing that is wrong in a cell."""
+    """Yield a sentence for each failure, bad verdict, unfinished run or regression of a cell."""
     by_words = {BAD_IN_WORDS[key]: seeds for key, seeds in cell.violated.items()}
     for trouble, seeds in {**by_words, "more time needed": cell.unfinished}.items():
         if seeds:
@@ -152,7 +154,7 @@ def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
 
 
 def unsupported(record: MatrixRecord, cell: Cell) -> Iterable[str]:
-    """What an agent lacks for runs of this cell: each sentence once."""
+    """Return the features that agents lack for runs of this cell, without repetitions."""
     return dict.fromkeys(run.reason for run in record.unsupported if run.point == cell.point)
 
 
@@ -181,7 +183,7 @@ def _say_change(change: Change) -> str:
 
 
 def say_finished(cell: Cell) -> str:
-    """The share of runs whose swarm finished."""
+    """Format the share of runs whose swarm became idle."""
     share = cell.finished.mean
     return "\u2013" if share is None else f"{round(100 * share)}\u00a0%"
 
@@ -200,7 +202,7 @@ def _violated(cell: Cell) -> Text:
 
 
 def _number(number: float) -> str:
-    """Three digits that mean something."""
+    """Format with about three significant digits."""
     digits = 2 if abs(number) < 10 else 1 if abs(number) < 100 else 0
     text = f"{number:.{digits}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text

@@ -1,4 +1,4 @@
-"""Earlier nights of a matrix: where they are kept, and which one to compare with."""
+"""The results of earlier nights: where they are stored, and which one a matrix is compared with."""
 
 import json
 import re
@@ -14,18 +14,21 @@ from harness.sweep.matrix.matrix_record import SCHEMA, MatrixRecord
 from ucp.agent_files import write_json_atomically
 from ucp.short_value import shown
 
-_SAYS_NOTHING_OF_RUNS: Any = {"name": True, "about": True, "keep": True, "scenario": {"name", "about"}}
+_IRRELEVANT_KEYS: Any = {"name": True, "about": True, "keep": True, "scenario": {"name", "about"}}
 
 
 def load_baseline(path: Path, matrix: Matrix) -> MatrixRecord:
-    """Raises ScenarioError if `load_night` does, or nothing can be compared."""
+    """Load a night for a comparison.
+
+    Raises ScenarioError if the file is unsuitable (see `load_night`), or if the matrix has only one seed.
+    """
     if len(matrix.seed_list) < 2:
         raise ScenarioError("--against compares 95 % intervals, which one seed has not: give the matrix more `seeds`")
     return load_night(path, matrix)
 
 
 def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
-    """Raises ScenarioError if it is not the finished record of the same matrix."""
+    """Load matrix.json. Raises ScenarioError if it is not the finished record of the same matrix."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -43,7 +46,7 @@ def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
         raise ScenarioError(
             f"{path} says of itself that it is a {SCHEMA}, but its `{place}` is not: make one with this version"
         ) from None
-    before, now = (side.model_dump(mode="json", exclude=_SAYS_NOTHING_OF_RUNS) for side in (record.matrix, matrix))
+    before, now = (side.model_dump(mode="json", exclude=_IRRELEVANT_KEYS) for side in (record.matrix, matrix))
     differing = [f"`{key}`" for key in now if before[key] != now[key]]
     if differing:
         verb = "differs" if len(differing) == 1 else "differ"
@@ -54,12 +57,12 @@ def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
 
 
 LAST = 60
-"""So many nights are read: those whose files' names come last, and the names that we give begin with the date."""
+"""Maximum number of nights that are read: the last file names in order. The names start with the date."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nights:
-    """Those in `directory` that are of one matrix, by when they were begun; `left_out` says why others are not."""
+    """The nights in `directory` of one matrix, sorted by start. `left_out` holds a sentence for each other file."""
 
     directory: Path
     records: list[MatrixRecord]
@@ -76,7 +79,7 @@ class Nights:
 
 
 def opened(directory: Path) -> Path:
-    """Makes it if need be. Raises RunDirectoryError if it cannot be."""
+    """Create the directory if it is missing. Raises RunDirectoryError if that is impossible."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -85,7 +88,7 @@ def opened(directory: Path) -> Path:
 
 
 def keep(record: MatrixRecord, directory: Path) -> None:
-    """Add a night if it is finished; once, however often it is added. Raises MachineError if the disk refuses."""
+    """Store a finished night. Storing it again changes nothing. Raises MachineError if the file cannot be written."""
     if record.outcome != "completed":
         return
     path = directory / f"{re.sub('[^0-9TZ]', '', record.started_at)}.json"
@@ -96,7 +99,7 @@ def keep(record: MatrixRecord, directory: Path) -> None:
 
 
 def read(directory: Path, matrix: Matrix) -> Nights:
-    """What `directory` has of `matrix`."""
+    """Read the nights of `matrix` in `directory`."""
     records, left_out = [], []
     for path in sorted(directory.glob("*.json"))[-LAST:]:
         try:

@@ -142,7 +142,7 @@ def test_only_root_can_lay_cables(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_debugger_has_to_be_in_the_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     document = {"name": "gdb", "vehicles": {"each": {2: {"debugger": "gdb"}}}}
     with pytest.raises(docker_engine.DockerError, match=r"the project's image has no gdb: use .*--image-from-host"):
-        _container_preflight.refuse_debuggers_that_are_not_in_the_image(Scenario.model_validate(document))
+        _container_preflight.check_debuggers(Scenario.model_validate(document))
     from_host = Scenario.model_validate({**document, "docker": {"image_from_host": True}})
     for place, shared in ((tmp_path, False), (Path(sys.prefix, "bin"), True)):
         monkeypatch.setattr("shutil.which", lambda name, place=place: str(place / name))
@@ -151,7 +151,7 @@ def test_a_debugger_has_to_be_in_the_image(tmp_path: Path, monkeypatch: pytest.M
             if shared
             else pytest.raises(docker_engine.DockerError, match="in a directory that containers do not share")
         ):
-            _container_preflight.refuse_debuggers_that_are_not_in_the_image(from_host)
+            _container_preflight.check_debuggers(from_host)
 
 
 def test_user_mode_linux_has_no_engine(tmp_path: Path) -> None:

@@ -42,8 +42,8 @@ def begin(one: Rogue, what: str, now: float = 100.0, number: int = 1, **keys: An
     return one.to_send()
 
 
-def hears(one: Rogue, datagram: bytes, now: float) -> list[RogueDatagram]:
-    one.hears(datagram, now)
+def receive(one: Rogue, datagram: bytes, now: float) -> list[RogueDatagram]:
+    one.receive(datagram, now)
     return one.to_send()
 
 
@@ -66,7 +66,7 @@ def test_it_replays_the_last_that_match_byte_for_byte_in_their_order() -> None:
         encode(sender, sequence, CommitBlock(BLOCK, TOP)) for sender, sequence in ((1, 1), (2, 1), (1, 2), (1, 3))
     ]
     for datagram in [*commits, REQUEST]:
-        assert hears(one, datagram, 1.0) == []
+        assert receive(one, datagram, 1.0) == []
     again = begin(one, "replay", message="Commit Block", sender=1, count=2)
     assert [(it.source, it.datagram) for it in again] == [(1, commits[2]), (1, commits[3])]
     assert [it.datagram for it in begin(one, "replay")] == [REQUEST]
@@ -75,7 +75,7 @@ def test_it_replays_the_last_that_match_byte_for_byte_in_their_order() -> None:
 
 def test_what_it_has_not_heard_it_cannot_send() -> None:
     one = rogue()
-    hears(one, b"no message", 1.0)
+    receive(one, b"no message", 1.0)
     assert begin(one, "replay", number=1) == []
     assert begin(one, "forge", number=2, message="Commit Block", sender=2) == []
     assert one.sent == {1: 0, 2: 0}
@@ -84,23 +84,23 @@ def test_what_it_has_not_heard_it_cannot_send() -> None:
 def test_it_duplicates_what_matches_as_long_as_it_is_asked_to() -> None:
     one = rogue()
     begin(one, "duplicate", for_s=10, copies=2, message="Commit Block")
-    assert [it.datagram for it in hears(one, COMMIT, 109.9)] == [COMMIT, COMMIT]
-    assert hears(one, REQUEST, 109.9) == []
-    assert hears(one, COMMIT, 110.0) == []
+    assert [it.datagram for it in receive(one, COMMIT, 109.9)] == [COMMIT, COMMIT]
+    assert receive(one, REQUEST, 109.9) == []
+    assert receive(one, COMMIT, 110.0) == []
 
 
 def test_it_sends_again_later_what_it_has_heard_in_time() -> None:
     one = rogue()
     begin(one, "delay", for_s=10, by_s=30, sender=3)
-    assert hears(one, REQUEST, 101.0) == hears(one, REQUEST, 109.0) == hears(one, COMMIT, 109.0) == []
-    hears(one, REQUEST, 110.0)
+    assert receive(one, REQUEST, 101.0) == receive(one, REQUEST, 109.0) == receive(one, COMMIT, 109.0) == []
+    receive(one, REQUEST, 110.0)
     assert [(at, it.datagram) for at, it in wait(one, 1000)] == [(131.0, REQUEST), (139.0, REQUEST)]
 
 
 def test_it_flips_as_many_bits_as_asked() -> None:
     one = rogue()
     begin(one, "corrupt", for_s=10, bits=3)
-    (changed,) = hears(one, COMMIT, 101.0)
+    (changed,) = receive(one, COMMIT, 101.0)
     assert changed.source == 1
     assert sum((a ^ b).bit_count() for a, b in zip(changed.datagram, COMMIT, strict=True)) == 3
     assert corrupted(b"\x0f", 1000, Random(1)) == b"\xf0"
@@ -108,9 +108,9 @@ def test_it_flips_as_many_bits_as_asked() -> None:
 
 def test_a_forged_commit_goes_on_top_of_what_was_heard_last() -> None:
     one = rogue()
-    hears(one, COMMIT, 1.0)
+    receive(one, COMMIT, 1.0)
     other = bytes(32)
-    hears(one, encode(3, 9, BlockAddRequest(BLOCK.block_hash, other)), 2.0)
+    receive(one, encode(3, 9, BlockAddRequest(BLOCK.block_hash, other)), 2.0)
     (first,) = begin(one, "forge", number=4, message="Commit Block", sender=2)
     sender, sequence, commit = decode(first.datagram)
     assert isinstance(commit, CommitBlock)
@@ -132,20 +132,20 @@ def test_a_forged_commit_goes_on_top_of_what_was_heard_last() -> None:
         ({}, ChainHashSuccessorQuery(TOP), NextInSequenceResponse(TOP, None, 0)),
     ],
 )
-def test_it_answers_every_question_in_an_agent_s_name(keys: dict[str, Any], question: Message, answer: Message) -> None:
+def test_it_answers_every_question_in_an_agent_s_name(keys: dict[str, Any], query: Message, answer: Message) -> None:
     one = rogue()
     begin(one, "forge", message=answer.NAME, sender=2, for_s=10, **keys)
-    assert [(it.source, said(it)) for it in hears(one, encode(1, 1, question), 101.0)] == [(2, answer)]
-    assert hears(one, encode(2, 1, question), 101.0) == []
-    assert hears(one, encode(1, 2, RequestForBlock(TOP)), 101.0) == []
-    assert hears(one, encode(1, 3, question), 110.0) == []
+    assert [(it.source, said(it)) for it in receive(one, encode(1, 1, query), 101.0)] == [(2, answer)]
+    assert receive(one, encode(2, 1, query), 101.0) == []
+    assert receive(one, encode(1, 2, RequestForBlock(TOP)), 101.0) == []
+    assert receive(one, encode(1, 3, query), 110.0) == []
 
 
 def test_a_forged_vote_names_the_chain_where_votes_do() -> None:
     one = rogue()
     begin(one, "forge", message="Block Add Response", sender=2, for_s=10)
-    hears(one, encode(1, 1, BlockAddResponse(TOP, True, TOP)), 101.0)
-    (vote,) = hears(one, REQUEST, 101.0)
+    receive(one, encode(1, 1, BlockAddResponse(TOP, True, TOP)), 101.0)
+    (vote,) = receive(one, REQUEST, 101.0)
     assert said(vote) == BlockAddResponse(BLOCK.block_hash, False, TOP)
 
 

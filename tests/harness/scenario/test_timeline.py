@@ -12,7 +12,7 @@ from harness.play.process.process_preflight import network_needs
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.changes import NetworkChange, timeline_of
-from harness.sweep.explore._scenario_document import cut_after, document_of, moved, scripted, with_agents
+from harness.sweep.explore._scenario_document import cut_after, document_of, keep_agents, move_times, with_script
 from netem.conditions import Delay, LinkConditions
 from tests.harness.command import harness, write_scenario
 from tests.harness.virtual import scenario
@@ -205,10 +205,10 @@ def test_a_link_that_loses_everything_for_a_while_is_silent_in_virtual_time() ->
         final_reconcile=True,
     )
     simulated = simulate(one, 1, tracing=True)
-    heard = [run.t for run in simulated.evidence.traces[2].runs if run.trigger.to_json().get("from") == 1]
-    assert not [at_s for at_s in heard if 100.1 < at_s < 200]
-    assert [at_s for at_s in heard if at_s < 100]
-    assert [at_s for at_s in heard if 200 < at_s < 300]
+    datagram = [run.t for run in simulated.evidence.traces[2].runs if run.trigger.to_json().get("from") == 1]
+    assert not [at_s for at_s in datagram if 100.1 < at_s < 200]
+    assert [at_s for at_s in datagram if at_s < 100]
+    assert [at_s for at_s in datagram if 200 < at_s < 300]
     assert {one.verdict for one in simulated.result.characteristics.values()} == {"holds"}
 
 
@@ -236,15 +236,15 @@ def test_exploring_cuts_a_network_s_changes_to_pieces() -> None:
             ],
         )
     )
-    fewer = with_agents(document, [1, 2])
+    fewer = keep_agents(document, [1, 2])
     assert fewer["timeline"] == [
         {"at_s": 10, "for_s": 20, "network": {"loss": 0.5, "links": [{"from": [1], "to": [2], "loss": 0.9}]}}
     ]
     assert [*fewer["schedule"][0]] == ["ramp", "from_s"]
     assert "for_s" not in cut_after(document, 25)["timeline"][0]
-    later = moved(document, lambda at_s: at_s if at_s < 20 else at_s + 5)
+    later = move_times(document, lambda at_s: at_s if at_s < 20 else at_s + 5)
     assert (later["timeline"][0]["at_s"], later["timeline"][0]["for_s"]) == (10, 25)
-    silent = Scenario.model_validate(scripted(document, [], []))
+    silent = Scenario.model_validate(with_script(document, [], []))
     changes = [change for change in timeline_of(silent) if isinstance(change, NetworkChange)]
     assert all(change.conditions.fully_connected for change in changes)
 
@@ -281,9 +281,9 @@ def test_a_link_loses_for_a_while_as_processes(tmp_path: Path) -> None:
     )
     sent_s = {message["seq"]: run["t"] for run in sender for message in run.get("sent", ())}
     triggers = [(run["t"], run["trigger"]) for run in receiver if run.get("trigger", {}).get("from") == 1]
-    heard = [(at_s, sent_s[trigger["seq"]]) for at_s, trigger in triggers]
-    assert not [at_s for at_s, since_s in heard if since_s > applied_s and at_s < 80], (
+    datagram = [(at_s, sent_s[trigger["seq"]]) for at_s, trigger in triggers]
+    assert not [at_s for at_s, since_s in datagram if since_s > applied_s and at_s < 80], (
         "sent and heard while all is lost"
     )
-    assert [at_s for at_s, _ in heard if at_s < 40]
-    assert [at_s for at_s, _ in heard if at_s > undone_s]
+    assert [at_s for at_s, _ in datagram if at_s < 40]
+    assert [at_s for at_s, _ in datagram if at_s > undone_s]

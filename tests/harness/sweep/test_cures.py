@@ -62,7 +62,7 @@ def in_short(outcomes: list[str]) -> str:
 
 @pytest.mark.any_user
 @pytest.mark.parametrize(("cure", "cells"), rows(), ids=[cure.replace("`", "") for cure, _ in rows()])
-def test_a_cure_ends_what_the_page_says(cure: str, cells: list[str]) -> None:
+def test_cure_ends_the_livelocks_that_the_page_names(cure: str, cells: list[str]) -> None:
     played = [
         outcome(yaml.safe_load((SCENARIOS / f"{name}.yaml").read_text()), cure)
         for name in ("in_step", "refused_by_the_third", "by_turns", "drawn_in", "in_resonance", "two_losses")

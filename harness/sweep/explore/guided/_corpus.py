@@ -1,14 +1,14 @@
-"""What is kept between nights, in a directory: scenarios that reached something, and what was found.
+"""The corpus: a directory that stores scenarios and findings from night to night.
 
-corpus.json    which scenario it is of
-runs/          a scenario for each run that is kept; its name ends in the seed
-findings.json  what was found, with the night in which it was first and last seen
+corpus.json    the scenario of the corpus
+runs/          a scenario for each kept run; its file name ends with the seed
+findings.json  the findings, with the first and last night that showed each
 findings/      the smallest scenario of each finding
-nights/        what each night came to, as JSON
+nights/        the results of each night, as JSON
 report.html    the last night
 
-Whatever is there may come from anybody. A file that is no scenario of this corpus is left out, and told; none of them
-says which program is started.
+Any user may have written these files. A file that does not fit the corpus is reported and left out. No file can choose
+the program of an agent.
 """
 
 import fcntl
@@ -35,7 +35,7 @@ from ucp.agent_files import write_atomically, write_json_atomically
 
 SCHEMA = "ucp-corpus/1"
 MOST_BYTES = 256 * 1024
-"""No file of a run that is kept is larger."""
+"""Maximum size of a file of a kept run."""
 MOST_FINDINGS = 500
 MOST_NIGHTS = 400
 MOST_STATES = 10**12
@@ -58,7 +58,7 @@ CHANGED = frozenset(
         "name",
     )
 )
-"""Keys in which a run may differ from the scenario that the corpus is of; no other says anything to this machine."""
+"""Keys in which a run may differ from the scenario of the corpus. None of them affects this machine."""
 LONGEST_S = 3600.0
 _NAME = re.compile(r"[0-9a-f]{12}-seed-(\d{1,10})\.yaml")
 Text = Annotated[str, Field(max_length=500)]
@@ -66,7 +66,7 @@ NightName = Annotated[str, Field(max_length=40)]
 
 
 class Finding(BaseModel):
-    """Something bad that runs showed. `first` and `last` are the nights that saw it, by when they were begun."""
+    """A bad verdict that runs showed. `first` and `last` are the start times of the nights that showed it."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -78,7 +78,7 @@ class Finding(BaseModel):
     first: NightName
     last: NightName
     words: Annotated[list[Text], Field(max_length=20)] = []
-    """What one sees of it."""
+    """Evidence lines."""
 
     @property
     def identity(self) -> Identity:
@@ -86,7 +86,7 @@ class Finding(BaseModel):
 
     @property
     def file(self) -> str:
-        """The name of its scenario."""
+        """File name of its scenario."""
         digest = sha256(repr((self.key, self.verdict, self.handler, self.shape)).encode()).hexdigest()[:8]
         slug = re.sub(r"[^a-z0-9]+", "_", f"{self.key} {self.verdict} {self.handler}".lower()).strip("_")[:60]
         return f"{slug}_{digest}.yaml"
@@ -101,7 +101,7 @@ class _Findings(BaseModel):
 
 @dataclass
 class Corpus:
-    """An open directory, which nobody else works on. `left_out` says why files of it are not used."""
+    """An open directory, locked against other commands. `left_out` holds a sentence for each unused file."""
 
     directory: Path
     base: Document
@@ -113,10 +113,8 @@ class Corpus:
         if self._lock is not None:
             self._lock.close()
 
-    # Runs
-
     def runs(self) -> list[Candidate]:
-        """Those that are kept, each once, in the order of their names."""
+        """Return the kept runs without duplicates, in the order of their names."""
         paths = sorted((self.directory / "runs").iterdir())
         if len(paths) > 2 * MOST_KEPT:
             self.left_out.append(f"{len(paths) - 2 * MOST_KEPT} of {len(paths)} files in {self.directory / 'runs'}")
@@ -125,7 +123,7 @@ class Corpus:
             if (candidate := self._run(path)) is not None:
                 name = _name_of(candidate)
                 by_name[name] = candidate
-                if path.name != name:  # as others, or older versions, name it
+                if path.name != name:  # copied by hand, or from an older version
                     self._rename(path, name)
         return list(by_name.values())
 
@@ -139,18 +137,16 @@ class Corpus:
         return Candidate(without_liveness_phase(document), int(name[1]))
 
     def keep(self, candidate: Candidate) -> None:
-        """Raises MachineError if the disk refuses."""
+        """Store a run. Raises MachineError if the file cannot be written."""
         text = json.dumps(with_liveness_phase(candidate.document), sort_keys=True)
         self._write(self.directory / "runs" / _name_of(candidate), text + "\n")
 
     def drop(self, candidate: Candidate) -> None:
-        """It gives nothing that others do not."""
+        """Delete a run that reaches nothing that other runs do not reach."""
         (self.directory / "runs" / _name_of(candidate)).unlink(missing_ok=True)
 
-    # Findings
-
     def findings(self) -> list[Finding]:
-        """Those that were told before."""
+        """Return the stored findings."""
         path = self.directory / "findings.json"
         if not path.exists():
             return []
@@ -161,25 +157,24 @@ class Corpus:
             return []
 
     def scenario_of(self, finding: Finding) -> Document | None:
-        """What shows it; None if its file is gone, or is none."""
+        """Return the scenario of a finding, or None if its file is missing or invalid."""
         path = self.directory / "findings" / finding.file
         return self._document(path) if path.exists() else None
 
     def write_findings(self, findings: list[Finding]) -> None:
         document = _Findings(findings=findings[-MOST_FINDINGS:]).model_dump(mode="json", by_alias=True)
-        self._tell(lambda path: write_json_atomically(path, document), self.directory / "findings.json")
+        self._checked_write(lambda path: write_json_atomically(path, document), self.directory / "findings.json")
 
     def write_scenario(self, finding: Finding, text: str) -> Path:
         path = self.directory / "findings" / finding.file
         self._write(path, text)
         return path
 
-    # Nights
-
     def write_night(self, began: str, document: dict[str, Any], page: Callable[[list[dict[str, Any]]], str]) -> Path:
-        """Keep it, and draw `page` from all that are there."""
+        """Store the results of a night, and write the page of all nights."""
         name = re.sub("[^0-9TZ]", "", began)
-        self._tell(lambda path: write_json_atomically(path, document), self.directory / "nights" / f"{name}.json")
+        path = self.directory / "nights" / f"{name}.json"
+        self._checked_write(lambda path: write_json_atomically(path, document), path)
         report = self.directory / "report.html"
         self._write(report, page(list(self._nights())))
         return report
@@ -195,14 +190,12 @@ class Corpus:
                 continue
             yield night
 
-    # Files
-
     def _document(self, path: Path) -> Document | None:
         try:
             if path.stat(follow_symlinks=False).st_size > MOST_BYTES:
                 raise ScenarioError(f"{path}: larger than {MOST_BYTES} bytes")
             document = json.loads(text) if (text := self._read(path)).startswith(b"{") else read_yaml(path, "scenario")
-            return fitting(document, self.base, self.limits)
+            return check_fits(document, self.base, self.limits)
         except (OSError, ValueError, RecursionError, ScenarioError) as error:
             self.left_out.append(f"{path.name} is left out: {str(error)[:200]}")
             return None
@@ -211,7 +204,7 @@ class Corpus:
         def rename(path: Path) -> None:
             path.replace(path.with_name(name))
 
-        self._tell(rename, path)
+        self._checked_write(rename, path)
 
     def _read(self, path: Path) -> bytes:
         status = path.stat(follow_symlinks=False)
@@ -220,9 +213,9 @@ class Corpus:
         return path.read_bytes()
 
     def _write(self, path: Path, text: str) -> None:
-        self._tell(lambda path: write_atomically(path, text), path)
+        self._checked_write(lambda path: write_atomically(path, text), path)
 
-    def _tell(self, write: Callable[[Path], None], path: Path) -> None:
+    def _checked_write(self, write: Callable[[Path], None], path: Path) -> None:
         try:
             write(path)
         except OSError as error:
@@ -230,9 +223,9 @@ class Corpus:
 
 
 def opened(directory: Path, scenario: Scenario, limits: Limits) -> Corpus:
-    """Make the directory, or go on with what is there.
+    """Create the directory, or open an existing corpus.
 
-    Raises RunDirectoryError if it is another's: of another scenario, or no corpus; or if another command works on it.
+    Raises RunDirectoryError if it is no corpus, is the corpus of another scenario, or is used by another command.
     """
     base, path = document_of(scenario), directory / "corpus.json"
     try:
@@ -259,8 +252,8 @@ def opened(directory: Path, scenario: Scenario, limits: Limits) -> Corpus:
     return Corpus(directory, base, limits, _lock=lock)
 
 
-def fitting(document: Any, base: Document, limits: Limits) -> Document:
-    """The document, if changes of the base could have come to it. Raises ScenarioError."""
+def check_fits(document: Any, base: Document, limits: Limits) -> Document:
+    """Return the document if changes of the base can produce it. Raises ScenarioError otherwise."""
     if not isinstance(document, dict):
         raise ScenarioError("it is no scenario")
     document = {"agents": base["agents"], **document}
@@ -279,12 +272,12 @@ def fitting(document: Any, base: Document, limits: Limits) -> Document:
 
 
 def _is_part(value: Any, whole: Any) -> bool:
-    """Whether it says no more than the whole does: of fewer agents it may be less."""
+    """Return whether the value equals the whole or a part of it. A run with fewer agents has fewer entries."""
     if isinstance(value, dict) and isinstance(whole, dict):
         return all(_is_part(part, whole.get(key)) for key, part in value.items())
     return bool(value == whole)
 
 
 def _name_of(candidate: Candidate) -> str:
-    text = json.dumps(with_liveness_phase(candidate.document), sort_keys=True)  # as it is read again
+    text = json.dumps(with_liveness_phase(candidate.document), sort_keys=True)  # as it is after reading
     return f"{sha256(text.encode()).hexdigest()[:12]}-seed-{candidate.seed}.yaml"

@@ -1,4 +1,4 @@
-"""What a finding is, whichever run shows it: the verdict, the handler that it names, its shape; never the seed."""
+"""The identity of a finding, independent of the run: verdict, handler and shape. The seed is not part of it."""
 
 import dataclasses
 from collections import Counter, defaultdict
@@ -14,19 +14,19 @@ from harness.scenario.verdict_names import CHARACTERISTICS
 from ucp.agent import ON_TIMER
 from ucp.settings import Settings
 
-FOLLOW_FROM_A_CYCLE = frozenset(("5", "6"))
-"""Those who go round for ever commit no more, and their chains stay apart."""
+CAUSED_BY_LIVELOCK = frozenset(("5", "6"))
+"""Characteristics that every livelock violates, because agents in a livelock commit no more blocks."""
 TIMERS = {ON_TIMER[timer].name: timer for timer in ("voting", "phase one", "phase two", "phase three")}
-"""Handler that runs when it ends -> the timer."""
+"""Handler that runs at the end of a timer -> the timer."""
 ORDER = [*TIMERS.values()]
-MOST_FORM = 250
-"""A longer form is none that anybody reads."""
-OF_SIZE = frozenset(("max_block_bytes", "max_event_bytes"))
+MAX_FORM = 250
+"""Maximum length of a readable form, in characters."""
+SIZE_SETTINGS = frozenset(("max_block_bytes", "max_event_bytes"))
 
 
 @dataclass(frozen=True, order=True)
 class Identity:
-    """`key` is that of a judgement; `handler` is empty if none of the 20 is named."""
+    """`key` is the key of a judgement. `handler` is empty if the evidence names no handler."""
 
     key: str
     verdict: str
@@ -39,8 +39,11 @@ class Identity:
 
 
 def identities(result: Result, cycle: Cycle | None, scenario: Scenario) -> tuple[Identity, ...]:
-    """Of all that is bad about a run; those with other settings than the thesis's are others."""
-    settings = _otherwise(scenario.settings)
+    """Return the identities of all bad verdicts of a run.
+
+    Settings that differ from the thesis are part of the shape.
+    """
+    settings = _changed_settings(scenario.settings)
     return tuple(
         Identity(
             key,
@@ -49,16 +52,15 @@ def identities(result: Result, cycle: Cycle | None, scenario: Scenario) -> tuple
             ", ".join(part for part in (_shape(key, judgement, result, cycle), settings) if part),
         )
         for key, judgement in ((key, result.judgements[key]) for key in result.wrong)
-        if cycle is None or key not in FOLLOW_FROM_A_CYCLE
+        if cycle is None or key not in CAUSED_BY_LIVELOCK
     )
 
 
-def _otherwise(settings: Settings) -> str:
+def _changed_settings(settings: Settings) -> str:
     default = Settings()
-    named = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
-    return ", ".join(
-        f"{name} {value}" for name, value in named.items() if name not in OF_SIZE and value != getattr(default, name)
-    )
+    values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    changed = {name: value for name, value in values.items() if value != getattr(default, name)}
+    return ", ".join(f"{name} {value}" for name, value in changed.items() if name not in SIZE_SETTINGS)
 
 
 def _shape(key: str, judgement: Judgement, result: Result, cycle: Cycle | None) -> str:
@@ -73,24 +75,25 @@ def _shape(key: str, judgement: Judgement, result: Result, cycle: Cycle | None) 
     if cycle.period_s is None:
         return f"{going} standing still"
     form = "; ".join(_form(cycle))
-    return f"{going} going round every {cycle.period_s:.0f} s" + (f" ({form})" if len(form) <= MOST_FORM else "")
+    return f"{going} going round every {cycle.period_s:.0f} s" + (f" ({form})" if len(form) <= MAX_FORM else "")
 
 
 def _form(cycle: Cycle) -> list[str]:
-    """The timers that end on each agent's way round, in order, of those that go the same way once: as `prove` tells
-    ways round apart.
+    """Return the cycles of timers of the agents, each distinct cycle once.
+
+    `prove` compares livelocks in the same way.
     """
-    ways = defaultdict[int, list[str]](list)
+    patterns = defaultdict[int, list[str]](list)
     for step in cycle.steps:
         if step.handler in TIMERS:
-            ways[step.agent_id].append(TIMERS[step.handler])
-    return sorted({", ".join(_once_round(way)) for way in ways.values()})
+            patterns[step.agent_id].append(TIMERS[step.handler])
+    return sorted({", ".join(_one_repetition(pattern)) for pattern in patterns.values()})
 
 
-def _once_round(way: Sequence[str]) -> Sequence[str]:
-    """Without repeating itself, and wherever it was entered begun at the same place: with the vote, if there is one."""
-    length = len(way)
-    once = next(part for part in range(1, length + 1) if length % part == 0 and [*way[:part]] * (length // part) == way)
-    return min(
-        ([*way[start:once], *way[:start]] for start in range(once)), key=lambda turned: [*map(ORDER.index, turned)]
-    )
+def _one_repetition(pattern: Sequence[str]) -> Sequence[str]:
+    """Return one repetition of the cycle, rotated to a fixed start: the vote, if there is one."""
+    length = len(pattern)
+    divisors = (part for part in range(1, length + 1) if length % part == 0)
+    once = next(part for part in divisors if [*pattern[:part]] * (length // part) == pattern)
+    rotations = ([*pattern[start:once], *pattern[:start]] for start in range(once))
+    return min(rotations, key=lambda rotation: [*map(ORDER.index, rotation)])

@@ -1,7 +1,7 @@
 """The hunt: change documents, play them, and keep those that reach something new.
 
-It goes by rounds. What a round tries depends on what was kept before it and on the lots alone, never on how fast
-anything was, so that it is the same however many processes play.
+The hunt proceeds in rounds. A round depends only on the documents that were kept before it and on the random draws. It
+does not depend on speed, so any number of processes gives the same result.
 """
 
 from collections import Counter
@@ -20,15 +20,15 @@ from harness.run.parallel import Failed, sweep
 from harness.scenario import Scenario
 from harness.sweep.explore._scenario_document import Document, with_key
 from harness.sweep.explore.guided._finding_identity import Identity
-from harness.sweep.explore.guided._hunt_trial import Apart, Tried, Ways, tried, with_liveness_phase
-from harness.sweep.explore.guided._mutation import Limits, changed
+from harness.sweep.explore.guided._hunt_trial import Divergence, TimerPatterns, Trial, play_trial, with_liveness_phase
+from harness.sweep.explore.guided._mutation import Limits, mutate
 
 BITS = 1 << 28
-"""32 MiB. Of ten million numbers one in thirty is taken for another that was there before."""
+"""Size of the bit field (32 MiB). With ten million numbers, one new number in about 30 counts as known."""
 
 
-class Beyond:
-    """Numbers of local states, or of pairs, which are digests. `count` is how many there are, at least."""
+class DigestSet:
+    """A set of digests of local states or pairs, as a bit field. `count` is a lower limit of its size."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -39,72 +39,72 @@ class Beyond:
         return bool(self._bits[place >> 3] >> (place & 7) & 1)
 
     def add(self, number: int) -> None:
-        """Take down one that is not there."""
+        """Add a number that is not in the set."""
         place = number % BITS
         self._bits[place >> 3] |= 1 << (place & 7)
         self.count += 1
 
 
 ROUND = 64
-"""Runs that are tried before it is looked at what they reached."""
+"""Number of runs in a round."""
 MOST_KEPT = 3000
-"""Documents that are kept; those that gave least for their length go first."""
+"""Maximum number of kept documents. The least worthwhile ones are dropped first."""
 MOST_FAILED = 100
-MOST_WAYS = 100_000
-"""When so many ways are known on which votes failed, others are not told from them: 50 MB."""
-WORTH_OF_WAYS = 100
-"""Local states for which new ways count on which votes failed."""
+MAX_PATTERNS = 100_000
+"""Maximum number of stored patterns of failed votes (50 MB). Further patterns do not count as new."""
+WORTH_OF_PATTERN = 100
+"""Number of local states that a new pattern of failed votes counts for."""
 NEWEST = 24
-NEAR = 0.6
+NEAR_LIVELOCK = 0.6
 SEEDS = 1 << 16
 
 
 class Candidate(NamedTuple):
-    """A document to be played with a seed; without its liveness phase, which every run has."""
+    """A document to play with a seed. It does not contain the liveness phase, which every run gets."""
 
     document: Document
     seed: int
 
     def scenario(self) -> Scenario:
-        """What is played. Raises ValidationError if that cannot be."""
+        """Return the scenario to play. Raises ValidationError if it is invalid."""
         return Scenario.model_validate(with_liveness_phase(self.document))
 
 
 @dataclass
 class Kept:
-    """A candidate that gave something new: `gave` local states, or what counts as such, for `steps` handler runs."""
+    """A kept candidate. It reached `gave` new local states, or their equivalent, in `steps` handler runs."""
 
     candidate: Candidate
-    gave: int
+    new_states: int
     steps: int
     failed: int
-    """Votes that failed one after the other, on ways on which nobody had gone before."""
+    """Number of successive failed votes in a new pattern."""
     timers_ended_s: tuple[float, ...]
     picked: int = 0
 
     @property
     def worth(self) -> float:
-        """How promising it is to change it."""
-        return (1 + self.gave) / (1 + self.picked) / (100 + self.steps)
+        """Expected benefit of changing this document."""
+        return (1 + self.new_states) / (1 + self.picked) / (100 + self.steps)
 
     @property
     def nearness(self) -> float:
-        """How promising it is to look for a livelock near it; 0 if votes did not fail in vain."""
+        """Expected benefit of this document in the search for a livelock; 0 if no votes failed in a new pattern."""
         return self.failed**2 / (1 + self.picked) / (100 + self.steps)
 
 
 @dataclass(frozen=True)
-class News:
-    """What a run reached that nobody had before its round, and which findings it showed."""
+class NewCoverage:
+    """The parts of a run's coverage that are new in its round, and the findings of the run."""
 
     reached: Reached
     found: tuple[Identity, ...]
-    apart: Apart | None
+    divergence: Divergence | None
     timers_ended_s: tuple[float, ...]
-    in_vain: Ways
+    failed_votes: TimerPatterns
 
     @classmethod
-    def of(cls, run: Tried, known: Reached) -> "News":
+    def of(cls, run: Trial, known: Reached) -> "NewCoverage":
         new = Reached(
             run.reached.states - known.states,
             run.reached.pairs - known.pairs,
@@ -112,57 +112,57 @@ class News:
             run.reached.steps,
             run.reached.untold,
         )
-        return cls(new, run.found, run.apart, run.timers_ended_s, run.in_vain)
+        return cls(new, run.found, run.divergence, run.timers_ended_s, run.failed_votes)
 
 
 @dataclass
 class Hunt:
-    """What is known by now, and what is kept."""
+    """The state of a hunt: coverage, findings and kept documents."""
 
     limits: Limits
-    lots: Random
+    rng: Random
     reached: Reached = field(default_factory=Reached)
-    states_beyond: Beyond = field(default_factory=Beyond)
-    pairs_beyond: Beyond = field(default_factory=Beyond)
-    """What was reached when `reached` was full."""
+    states_overflow: DigestSet = field(default_factory=DigestSet)
+    pairs_overflow: DigestSet = field(default_factory=DigestSet)
+    """Digests of further coverage after `reached` is full."""
     kept: list[Kept] = field(default_factory=list)
     runs: int = 0
     found: dict[Identity, Candidate] = field(default_factory=dict)
-    """Findings, and the first run that showed each."""
+    """Findings, with the first run that showed each."""
     shown: Counter[Identity] = field(default_factory=Counter)
-    """In how many runs."""
+    """Number of runs that showed each finding."""
     failures: int = 0
     failed: list[tuple[Candidate, str]] = field(default_factory=list)
-    """The first runs without a verdict, and why; `failures` counts all of them."""
+    """The first runs without a verdict, with the reason. `failures` counts all of them."""
     _dropped: list[Candidate] = field(default_factory=list)
-    _apart: set[Apart] = field(default_factory=set)
-    """How chains differed at rest: of each way the first is played again, with a final reconcile."""
-    _in_vain: set[Ways] = field(default_factory=set)
-    """How agents went on while votes failed: of each way the first run is kept."""
+    _known_divergences: set[Divergence] = field(default_factory=set)
+    """Known differences of chains at rest. The first run of each is played again with a final reconcile."""
+    _known_patterns: set[TimerPatterns] = field(default_factory=set)
+    """Known patterns of failed votes. The first run of each is kept."""
     _to_reconcile: list[Candidate] = field(default_factory=list)
 
     def begin(self, candidates: Iterable[Candidate], jobs: int) -> Iterator[tuple[Candidate, bool]]:
-        """Play these as they are; each run that was played, and whether it is kept."""
+        """Play these candidates unchanged. Yield each played run, and whether it is kept."""
         yield from self._play(list(candidates), jobs)
 
     def round(self, jobs: int) -> Iterator[tuple[Candidate, bool]]:
-        """Change what is kept, and play it; each run that was played, and whether it is kept."""
+        """Change kept documents and play them. Yield each played run, and whether it is kept."""
         to_reconcile, self._to_reconcile = self._to_reconcile, []
         worth = list(accumulate(kept.worth for kept in self.kept))
         yield from self._play([*to_reconcile, *(self._next(worth) for _ in range(ROUND))], jobs)
 
     def dropped(self) -> list[Candidate]:
-        """What is no longer kept, since it was last asked for."""
+        """Return the documents that were dropped since the last call."""
         dropped, self._dropped = self._dropped, []
         return dropped
 
     def _play(self, candidates: Sequence[Candidate], jobs: int) -> Iterator[tuple[Candidate, bool]]:
         known = self.reached
 
-        def play(candidate: Candidate) -> News | None:
+        def play(candidate: Candidate) -> NewCoverage | None:
             try:
-                return News.of(tried(candidate.scenario(), candidate.seed), known)
-            except (ValidationError, ScenarioError, UnsupportedError):  # a change has asked for what cannot be played
+                return NewCoverage.of(play_trial(candidate.scenario(), candidate.seed), known)
+            except (ValidationError, ScenarioError, UnsupportedError):  # the changed scenario cannot be played
                 return None
 
         with sweep(candidates, play, jobs) as outcomes:
@@ -178,27 +178,31 @@ class Hunt:
                 else:
                     yield candidate, self._learn(candidate, outcome)
 
-    def _learn(self, candidate: Candidate, news: News) -> bool:
-        """Whether it reached anything that nobody had before it."""
+    def _learn(self, candidate: Candidate, news: NewCoverage) -> bool:
+        """Add a run to the state. Return whether it reached something new."""
         for identity in news.found:
             self.shown[identity] += 1
             self.found.setdefault(identity, candidate)
-        if news.apart is not None and news.apart not in self._apart:
-            self._apart.add(news.apart)
+        if news.divergence is not None and news.divergence not in self._known_divergences:
+            self._known_divergences.add(news.divergence)
             document = with_key(candidate.document, "final_reconcile", True)
             self._to_reconcile.append(candidate._replace(document=document))
-        gave = _taken_down(news.reached.states, self.reached.states, self.states_beyond)
-        pairs = _taken_down(news.reached.pairs, self.reached.pairs, self.pairs_beyond)
+        new_states = _count_new(news.reached.states, self.reached.states, self.states_overflow)
+        pairs = _count_new(news.reached.pairs, self.reached.pairs, self.pairs_overflow)
         branches = any(branch not in self.reached.branches for branch in news.reached.branches)
         self.reached.add(news.reached)
         failed = 0
-        if news.in_vain and news.in_vain not in self._in_vain and len(self._in_vain) < MOST_WAYS:
-            self._in_vain.add(news.in_vain)
-            failed = sum(way.count("voting") for way in news.in_vain)
-            gave += WORTH_OF_WAYS
-        if not (gave or branches or pairs):
+        if (
+            news.failed_votes
+            and news.failed_votes not in self._known_patterns
+            and len(self._known_patterns) < MAX_PATTERNS
+        ):
+            self._known_patterns.add(news.failed_votes)
+            failed = sum(pattern.count("voting") for pattern in news.failed_votes)
+            new_states += WORTH_OF_PATTERN
+        if not (new_states or branches or pairs):
             return False
-        self.kept.append(Kept(candidate, gave, news.reached.steps, failed, news.timers_ended_s))
+        self.kept.append(Kept(candidate, new_states, news.reached.steps, failed, news.timers_ended_s))
         if len(self.kept) > MOST_KEPT:
             least = min(self.kept[:-NEWEST], key=lambda kept: kept.worth)
             self.kept.remove(least)
@@ -207,39 +211,40 @@ class Hunt:
 
     @property
     def local_states(self) -> int:
-        """How many were reached."""
-        return len(self.reached.states) + self.states_beyond.count
+        """Number of local states that were reached."""
+        return len(self.reached.states) + self.states_overflow.count
 
     @property
     def pairs(self) -> int:
-        """How many pairs of one and an input were reached."""
-        return len(self.reached.pairs) + self.pairs_beyond.count
+        """Number of pairs of a local state and an input that were reached."""
+        return len(self.reached.pairs) + self.pairs_overflow.count
 
     def _next(self, worth: Sequence[float]) -> Candidate:
-        lots, kept = self.lots, self._pick(worth)
+        rng, kept = self.rng, self._pick(worth)
         kept.picked += 1
-        other = lots.choice(self.kept).candidate.document
-        document = changed(kept.candidate.document, other, self.limits, lots, kept.timers_ended_s)
+        other = rng.choice(self.kept).candidate.document
+        document = mutate(kept.candidate.document, other, self.limits, rng, kept.timers_ended_s)
         document = with_key(document, "final_reconcile", None)
-        return Candidate(document, kept.candidate.seed if lots.random() < 0.8 else lots.randrange(SEEDS))
+        return Candidate(document, kept.candidate.seed if rng.random() < 0.8 else rng.randrange(SEEDS))
 
     def _pick(self, worth: Sequence[float]) -> Kept:
-        """One of the newest as often as any of the others, which are picked by their worth, here summed up; or, more
-        often than that, by how near a livelock they came.
+        """Choose a document: in half of all cases one of the newest, otherwise by nearness to a livelock or by worth.
+
+        `worth` holds cumulative sums.
         """
-        if self.lots.random() < 0.5:
-            return self.lots.choice(self.kept[-NEWEST:])
-        if self.lots.random() < NEAR:
+        if self.rng.random() < 0.5:
+            return self.rng.choice(self.kept[-NEWEST:])
+        if self.rng.random() < NEAR_LIVELOCK:
             near = [kept for kept in self.kept if kept.failed]
             if near:
-                return self.lots.choices(near, [kept.nearness for kept in near])[0]
-        return self.lots.choices(self.kept, cum_weights=worth)[0]
+                return self.rng.choices(near, [kept.nearness for kept in near])[0]
+        return self.rng.choices(self.kept, cum_weights=worth)[0]
 
 
-def _taken_down(numbers: Iterable[int], told_apart: Collection[int], beyond: Beyond) -> int:
-    """How many of them are new; they go beyond, if there is no more room."""
-    new = [number for number in numbers if number not in told_apart and number not in beyond]
-    if len(told_apart) >= MOST:
+def _count_new(numbers: Iterable[int], exact: Collection[int], overflow: DigestSet) -> int:
+    """Return how many of the numbers are new. If `told_apart` is full, add the new ones to `beyond`."""
+    new = [number for number in numbers if number not in exact and number not in overflow]
+    if len(exact) >= MOST:
         for number in new:
-            beyond.add(number)
+            overflow.add(number)
     return len(new)

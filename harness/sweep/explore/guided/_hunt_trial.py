@@ -1,9 +1,10 @@
 """One run of a hunt: its document, its verdict, and the timers that ended in it.
 
-In the liveness phase all conditions are cleared and no more events are logged; the swarm must become idle. Where it
-then has several chains, whoever plays it may play it again with a final reconcile, after which there must be one.
+The liveness phase clears all conditions and logs no more events. The swarm must then become idle. If it has several
+chains at that time, the run may be played again with a final reconcile, after which there must be one chain.
 
-A livelock is such a way that never ends. Those that end are near it.
+In a livelock, agents repeat a pattern of failed votes forever. The hunt prefers runs with long patterns of failed
+votes, because they are close to a livelock.
 """
 
 import json
@@ -34,14 +35,14 @@ from ucp.trigger import TimerTrigger
 
 APPROVED = (ON_TIMER["voting"].name, "approved")
 MOST = 16
-"""Of a longer way only so many timers, the last, tell it from others."""
+"""Maximum number of timers of a pattern that are compared. The last ones count."""
 
-Ways = tuple[tuple[str, ...], ...]
-"""Of each agent which timers ended, in order."""
+TimerPatterns = tuple[tuple[str, ...], ...]
+"""The timers that ended, in order, for each agent."""
 
 
-class Ended(NamedTuple):
-    """A timer ended, and its handler took this branch."""
+class TimerEnd(NamedTuple):
+    """The end of a timer, and the branch that its handler took."""
 
     at_s: float
     agent_id: int
@@ -50,74 +51,74 @@ class Ended(NamedTuple):
     branch: str
 
 
-def timers_ended(evidence: Evidence) -> list[Ended]:
-    """Of all agents, in order."""
+def timers_ended(evidence: Evidence) -> list[TimerEnd]:
+    """Return the ends of timers of all agents in time order."""
     return sorted(
-        Ended(run.t, agent_id, run.trigger.timer, run.handler, run.branch)
+        TimerEnd(run.t, agent_id, run.trigger.timer, run.handler, run.branch)
         for agent_id, trace in evidence.traces.items()
         for run in trace.runs
         if isinstance(run.trigger, TimerTrigger)
     )
 
 
-def in_vain(ended: Iterable[Ended]) -> Ways:
-    """The longest that agents went on without a vote that was approved; none if not at least two votes failed on it."""
-    longest: Sequence[Ended] = ()
-    for approved, stretch in groupby(ended, lambda each: (each.handler, each.branch) == APPROVED):
+def failed_votes(timer_ends: Iterable[TimerEnd]) -> TimerPatterns:
+    """Return the longest pattern of timers without an approved vote, or no pattern if fewer than two votes failed."""
+    longest: Sequence[TimerEnd] = ()
+    for approved, stretch in groupby(timer_ends, lambda each: (each.handler, each.branch) == APPROVED):
         if not approved:
             longest = max(longest, [*stretch], key=len)
     if sum(each.timer == "voting" for each in longest) < 2:
         return ()
-    ways = defaultdict[int, list[str]](list)
+    patterns = defaultdict[int, list[str]](list)
     for each in longest[-MOST:]:
-        ways[each.agent_id].append(each.timer)
-    return tuple(sorted(map(tuple, ways.values())))
+        patterns[each.agent_id].append(each.timer)
+    return tuple(sorted(map(tuple, patterns.values())))
 
 
 MOST_BLOCKS = 12
-"""Runs have no more: states of many blocks are new in every run, and tell nothing."""
+"""Maximum number of blocks of a run. With many blocks, the states of every run are new, so novelty means nothing."""
 LAST_S = 240.0
-"""Up to when blocks are completed, at least."""
+"""Minimum of the mission second up to which blocks are completed."""
 CLEARED_S = 0.001
-"""So long before the end of a mission the conditions are cleared."""
+"""Seconds before the end of the mission at which conditions are cleared."""
 LONGEST_GAP_S = 40.0
-"""Between two events: a round of votes and reconciles is over."""
+"""Maximum seconds between two events. A round of votes and reconciles ends within this time."""
 
 
-Apart = tuple[tuple[int, int], ...]
-"""Of each chain how many agents hold it, and how many of its blocks are not in all chains; in order."""
+Divergence = tuple[tuple[int, int], ...]
+"""Pairs for each chain, sorted: number of agents that hold it, and number of its blocks outside the mutual chain."""
 
 
 @dataclass(frozen=True)
-class Tried:
-    """What a run reached, and which findings it is evidence of."""
+class Trial:
+    """The coverage of a run, and the findings that it shows."""
 
     reached: Reached
     found: tuple[Identity, ...]
-    apart: Apart | None = None
-    """How chains differ at rest, where nobody has been told to reconcile finally."""
+    divergence: Divergence | None = None
+    """The difference of the chains at rest, in a run without a final reconcile."""
     timers_ended_s: tuple[float, ...] = ()
-    """When timers of agents ended, up to when conditions were cleared; in order."""
-    in_vain: Ways = ()
-    """How agents went on in the liveness phase while votes failed, and none was approved."""
+    """Times at which timers ended before the liveness phase, in order."""
+    failed_votes: TimerPatterns = ()
+    """The longest pattern of failed votes in the liveness phase."""
 
 
 @gc_paused()
-def tried(scenario: Scenario, seed: int) -> Tried:
-    """Play it. Raises HarnessError if it cannot be played."""
+def play_trial(scenario: Scenario, seed: int) -> Trial:
+    """Play a scenario. Raises HarnessError if it cannot be played."""
     watcher = Watcher()
     result, evidence = _played(scenario, seed, watcher.step)
-    apart = None if scenario.final_reconcile or result.bad else _apart(result)
+    divergence = None if scenario.final_reconcile or result.bad else _known_divergences(result)
     found = identities(result, evidence.once(cycle_of) if evidence else None, scenario)
     if evidence is None:
-        return Tried(watcher.reached, found)
-    ended = timers_ended(evidence)
-    moments = tuple(sorted({round(each.at_s, 3) for each in ended if each.at_s <= scenario.duration_s}))
-    ways = in_vain([each for each in ended if each.at_s > scenario.duration_s])
-    return Tried(watcher.reached, found, apart, moments, ways)
+        return Trial(watcher.reached, found)
+    timer_ends = timers_ended(evidence)
+    moments = tuple(sorted({round(each.at_s, 3) for each in timer_ends if each.at_s <= scenario.duration_s}))
+    patterns = failed_votes([each for each in timer_ends if each.at_s > scenario.duration_s])
+    return Trial(watcher.reached, found, divergence, moments, patterns)
 
 
-def _apart(result: Result) -> Apart | None:
+def _known_divergences(result: Result) -> Divergence | None:
     holders = Counter(result.chains.values())
     if len(holders) < 2:
         return None
@@ -125,8 +126,8 @@ def _apart(result: Result) -> Apart | None:
     return tuple(sorted((agents, len(chain) - mutual) for chain, agents in holders.items()))
 
 
-def found_in(scenario: Scenario, seed: int) -> tuple[Identity, ...]:
-    """What the very run of the scenario shows. Raises HarnessError if it cannot be played."""
+def findings_of(scenario: Scenario, seed: int) -> tuple[Identity, ...]:
+    """Return the findings of a run. Raises HarnessError if the scenario cannot be played."""
     result, evidence = _played(scenario, seed, lambda state, run: None)
     return identities(result, evidence.once(cycle_of) if evidence else None, scenario)
 
@@ -140,7 +141,7 @@ def _played(scenario: Scenario, seed: int, watch: Watch) -> tuple[Result, Eviden
 
 
 def with_liveness_phase(document: Document) -> Document:
-    """The same, with all conditions cleared when the last event may be logged."""
+    """Add entries that clear all conditions at the end of the mission."""
     ends_s = float(document.get("duration_s", 1200.0))
     fates = [_until(fate, ends_s) for fate in document.get("fates", []) if fate.get("from_s", 0.0) < ends_s]
     entries = [entry for entry in timeline(document) if entry["at_s"] < ends_s - 3 * CLEARED_S]
@@ -156,7 +157,7 @@ def with_liveness_phase(document: Document) -> Document:
 
 
 def without_liveness_phase(document: Document) -> Document:
-    """The same before it had one."""
+    """Remove the entries that `with_liveness_phase` added."""
     last_s = float(document.get("duration_s", 1200.0)) - 3 * CLEARED_S
     return with_key(document, "timeline", [entry for entry in timeline(document) if entry["at_s"] < last_s])
 
@@ -177,27 +178,27 @@ def _until(fate: Document, ends_s: float) -> Document:
     return {**fate, "until_s": min(ends_s, fate.get("until_s", ends_s))}
 
 
-def beginnings(scenario: Scenario, seeds: Iterable[int]) -> tuple[Limits, list[tuple[Document, int]]]:
-    """Short documents to begin with, and how far changes of them may go."""
-    begun, last_s = [], LAST_S
+def initial_documents(scenario: Scenario, seeds: Iterable[int]) -> tuple[Limits, list[tuple[Document, int]]]:
+    """Return the limits of changes, and short documents to start with."""
+    initial, last_s = [], LAST_S
     for seed in seeds:
         completing = [event for event in record(scenario, seed).logged if event.completes]
-        documents = [_as_json(_beginning(scenario, completing[:blocks])) for blocks in (FEW_BLOCKS, MOST_BLOCKS)]
-        begun += [(document, seed) for document in documents]
+        documents = [_as_json(_initial_document(scenario, completing[:blocks])) for blocks in (FEW_BLOCKS, MOST_BLOCKS)]
+        initial += [(document, seed) for document in documents]
         last_s = max(last_s, documents[-1]["duration_s"])
-    return Limits(scenario.roster, MOST_BLOCKS, last_s), begun
+    return Limits(scenario.roster, MOST_BLOCKS, last_s), initial
 
 
 def _as_json(document: Document) -> Document:
-    """As it is when it was written and read again: numbers that are keys are text."""
+    """Return the document as it is after writing and reading. Keys that are numbers become text."""
     copy: Document = json.loads(json.dumps(document))
     return copy
 
 
-def _beginning(scenario: Scenario, completing: Sequence[Logged]) -> Document:
-    """With these blocks, each completed by one event.
+def _initial_document(scenario: Scenario, completing: Sequence[Logged]) -> Document:
+    """Return a document with these blocks, each completed by one event.
 
-    All else is as the scenario says, up to then: what happens to messages is still left to chance.
+    Everything else is as in the scenario up to then. Losses and latencies are still random.
     """
     document = document_of(scenario)
     largest = at(document, "settings.max_event_bytes") or Settings().max_event_bytes

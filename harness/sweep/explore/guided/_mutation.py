@@ -1,7 +1,7 @@
-"""A scenario changed by chance into another: what happens when, to whom, on which network, by which settings.
+"""Random changes of a scenario: times, agents, network, single messages and settings.
 
-A change takes a document as it is and gives another, which need not be a scenario that can be played; who tries it
-finds out. All chance is drawn from the lots that are given: equal lots make equal changes.
+A change takes a document and returns another, which may be an invalid scenario. The caller finds out by playing it. All
+random draws come from `rng`, so equal generators make equal changes.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,15 +10,15 @@ from typing import NamedTuple, get_args
 
 from harness.scenario.fates import MessageName
 from harness.scenario.strict_model import in_text, numbered
-from harness.sweep.explore._scenario_document import Document, at, script, timeline, with_agents, with_key
+from harness.sweep.explore._scenario_document import Document, at, keep_agents, script, timeline, with_key
 from ucp.settings import CHOICES, Settings
 
 MOST_FATES = 12
 MOST_ENTRIES = 6
-"""Of its timeline."""
-LINED_UP = 0.6
+"""Maximum number of entries in the timeline."""
+ALIGN_PROBABILITY = 0.6
 AFTER_LAST_S = 30.0
-"""So long after its last event a changed scenario goes on: a vote and a reconcile are over."""
+"""Seconds between the last event and the end of a changed scenario. A vote and a reconcile end within this time."""
 FEW_BLOCKS = 4
 MESSAGES = get_args(MessageName)
 READINGS = {name: choice.values[1:] for name, choice in CHOICES.items() if choice.is_reading}
@@ -29,42 +29,42 @@ TIMERS_S = tuple(
 NEAR_S = 0.03
 """Maximum distance between two moments at which a message of the first can arrive after the second."""
 DELAYS_S = (0.0, 0.06, 0.2, 1.0, 4.99, 5.02, 9.99, 10.02, 15.0, 20.0)
-"""Of single messages: later than the next one, than a timer, than a round."""
+"""Delays of single messages: longer than the next message, than a timer, or than a round."""
 LATE_S = (0.001, 0.01, 0.03, 0.06, 0.2, 0.5)
-"""Of timers: later than a message, or than another timer; as late as a machine that is right may be."""
+"""Delays of timers: longer than a message or another timer. The largest is within the limits of a correct machine."""
 
 Change = Callable[[Document, Random], Document]
 
 
 class Limits(NamedTuple):
-    """Who may be there, how many blocks may be completed, and up to when."""
+    """The agents that may take part, the maximum number of blocks, and the time of the last one."""
 
     roster: Sequence[int]
     blocks: int
     last_s: float
 
 
-def changed(
-    document: Document, other: Document, limits: Limits, lots: Random, timers_ended_s: Sequence[float] = ()
+def mutate(
+    document: Document, other: Document, limits: Limits, rng: Random, timers_ended_s: Sequence[float] = ()
 ) -> Document:
-    """One to eight changes; now and then some of another document before them, or other agents of the roster.
+    """Return a document with one to eight random changes, sometimes combined with parts of `other` or other agents.
 
-    `timers_ended_s` is when timers ended in the document's run.
+    `timers_ended_s` are times at which timers ended in the document's run.
     """
-    if timers_ended_s and lots.random() < LINED_UP:
-        document = _lined_up(document, timers_ended_s, lots)
-    if lots.random() < 0.1:
-        document = _spliced(document, other, lots)
-    if lots.random() < 0.05:
-        document = _others_there(document, limits.roster, lots)
-    for _ in range(min(8, 1 + int(lots.expovariate(0.5)))):
-        document = lots.choices(_CHANGES, _WEIGHTS)[0](document, lots)
-    few = lots.random() < 0.1
-    return _within(document, limits._replace(blocks=min(FEW_BLOCKS, limits.blocks)) if few else limits)
+    if timers_ended_s and rng.random() < ALIGN_PROBABILITY:
+        document = _align_with_timer(document, timers_ended_s, rng)
+    if rng.random() < 0.1:
+        document = _splice(document, other, rng)
+    if rng.random() < 0.05:
+        document = _change_agents(document, limits.roster, rng)
+    for _ in range(min(8, 1 + int(rng.expovariate(0.5)))):
+        document = rng.choices(_CHANGES, _WEIGHTS)[0](document, rng)
+    few = rng.random() < 0.1
+    return _limited(document, limits._replace(blocks=min(FEW_BLOCKS, limits.blocks)) if few else limits)
 
 
-def _within(document: Document, limits: Limits) -> Document:
-    """Only what the limits allow, and no longer than it takes."""
+def _limited(document: Document, limits: Limits) -> Document:
+    """Apply the limits, and end the mission soon after the last event."""
     events = [event for event in script(document) if event["at_s"] <= limits.last_s][: limits.blocks]
     last_s = max((event["at_s"] for event in events), default=0.0)
     document = with_events(document, events)
@@ -76,299 +76,299 @@ def _within(document: Document, limits: Limits) -> Document:
 # Events
 
 
-def _another_event(document: Document, lots: Random) -> Document:
-    event = {"at_s": _moment(document, lots), "agent": lots.choice(document["agents"])}
+def _add_event(document: Document, rng: Random) -> Document:
+    event = {"at_s": _moment(document, rng), "agent": rng.choice(document["agents"])}
     return with_events(document, [*script(document), event])
 
 
-def _event_gone(document: Document, lots: Random) -> Document:
+def _remove_event(document: Document, rng: Random) -> Document:
     events = list(script(document))
     if len(events) > 1:
-        events.pop(lots.randrange(len(events)))
+        events.pop(rng.randrange(len(events)))
     return with_events(document, events)
 
 
-def _event_moved(document: Document, lots: Random) -> Document:
+def _move_event(document: Document, rng: Random) -> Document:
     events = list(script(document))
     if not events:
         return document
-    index = lots.randrange(len(events))
-    events[index] = {**events[index], "at_s": _moment(document, lots)}
+    index = rng.randrange(len(events))
+    events[index] = {**events[index], "at_s": _moment(document, rng)}
     return with_events(document, events)
 
 
-def _event_of_another(document: Document, lots: Random) -> Document:
+def _reassign_event(document: Document, rng: Random) -> Document:
     events = list(script(document))
     if not events:
         return document
-    index = lots.randrange(len(events))
-    events[index] = {**events[index], "agent": lots.choice(document["agents"])}
+    index = rng.randrange(len(events))
+    events[index] = {**events[index], "agent": rng.choice(document["agents"])}
     return with_events(document, events)
 
 
-def _in_step(document: Document, lots: Random) -> Document:
-    """Two agents complete a block in the same instant."""
+def _align_two_events(document: Document, rng: Random) -> Document:
+    """Let two agents complete a block at the same instant."""
     events = list(script(document))
     if len(events) < 2:
-        return _another_event(document, lots)
-    index, other = lots.sample(range(len(events)), 2)
+        return _add_event(document, rng)
+    index, other = rng.sample(range(len(events)), 2)
     events[index] = {**events[index], "at_s": events[other]["at_s"]}
     if events[index]["agent"] == events[other]["agent"] and len(document["agents"]) > 1:
         others = [agent for agent in document["agents"] if agent != events[other]["agent"]]
-        events[index]["agent"] = lots.choice(others)
+        events[index]["agent"] = rng.choice(others)
     return with_events(document, events)
 
 
-def _lined_up(document: Document, timers_ended_s: Sequence[float], lots: Random) -> Document:
-    """Blocks are completed when a timer ended: those of some agents, or one that there is, or all from one on."""
-    moment = lots.choice(timers_ended_s)
+def _align_with_timer(document: Document, timers_ended_s: Sequence[float], rng: Random) -> Document:
+    """Move events to the end of a timer: new events of some agents, one event, or all events from one on."""
+    moment = rng.choice(timers_ended_s)
 
     def near() -> float:
-        return round(max(0.5, moment + lots.choice((0.0, lots.uniform(-NEAR_S, NEAR_S)))), 3)
+        return round(max(0.5, moment + rng.choice((0.0, rng.uniform(-NEAR_S, NEAR_S)))), 3)
 
     events = list(script(document))
-    index = lots.randrange(len(events) + 1)
+    index = rng.randrange(len(events) + 1)
     if index == len(events):
-        agents = lots.sample(document["agents"], lots.randint(1, len(document["agents"])))
+        agents = rng.sample(document["agents"], rng.randint(1, len(document["agents"])))
         return with_events(document, [*events, *({"at_s": near(), "agent": agent} for agent in agents)])
     later_s = near() - events[index]["at_s"]
-    until = len(events) if lots.random() < 0.5 else index + 1
-    moved = [{**event, "at_s": round(event["at_s"] + later_s, 3)} for event in events[index:until]]
-    return with_events(document, [*events[:index], *moved, *events[until:]])
+    until = len(events) if rng.random() < 0.5 else index + 1
+    move_times = [{**event, "at_s": round(event["at_s"] + later_s, 3)} for event in events[index:until]]
+    return with_events(document, [*events[:index], *move_times, *events[until:]])
 
 
 def with_events(document: Document, events: Sequence[Document]) -> Document:
-    """With these events, in the order of time, and as long as they take."""
+    """Return the document with these events in time order, extended to their duration."""
     ordered = sorted(events, key=lambda event: (event["at_s"], event["agent"]))
     document = {**document, "events": {"source": "scripted", **({"script": ordered} if ordered else {})}}
     last = max((event["at_s"] for event in ordered), default=0.0)
     return {**document, "duration_s": max(float(document.get("duration_s", 0.0)), last + AFTER_LAST_S)}
 
 
-# Single messages, and timers
+# Single messages and timers
 
 
-def _message_lost(document: Document, lots: Random) -> Document:
-    return _with_fate(document, {**_which(document, lots), "drop": True}, lots)
+def _lose_message(document: Document, rng: Random) -> Document:
+    return _with_fate(document, {**_choose_messages(document, rng), "drop": True}, rng)
 
 
-def _message_late(document: Document, lots: Random) -> Document:
-    return _with_fate(document, {**_which(document, lots), "delay_s": lots.choice(DELAYS_S)}, lots)
+def _delay_message(document: Document, rng: Random) -> Document:
+    return _with_fate(document, {**_choose_messages(document, rng), "delay_s": rng.choice(DELAYS_S)}, rng)
 
 
-def _silence(document: Document, lots: Random) -> Document:
-    """All that one agent says, or hears, is lost for a while."""
-    from_s = _moment(document, lots)
-    whom = {lots.choice(("sender", "receiver")): lots.choice(document["agents"])}
-    until_s = round(from_s + lots.choice((1.0, 6.0, 12.0, 30.0)), 3)
-    return _with_fate(document, {**whom, "from_s": from_s, "until_s": until_s, "drop": True}, lots)
+def _silence_agent(document: Document, rng: Random) -> Document:
+    """Lose all messages to or from one agent for some time."""
+    from_s = _moment(document, rng)
+    whom = {rng.choice(("sender", "receiver")): rng.choice(document["agents"])}
+    until_s = round(from_s + rng.choice((1.0, 6.0, 12.0, 30.0)), 3)
+    return _with_fate(document, {**whom, "from_s": from_s, "until_s": until_s, "drop": True}, rng)
 
 
-def _fate_gone(document: Document, lots: Random) -> Document:
+def _remove_fate(document: Document, rng: Random) -> Document:
     fates = list(document.get("fates", []))
     if fates:
-        fates.pop(lots.randrange(len(fates)))
+        fates.pop(rng.randrange(len(fates)))
     return with_key(document, "fates", fates)
 
 
-def _fate_changed(document: Document, lots: Random) -> Document:
+def _retarget_fate(document: Document, rng: Random) -> Document:
     fates = list(document.get("fates", []))
     if not fates:
-        return _message_lost(document, lots)
-    index = lots.randrange(len(fates))
-    fates[index] = _as(fates[index], _which(document, lots))
+        return _lose_message(document, rng)
+    index = rng.randrange(len(fates))
+    fates[index] = _with_target(fates[index], _choose_messages(document, rng))
     return with_key(document, "fates", fates)
 
 
-def _as(fate: Document, which: Document) -> Document:
-    """The same becomes of other messages."""
+def _with_target(fate: Document, which: Document) -> Document:
+    """Return a fate with the effect of `fate` on other messages."""
     return {**which, **{key: fate[key] for key in ("drop", "delay_s") if key in fate}}
 
 
-def _with_fate(document: Document, fate: Document, lots: Random) -> Document:
+def _with_fate(document: Document, fate: Document, rng: Random) -> Document:
     fates = list(document.get("fates", []))
     if len(fates) >= MOST_FATES:
-        fates.pop(lots.randrange(len(fates)))
-    fates.insert(lots.randint(0, len(fates)), fate)
+        fates.pop(rng.randrange(len(fates)))
+    fates.insert(rng.randint(0, len(fates)), fate)
     return {**document, "fates": fates}
 
 
-def _which(document: Document, lots: Random) -> Document:
-    """One message, to one of those who hear it or to all."""
+def _choose_messages(document: Document, rng: Random) -> Document:
+    """Choose a message, for one receiver or for all."""
     which: Document = {
-        "message": lots.choice(MESSAGES),
-        "sender": lots.choice(document["agents"]),
+        "message": rng.choice(MESSAGES),
+        "sender": rng.choice(document["agents"]),
     }
-    if lots.random() < 0.5:
-        which["count"] = 1 + min(7, int(lots.expovariate(0.7)))
+    if rng.random() < 0.5:
+        which["count"] = 1 + min(7, int(rng.expovariate(0.7)))
     else:
-        which["from_s"] = _moment(document, lots)
-        which["until_s"] = round(which["from_s"] + lots.choice((0.06, 0.3, 6.0)), 3)
-    if lots.random() < 0.7:
-        which["receiver"] = lots.choice(document["agents"])
+        which["from_s"] = _moment(document, rng)
+        which["until_s"] = round(which["from_s"] + rng.choice((0.06, 0.3, 6.0)), 3)
+    if rng.random() < 0.7:
+        which["receiver"] = rng.choice(document["agents"])
     return which
 
 
-def _timer_late(document: Document, lots: Random) -> Document:
-    if document.get("agent_command"):  # only our own agents' timers can be late
-        return _message_late(document, lots)
-    agent = str(lots.choice(document["agents"]))
+def _delay_timer(document: Document, rng: Random) -> Document:
+    if document.get("agent_command"):  # only timers of the harness's own agents can be late
+        return _delay_message(document, rng)
+    agent = str(rng.choice(document["agents"]))
     lateness: Document = dict(document.get("lateness", {}))
     late = dict(numbered(lateness.get(agent, "")))
-    late[lots.randrange(12)] = lots.choice(LATE_S)
+    late[rng.randrange(12)] = rng.choice(LATE_S)
     lateness[agent] = in_text(sorted(late.items()), "+")
     return {**document, "lateness": lateness}
 
 
-def _punctual(document: Document, lots: Random) -> Document:
+def _undo_delay(document: Document, rng: Random) -> Document:
     lateness = dict(document.get("lateness", {}))
     if lateness:
-        del lateness[lots.choice(list(lateness))]
+        del lateness[rng.choice(list(lateness))]
     return with_key(document, "lateness", lateness)
 
 
-# The network, and who is there
+# Network and agents
 
 
-def _partition(document: Document, lots: Random) -> Document:
+def _add_partition(document: Document, rng: Random) -> Document:
     agents = list(document["agents"])
     if len(agents) < 2:
         return document
-    lots.shuffle(agents)
-    cut = lots.randint(1, len(agents) - 1)
+    rng.shuffle(agents)
+    cut = rng.randint(1, len(agents) - 1)
     groups = [sorted(agents[:cut]), sorted(agents[cut:])]
-    return _with_entry(document, {"partition": groups, "for_s": lots.choice((3.0, 8.0, 12.0, 20.0, 40.0))}, lots)
+    return _with_entry(document, {"partition": groups, "for_s": rng.choice((3.0, 8.0, 12.0, 20.0, 40.0))}, rng)
 
 
-def _loss_for_a_while(document: Document, lots: Random) -> Document:
-    loss = lots.choice((0.2, 0.5, 0.8, 1.0))
-    return _with_entry(document, {"loss": loss, "for_s": lots.choice((2.0, 6.0, 12.0, 30.0))}, lots)
+def _add_temporary_loss(document: Document, rng: Random) -> Document:
+    loss = rng.choice((0.2, 0.5, 0.8, 1.0))
+    return _with_entry(document, {"loss": loss, "for_s": rng.choice((2.0, 6.0, 12.0, 30.0))}, rng)
 
 
-def _gone(document: Document, lots: Random) -> Document:
-    """An agent is lost, or its computer browns out, or it stands still for a while."""
-    agent = lots.choice(document["agents"])
-    what = lots.randrange(4)
+def _add_agent_fault(document: Document, rng: Random) -> Document:
+    """Kill, reboot or pause an agent."""
+    agent = rng.choice(document["agents"])
+    what = rng.randrange(4)
     if what == 0:
-        return _with_entry(document, {"kill": [agent]}, lots)
-    down_s = lots.choice((0.001, 0.5, 6.0, 12.0))
+        return _with_entry(document, {"kill": [agent]}, rng)
+    down_s = rng.choice((0.001, 0.5, 6.0, 12.0))
     if what < 3:
-        disk = "kept" if lots.random() < 0.8 else "lost"
-        return _with_entry(document, {"reboot": [agent], "down_s": down_s, "disk": disk}, lots)
-    paused = _with_entry(document, {"pause": [agent]}, lots)
+        disk = "kept" if rng.random() < 0.8 else "lost"
+        return _with_entry(document, {"reboot": [agent], "down_s": down_s, "disk": disk}, rng)
+    paused = _with_entry(document, {"pause": [agent]}, rng)
     began_s = next((entry["at_s"] for entry in timeline(paused) if entry.get("pause") == [agent]), 0.0)
     entry = {"at_s": round(began_s + down_s, 3), "resume": [agent]}
     return {**paused, "timeline": [*timeline(paused), entry]}
 
 
-def _entry_gone(document: Document, lots: Random) -> Document:
+def _remove_entry(document: Document, rng: Random) -> Document:
     entries = list(timeline(document))
     if entries:
-        entries.pop(lots.randrange(len(entries)))
+        entries.pop(rng.randrange(len(entries)))
     return with_key(document, "timeline", entries)
 
 
-def _entry_moved(document: Document, lots: Random) -> Document:
+def _move_entry(document: Document, rng: Random) -> Document:
     entries = list(timeline(document))
     if not entries:
-        return _partition(document, lots)
-    index = lots.randrange(len(entries))
-    entries[index] = {**entries[index], "at_s": _moment(document, lots)}
+        return _add_partition(document, rng)
+    index = rng.randrange(len(entries))
+    entries[index] = {**entries[index], "at_s": _moment(document, rng)}
     return {**document, "timeline": entries}
 
 
-def _with_entry(document: Document, entry: Document, lots: Random) -> Document:
+def _with_entry(document: Document, entry: Document, rng: Random) -> Document:
     entries = list(timeline(document))
     if len(entries) >= MOST_ENTRIES:
-        entries.pop(lots.randrange(len(entries)))
-    return {**document, "timeline": [*entries, {"at_s": _moment(document, lots), **entry}]}
+        entries.pop(rng.randrange(len(entries)))
+    return {**document, "timeline": [*entries, {"at_s": _moment(document, rng), **entry}]}
 
 
-def _loss(document: Document, lots: Random) -> Document:
-    return with_key(document, "network.loss", lots.choice((None, None, 0.1, 0.25, 0.5)))
+def _change_loss(document: Document, rng: Random) -> Document:
+    return with_key(document, "network.loss", rng.choice((None, None, 0.1, 0.25, 0.5)))
 
 
-def _latency(document: Document, lots: Random) -> Document:
-    return with_key(document, "network.delay", lots.choice((None, 0.02, 0.02, {"mean_s": 0.3, "jitter_s": 0.3})))
+def _change_latency(document: Document, rng: Random) -> Document:
+    return with_key(document, "network.delay", rng.choice((None, 0.02, 0.02, {"mean_s": 0.3, "jitter_s": 0.3})))
 
 
-def _twice(document: Document, lots: Random) -> Document:
-    return with_key(document, "network.duplicate", lots.choice((None, 0.1, 0.5)))
+def _change_duplication(document: Document, rng: Random) -> Document:
+    return with_key(document, "network.duplicate", rng.choice((None, 0.1, 0.5)))
 
 
-def _clock(document: Document, lots: Random) -> Document:
-    """An agent's clock is apart from the others', so that its blocks are older, or younger, than they are."""
+def _change_clock(document: Document, rng: Random) -> Document:
+    """Set an agent's clock apart from the others, so that its blocks look older or younger than they are."""
     clocks = dict(document.get("clocks", {}))
-    agent = str(lots.choice(document["agents"]))
+    agent = str(rng.choice(document["agents"]))
     clocks.pop(agent, None)
-    if lots.random() < 0.7:
-        clocks[agent] = {"offset_s": lots.choice((0.5, 5.0, 30.0, 300.0))}
+    if rng.random() < 0.7:
+        clocks[agent] = {"offset_s": rng.choice((0.5, 5.0, 30.0, 300.0))}
     return with_key(document, "clocks", clocks)
 
 
-def _reading(document: Document, lots: Random) -> Document:
-    name = lots.choice(list(READINGS))
+def _change_reading(document: Document, rng: Random) -> Document:
+    name = rng.choice(list(READINGS))
     now = at(document, f"settings.{name}")
-    return with_key(document, f"settings.{name}", lots.choice(READINGS[name]) if now is None else None)
+    return with_key(document, f"settings.{name}", rng.choice(READINGS[name]) if now is None else None)
 
 
-def _others_there(document: Document, roster: Sequence[int], lots: Random) -> Document:
+def _change_agents(document: Document, roster: Sequence[int], rng: Random) -> Document:
     if isinstance(document.get("agent_command"), dict) or document.get("quirks"):
-        return document  # who is whose is the scenario's affair
-    agents = sorted(lots.sample(list(roster), lots.randint(min(2, len(roster)), len(roster))))
+        return document  # the scenario assigns programs and quirks to agents
+    agents = sorted(rng.sample(list(roster), rng.randint(min(2, len(roster)), len(roster))))
     kept = [agent for agent in document["agents"] if agent in agents]
-    return {**with_agents(document, kept), "agents": agents}
+    return {**keep_agents(document, kept), "agents": agents}
 
 
-def _spliced(document: Document, other: Document, lots: Random) -> Document:
-    """What happens in one, under the conditions of the other."""
+def _splice(document: Document, other: Document, rng: Random) -> Document:
+    """Combine the events of one document with conditions of the other."""
     if document["agents"] != other["agents"]:
         return document
     for key in ("fates", "timeline", "lateness", "network", "clocks", "settings"):
-        if lots.random() < 0.5:
+        if rng.random() < 0.5:
             document = with_key(document, key, other.get(key))
-    return with_events(document, script(other)) if lots.random() < 0.5 and script(other) else document
+    return with_events(document, script(other)) if rng.random() < 0.5 and script(other) else document
 
 
-def _moment(document: Document, lots: Random) -> float:
-    """When something happens, or a timer that then began ends, or somewhen between."""
+def _moment(document: Document, rng: Random) -> float:
+    """Choose a time: at or between known times, or when a timer that started then would end."""
     known = [event["at_s"] for event in script(document)]
     known += [entry["at_s"] for entry in timeline(document)]
     last = max(known, default=20.0)
-    if not known or lots.random() < 0.25:
-        return round(lots.uniform(1.0, last + 15.0), 3)
-    moment = float(lots.choice(known))
-    for _ in range(lots.randrange(4)):
-        moment += lots.choice(TIMERS_S)
-    moment += lots.choice((0.0, 0.0, 0.001, 0.01, 0.025, 0.05, 0.1, 1.0, -0.001, -0.025))
+    if not known or rng.random() < 0.25:
+        return round(rng.uniform(1.0, last + 15.0), 3)
+    moment = float(rng.choice(known))
+    for _ in range(rng.randrange(4)):
+        moment += rng.choice(TIMERS_S)
+    moment += rng.choice((0.0, 0.0, 0.001, 0.01, 0.025, 0.05, 0.1, 1.0, -0.001, -0.025))
     return round(max(moment, 0.5), 3)
 
 
 _CHANGES: tuple[Change, ...]
 _CHANGES, _WEIGHTS = zip(
     *{
-        _another_event: 8,
-        _event_gone: 3,
-        _event_moved: 8,
-        _event_of_another: 5,
-        _in_step: 8,
-        _message_lost: 6,
-        _message_late: 4,
-        _silence: 4,
-        _fate_gone: 2,
-        _fate_changed: 3,
-        _timer_late: 3,
-        _punctual: 2,
-        _partition: 5,
-        _loss_for_a_while: 4,
-        _gone: 3,
-        _entry_gone: 1,
-        _entry_moved: 3,
-        _loss: 3,
-        _latency: 2,
-        _twice: 1,
-        _clock: 4,
-        _reading: 1,
+        _add_event: 8,
+        _remove_event: 3,
+        _move_event: 8,
+        _reassign_event: 5,
+        _align_two_events: 8,
+        _lose_message: 6,
+        _delay_message: 4,
+        _silence_agent: 4,
+        _remove_fate: 2,
+        _retarget_fate: 3,
+        _delay_timer: 3,
+        _undo_delay: 2,
+        _add_partition: 5,
+        _add_temporary_loss: 4,
+        _add_agent_fault: 3,
+        _remove_entry: 1,
+        _move_entry: 3,
+        _change_loss: 3,
+        _change_latency: 2,
+        _change_duplication: 1,
+        _change_clock: 4,
+        _change_reading: 1,
     }.items(),
     strict=True,
 )

@@ -1,6 +1,6 @@
-"""A night: known findings are played first, then the hunt goes on from what is kept, until its time is over.
+"""A night: known findings are played first, then the hunt continues from the kept runs until its time is over.
 
-What ends it early loses the run under way: whatever reached something, and whatever was found, is written at once.
+An interruption loses only the runs in progress, because new coverage and findings are written at once.
 """
 
 import resource
@@ -28,36 +28,36 @@ from harness.sweep.explore._smaller import scenario_of
 from harness.sweep.explore.guided._corpus import Corpus, Finding, opened
 from harness.sweep.explore.guided._finding_identity import Identity
 from harness.sweep.explore.guided._hunt import Candidate, Hunt
-from harness.sweep.explore.guided._hunt_trial import beginnings, found_in, with_liveness_phase
+from harness.sweep.explore.guided._hunt_trial import findings_of, initial_documents, with_liveness_phase
 from harness.sweep.explore.guided._mutation import Limits
 from harness.sweep.explore.guided._night_page import to_html
 
 Status = Literal["new", "resolved", "rare", "ongoing"]
 
 SCHEMA = "ucp-exploration/1"
-BEGUN_WITH = 4
-"""Runs of the scenario whose beginnings are changed at first."""
+INITIAL_RUNS = 4
+"""Number of runs of the scenario from which the first documents are made."""
 SEEDS = 20
-"""With so many seeds it is seen how often a finding shows."""
+"""Number of seeds with which a finding is played, to measure how often it appears."""
 RARE = 0.5
-"""Findings that show with less than this share of them are rare."""
+"""A finding that appears with a smaller share of the seeds is rare."""
 SHRINKING_RUNS = 400
 MOST_AGENTS, MOST_BLOCKS = 3, 3
-"""Shares are of what exists within these bounds."""
+"""Bounds of the states that coverage is compared with: numbers of agents and blocks."""
 SAMPLES = 200
 
 
 @dataclass(frozen=True)
 class Watcher:
-    """Who is told meanwhile: of runs, local states, findings; and of what happens now, in words."""
+    """Functions that report progress: `on_progress` receives runs, local states and findings, `on_event` a text."""
 
     on_progress: Callable[[int, int, int], None] = lambda runs, states, findings: None
     on_event: Callable[[str], None] = lambda words: None
 
 
 @dataclass
-class Told:
-    """A finding as of this night: it showed with `shown` of `of` seeds."""
+class NightFinding:
+    """A finding with its status of this night. It appeared with `shown` of `of` seeds."""
 
     finding: Finding
     status: Status
@@ -84,23 +84,23 @@ class Told:
 
 @dataclass
 class Night:
-    """What came of it. `growth`: runs, and local states that were known after them."""
+    """The results of a night. `growth` holds pairs of a number of runs and the local states known after them."""
 
     scenario: Scenario
     directory: Path
     hunt: Hunt
-    began: str
-    told: list[Told] = field(default_factory=list)
+    started_at: str
+    findings: list[NightFinding] = field(default_factory=list)
     growth: list[tuple[int, int]] = field(default_factory=list)
     interrupted: bool = False
     seconds: float = 0.0
     processor_s: float = 0.0
     left_out: list[str] = field(default_factory=list)
-    there: Existing | None = None
+    existing_states: Existing | None = None
     report: Path | None = None
 
     def grow(self) -> None:
-        """Take down what is known by now; of a long night every second, fourth, eighth run."""
+        """Add a sample to `growth`. In a long night, only every second, fourth or eighth run is kept."""
         self.growth.append((self.hunt.runs, self.hunt.local_states))
         if len(self.growth) > 2 * SAMPLES:
             del self.growth[1::2]
@@ -109,14 +109,14 @@ class Night:
     def exit_status(self) -> int:
         if self.interrupted:
             return INTERRUPTED
-        return VIOLATED if self.hunt.failed or any(told.status != "resolved" for told in self.told) else 0
+        return VIOLATED if self.hunt.failed or any(finding.status != "resolved" for finding in self.findings) else 0
 
     def to_json(self) -> dict[str, Any]:
         reached = self.hunt.reached
         return {
             "schema": SCHEMA,
             "scenario": self.scenario.name,
-            "started_at": self.began,
+            "started_at": self.started_at,
             "outcome": "interrupted" if self.interrupted else "completed",
             "seconds": round(self.seconds, 1),
             "processor_s": round(self.processor_s, 1),
@@ -124,9 +124,9 @@ class Night:
             "kept": len(self.hunt.kept),
             "local_states": self.hunt.local_states,
             "pairs": self.hunt.pairs,
-            "coverage": coverage_to_json(reached, self.there),
+            "coverage": coverage_to_json(reached, self.existing_states),
             "growth": [list(sample) for sample in self.growth],
-            "findings": [told.to_json() for told in self.told],
+            "findings": [finding.to_json() for finding in self.findings],
             "failed": [{"seed": candidate.seed, "reason": reason} for candidate, reason in self.hunt.failed],
             "failures": self.hunt.failures,
             "left_out": self.left_out[:SAMPLES],
@@ -144,24 +144,24 @@ def spend(
     jobs: int = 1,
     watcher: Watcher = Watcher(),
 ) -> Night:
-    """Hunt for so long, or so many runs, and keep in `directory` what is worth it. Ctrl-C ends it early.
+    """Hunt for `for_s` seconds or `most_runs` runs, and store results in `directory`. Ctrl-C ends the night early.
 
-    Raises HarnessError if the scenario cannot be played, or the directory not be used.
+    Raises HarnessError if the scenario cannot be played, or if the directory cannot be used.
     """
     if scenario.foreign:
         same_twice(scenario, first_seed)
-    limits, begun = beginnings(scenario, range(first_seed, first_seed + BEGUN_WITH))
+    limits, initial = initial_documents(scenario, range(first_seed, first_seed + INITIAL_RUNS))
     corpus = opened(directory, scenario, limits)
     try:
-        return _Nightwatch(scenario, corpus, limits, first_seed, for_s, most_runs, jobs, watcher).spend(
-            [Candidate(*each) for each in begun]
+        return _NightRun(scenario, corpus, limits, first_seed, for_s, most_runs, jobs, watcher).spend(
+            [Candidate(*each) for each in initial]
         )
     finally:
         corpus.close()
 
 
-class _Nightwatch:
-    """Goes through one night."""
+class _NightRun:
+    """Carries out one night."""
 
     def __init__(
         self,
@@ -176,50 +176,50 @@ class _Nightwatch:
     ) -> None:
         self._corpus, self._jobs, self._watcher = corpus, jobs, watcher
         self._most_runs = most_runs
-        self._began_s, self._began_processor_s = time.monotonic(), _processor_s()
-        self._ends_s = self._began_s + for_s
-        began = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-        self._night = Night(scenario, corpus.directory, Hunt(limits, Random(f"{first_seed}")), began)
+        self._start_s, self._start_processor_s = time.monotonic(), _processor_s()
+        self._ends_s = self._start_s + for_s
+        started_at = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+        self._night = Night(scenario, corpus.directory, Hunt(limits, Random(f"{first_seed}")), started_at)
         self._known = {finding.identity: finding for finding in corpus.findings()}
         self._new: dict[Identity, Finding] = {}
         self._shown: dict[Identity, tuple[int, int]] = {}
 
-    def spend(self, begun: list[Candidate]) -> Night:
+    def spend(self, initial: list[Candidate]) -> Night:
         night = self._night
         try:
             self._replay()
-            self._hunt(begun)
+            self._hunt(initial)
             self._shrink()
             bounds = Bounds(min(len(night.hunt.limits.roster), MOST_AGENTS), min(night.hunt.limits.blocks, MOST_BLOCKS))
-            night.there = existing(bounds)
+            night.existing_states = existing(bounds)
         except KeyboardInterrupt:
             night.interrupted = True
-        self._tell()
+        self._finish()
         return night
 
     def _replay(self) -> None:
-        """Play what was found before: does it still show, and how often?"""
+        """Play known findings again, and count the seeds with which they appear."""
         for identity, finding in self._known.items():
             document = self._corpus.scenario_of(finding)
             if document is None:
                 self._corpus.left_out.append(f"{finding.file}: nothing shows {identity} again")
             else:
                 self._watcher.on_event(f"playing a known finding again: {identity}")
-                self._shown[identity] = self._how_often(identity, document, finding.seed)
+                self._shown[identity] = self._count_seeds(identity, document, finding.seed)
 
-    def _how_often(self, identity: Identity, document: Document, seed: int) -> tuple[int, int]:
+    def _count_seeds(self, identity: Identity, document: Document, seed: int) -> tuple[int, int]:
         seeds = [seed, *(other for other in range(1, SEEDS + 1) if other != seed)][:SEEDS]
 
         def shows(with_seed: int) -> bool:
-            return identity in found_in(Scenario.model_validate(document), with_seed)
+            return identity in findings_of(Scenario.model_validate(document), with_seed)
 
         with sweep(seeds, shows, self._jobs) as outcomes:
             return sum(outcome is True for _, outcome in outcomes), len(seeds)
 
-    def _hunt(self, begun: list[Candidate]) -> None:
-        """From what is kept; what of that gives nothing any more is dropped, if there was time to play all of it."""
+    def _hunt(self, initial: list[Candidate]) -> None:
+        """Hunt from the kept runs. If all were played and one of them reaches nothing new any more, it is dropped."""
         hunt, before = self._night.hunt, self._corpus.runs()
-        kept = set(map(id, self._taken(hunt.begin([*begun, *before], self._jobs))))
+        kept = set(map(id, self._kept_runs(hunt.begin([*initial, *before], self._jobs))))
         if not hunt.kept:
             reason = hunt.failed[0][1] if hunt.failed else "no run of the scenario can be changed and played"
             raise HarnessError(f"there is nothing to begin with: {reason}")
@@ -227,7 +227,7 @@ class _Nightwatch:
             if id(candidate) not in kept:
                 self._corpus.drop(candidate)
         while not self._over:
-            for _ in self._taken(hunt.round(self._jobs)):
+            for _ in self._kept_runs(hunt.round(self._jobs)):
                 pass
             for candidate in hunt.dropped():
                 self._corpus.drop(candidate)
@@ -236,8 +236,8 @@ class _Nightwatch:
     def _over(self) -> bool:
         return time.monotonic() >= self._ends_s or self._night.hunt.runs >= self._most_runs
 
-    def _taken(self, runs: Iterator[tuple[Candidate, bool]]) -> Iterator[Candidate]:
-        """Those that reached something are written at once, and so is what is found."""
+    def _kept_runs(self, runs: Iterator[tuple[Candidate, bool]]) -> Iterator[Candidate]:
+        """Yield the runs that are kept. Kept runs and findings are written at once."""
         night, hunt = self._night, self._night.hunt
         for candidate, is_kept in runs:
             night.grow()
@@ -245,17 +245,17 @@ class _Nightwatch:
                 self._corpus.keep(candidate)
                 yield candidate
             for identity in hunt.found.keys() - self._known.keys() - self._new.keys():
-                self._take_down(identity, hunt.found[identity])
+                self._add_finding(identity, hunt.found[identity])
             self._watcher.on_progress(hunt.runs, hunt.local_states, len(hunt.found))
             if self._over:
                 return
 
-    def _take_down(self, identity: Identity, candidate: Candidate) -> None:
+    def _add_finding(self, identity: Identity, candidate: Candidate) -> None:
         finding = Finding(
             **vars(identity),
             seed=candidate.seed,
-            first=self._night.began,
-            last=self._night.began,
+            first=self._night.started_at,
+            last=self._night.started_at,
         )
         self._new[identity] = finding
         self._write(finding, with_liveness_phase(candidate.document), "as it was found")
@@ -273,13 +273,13 @@ class _Nightwatch:
         assert path.exists()
 
     def _shrink(self) -> None:
-        """Make what is new small."""
+        """Shrink the new findings."""
         for identity, finding in self._new.items():
             document = with_liveness_phase(self._night.hunt.found[identity].document)
             self._watcher.on_event(f"shrinking: {identity}")
 
             def still(scenario: Scenario, identity: Identity = identity, seed: int = finding.seed) -> bool:
-                return identity in found_in(scenario, seed)
+                return identity in findings_of(scenario, seed)
 
             smallest, words, interrupted = smallest_of(
                 document,
@@ -292,10 +292,10 @@ class _Nightwatch:
             self._write(finding, smallest, words)
             if interrupted:
                 raise KeyboardInterrupt
-            self._shown[identity] = self._how_often(identity, smallest, finding.seed)
+            self._shown[identity] = self._count_seeds(identity, smallest, finding.seed)
 
-    def _tell(self) -> None:
-        """What the night came to."""
+    def _finish(self) -> None:
+        """Determine the status of all findings, and write the results."""
         night, corpus = self._night, self._corpus
         for identity, finding in {**self._known, **self._new}.items():
             shown, of = self._shown.get(identity, (0, 0))
@@ -308,15 +308,15 @@ class _Nightwatch:
             elif of and shown < RARE * of:
                 status = "rare"
             if status != "resolved" and (shown or in_hunt):
-                finding.last = night.began
+                finding.last = night.started_at
             path = corpus.directory / "findings" / finding.file
-            night.told.append(Told(finding, status, shown, of, path if path.exists() else None))
+            night.findings.append(NightFinding(finding, status, shown, of, path if path.exists() else None))
         corpus.write_findings([*self._known.values(), *self._new.values()])
-        night.seconds = time.monotonic() - self._began_s
-        night.processor_s = _processor_s() - self._began_processor_s
+        night.seconds = time.monotonic() - self._start_s
+        night.processor_s = _processor_s() - self._start_processor_s
         night.left_out = corpus.left_out
         document = night.to_json()
-        night.report = corpus.write_night(night.began, document, lambda nights: to_html(document, nights))
+        night.report = corpus.write_night(night.started_at, document, lambda nights: to_html(document, nights))
 
 
 def _processor_s() -> float:

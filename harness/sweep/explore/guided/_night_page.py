@@ -1,4 +1,4 @@
-"""The page of a night: what was found, how much was tried, the nights before it. It is all text to the template."""
+"""The page of a night: findings, coverage, and earlier nights. The template escapes all text."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,10 @@ MOST_BRANCHES = 100
 
 
 def to_html(night: dict[str, Any], nights: Sequence[dict[str, Any]]) -> str:
-    """`night` is what its JSON says; `nights` are that of all that were kept, this one among them."""
+    """Return the page.
+
+    `night` is the night's JSON, and `nights` holds that of all stored nights, including this one.
+    """
     last = list(nights)[-MOST_NIGHTS:]
     return html.render(
         _TEMPLATE,
@@ -44,9 +47,9 @@ def headline(night: dict[str, Any]) -> str:
     counts = dict.fromkeys(("new", "ongoing", "rare", "resolved"), 0)
     for finding in night["findings"]:
         counts[finding["status"]] += 1
-    told = ", ".join(f"{count} {status}" for status, count in counts.items() if count) or "no findings"
+    by_status = ", ".join(f"{count} {status}" for status, count in counts.items() if count) or "no findings"
     broken_off = "; interrupted" if night["outcome"] == "interrupted" else ""
-    return f"{told}; {night['runs']:,} runs, {night['local_states']:,} local states{broken_off}"
+    return f"{by_status}; {night['runs']:,} runs, {night['local_states']:,} local states{broken_off}"
 
 
 def _curve(title: str, samples: Sequence[Sequence[int]], unit: str) -> Markup:

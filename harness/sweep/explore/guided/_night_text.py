@@ -1,4 +1,4 @@
-"""What the command line says of a night: while it goes on, and at its end."""
+"""The output of the command `explore --for`, during a night and at its end."""
 
 import contextlib
 import time
@@ -11,13 +11,16 @@ from harness.sweep.explore.guided._night import Night, Watcher
 
 REDRAW_EVERY_S = 0.1
 FIRST_LINE_S, LINES_GROW, LONGEST_S = 10.0, 1.5, 600.0
-"""Where there is no terminal a line comes after so long, and ever later ones, but at last every ten minutes."""
+"""Without a terminal, the seconds before the first line, the growth of this interval, and its maximum."""
 CLEAR_LINE = "\r\x1b[2K"
 
 
 @contextlib.contextmanager
 def watching(console: Console) -> Iterator[Watcher]:
-    """On one line of a terminal; elsewhere a line now and then, ever more seldom."""
+    """Yield functions that print the progress.
+
+    On a terminal, the progress is one line that is redrawn. Elsewhere it is a line at growing intervals.
+    """
     began = last = time.monotonic()
     every_s = REDRAW_EVERY_S if console.is_terminal else FIRST_LINE_S
 
@@ -48,15 +51,15 @@ def watching(console: Console) -> Iterator[Watcher]:
 
 def in_words(night: Night) -> Iterator[str]:
     """Yield the lines that the command prints at the end of a night."""
-    for told in night.told:
-        of = f", appears with {told.shown} of {told.of} seeds" if told.of else ""
-        yield f"{told.status}: {told.finding.identity}{of}"
-        if told.replay:
-            yield f"  {told.replay}"
-    if not night.told:
+    for finding in night.findings:
+        of = f", appears with {finding.shown} of {finding.of} seeds" if finding.of else ""
+        yield f"{finding.status}: {finding.finding.identity}{of}"
+        if finding.replay:
+            yield f"  {finding.replay}"
+    if not night.findings:
         yield "no findings"
     for candidate, reason in night.hunt.failed[:3]:
         yield f"no verdict on the run with seed {candidate.seed}: {reason}"
     yield f"{night.hunt.runs:,} runs, {len(night.hunt.kept):,} kept in {night.directory}"
-    yield from coverage_in_words(night.hunt.reached, night.there)
+    yield from coverage_in_words(night.hunt.reached, night.existing_states)
     yield f"{night.report}"

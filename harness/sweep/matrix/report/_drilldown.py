@@ -1,4 +1,4 @@
-"""The runs of each cell, those that went wrong first, and how to play one of them again."""
+"""The runs of each cell, failures first, with the command that plays one of them again."""
 
 import shlex
 from collections.abc import Sequence
@@ -17,12 +17,12 @@ from harness.sweep.matrix.matrix_table import name_of
 from harness.sweep.matrix.report._heatmap import anchor
 
 MAX_ROWS = 12_000
-"""Of all cells together, so that the page stays below 3 MB."""
+"""Maximum number of rows of all cells together. It keeps the page below 3 MB."""
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """`href` is the report of the run if it was kept; `failed` and `unsupported` why it has no verdicts and figures."""
+class RunRow:
+    """One run. `href` is its report if it was kept. `failed` or `unsupported` is the reason for missing verdicts."""
 
     seed: int
     href: str | None
@@ -34,19 +34,19 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class CellRuns:
-    """Of one cell: `left_out` says for how many there was no room."""
+    """The runs of one cell. `left_out` is the number of runs without a row."""
 
     anchor: str
     name: str
     runs: str
     command: str
     figures: list[str]
-    rows: list[Row]
+    rows: list[RunRow]
     left_out: int
 
 
 def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
-    """`directory` is the matrix's, beside whose files the page will be."""
+    """Return the runs of all cells. `directory` is the directory of the matrix, in which the page will be."""
     by_point = [(point, list(runs)) for point, runs in groupby(finished.runs, key=lambda run: run.point)]
     room = MAX_ROWS // max(1, len(by_point))
     cells = []
@@ -83,9 +83,9 @@ def _bad(run: Run) -> bool:
     return any(map(is_wrong, run.verdicts.values()))
 
 
-def _row(run: Run, figures: Sequence[str], directory: Path) -> Row:
+def _row(run: Run, figures: Sequence[str], directory: Path) -> RunRow:
     kept = f"runs/{directory_name(run.task)}/report.html"
-    return Row(
+    return RunRow(
         run.seed,
         kept if (directory / kept).exists() else None,
         [] if not run.judged else [ICONS[kind_of(run.verdicts.get(key, ""))] for key in JUDGED],

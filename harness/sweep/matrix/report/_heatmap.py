@@ -1,7 +1,7 @@
-"""Figures at each point of a matrix as a heatmap, and the menu of figures.
+"""Heatmaps of figures over the points of a matrix, and the menu of figures.
 
-The shade grows with the figure. It has one hue, so that anybody sees it, and each cell says its number; a sign and
-words say what was violated, failed, or changed.
+The shade grows with the figure. All shades have one hue, so they can be distinguished with any colour vision. Each cell
+also shows its number. Violations, failures and changes have a sign and a text.
 """
 
 from collections.abc import Iterable
@@ -50,8 +50,11 @@ class Figure:
         return cell.estimates.get(self.metric.name, Estimate(n=0))
 
 
-def known(cells: Iterable[Cell]) -> list[Figure]:
-    """Those that a run told, first what the mission left; the violated at least."""
+def known_figures(cells: Iterable[Cell]) -> list[Figure]:
+    """Return the figures that runs determined, those before the final reconcile first.
+
+    "violated" is always included.
+    """
     cells = list(cells)
     names = {name for cell in cells for name, estimate in cell.estimates.items() if estimate.n}
     metrics = [metric for metric in BEFORE_FINAL_RECONCILE + METRICS if metric.name in names]
@@ -77,8 +80,8 @@ STYLE = (
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
-    """`kind` is bad or good, for the style sheet."""
+class TileMark:
+    """A note in a tile. `kind` is "bad" or "good", for the style sheet."""
 
     sign: str
     text: str
@@ -87,12 +90,12 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """A cell; `shade` is None if the figure is not known there, and `href` if there are no runs to show."""
+    """A cell of the heatmap. `shade` is None for an unknown figure, and `href` is None without runs."""
 
     shade: int | None
     mean: str
     interval: str
-    marks: list[Mark]
+    marks: list[TileMark]
     in_words: str
     href: str | None
 
@@ -108,7 +111,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Heatmap:
-    """`lowest` and `highest` are what the first and the last shade stand for."""
+    """A heatmap. `lowest` and `highest` are the values of the first and the last shade."""
 
     figure: Figure
     lowest: str
@@ -117,7 +120,7 @@ class Heatmap:
 
 
 def anchor(point: Point) -> str:
-    """Where in the page its runs are."""
+    """Return the ID of the page section with the point's runs."""
     return f"{point.file_name}-{point.backend}"
 
 
@@ -140,7 +143,7 @@ def heatmap(record: MatrixRecord, figure: Figure) -> Heatmap:
 
 
 def _scale(figure: Figure, record: MatrixRecord) -> tuple[float, float]:
-    """Shares are shaded from 0 to 100 %, numbers from the lowest to the highest mean."""
+    """Return the values of the first and the last shade: 0 and 1 for shares, otherwise the extreme means."""
     if figure.metric.unit != "number":
         return 0.0, 1.0
     means = [mean for cell in record.cells if (mean := figure.of(cell).mean) is not None]
@@ -167,19 +170,19 @@ def _shade(mean: float, lowest: float, highest: float) -> int:
     return round((SHADES - 1) * (mean - lowest) / (highest - lowest)) if highest > lowest else 0
 
 
-def _marks(record: MatrixRecord, figure: Figure, cell: Cell) -> list[Mark]:
+def _marks(record: MatrixRecord, figure: Figure, cell: Cell) -> list[TileMark]:
     marks = []
     if number := violated(cell):
-        marks.append(Mark("\u2717", f"{number} violated", "bad"))
+        marks.append(TileMark("\u2717", f"{number} violated", "bad"))
     if cell.failed:
-        marks.append(Mark("!", f"{cell.failed} failed", "bad"))
+        marks.append(TileMark("!", f"{cell.failed} failed", "bad"))
     if cell.unsupported:
-        marks.append(Mark("\u2013", f"{cell.unsupported} not supported", "good"))
+        marks.append(TileMark("\u2013", f"{cell.unsupported} not supported", "good"))
     for change in record.against.changes if record.against else ():
         if change.point == cell.point and change.metric == figure.metric.name:
             up = change.now.mean is not None and change.before.mean is not None and change.now.mean > change.before.mean
             text, kind = ("worse", "bad") if change.worse else ("better", "good")
-            marks.append(Mark("\u25b2" if up else "\u25bc", text, kind))
+            marks.append(TileMark("\u25b2" if up else "\u25bc", text, kind))
     if cell.runs < (asked := len(record.matrix.seed_list)):
-        marks.append(Mark("\u2026", f"{cell.runs} of {asked} runs", "good"))
+        marks.append(TileMark("\u2026", f"{cell.runs} of {asked} runs", "good"))
     return marks

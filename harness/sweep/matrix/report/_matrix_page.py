@@ -1,4 +1,4 @@
-"""The page: what is shown where. Whatever comes from scenarios, runs and earlier nights is text to the template."""
+"""The page of a matrix. The template escapes all text from scenarios, runs and earlier nights."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from harness.sweep.matrix._growth_picture import draw_growth
 from harness.sweep.matrix._matrix_picture import draw, series_of
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_run import Finished
-from harness.sweep.matrix.matrix_summary import tried_in_words, verdict
+from harness.sweep.matrix.matrix_summary import describe_coverage, verdict
 from harness.sweep.matrix.matrix_table import explanation, improvements, name_of, say_lengths, troubles, unjudged
 from harness.sweep.matrix.nights import Nights
 from harness.sweep.matrix.report import _heatmap, _trend
@@ -25,9 +25,12 @@ _STYLE, _GROWTH_STYLE = (_TEMPLATE.with_name(f"{name}.css").read_text(encoding="
 
 
 def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -> str:
-    """`directory` is where the page will be, beside the runs that were kept; `nights` has this one too, if finished."""
+    """Return the page.
+
+    `directory` will contain the page and the kept runs. `nights` includes this one, if it is finished.
+    """
     record = finished.record
-    shown = _heatmap.known(record.cells)
+    shown = _heatmap.known_figures(record.cells)
     drawn = _trend.nights_drawn(nights.records, record, len(shown)) if nights else []
     return html.render(
         _TEMPLATE,
@@ -53,22 +56,22 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
         shades=range(_heatmap.SHADES),
         cells=drilldown(finished, directory),
         judged=JUDGED,
-        tried=list(tried_in_words(record.tried)) if record.tried else [],
+        tried=list(describe_coverage(record.tried)) if record.tried else [],
         tried_cells=[(name_of(record.matrix, cell.point), cell) for cell in record.tried.cells] if record.tried else [],
         not_taken=record.tried.all_cells["branches"]["not_taken"] if record.tried else [],
         nights=nights,
         drawn=drawn,
         trends=[(figure, _trend.trend(drawn, record, figure)) for figure in shown] if len(drawn) > 1 else [],
         series=series_of(record),
-        picture=Markup(draw(record)),  # noqa: S704 - it has escaped what is not ours
-        growth=list(_growth_table.grown(record)),
+        picture=Markup(draw(record)),  # noqa: S704 - it escapes text from outside
+        growth=list(_growth_table.growth_tables(record)),
         growth_table=_growth_table,
         growth_picture=Markup(draw_growth(record)) if record.matrix.grows else None,  # noqa: S704 - as above
     )
 
 
 def _choosing(shown: list[_heatmap.Figure]) -> str:
-    """Of what is drawn for each figure only the chosen one's is shown; on paper all heatmaps are."""
+    """Return CSS that shows only the parts of the chosen figure. On paper, all heatmaps are shown."""
     others = [
         f"main:has(#show-{figure.metric.name}:checked) {{}} .figure:not(.of-{figure.metric.name})" for figure in shown
     ]
@@ -77,7 +80,7 @@ def _choosing(shown: list[_heatmap.Figure]) -> str:
 
 
 def _kind(record: MatrixRecord) -> str:
-    """For the style sheet: half a matrix is no success."""
+    """Return the kind of result for the style sheet. An interrupted matrix is never "holds"."""
     if record.outcome == "interrupted":
         return "violated" if record.failed or any(cell.violated for cell in record.cells) else "unknown"
     return {0: "holds", CANNOT_HERE: "unknown"}.get(record.exit_status, "violated")

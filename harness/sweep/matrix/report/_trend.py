@@ -1,7 +1,7 @@
-"""A figure over the nights: a small panel for each loss, one below the other for each number of agents and backend.
+"""A figure over the nights: a row of small panels, one for each loss, for each number of agents and backend.
 
-Dots and lines are means, bands their 95 % intervals; each panel has a scale of its own, since here it is change that
-matters. One step to the right is one night that was played.
+Dots and lines are means, and bands are 95 % intervals. Each panel has its own scale, because only changes matter here.
+Each step to the right is one night.
 """
 
 import math
@@ -20,18 +20,18 @@ from harness.sweep.matrix.report._heatmap import Figure
 
 COLUMNS, PANEL_HEIGHT, FOOT = 4, 158, 4
 MAX_DOTS = 12_000
-"""Of all panels of a page; where there would be more, fewer nights are drawn."""
+"""Maximum number of dots on a page. If there would be more, fewer nights are drawn."""
 LARGEST = 1e12
-"""No figure is larger, whatever a file says."""
+"""Upper limit of a plausible figure. Larger values in a file are ignored."""
 
 
 def nights_drawn(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figures: int) -> Sequence[MatrixRecord]:
-    """The last of them, two at least."""
+    """Return the last nights, at least two, within `MAX_DOTS`."""
     return nights[-max(2, MAX_DOTS // max(1, len(tonight.cells) * figures)) :]
 
 
 def trend(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figure: Figure) -> list[tuple[str, Markup]]:
-    """A drawing for each number of agents and backend, with its name if there are several."""
+    """Return a drawing for each number of agents and backend, with its name if there are several."""
     of_night = [{cell.point: figure.of(cell) for cell in night.cells} for night in nights]
     begun = [text.started(night.started_at)[:16] for night in nights]
     drawings = []
@@ -76,7 +76,7 @@ def _panel(figure: Figure, cell: Cell, dots: Sequence[Dot], dates: Sequence[str]
 
 
 def _value_axis(figure: Figure, estimates: Sequence[Estimate], area: Area) -> Axis:
-    """Around all intervals, and never so narrow that a trifle looks like a change."""
+    """Return an axis around all intervals. It has a minimum span, so that small changes look small."""
     bounds = [
         bound for estimate in estimates for bound in (estimate.low, estimate.mean, estimate.high) if bound is not None
     ]

@@ -35,7 +35,7 @@ def find(out: Path, asked: Scenario = LOSSY, jobs: int = 1, **options: Any) -> E
     return explore(asked, range(20), out, source="lossy.yaml", jobs=jobs, **options)
 
 
-def test_all_that_is_irrelevant_is_left_out(tmp_path: Path) -> None:
+def test_irrelevant_parts_are_left_out(tmp_path: Path) -> None:
     explored = find(tmp_path / "small.yaml")
     assert explored.exit_status == 1
     smallest = load_scenario(tmp_path / "small.yaml")
@@ -49,7 +49,7 @@ def test_all_that_is_irrelevant_is_left_out(tmp_path: Path) -> None:
     assert one_commit_is_lost(smallest, explored.searched.violation.seed).bad == ("6",)
 
 
-def test_the_file_says_to_people_what_it_is(tmp_path: Path) -> None:
+def test_file_explains_itself_in_comments(tmp_path: Path) -> None:
     explored = find(tmp_path / "small.yaml")
     assert explored.shrunk is not None
     text = (tmp_path / "small.yaml").read_text()
@@ -63,7 +63,7 @@ def test_the_file_says_to_people_what_it_is(tmp_path: Path) -> None:
     assert len(text.splitlines()) < 20
 
 
-def test_the_lowest_seed_is_found_and_shrunk_alike_by_any_number_of_processes(tmp_path: Path) -> None:
+def test_lowest_seed_is_found_and_shrunk_by_any_number_of_processes(tmp_path: Path) -> None:
     def from_seed_3_on(asked: Scenario, seed: int) -> Result:
         return one_commit_is_lost(asked, seed) if seed >= 3 else simulated(asked, seed)
 
@@ -95,7 +95,7 @@ def test_no_violation_writes_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_without_a_verdict_is_told_and_is_status_1(tmp_path: Path) -> None:
+def test_run_without_a_verdict_is_reported_with_status_1(tmp_path: Path) -> None:
     def fails(asked: Scenario, seed: int) -> Result:
         assert seed != 7, "a bug"
         return simulated(asked, seed)
@@ -131,7 +131,7 @@ def test_ctrl_c_while_searching_writes_nothing(tmp_path: Path) -> None:
     assert (explored.exit_status, explored.shrunk) == (130, None)
 
 
-def test_a_reached_bound_is_said(tmp_path: Path) -> None:
+def test_reached_limit_is_reported(tmp_path: Path) -> None:
     explored = find(tmp_path / "small.yaml", max_runs=10)
     assert explored.shrunk is not None
     assert "in 10 runs, when the bound was reached" in explored.shrunk.words
@@ -139,7 +139,7 @@ def test_a_reached_bound_is_said(tmp_path: Path) -> None:
     assert one_commit_is_lost(smallest, explored.shrunk.seed).bad == ("6",)
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     out = tmp_path / "mine.yaml"
     out.write_text("mine")
     with pytest.raises(RunDirectoryError, match="existing files are not overwritten"):
@@ -156,7 +156,7 @@ def test_a_message_that_a_fate_drops_is_no_full_connectivity() -> None:
     assert simulated.evidence.connected_since_s > 100
 
 
-def test_the_command_says_what_it_found_and_how_to_play_it_again(tmp_path: Path) -> None:
+def test_command_prints_the_finding_and_how_to_play_it_again(tmp_path: Path) -> None:
     path, out = tmp_path / "tie.yaml", tmp_path / "small.yaml"
     path.write_text("name: tie\nagents: 4\nduration_s: 400\nnetwork: {loss: 0.3}\nquirks: {crash_on_tie: true}\n")
     done = harness("explore", path, "--jobs", 1, "--out", out)

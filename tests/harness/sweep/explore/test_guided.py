@@ -26,14 +26,14 @@ from harness.sweep.explore.guided._corpus import MOST_BYTES, opened
 from harness.sweep.explore.guided._finding_identity import identities
 from harness.sweep.explore.guided._hunt import Candidate, Hunt, Kept
 from harness.sweep.explore.guided._hunt_trial import (
-    Tried,
-    beginnings,
-    found_in,
-    tried,
+    Trial,
+    findings_of,
+    initial_documents,
+    play_trial,
     with_liveness_phase,
     without_liveness_phase,
 )
-from harness.sweep.explore.guided._mutation import changed
+from harness.sweep.explore.guided._mutation import mutate
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 
 ORDINARY = {
@@ -54,15 +54,15 @@ def night(directory: Path, scenario: Scenario | None = None, *, runs: int = 70, 
     return spend(scenario or ordinary(), directory, most_runs=runs, jobs=jobs)
 
 
-def test_equal_lots_make_equal_changes_and_most_can_be_played() -> None:
-    limits, begun = beginnings(ordinary(agents=3), range(2))
-    document = begun[0][0]
+def test_equal_draws_make_equal_changes_and_most_are_playable() -> None:
+    limits, initial = initial_documents(ordinary(agents=3), range(2))
+    document = initial[0][0]
 
     def many(seed: int) -> list[Any]:
-        lots, last = Random(seed), document
+        rng, last = Random(seed), document
         documents = []
         for _ in range(200):
-            last = changed(document if lots.random() < 0.2 else last, begun[-1][0], limits, lots)
+            last = mutate(document if rng.random() < 0.2 else last, initial[-1][0], limits, rng)
             documents.append(last)
         return documents
 
@@ -78,42 +78,43 @@ def test_equal_lots_make_equal_changes_and_most_can_be_played() -> None:
 
 
 def test_blocks_are_completed_when_a_timer_ended() -> None:
-    limits, ((document, _), *_) = beginnings(ordinary(agents=3), range(1))
+    limits, ((document, _), *_) = initial_documents(ordinary(agents=3), range(1))
 
     def lined_up(timers_ended_s: tuple[float, ...]) -> int:
-        lots = Random(1)
-        documents = [changed(document, document, limits, lots, timers_ended_s) for _ in range(200)]
+        rng = Random(1)
+        documents = [mutate(document, document, limits, rng, timers_ended_s) for _ in range(200)]
         return sum(any(abs(event["at_s"] - 17.123) <= 0.03 for event in script(document)) for document in documents)
 
     assert lined_up((17.123,)) > 40
     assert lined_up(()) < 5
 
 
-def test_of_a_run_it_is_known_when_timers_ended_and_which_votes_failed_in_vain() -> None:
-    round_about = tried(load_scenario(find(Path("refused_by_the_third"))), 1)
+def test_trial_records_ends_of_timers_and_failed_votes() -> None:
+    round_about = play_trial(load_scenario(find(Path("refused_by_the_third"))), 1)
     assert 11.0 in round_about.timers_ended_s
     assert round_about.timers_ended_s == tuple(sorted(round_about.timers_ended_s))
-    assert len(round_about.in_vain) == 2
-    assert {timer for way in round_about.in_vain for timer in way} == {"voting", "phase one", "phase two"}
-    at_rest = tried(Scenario.model_validate({**ORDINARY, "network": {}}), 1)
-    assert (bool(at_rest.timers_ended_s), at_rest.in_vain) == (True, ())
+    assert len(round_about.failed_votes) == 2
+    assert {timer for pattern in round_about.failed_votes for timer in pattern} == {"voting", "phase one", "phase two"}
+    at_rest = play_trial(Scenario.model_validate({**ORDINARY, "network": {}}), 1)
+    assert (bool(at_rest.timers_ended_s), at_rest.failed_votes) == (True, ())
 
 
-def test_who_votes_in_vain_in_a_new_way_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_with_a_new_pattern_of_failed_votes_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Though the local states of it are all known."""
-    limits, ((document, seed), *_) = beginnings(ordinary(), range(1))
-    ways = iter((("voting", "phase one", "voting"),) * 2 + (("voting", "voting"),))
+    limits, ((document, seed), *_) = initial_documents(ordinary(), range(1))
+    patterns = iter((("voting", "phase one", "voting"),) * 2 + (("voting", "voting"),))
     monkeypatch.setattr(
-        "harness.sweep.explore.guided._hunt.tried", lambda scenario, seed: Tried(Reached(), (), in_vain=(next(ways),))
+        "harness.sweep.explore.guided._hunt.play_trial",
+        lambda scenario, seed: Trial(Reached(), (), failed_votes=(next(patterns),)),
     )
     hunt = Hunt(limits, Random(1))
     assert [kept for _, kept in hunt.begin([Candidate(document, seed)] * 3, 1)] == [True, False, True]
 
 
-def test_what_came_near_a_livelock_is_changed_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    limits, ((document, seed), *_) = beginnings(ordinary(), range(1))
-    monkeypatch.setattr("harness.sweep.explore.guided._hunt.tried", lambda scenario, seed: Tried(Reached(), ()))
-    near = Kept(Candidate(document, seed), gave=1, steps=100, failed=3, timers_ended_s=())
+def test_documents_near_a_livelock_are_changed_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits, ((document, seed), *_) = initial_documents(ordinary(), range(1))
+    monkeypatch.setattr("harness.sweep.explore.guided._hunt.play_trial", lambda scenario, seed: Trial(Reached(), ()))
+    near = Kept(Candidate(document, seed), new_states=1, steps=100, failed=3, timers_ended_s=())
     others = [dataclasses.replace(near, failed=0) for _ in range(100)]
     hunt = Hunt(limits, Random(1), kept=[near, *others])
     for _ in hunt.round(1):
@@ -121,16 +122,16 @@ def test_what_came_near_a_livelock_is_changed_more_often(monkeypatch: pytest.Mon
     assert near.picked > 5 > max(other.picked for other in others[:50])
 
 
-def test_livelocks_are_told_apart_by_the_timers_on_the_way_round() -> None:
-    def shape(*ways: str) -> str:
+def test_livelocks_differ_by_their_cycles_of_timers() -> None:
+    def shape(*patterns: str) -> str:
         letters = {"v": "vote", "1": "reconcile_phase_1", "2": "reconcile_phase_2", "f": "finalize"}
         steps = [
             {"agent_id": agent_id, "after_s": float(number), "handler": f"{letters[letter]}_timer_expiration"}
-            for agent_id, way in enumerate(ways, 1)
-            for number, letter in enumerate(way)
+            for agent_id, pattern in enumerate(patterns, 1)
+            for number, letter in enumerate(pattern)
         ]
         cycle = Cycle.model_validate(
-            {"since_s": 1, "period_s": 20, "agents": [*range(1, len(ways) + 1)], "steps": steps}
+            {"since_s": 1, "period_s": 20, "agents": [*range(1, len(patterns) + 1)], "steps": steps}
         )
         judgement = Judgement("Liveness", "never finishes", "round in circles")
         result = SimpleNamespace(judgements={"liveness": judgement}, wrong=["liveness"], chains={})
@@ -143,17 +144,17 @@ def test_livelocks_are_told_apart_by_the_timers_on_the_way_round() -> None:
     assert shape("v12", "v12", "1").startswith("3 agents")
 
 
-def test_a_livelock_is_one_whoever_is_idle_when_it_is_looked_at() -> None:
+def test_identity_of_a_livelock_does_not_depend_on_the_moment() -> None:
     drawn_in = load_scenario(find(Path("drawn_in"))).model_dump(exclude={"expect"}, exclude_unset=True)
     shapes = set()
     for later_s in range(0, 25, 5):
         scenario = Scenario.model_validate({**drawn_in, "duration_s": 106 + later_s})
-        shapes |= {identity.shape for identity in found_in(scenario, 1)}
+        shapes |= {identity.shape for identity in findings_of(scenario, 1)}
     (shape,) = shapes
     assert shape.startswith("4 agents going round every 25 s (phase one; ")
 
 
-def test_in_the_liveness_phase_everybody_hears_everybody() -> None:
+def test_liveness_phase_delivers_all_messages() -> None:
     document = document_of(
         ordinary(
             timeline=[{"at_s": 5, "partition": [[1], [2]]}, {"at_s": 20, "loss": 0.9, "for_s": 40}],
@@ -167,11 +168,11 @@ def test_in_the_liveness_phase_everybody_hears_everybody() -> None:
     assert evidence.connected_since_s == pytest.approx(60, abs=0.01)
 
 
-def test_a_hunt_is_the_same_however_many_play_it() -> None:
+def test_hunt_does_not_depend_on_the_number_of_processes() -> None:
     def hunted(jobs: int) -> Hunt:
-        limits, begun = beginnings(ordinary(), range(2))
+        limits, initial = initial_documents(ordinary(), range(2))
         hunt = Hunt(limits, Random(1))
-        for _ in (*hunt.begin([Candidate(*each) for each in begun], jobs), *hunt.round(jobs)):
+        for _ in (*hunt.begin([Candidate(*each) for each in initial], jobs), *hunt.round(jobs)):
             pass
         return hunt
 
@@ -180,11 +181,11 @@ def test_a_hunt_is_the_same_however_many_play_it() -> None:
     assert [kept.candidate for kept in alone.kept] == [kept.candidate for kept in shared.kept]
 
 
-def test_a_hunt_goes_on_to_learn_when_it_can_keep_no_more_local_states(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hunt_finds_new_states_after_its_sets_are_full(monkeypatch: pytest.MonkeyPatch) -> None:
     def hunted() -> Hunt:
-        limits, begun = beginnings(ordinary(), range(2))
+        limits, initial = initial_documents(ordinary(), range(2))
         hunt = Hunt(limits, Random(1))
-        for _ in (*hunt.begin([Candidate(*each) for each in begun], 1), *hunt.round(1)):
+        for _ in (*hunt.begin([Candidate(*each) for each in initial], 1), *hunt.round(1)):
             pass
         return hunt
 
@@ -197,7 +198,7 @@ def test_a_hunt_goes_on_to_learn_when_it_can_keep_no_more_local_states(monkeypat
     assert [kept.candidate for kept in narrow.kept] == [kept.candidate for kept in roomy.kept]
 
 
-def test_a_night_too_short_to_play_what_is_kept_loses_none_of_it(tmp_path: Path) -> None:
+def test_short_night_loses_no_kept_run(tmp_path: Path) -> None:
     night(tmp_path / "corpus")
     kept = {*(tmp_path / "corpus/runs").iterdir()}
     short = night(tmp_path / "corpus", runs=5)
@@ -205,7 +206,7 @@ def test_a_night_too_short_to_play_what_is_kept_loses_none_of_it(tmp_path: Path)
     assert {*(tmp_path / "corpus/runs").iterdir()} == kept, "each once"
 
 
-def test_what_is_kept_is_there_once_from_night_to_night(tmp_path: Path) -> None:
+def test_kept_runs_are_stored_once_over_several_nights(tmp_path: Path) -> None:
     first = night(tmp_path / "corpus")
     (one, *_) = (tmp_path / "corpus/runs").iterdir()
     one.rename(one.with_name(f"{'0' * 12}-{one.name.partition('-')[2]}"))
@@ -215,7 +216,7 @@ def test_what_is_kept_is_there_once_from_night_to_night(tmp_path: Path) -> None:
     assert len(files) <= len(again.hunt.kept)
 
 
-def test_an_agent_alone_that_others_refuse_for_ever_is_shown_by_a_short_document() -> None:
+def test_short_document_shows_an_agent_that_is_refused_forever() -> None:
     """What a hunt found: of five with four chains at rest one has a block, and nobody takes it."""
     script = [(1.0, 3), (42.944, 2), (48.087, 1), (82.944, 4)]
     document = {
@@ -227,27 +228,27 @@ def test_an_agent_alone_that_others_refuse_for_ever_is_shown_by_a_short_document
         "network": {"loss": 0.5},
         "timeline": [{"at_s": 112.943, "network": {"loss": 0.0}}],
     }
-    (finding,) = tried(Scenario.model_validate(document), 3).found
+    (finding,) = play_trial(Scenario.model_validate(document), 3).found
     assert str(finding) == "liveness never finishes, 1 agent going round every 20 s (voting, phase one, phase two)"
 
 
-def test_nights_tell_new_ongoing_and_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nights_report_new_ongoing_and_resolved_findings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     directory, wrong = tmp_path / "corpus", ordinary(quirks={"approve_everything": True})
     first = night(directory, wrong)
-    assert {told.status for told in first.told} == {"new"}
+    assert {finding.status for finding in first.findings} == {"new"}
     assert first.exit_status == 1
-    told = first.told[0]
+    told = first.findings[0]
     assert told.path is not None
-    assert told.finding.identity in found_in(load_scenario(told.path), told.finding.seed)
+    assert told.finding.identity in findings_of(load_scenario(told.path), told.finding.seed)
     assert [*(directory / "runs").iterdir()]
-    again = {each.finding.identity: each.status for each in night(directory, wrong, runs=1).told}
-    assert again.keys() == {each.finding.identity for each in first.told}
+    again = {each.finding.identity: each.status for each in night(directory, wrong, runs=1).findings}
+    assert again.keys() == {each.finding.identity for each in first.findings}
     assert {*again.values()} <= {"ongoing", "rare"}
     monkeypatch.setattr(
         "harness.sweep.explore.guided._hunt_trial.identities", lambda *found: ()
     )  # the agents are mended
     mended = night(directory, wrong, runs=1)
-    assert {each.status for each in mended.told} == {"resolved"}
+    assert {each.status for each in mended.findings} == {"resolved"}
     assert mended.exit_status == 0
     assert "resolved" in (directory / "report.html").read_text()
 
@@ -279,7 +280,7 @@ def test_hostile_files_are_left_out_with_a_sentence(tmp_path: Path) -> None:
 
 
 def test_a_corpus_is_of_one_scenario_and_of_one_command(tmp_path: Path) -> None:
-    limits, _ = beginnings(ordinary(), range(1))
+    limits, _ = initial_documents(ordinary(), range(1))
     corpus = opened(tmp_path / "corpus", ordinary(), limits)
     with pytest.raises(RunDirectoryError, match="another command works"):
         opened(tmp_path / "corpus", ordinary(), limits)
@@ -292,7 +293,7 @@ def test_a_corpus_is_of_one_scenario_and_of_one_command(tmp_path: Path) -> None:
         opened(tmp_path / "mine", ordinary(), limits)
 
 
-def test_ctrl_c_keeps_what_was_found(tmp_path: Path) -> None:
+def test_ctrl_c_keeps_findings(tmp_path: Path) -> None:
     path, directory = tmp_path / "wrong.yaml", tmp_path / "corpus"
     path.write_text(json.dumps({**ORDINARY, "quirks": {"approve_everything": True}}))
     command = [*COMMAND, "explore", str(path), "--for", "1h", "--jobs", "1", "--corpus", str(directory), "--json"]
@@ -325,10 +326,10 @@ def test_wrong_options_are_one_sentence(tmp_path: Path, arguments: list[str], sa
     assert said in " ".join(" ".join(sentences(told.stderr)).replace("│", " ").split())
 
 
-def test_agents_of_another_make_are_hunted_too(tmp_path: Path) -> None:
+def test_hunt_plays_foreign_agents(tmp_path: Path) -> None:
     foreign = ordinary(agent_command=[sys.executable, "-m", "ucp.node"])
     told = night(tmp_path / "corpus", foreign, runs=4)
-    assert not told.told
+    assert not told.findings
     assert not told.hunt.failed
     assert told.hunt.reached.steps > 0
     assert len(told.hunt.reached.states) > 1

@@ -6,7 +6,7 @@ import pytest
 
 from harness.run.simulate import simulate
 from harness.sweep.explore._recording import record
-from harness.sweep.explore._scenario_document import document_of, with_agents
+from harness.sweep.explore._scenario_document import document_of, keep_agents
 from harness.sweep.explore._smaller import replays, scenario_of
 from tests.harness.virtual import scenario
 
@@ -31,7 +31,7 @@ LOSS: list[dict[str, Any]] = [
 
 
 @pytest.mark.parametrize("keys", LOSS)
-def test_what_is_scripted_from_a_run_is_that_run(keys: dict[str, Any]) -> None:
+def test_script_of_a_run_reproduces_the_run(keys: dict[str, Any]) -> None:
     asked = scenario(agents=4, duration_s=600, final_reconcile=True, **keys)
     original = simulate(asked, 5, tracing=True)
     faithful = scenario_of(next(replays(document_of(asked), record(asked, 5))))
@@ -46,23 +46,23 @@ def test_what_is_scripted_from_a_run_is_that_run(keys: dict[str, Any]) -> None:
     assert faithful.network.radio is None and not faithful.flight, "nothing is left to distance"
 
 
-def test_agents_that_are_left_out_fly_no_more() -> None:
+def test_removed_agents_have_no_vehicles() -> None:
     asked = scenario(agents=4, network={"radio": {"hard_range": {}}}, vehicles={"types": {2: "copter"}}, flight=APART)
-    fewer = scenario_of(with_agents(document_of(asked), [1, 3]))
+    fewer = scenario_of(keep_agents(document_of(asked), [1, 3]))
     assert [flight.vehicles for flight in fewer.flight] == [[1], [3]]
     assert fewer.vehicles.types == {}
-    assert scenario_of(with_agents(document_of(asked), [1])).flight_of(3) is None
+    assert scenario_of(keep_agents(document_of(asked), [1])).flight_of(3) is None
 
 
-def test_agents_that_are_left_out_take_their_quirks_along() -> None:
+def test_removed_agents_have_no_quirks() -> None:
     asked = scenario(agents=4, quirks={"crash_on_tie": {"agents": [2, 3]}, "hide_commits": True})
-    fewer = scenario_of(with_agents(document_of(asked), [1, 3]))
+    fewer = scenario_of(keep_agents(document_of(asked), [1, 3]))
     assert fewer.quirks_of(3) == {"crash_on_tie": True, "hide_commits": True}
     assert fewer.quirks_of(1) == {"hide_commits": True}
-    assert "crash_on_tie" not in scenario_of(with_agents(document_of(asked), [1, 4])).quirks
+    assert "crash_on_tie" not in scenario_of(keep_agents(document_of(asked), [1, 4])).quirks
 
 
-def test_a_recording_names_what_was_lost() -> None:
+def test_recording_names_lost_messages() -> None:
     asked = scenario(
         agents=[1, 2],
         events={"source": "scripted", "script": [{"at_s": 1, "agent": 1}]},

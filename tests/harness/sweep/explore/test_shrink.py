@@ -3,7 +3,7 @@
 import pytest
 
 from harness.scenario import Scenario
-from harness.sweep.explore._scenario_document import Document, document_of, moved, script, with_agents, with_key
+from harness.sweep.explore._scenario_document import Document, document_of, keep_agents, move_times, script, with_key
 from harness.sweep.explore._shrink import BudgetSpentError, Shrinker
 from tests.harness.virtual import scenario
 
@@ -27,7 +27,7 @@ def shrink(it: Shrinker) -> list[Document]:
     return script(it.best)
 
 
-def test_what_is_needed_is_left_and_nothing_else() -> None:
+def test_only_necessary_parts_are_left() -> None:
     assert {event["at_s"] for event in shrink(shrinker())} == NEEDED
 
 
@@ -37,7 +37,7 @@ def test_more_processes_find_the_same_in_as_many_runs() -> None:
     assert alone.runs == together.runs
 
 
-def test_what_is_no_scenario_is_not_tried() -> None:
+def test_invalid_scenarios_are_not_tried() -> None:
     it = shrinker()
     assert it.first([{**START, "agents": []}, {**START, "duration_s": -1}]) is None
     assert it.runs == 0
@@ -59,7 +59,7 @@ def test_the_number_of_runs_is_bounded_and_the_best_so_far_stays() -> None:
     assert violates(Scenario.model_validate(it.best))
 
 
-def test_a_flight_that_was_flown_again_is_shrunk_without_what_only_made_it_the_same() -> None:
+def test_recorded_flight_is_shrunk_without_irrelevant_recorded_parts() -> None:
     flight = {
         "agents": [1, 2],
         "duration_s": 60,
@@ -72,10 +72,10 @@ def test_a_flight_that_was_flown_again_is_shrunk_without_what_only_made_it_the_s
     }
     document = document_of(scenario(**flight, expect={"seeds": [1]}))
     assert "expect" not in document
-    alone = with_agents(document, {1})
+    alone = keep_agents(document, {1})
     assert alone["lateness"] == {"1": "0+0.25"}
     assert "datagrams" not in alone
     assert "fates" not in alone
-    later = moved(document, lambda at_s: at_s + 100)
+    later = move_times(document, lambda at_s: at_s + 100)
     assert later["fates"][0]["arrivals"] == "0@110.5"
     assert later["datagrams"][0]["reaches"] == {"1": 120}

@@ -74,7 +74,7 @@ def written(directory: Path) -> Path:
     return path
 
 
-def test_a_worker_is_killed_midway_and_nothing_is_lost_or_counted_twice(tmp_path: Path, dask: Cluster) -> None:
+def test_killed_worker_loses_no_task_and_duplicates_none(tmp_path: Path, dask: Cluster) -> None:
     address = dask.start_scheduler()
     doomed, _ = (dask.start_worker(address, name) for name in ("one", "two"))
     asked, out = written(tmp_path), tmp_path / "out"
@@ -93,7 +93,7 @@ def test_a_worker_is_killed_midway_and_nothing_is_lost_or_counted_twice(tmp_path
         assert (out / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
-def test_a_lost_scheduler_is_one_sentence_and_the_matrix_goes_on(tmp_path: Path, dask: Cluster) -> None:
+def test_lost_scheduler_is_one_sentence_and_the_matrix_can_continue(tmp_path: Path, dask: Cluster) -> None:
     address = dask.start_scheduler()
     dask.start_worker(address, "one")
     asked, out = written(tmp_path), tmp_path / "out"
@@ -147,19 +147,19 @@ def test_no_scheduler_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("address", ["nowhere", "http://127.0.0.1:1", "tcp://127.0.0.1", "tcp://127.0.0.1:x", ""])
-def test_what_is_no_address_is_one_sentence(address: str) -> None:
+def test_invalid_address_is_refused_in_one_sentence(address: str) -> None:
     with pytest.raises(HarnessError) as told, cluster([1], abs, address):
         pass
     assert str(told.value) == f"--scheduler {address} is not an address such as tcp://127.0.0.1:8786"
     assert told.value.exit_status == 2
 
 
-def test_without_dask_it_is_said_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_dask_gives_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert "pip install 'ucp-harness[cluster]'" in refused("tcp://127.0.0.1:1")
 
 
-def test_outcomes_and_failures_are_those_of_a_sweep(dask: Cluster) -> None:
+def test_cluster_gives_the_outcomes_and_failures_of_a_sweep(dask: Cluster) -> None:
     address = dask.start_scheduler()
     dask.start_worker(address, "one")
     with cluster([4, -1, 9], "abc".__getitem__, address) as outcomes:
@@ -169,7 +169,7 @@ def test_outcomes_and_failures_are_those_of_a_sweep(dask: Cluster) -> None:
     assert "IndexError" in found[4]
 
 
-def test_processes_stay_here(tmp_path: Path) -> None:
+def test_runs_of_processes_are_refused_on_a_cluster(tmp_path: Path) -> None:
     done = harness(
         "matrix",
         written(tmp_path),

@@ -36,7 +36,7 @@ def test_a_matrix_ends_in_a_table_and_files(tmp_path: Path) -> None:
     assert files == {*figures, "matrix.svg", "report.html", "summary.md", "junit.xml", "cells"}
 
 
-def test_it_finds_one_chain_without_loss_and_none_in_common_without_contact(tmp_path: Path) -> None:
+def test_matrix_finds_one_chain_at_loss_0_and_no_mutual_chain_at_loss_1(tmp_path: Path) -> None:
     harness("matrix", written(tmp_path), "--out", tmp_path / "out")
     with (tmp_path / "out" / "matrix.csv").open() as file:
         perfect, alone = csv.DictReader(file)
@@ -57,7 +57,7 @@ def test_matrix_with_three_sizes_prints_and_draws_growth(tmp_path: Path) -> None
     assert pair.estimates["messages_per_block"].mean == 3, "a request, a response and a commit"
 
 
-def test_json_is_all_that_standard_output_gets(tmp_path: Path) -> None:
+def test_standard_output_contains_only_json(tmp_path: Path) -> None:
     done = harness("matrix", written(tmp_path), "--json", "--jobs", 2, "--out", tmp_path / "out")
     assert done.returncode == 0
     assert json.loads(done.stdout) == json.loads((tmp_path / "out" / "matrix.json").read_text())
@@ -78,7 +78,7 @@ def test_a_wrong_request_is_one_sentence_and_status_2(tmp_path: Path, keys: dict
     assert sentence in said
 
 
-def test_an_interrupted_matrix_goes_on_and_ends_as_if_it_had_not_been(tmp_path: Path) -> None:
+def test_continued_matrix_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     asked = written(tmp_path, seeds=80)
     command = [*COMMAND, "matrix", str(asked), "--jobs", "2", "--out", str(tmp_path / "out")]
     results = tmp_path / "out" / "results.jsonl"
@@ -100,7 +100,7 @@ def test_an_interrupted_matrix_goes_on_and_ends_as_if_it_had_not_been(tmp_path: 
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
-def test_against_an_earlier_night(tmp_path: Path) -> None:
+def test_against_compares_with_an_earlier_night(tmp_path: Path) -> None:
     asked = written(tmp_path)
     harness("matrix", asked, "--out", tmp_path / "before")
     baseline = tmp_path / "before" / "matrix.json"
@@ -152,7 +152,7 @@ def test_a_run_whose_agent_crashes_is_a_result_and_is_kept(tmp_path: Path) -> No
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_what_an_agent_does_not_support_is_neither_failed_nor_violated(tmp_path: Path) -> None:
+def test_unsupported_run_is_neither_failed_nor_violated(tmp_path: Path) -> None:
     agent = refusing_to_start(tmp_path / "agent")
     scenario = {"agents": 2, "duration_s": 60, "vehicles": {"kind": "none"}, "agent_command": {1: [str(agent)]}}
     asked = written(tmp_path, scenario=scenario, loss=[0.0], seeds=1, backend="process")
@@ -168,7 +168,7 @@ def test_what_an_agent_does_not_support_is_neither_failed_nor_violated(tmp_path:
     assert "1 not supported" in page and f"agent 1 ran {agent}" in page
 
 
-def test_what_a_backend_cannot_play_is_refused_before_anything_is_played(tmp_path: Path) -> None:
+def test_unplayable_backend_is_refused_before_the_first_run(tmp_path: Path) -> None:
     scenario = {"agents": 2, "clocks": {"1": {"drift": 0.1}}}
     done = harness(
         "matrix", written(tmp_path, scenario=scenario, backend=["sim", "process"]), "--out", tmp_path / "out"
@@ -178,7 +178,7 @@ def test_what_a_backend_cannot_play_is_refused_before_anything_is_played(tmp_pat
     assert (tmp_path / "out" / "results.jsonl").read_text().count("\n") == 1
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     done = harness("matrix", written(tmp_path), "--out", tmp_path)
     assert done.returncode == 2
     assert "is not empty: choose another --out" in sentences(done.stderr)[0]

@@ -13,7 +13,7 @@ from harness.sweep.matrix import Finished, MatrixRecord, matrix_outputs
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._comparison import compare
 from harness.sweep.matrix._estimate import BY_NAME, Estimate
-from harness.sweep.matrix.matrix_run import compared
+from harness.sweep.matrix.matrix_run import compare_with
 from harness.sweep.matrix.nights import load_baseline
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 
@@ -54,7 +54,7 @@ def test_intervals_that_touch_are_no_change() -> None:
     assert list(compare([cell()], [cell(uniform=Estimate(n=10, mean=0.3, low=0.2, high=0.3999))]))
 
 
-def test_a_figure_without_an_interval_tells_nothing() -> None:
+def test_figure_without_an_interval_is_not_compared() -> None:
     assert not list(compare([cell()], [cell(uniform=Estimate(n=1, mean=0.0), reconciles=Estimate(n=0))]))
     assert not list(compare([cell(uniform=Estimate(n=0))], [cell(uniform=at(0.0))]))
 
@@ -87,7 +87,7 @@ def night(directory: Path, **keys: Any) -> Path:
 def tonight(baseline: Path, judged: Any = judge) -> Finished:
     asked = matrix(seeds=[1, 3, 4])
     record = load_baseline(baseline, asked)
-    return compared(played(asked, 1, judged), record, str(baseline))
+    return compare_with(played(asked, 1, judged), record, str(baseline))
 
 
 def test_the_same_night_again_is_no_regression(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_the_same_night_again_is_no_regression(tmp_path: Path) -> None:
     assert record.exit_status == 0
 
 
-def test_a_figure_that_became_worse_fails_the_night_and_is_told_everywhere(tmp_path: Path) -> None:
+def test_worse_figure_fails_the_night_and_is_reported_everywhere(tmp_path: Path) -> None:
     finished = tonight(night(tmp_path / "before"), busier)
     assert finished.record.exit_status == 1
     matrix_outputs.write(finished, tmp_path)
@@ -111,7 +111,7 @@ def test_a_figure_that_became_worse_fails_the_night_and_is_told_everywhere(tmp_p
     assert "1 figure is worse than on " in summary
 
 
-def test_a_figure_that_became_better_is_told_and_passes(tmp_path: Path) -> None:
+def test_better_figure_is_reported_and_passes(tmp_path: Path) -> None:
     before = tmp_path / "matrix.json"
     before.write_text(json.dumps(played(matrix(seeds=[1, 3, 4]), 1, busier).record.to_json()))
     finished = tonight(before)
@@ -121,7 +121,7 @@ def test_a_figure_that_became_better_is_told_and_passes(tmp_path: Path) -> None:
     assert "failure" not in (tmp_path / "junit.xml").read_text().replace('failures="0"', "")
 
 
-def test_words_do_not_make_another_matrix(tmp_path: Path) -> None:
+def test_changed_names_do_not_prevent_a_comparison(tmp_path: Path) -> None:
     assert tonight(night(tmp_path / "before", name="before", about="as it was", keep="all"))
 
 
@@ -149,7 +149,7 @@ def test_another_matrix_is_refused(tmp_path: Path, keys: dict[str, Any], sentenc
         ('{"schema": "ucp-matrix/1"}', "says of itself that it is a ucp-matrix/1, but its `matrix` is not"),
     ],
 )
-def test_what_is_no_baseline_is_refused(tmp_path: Path, content: str | None, sentence: str) -> None:
+def test_invalid_baseline_is_refused(tmp_path: Path, content: str | None, sentence: str) -> None:
     path = tmp_path / "baseline.json"
     if content is not None:
         path.write_text(content)

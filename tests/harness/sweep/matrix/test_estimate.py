@@ -12,7 +12,7 @@ from harness.sweep.matrix._estimate import Estimate, estimate_mean, estimate_sha
     [(1, 12.7062047), (2, 4.3026527), (3, 3.1824463), (4, 2.7764451), (9, 2.2621572), (10, 2.2281389),
      (30, 2.0422725), (99, 1.9842170), (199, 1.9719565), (1000, 1.9623391), (9999, 1.9602012)],
 )  # fmt: skip
-def test_students_quantile_is_that_of_the_tables(degrees: int, expected: float) -> None:
+def test_student_quantile_equals_the_published_table(degrees: int, expected: float) -> None:
     assert student_quantile(0.975, degrees) == pytest.approx(expected, abs=1e-7)
 
 
@@ -39,7 +39,7 @@ def test_a_share_has_wilsons_interval(count: int, n: int, low: float, high: floa
     assert (estimate.low, estimate.high) == (pytest.approx(low, abs=5e-5), pytest.approx(high, abs=5e-5))
 
 
-def test_one_run_has_no_interval_and_none_has_nothing() -> None:
+def test_one_run_has_no_interval_and_no_run_has_no_mean() -> None:
     assert estimate_mean([3.0]) == Estimate(n=1, mean=3.0)
     assert estimate_share(1, 1) == Estimate(n=1, mean=1.0)
     assert estimate_mean([]) == estimate_share(0, 0) == Estimate(n=0)

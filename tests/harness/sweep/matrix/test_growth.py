@@ -35,7 +35,7 @@ def sizes(
     return matrix(agents=list(agents), duration_s=list(lengths), loss=loss, seeds=seeds, scenario={})
 
 
-def grown(asked: Matrix) -> MatrixRecord:
+def played_record(asked: Matrix) -> MatrixRecord:
     return played(asked, 1, judge).record
 
 
@@ -75,7 +75,7 @@ def parsed(drawing: str) -> ElementTree.Element:
 
 
 def test_matrix_finds_the_laws_that_its_runs_follow() -> None:
-    growths = grown(sizes()).growths
+    growths = played_record(sizes()).growths
     found = {(it.metric, it.over, it.duration_s, it.agents): it.law for it in growths if it.load == "any"}
     assert found["messages", ("agents",), 600, None].exponents["agents"].value == pytest.approx(2.5, abs=1e-3)
     per_block = found["messages_per_block", ("agents",), 1200, None]
@@ -88,13 +88,13 @@ def test_matrix_finds_the_laws_that_its_runs_follow() -> None:
 
 
 def test_cells_on_both_sides_of_load_1_have_laws_of_their_own() -> None:
-    record = grown(sizes((5, 10, 15, 40, 80, 90)))
+    record = played_record(sizes((5, 10, 15, 40, 80, 90)))
     assert [cell.agents for cell in record.cells if overloaded(cell)] == [40, 80, 90] * 3
     assert {it.load for it in record.growths} == {"any", "below 1", "from 1"}
 
 
 def test_cell_has_the_shares_of_uniform_and_finished_runs() -> None:
-    record = grown(sizes())
+    record = played_record(sizes())
     assert [cell.estimates["uniform"].mean for cell in record.cells] == [0.5] * 9
     assert [cell.finished.mean for cell in record.cells] == [1, 1, 0] * 3
     assert record.cells[0].estimates["uniform_after_s"].n == 1
@@ -134,7 +134,7 @@ def test_files_of_growth_read_back_as_they_were_written(tmp_path: Path) -> None:
     parsed((tmp_path / "growth.svg").read_text())
 
 
-def test_report_and_file_names_tell_mission_lengths_apart(tmp_path: Path) -> None:
+def test_report_and_file_names_contain_the_mission_length(tmp_path: Path) -> None:
     finished = played(sizes(agents=(5,), seeds=1), 1, judge)
     matrix_outputs.write(finished, tmp_path)
     assert sorted(path.name for path in (tmp_path / "cells").iterdir()) == [
@@ -214,7 +214,7 @@ def test_failed_run_is_named_with_its_length_and_is_no_point_of_a_law() -> None:
     ids=["one seed", "hardly a block", "no message", "many lines", "many agents", "one number of agents"],
 )
 def test_any_growth_can_be_shown_and_drawn(asked: Matrix) -> None:
-    record = grown(asked)
+    record = played_record(asked)
     assert shown(record)
     drawing = parsed(draw_growth(record))
     places = [float(dot.attrib[axis]) for dot in drawing.iter(f"{SVG}circle") for axis in ("cx", "cy")]
@@ -222,7 +222,7 @@ def test_any_growth_can_be_shown_and_drawn(asked: Matrix) -> None:
 
 
 def test_picture_has_panels_exponents_and_a_description_and_no_links() -> None:
-    drawing = draw_growth(grown(sizes()))
+    drawing = draw_growth(played_record(sizes()))
     texts = ["".join(element.itertext()) for element in parsed(drawing).iter(f"{SVG}text")]
     assert {panel.title for panel in PANELS} <= set(texts)
     assert {"Messages, over blocks", "Bytes, over blocks"} <= set(texts)
@@ -232,7 +232,7 @@ def test_picture_has_panels_exponents_and_a_description_and_no_links() -> None:
 
 
 def test_table_of_growth_fits_eighty_columns() -> None:
-    lines = shown(grown(sizes((5, 10, 40, 80))))
+    lines = shown(played_record(sizes((5, 10, 40, 80))))
     assert "\u2026" not in lines
     assert max(map(len, lines.splitlines())) <= 80
     assert "N 600 s, load < 1" in lines
@@ -265,14 +265,14 @@ def test_matrix_without_traces_has_the_same_figures_and_judges_no_step(tmp_path:
 def test_page_has_the_tables_of_a_matrix() -> None:
     page = PAGE.read_text(encoding="utf-8")
     assert page.count(BEGIN) == page.count(END) == 1
-    text = tables(grown(sizes((5, 10, 40, 80))))
+    text = tables(played_record(sizes((5, 10, 40, 80))))
     assert "| 15\u00a0% | 5 | 30 |" in text
     assert "| 15\u00a0% | any | N | 1.50\u00b1.00<br>" in text
     assert len({line.count("|") for line in text.split("\n\n")[0].splitlines()}) == 1
 
 
 def test_growth_in_the_record_names_what_each_law_holds_for() -> None:
-    laws = json.loads(grown(sizes(lengths=(600,))).model_dump_json())["growths"]
+    laws = json.loads(played_record(sizes(lengths=(600,))).model_dump_json())["growths"]
     assert {(law["backend"], law["loss"], law["duration_s"], law["agents"]) for law in laws} == {
         ("sim", 0.15, 600, None)
     }

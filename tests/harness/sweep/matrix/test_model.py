@@ -117,7 +117,7 @@ def test_a_mistake_in_that_file_names_it(tmp_path: Path) -> None:
         load_matrix(written(tmp_path, scenario="base.yaml"))
 
 
-def test_what_matrix_json_says_of_it_is_a_matrix_again(tmp_path: Path) -> None:
+def test_matrix_in_matrix_json_can_be_loaded_again(tmp_path: Path) -> None:
     matrix = load_matrix(written(tmp_path, scenario={}, agents=[3, 4], duration_s=[60, 90.5], traces=False))
     assert Matrix.model_validate_json(matrix.model_dump_json()) == matrix
 
@@ -182,7 +182,7 @@ def test_what_matrix_json_says_of_it_is_a_matrix_again(tmp_path: Path) -> None:
         ({"scenario": None, "timeline": []}, "this is a scenario; a matrix names one, `scenario: "),
     ],
 )
-def test_a_mistake_is_told_with_its_key_value_and_what_is_allowed(
+def test_mistake_is_reported_with_key_value_and_allowed_values(
     tmp_path: Path, keys: dict[str, Any], sentence: str
 ) -> None:
     with pytest.raises(ScenarioError) as told:

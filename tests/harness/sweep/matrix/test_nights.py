@@ -26,7 +26,7 @@ def test_nights_are_kept_once_and_read_in_their_order(tmp_path: Path) -> None:
     assert (found.left_out, found.said_left_out) == ([], "")
 
 
-def test_half_a_night_is_not_kept_and_no_name_leads_elsewhere(tmp_path: Path) -> None:
+def test_unfinished_night_is_not_stored_and_names_stay_in_the_directory(tmp_path: Path) -> None:
     directory = nights.opened(tmp_path / "nights")
     nights.keep(night("2026-01-01T00:00:00Z", outcome="interrupted"), directory)
     assert not list(directory.iterdir())
@@ -34,7 +34,7 @@ def test_half_a_night_is_not_kept_and_no_name_leads_elsewhere(tmp_path: Path) ->
     assert [path.name for path in directory.iterdir()] == ["T1.json"]
 
 
-def test_what_is_no_night_of_this_matrix_is_left_out_by_name(tmp_path: Path) -> None:
+def test_files_that_are_no_night_of_this_matrix_are_named(tmp_path: Path) -> None:
     nights.keep(night("2026-01-01T00:00:00Z"), tmp_path)
     nights.keep(played(matrix(loss=(0.3,)), 1, judge).record, tmp_path)
     (tmp_path / "a.json").write_text("half a ni")
@@ -67,7 +67,7 @@ def test_a_place_that_cannot_be_a_directory_is_refused(tmp_path: Path) -> None:
         nights.opened(tmp_path / "file")
 
 
-def test_the_command_keeps_each_night_and_says_what_it_left_out(tmp_path: Path) -> None:
+def test_command_stores_each_night_and_reports_unused_files(tmp_path: Path) -> None:
     asked, kept = tmp_path / "matrix.yaml", tmp_path / "nights"
     scenario = {"agents": 3, "duration_s": 100, "events": {"source": "random"}}
     asked.write_text(json.dumps({"name": "small", "scenario": scenario, "loss": [0.0], "seeds": 2}))

@@ -16,7 +16,7 @@ from harness.sweep.matrix import Finished, matrix_outputs, matrix_table
 from harness.sweep.matrix._matrix_picture import PANELS, draw
 from harness.sweep.matrix.matrix_outputs import to_junit
 from harness.sweep.matrix.matrix_summary import to_markdown
-from harness.sweep.matrix.report._heatmap import known
+from harness.sweep.matrix.report._heatmap import known_figures
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -81,7 +81,7 @@ def test_the_summary_is_a_markdown_table_with_what_went_wrong_below() -> None:
     assert "\\<broken\\> \\| \\[away\\](\x00) for good" in failed
 
 
-def test_several_agents_are_told_apart_everywhere(tmp_path: Path) -> None:
+def test_number_of_agents_is_named_everywhere(tmp_path: Path) -> None:
     finished = played(matrix(agents=[3, 10]), 1, judge)
     assert list(cases(finished))[3] == "50\u00a0% loss, 10 agents"
     assert "| loss | agents | runs |" in to_markdown(finished.record)
@@ -119,10 +119,10 @@ def test_how_many_swarms_finished_is_a_column() -> None:
     shown.print(matrix_table.render(finished.record))
     text = shown.export_text()
     assert "fin-" in text and "25\u00a0%" in text
-    assert [figure.of(finished.record.cells[1]).mean for figure in known(finished.record.cells)][-2] == 0.25
+    assert [figure.of(finished.record.cells[1]).mean for figure in known_figures(finished.record.cells)][-2] == 0.25
 
 
-def test_a_column_that_nothing_tells_of_is_left_out() -> None:
+def test_column_without_values_is_left_out() -> None:
     shown = Console(width=100, record=True, file=io.StringIO())
     shown.print(matrix_table.render(played(matrix(), 1, judge).record))
     assert "fin-" not in shown.export_text()

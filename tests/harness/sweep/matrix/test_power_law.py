@@ -22,7 +22,7 @@ def test_a_law_without_noise_is_found_as_it_is(exponent: float) -> None:
     assert (law.n, law.left_out) == (5, 0)
 
 
-def test_two_variables_are_told_apart() -> None:
+def test_fit_separates_two_variables() -> None:
     law = fit(BOTH, [([n, n * m], 2 * n**1.5 * (n * m) ** 0.8) for n in (5, 20, 80) for m in (3, 6, 12)])
     assert law
     assert law.exponents["agents"].value == pytest.approx(1.5)
@@ -57,7 +57,7 @@ def test_the_interval_is_that_of_a_worked_example() -> None:
     assert law.r_squared == pytest.approx(0.6)
 
 
-def test_what_has_no_logarithm_is_left_out_and_counted() -> None:
+def test_points_without_logarithm_are_left_out_and_counted() -> None:
     law = fit(AGENTS, [([n], y) for n, y in ((1, 1), (2, 4), (4, 16), (8, 0), (16, -3), (0, 5))])
     assert law
     assert (law.n, law.left_out) == (3, 3)
@@ -77,7 +77,7 @@ def test_what_has_no_logarithm_is_left_out_and_counted() -> None:
     ],
     ids=["nothing", "two points", "one size", "no messages", "two as one", "one number of agents", "one of blocks"],
 )
-def test_where_there_is_no_law_none_is_found(
+def test_fit_finds_no_law_in_unsuitable_points(
     variables: list[Variable], points: list[tuple[list[float], float]]
 ) -> None:
     assert fit(variables, points) is None

@@ -14,10 +14,10 @@ from harness.sweep.matrix import Finished, MatrixRecord
 from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._cell_play import directory_name
 from harness.sweep.matrix._cell_scenarios import scenario_file, write_scenarios
-from harness.sweep.matrix.matrix_run import compared
+from harness.sweep.matrix.matrix_run import compare_with
 from harness.sweep.matrix.nights import Nights
 from harness.sweep.matrix.report import _drilldown, _heatmap, _trend, to_html
-from harness.sweep.matrix.report._heatmap import known
+from harness.sweep.matrix.report._heatmap import known_figures
 from tests.harness.command import harness
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 
@@ -32,7 +32,7 @@ def breaks(scenario: Scenario, seed: int) -> Result:
 
 def tiles(finished: Finished, name: str) -> dict[str, _heatmap.Tile]:
     """Of one figure, by where their runs are."""
-    (figure,) = [one for one in known(finished.record.cells) if one.metric.name == name]
+    (figure,) = [one for one in known_figures(finished.record.cells) if one.metric.name == name]
     grids = _heatmap.heatmap(finished.record, figure).grids
     return {str(tile.href): tile for grid in grids for _, row in grid.rows for tile in row}
 
@@ -53,7 +53,7 @@ def test_each_cell_has_its_number_and_the_shade_grows_with_it() -> None:
     assert shades[:3] == [10, 8, 0]
 
 
-def test_what_was_violated_or_failed_is_a_sign_and_words_whatever_figure_is_shown() -> None:
+def test_violations_and_failures_are_marked_for_every_figure() -> None:
     finished = played(matrix(), 1, breaks)
     for name in ("uniform", "reconciles", "violated"):
         well, bad = tiles(finished, name).values()
@@ -66,7 +66,7 @@ def test_a_figure_that_became_worse_is_marked_where_it_is_shown() -> None:
     finished = played(matrix(), 1, judge)
     baseline = json.loads(json.dumps(finished.record.to_json()))
     baseline["cells"][1]["estimates"]["reconciles"] = {"n": 4, "mean": 1.0, "low": 0.5, "high": 1.5}
-    finished = compared(finished, MatrixRecord.model_validate(baseline), "before.json")
+    finished = compare_with(finished, MatrixRecord.model_validate(baseline), "before.json")
     assert [mark.text for mark in tiles(finished, "reconciles")["#loss-0.5-agents-5-sim"].marks] == [
         "1 violated",
         "worse",
@@ -74,7 +74,7 @@ def test_a_figure_that_became_worse_is_marked_where_it_is_shown() -> None:
     assert [mark.text for mark in tiles(finished, "uniform")["#loss-0.5-agents-5-sim"].marks] == ["1 violated"]
 
 
-def test_cells_that_were_not_played_are_empty_and_half_of_one_is_said() -> None:
+def test_unplayed_cells_are_empty_and_partial_cells_are_marked() -> None:
     def interrupted(scenario: Scenario, seed: int) -> Result:
         if seed == 3:
             raise KeyboardInterrupt
@@ -108,7 +108,7 @@ def test_a_run_that_was_kept_leads_to_its_report(tmp_path: Path) -> None:
     assert [row.href for row in cells[0].rows] == [None, "runs/loss-0.0-agents-5-process-seed-2/report.html"]
 
 
-def test_more_runs_than_there_is_room_for_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_above_the_limit_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_drilldown, "MAX_ROWS", 4)
     finished = played(matrix(), 1, breaks)
     assert [(len(cell.rows), cell.left_out) for cell in _drilldown.drilldown(finished, Path())] == [(2, 2), (2, 2)]
@@ -130,7 +130,7 @@ def test_the_trend_has_a_panel_for_each_loss_and_a_dot_for_each_night() -> None:
 def test_nights_differ_in_their_panel() -> None:
     finished = played(matrix(), 1, judge)
     nights = over(finished, 3).records
-    (figure,) = [one for one in known(finished.record.cells) if one.metric.name == "reconciles"]
+    (figure,) = [one for one in known_figures(finished.record.cells) if one.metric.name == "reconciles"]
     cell = nights[1].cells[1]
     busier = {**cell.estimates, "reconciles": cell.estimates["reconciles"].model_copy(update={"mean": 40.0})}
     nights[1] = nights[1].model_copy(
@@ -161,7 +161,7 @@ def test_absurd_nights_are_drawn_without_their_absurdity() -> None:
         assert "1e+308" not in to_html(finished, Path(), nights)
 
 
-def test_more_nights_than_a_page_can_hold_are_left_away_from_the_front(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oldest_nights_are_left_out_if_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
     finished = played(matrix(), 1, judge)
     monkeypatch.setattr(_trend, "MAX_DOTS", 2 * 8 * 3)
     page = to_html(finished, Path(), over(finished, 5))

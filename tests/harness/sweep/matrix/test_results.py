@@ -89,7 +89,7 @@ def test_each_line_is_there_as_soon_as_its_run_has_ended(tmp_path: Path) -> None
     assert lines == list(range(1, 9))
 
 
-def test_a_run_that_stands_there_twice_counts_once(tmp_path: Path) -> None:
+def test_duplicate_run_counts_once(tmp_path: Path) -> None:
     whole = played(matrix(), 1, judge, tmp_path)
     path = tmp_path / FILE
     path.write_text(path.read_text() + path.read_text().splitlines()[-1] + "\n")
@@ -105,7 +105,7 @@ def test_another_matrix_is_refused_and_nothing_changed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["", "half a word", "[]\n", '{"schema": "else/1"}\n'])
-def test_a_file_of_somebody_else_is_left_alone(tmp_path: Path, content: str) -> None:
+def test_file_of_another_program_is_not_changed(tmp_path: Path, content: str) -> None:
     (tmp_path / FILE).write_text(content)
     with pytest.raises(RunDirectoryError, match="is not empty: choose another --out"):
         played(matrix(), 1, judge, tmp_path)
@@ -125,7 +125,7 @@ def test_a_line_that_is_no_run_of_the_matrix_is_named(tmp_path: Path, change: di
         played(matrix(), 1, judge, tmp_path)
 
 
-def test_one_command_at_a_time(tmp_path: Path) -> None:
+def test_second_command_on_the_same_matrix_is_refused(tmp_path: Path) -> None:
     with opened(tmp_path, matrix()), pytest.raises(RunDirectoryError, match="another command works on the matrix in"):
         played(matrix(), 1, judge, tmp_path)
 

@@ -52,7 +52,7 @@ def test_the_result_does_not_depend_on_the_number_of_jobs() -> None:
     assert one.record.exit_status == 0
 
 
-def test_a_run_that_fails_is_told_and_the_others_count() -> None:
+def test_failed_run_is_reported_and_the_others_count() -> None:
     def breaks(scenario: Scenario, seed: int) -> Result:
         if seed == 3:
             raise KeyError("block")
@@ -92,7 +92,7 @@ def test_an_interrupt_keeps_the_runs_that_had_ended(tmp_path: Path) -> None:
     assert "interrupted: 8 were asked for" in (tmp_path / "matrix.svg").read_text()
 
 
-def test_an_interrupt_before_the_first_run_ended_leaves_files_all_the_same(tmp_path: Path) -> None:
+def test_interrupt_before_the_first_run_still_writes_all_files(tmp_path: Path) -> None:
     def interrupted(scenario: Scenario, seed: int) -> Result:
         raise KeyboardInterrupt
 
@@ -172,7 +172,7 @@ def test_the_thesis_page_has_a_place_for_the_table_and_every_rate() -> None:
     assert all(row.count("|") == rows[0].count("|") for row in rows)
 
 
-def test_how_much_was_tried_is_told_if_asked_for_and_of_what_was_played_only(tmp_path: Path) -> None:
+def test_coverage_on_request_counts_only_runs_of_this_command(tmp_path: Path) -> None:
     asked = matrix(loss=(0.0, 1.0), seeds=2, scenario={"duration_s": 60, "agents": 2})
     record = run_matrix(asked, tmp_path / "out", on_cores(asked, 1), covers=True).record
     assert record.tried is not None

@@ -50,7 +50,7 @@ def test_outcomes_come_in_the_order_of_the_tasks(jobs: int) -> None:
         assert list(outcomes) == [(number, number * number) for number in range(40)]
 
 
-def test_outcomes_may_come_as_they_are_there() -> None:
+def test_outcomes_may_come_in_order_of_completion() -> None:
     with sweep([0.5, 0.0, 0.01], time.sleep, 2, in_order=False) as outcomes:
         assert [task for task, _ in outcomes] == [0.0, 0.01, 0.5]
 
@@ -82,7 +82,7 @@ def test_a_killed_process_costs_one_task() -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_what_makes_the_whole_request_wrong_is_raised(jobs: int) -> None:
+def test_error_of_the_whole_request_is_raised(jobs: int) -> None:
     def work(number: int) -> int:
         raise MachineError("there is no air here")
 
@@ -91,7 +91,7 @@ def test_what_makes_the_whole_request_wrong_is_raised(jobs: int) -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_endless_tasks_can_be_left_and_no_process_is(jobs: int) -> None:
+def test_leaving_endless_tasks_leaves_no_process(jobs: int) -> None:
     def work(number: int) -> int:
         return os.getpid()
 
