@@ -35,7 +35,7 @@ def test_equal_chains_are_one_branch_with_one_oval() -> None:
     assert texts(tree, "oval") == ["1\u20133"]
 
 
-def test_chains_that_part_share_their_beginning_only() -> None:
+def test_diverging_chains_share_only_their_beginning() -> None:
     tree = chain_tree(exports({1: "1.1 2.1", 2: "1.1 2.1", 3: "1.1 3.1"}))
     shared = only_child(tree)
     assert shared.holders == [1, 2, 3]
@@ -43,7 +43,7 @@ def test_chains_that_part_share_their_beginning_only() -> None:
     assert [child.ends for child in shared.children.values()] == [[1, 2], [3]]
 
 
-def test_an_agent_whose_chain_ends_inside_anothers_has_its_oval_beside_that_block() -> None:
+def test_chain_that_ends_inside_another_has_its_oval_beside_the_block() -> None:
     tree = drawn({1: "1.1 2.1 3.1", 2: "1.1 2.1", 3: "1.1 2.1 3.1"})
     beside = {mark.lines[0]: mark.beside.lines for mark in all_marks(tree) if mark.beside}
     assert beside == {"2.1": ["2"]}
@@ -66,7 +66,7 @@ def test_without_exports_there_is_the_inception_block_alone() -> None:
     assert [mark.lines for mark in all_marks(drawn({}))] == [["inception block"]]
 
 
-def test_a_long_stretch_is_abridged_to_its_ends_and_says_how_many_blocks_it_hides() -> None:
+def test_long_stretch_is_abridged_with_the_number_of_hidden_blocks() -> None:
     chain = [f"1.{ordinal}" for ordinal in range(1, 36)]
     tree = drawn({1: chain, 2: chain}, abridged=True)
     assert texts(tree, "ellipsis") == ["29 blocks"]
@@ -81,7 +81,7 @@ def test_a_stretch_whose_ellipsis_would_save_no_room_is_drawn_in_full() -> None:
     assert texts(drawn({1: [f"1.{n}" for n in range(1, most + 2)]}, abridged=True), "ellipsis") == ["3 blocks"]
 
 
-def test_blocks_where_chains_part_or_end_are_never_hidden() -> None:
+def test_blocks_at_which_chains_diverge_or_end_are_never_hidden() -> None:
     chain = [f"1.{ordinal}" for ordinal in range(1, 61)]
     tree = drawn({1: chain, 2: chain[:20], 3: [*chain[:40], "3.1"]}, abridged=True)
     assert {"1.20", "1.21", "1.40", "1.41", "3.1"} <= set(texts(tree, "block"))

@@ -25,7 +25,7 @@ def test_the_file_is_valid_xml_and_refers_to_nothing() -> None:
     assert "href" not in drawing
 
 
-def test_a_block_tells_its_name_time_hash_and_holders() -> None:
+def test_tooltip_of_a_block_has_name_time_hash_and_holders() -> None:
     drawing = picture({1: "1.1 2.1 3.1", 2: "1.1 3.1", 3: "1.1 3.1"}).draw("full")
     (both, *others) = [title for title in titles(drawing) if title.startswith("3.1")]
     assert block("3.1").block_hash.hex() in both
@@ -36,13 +36,13 @@ def test_a_block_tells_its_name_time_hash_and_holders() -> None:
     assert "with this history: agent 1" in both
 
 
-def test_an_ellipsis_tells_what_it_hides() -> None:
+def test_tooltip_of_an_ellipsis_names_its_hidden_blocks() -> None:
     drawn = picture({1: [f"1.{n}" for n in range(1, 36)]})
     assert drawn.hidden == 29
     assert "1.4 to 1.32, of agent 1" in titles(drawn.draw("abridged"))
 
 
-def test_the_description_says_in_words_what_the_picture_shows() -> None:
+def test_description_is_a_text_alternative_for_the_picture() -> None:
     described = picture({1: "1.1 2.1", 2: "1.1", 3: "1.1 2.1"}).description()
     assert described.startswith("agents 1\u20133: all share 1 block, up to 1.1.")
     assert "agent 2 at 1.1" in described

@@ -18,5 +18,5 @@ def test_every_box_stands_out_from_a_light_and_a_dark_page() -> None:
             assert max(contrast(ink.fill, page), contrast(ink.stroke, page)) >= 2.4
 
 
-def test_colours_depend_on_who_flies_and_not_on_the_order() -> None:
+def test_colours_depend_on_the_set_of_agents_and_not_on_their_order() -> None:
     assert inks([3, 1, 2]) == inks([1, 2, 3, 3])

@@ -59,7 +59,7 @@ def test_the_story_of_a_handler_takes_every_branch_of_its_figure(handler: EventH
     assert {*handler.branches} - taken == IN_NO_FIGURE.get(handler.name, set())
 
 
-def test_the_example_of_the_page_is_told_so(tmp_path: Path) -> None:
+def test_example_of_the_documentation_is_reproduced(tmp_path: Path) -> None:
     example = re.search(r"```text\n(.*?)```", PAGE, re.DOTALL)
     assert example is not None
     path = tmp_path / "example.story"
@@ -67,7 +67,7 @@ def test_the_example_of_the_page_is_told_so(tmp_path: Path) -> None:
     assert told(read_story(path), tmp_path / "run") == example[1]
 
 
-def test_who_happens_to_be_quicker_does_not_matter(tmp_path: Path) -> None:
+def test_order_of_equal_receivers_does_not_change_the_story(tmp_path: Path) -> None:
     text = (STORIES / "figure_3_14_reconcile_phase_1_timer_expiration.story").read_text()
     varied = text.replace("agents: 3\n", "agents: 3\nnetwork: {delay: {mean_s: 0.2, jitter_s: 0.19}}\n")
     path = tmp_path / "varied.story"
@@ -84,7 +84,7 @@ def test_who_happens_to_be_quicker_does_not_matter(tmp_path: Path) -> None:
         ("3_15_reconcile_phase_2", "early_phase3_expiry: true", "Reconcile Phase 3 Timer Expiration: gave up"),
     ],
 )
-def test_a_wrong_agent_makes_a_story_another(tmp_path: Path, figure: str, quirk: str, difference: str) -> None:
+def test_wrong_agent_changes_the_story(tmp_path: Path, figure: str, quirk: str, difference: str) -> None:
     right = (STORIES / f"figure_{figure}.story").read_text()
     wrong = right.replace("\nagents:", f"\nquirks: {{{quirk}}}\nagents:")
     path = tmp_path / "wrong.story"
@@ -94,7 +94,7 @@ def test_a_wrong_agent_makes_a_story_another(tmp_path: Path, figure: str, quirk:
 
 
 @pytest.mark.parametrize("path", sorted(STORIES.glob("*.story")), ids=lambda path: path.stem)
-def test_nothing_is_told_in_the_instant_in_which_a_timer_ends(path: Path) -> None:
+def test_sentences_do_not_coincide_with_the_end_of_a_timer(path: Path) -> None:
     """Which of the two is first would be chance among processes."""
     text = path.read_text()
     told_at = {*re.findall(r"^(\d+) s: ", text, re.MULTILINE)}

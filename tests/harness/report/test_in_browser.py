@@ -78,7 +78,7 @@ def test_the_keyboard_unfolds_the_tree_and_folds_it_again(browser: Browser, page
     assert browser.complaints == []
 
 
-def test_a_tree_wider_than_the_screen_scrolls_inside_its_frame_by_keyboard(browser: Browser, page: Path) -> None:
+def test_wide_tree_scrolls_inside_its_frame_by_keyboard(browser: Browser, page: Path) -> None:
     browser.show(page, width=360, scheme="light")
     assert browser.evaluate("document.querySelector('.abridged').tabIndex") == 0
     frame, tree = browser.evaluate(

@@ -40,7 +40,7 @@ def judged(number: str, **keys: Any) -> dict[str, Any]:
     return result
 
 
-def test_it_lies_beside_the_page_with_a_test_case_for_each_characteristic(tmp_path: Path) -> None:
+def test_junit_file_has_a_test_case_for_each_characteristic(tmp_path: Path) -> None:
     write_report(RunArchive(write_run(tmp_path / "run", {1: "1.1"})))
     suites = ElementTree.parse(tmp_path / "run" / "junit.xml").getroot()  # noqa: S314 - ours
     (suite,) = suites
@@ -60,7 +60,7 @@ def test_a_violation_is_a_failure_with_its_evidence() -> None:
     assert [name for name, inside in found.items() if inside] == ["3. single copy"]
 
 
-def test_what_was_not_applicable_is_skipped_with_the_reason() -> None:
+def test_not_applicable_characteristic_is_skipped_with_the_reason() -> None:
     found = cases(judged("5", verdict="not applicable", reason="never fully connected"))
     assert found["5. all committed everywhere"] == ("skipped", "not applicable: never fully connected", "")
 
@@ -74,7 +74,7 @@ def test_what_was_not_applicable_is_skipped_with_the_reason() -> None:
         ("not applicable", "not applicable", None),
     ],
 )
-def test_what_the_scenario_expects_of_a_characteristic_decides(expected: str, verdict: str, tag: str | None) -> None:
+def test_expected_verdict_decides_over_success(expected: str, verdict: str, tag: str | None) -> None:
     result = judged("6", verdict=verdict)
     result["scenario"]["expect"] = {"characteristics": {"6": expected}}
     inside = cases(result)["6. one uniform chain"]
@@ -111,7 +111,7 @@ def test_a_run_that_did_not_complete_fails_a_test_case_of_its_own(keys: dict[str
     assert said in inside[1]
 
 
-def test_whatever_the_run_holds_it_is_xml_that_says_so() -> None:
+def test_any_run_gives_valid_xml() -> None:
     hostile = "]]><failure/>\x00\x1b[31m\ud800\ufffe\x0b&"
     evidence = [{"agent_id": hostile, "detail": hostile, hostile: hostile}, hostile]
     result = judged("3", verdict="violated", name=hostile, reason=hostile, evidence=evidence)

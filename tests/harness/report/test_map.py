@@ -83,7 +83,7 @@ def test_the_moments_are_begin_changes_and_end_with_the_live_links(tmp_path: Pat
     assert links == [["whole"], ["part0", "part1"], ["whole"], ["whole"]]
 
 
-def test_links_are_drawn_by_what_they_lose_and_it_is_said(tmp_path: Path) -> None:
+def test_links_are_drawn_and_described_by_their_loss(tmp_path: Path) -> None:
     """All are connected, and hardly hear each other."""
     section = drawn(tmp_path, network={"loss": 0.98, "radio": {"hard_range": {"range_m": 2000}}})
     assert said(section)[0] == "0 s all 5 connected, links lose 98 %"
@@ -126,7 +126,7 @@ def test_a_known_track_gives_the_known_path(tmp_path: Path) -> None:
     assert float(bar[1]) / int(metres[1]) == pytest.approx(side / 200, rel=0.01)
 
 
-def test_a_vehicle_that_leaves_all_is_alone_from_where_it_left(tmp_path: Path) -> None:
+def test_vehicle_out_of_range_is_alone_from_that_place(tmp_path: Path) -> None:
     tracks = {1: still(0, 0), 2: still(10, 0), 3: lambda at_s: (0.0, 2 * at_s)}
     section = drawn(tmp_path, 200, tracks)
     ((_, tip, points),) = [way for way in paths(section) if way[0] == "alone"]
@@ -137,7 +137,7 @@ def test_a_vehicle_that_leaves_all_is_alone_from_where_it_left(tmp_path: Path) -
     assert said(section)[1] == "126 s A 1, 2; alone 3"
 
 
-def test_a_track_changes_its_colour_between_two_looks_where_the_vehicle_then_was(tmp_path: Path) -> None:
+def test_track_changes_colour_at_the_interpolated_position(tmp_path: Path) -> None:
     timeline = [{"at_s": 50.25, "partition": [[1]]}, {"at_s": 50.75, "heal": True}]
     tracks: dict[int, Way] = {1: lambda at_s: (at_s, 0.0), 2: lambda at_s: (0.0, at_s)}
     flown = paths(drawn(tmp_path, 100, tracks, timeline=timeline))
@@ -197,7 +197,7 @@ def test_parts_keep_their_letters_while_most_of_them_stay() -> None:
     assert [letter(number) for number in (0, 25, 26, 53)] == ["A", "Z", "A2", "B3"]
 
 
-def test_of_too_many_changes_those_that_lasted_longest_are_kept() -> None:
+def test_longest_divisions_are_kept_if_there_are_too_many() -> None:
     found = divisions([state(at_s, {1, 2}, {3 + at}) for at, at_s in enumerate((0, 1, 10, 12, 30))])
     assert [one.at_s for one in longest_divisions(found, 40, 3)] == [0, 12, 30]
     assert longest_divisions(found, 40, 5) == found
@@ -215,7 +215,7 @@ def test_at_most_six_moments_are_shown_the_longest_among_them(tmp_path: Path) ->
     assert not [one for one in said(section) if one.startswith("400 s")]
 
 
-def test_the_description_says_in_words_what_happened(tmp_path: Path) -> None:
+def test_description_of_the_map_names_its_moments(tmp_path: Path) -> None:
     tracks = str(drawn(tmp_path).tracks)
     described = re.search('<desc id="tracks-desc">([^<]*)</desc>', tracks)
     assert described
@@ -244,13 +244,13 @@ def ink() -> dict[int, Ink]:
     return inks(FIVE)
 
 
-def test_where_nobody_moves_or_nobody_looked_there_is_no_map(tmp_path: Path, ink: dict[int, Ink]) -> None:
+def test_run_without_movement_or_tracks_has_no_map(tmp_path: Path, ink: dict[int, Ink]) -> None:
     assert section_of(tmp_path, ink) is None
     write_flight(tmp_path, scenario(agents=5), {vehicle: still(vehicle, 0) for vehicle in FIVE}, 5)
     assert section_of(tmp_path, ink) is None
 
 
-def test_tracks_without_a_record_of_the_network_are_drawn_and_it_is_said(tmp_path: Path, ink: dict[int, Ink]) -> None:
+def test_tracks_without_network_record_are_drawn_with_a_note(tmp_path: Path, ink: dict[int, Ink]) -> None:
     write_lines(tmp_path / TRACKS_FILE, [{"at_s": at, "places": {"3": [at * 9, 0, 0]}} for at in range(3)])
     section = section_of(tmp_path, ink)
     assert section is not None

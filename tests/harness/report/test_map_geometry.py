@@ -17,7 +17,7 @@ places = st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)), min_siz
 lines = st.lists(st.tuples(st.floats(0, 900), st.floats(0, 600)), min_size=2, max_size=60)
 
 
-def test_north_is_up_east_is_right_and_metres_are_equal_both_ways() -> None:
+def test_north_is_up_east_is_right_and_metres_have_equal_lengths() -> None:
     assert TO_PX(Fix(0, 100, -200)) == (10, 20)
     assert TO_PX(Fix(0, -100, 200)) == (810, 420)
     assert TO_PX(Fix(0, 0, 0)) == (410, 220)
@@ -25,7 +25,7 @@ def test_north_is_up_east_is_right_and_metres_are_equal_both_ways() -> None:
     assert TO_PX(Fix(0, 0, 50)) == (510, 220)
 
 
-def test_the_land_fits_into_its_room_whichever_side_is_long() -> None:
+def test_land_of_any_shape_fits_into_its_rectangle() -> None:
     for land in (LAND, Extent(-500, 500, -10, 10), Extent(0, 30, 0, 30)):
         to_px = Projection(land, 0, 0, 800, 600)
         assert to_px.width <= 800 + 1e-9
@@ -42,7 +42,7 @@ def test_ticks_and_scale_bar_are_round_metres() -> None:
 
 
 @given(places)
-def test_everything_flown_is_inside_the_map_with_a_margin(flown: list[tuple[float, float]]) -> None:
+def test_all_tracks_are_inside_the_map_with_a_margin(flown: list[tuple[float, float]]) -> None:
     land = extent([Fix(0, *place) for place in flown])
     for north_m, east_m in flown:
         assert land.south_m < north_m < land.north_m
@@ -55,7 +55,7 @@ def test_a_swarm_that_hardly_moves_is_not_blown_up() -> None:
     assert land.width_m == land.height_m == pytest.approx(22)
 
 
-def test_a_straight_line_is_its_ends_and_a_corner_stays() -> None:
+def test_straight_line_is_reduced_to_its_ends_and_corners_stay() -> None:
     straight = [(float(x), 2.0 * x) for x in range(100)]
     assert simplify(straight, INVISIBLE_PX) == [(0, 0), (99, 198)]
     assert simplify([*straight, (99, 0)], INVISIBLE_PX) == [(0, 0), (99, 198), (99, 0)]

@@ -17,7 +17,7 @@ def lines_of(tmp_path: Path, result: dict[str, Any] | None = None) -> list[str]:
     return (run_dir / "report.md").read_text().splitlines()
 
 
-def test_it_says_how_the_run_went_in_little_more_than_a_screen(tmp_path: Path) -> None:
+def test_summary_of_a_run_fits_about_one_screen(tmp_path: Path) -> None:
     lines = lines_of(tmp_path)
     assert lines[:3] == ["## 15 % loss", "", "**none violated, 4 of 6 hold**"]
     assert "seed 1878470074 \u00b7 backend process \u00b7 engine nftables" in lines[4]
@@ -40,7 +40,7 @@ def test_a_violation_has_its_evidence_below_the_table(tmp_path: Path) -> None:
     assert len(told) == 3
 
 
-def test_a_run_that_was_killed_says_so_and_what_is_missing(tmp_path: Path) -> None:
+def test_summary_of_a_killed_run_names_missing_files(tmp_path: Path) -> None:
     agents = {str(agent): {"outcome": "running"} for agent in (1, 2, 3)}
     lines = lines_of(tmp_path, {"outcome": "running", "characteristics": {}, "figures": {}, "agents": agents})
     assert lines[2] == "**not judged**"

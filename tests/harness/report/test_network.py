@@ -22,7 +22,7 @@ def asked(at_s: float, loss: float, *groups: list[int]) -> dict[str, Any]:
     return {"at_s": at_s, "what": "network", "detail": "", "fully_connected": False, "asked": conditions}
 
 
-def test_partitions_and_loss_are_those_on_record(tmp_path: Path) -> None:
+def test_strip_shows_recorded_partitions_and_losses(tmp_path: Path) -> None:
     lines = (asked(0, 0.1), asked(60, 0.2), asked(120, 0.2, [1, 2], [3]), asked(180, 0.2, [1], [2], [3]), asked(240, 0))
     assert drawn(tmp_path / "network.jsonl", *lines) == [
         "partition: A 1, 2; alone 3, 120 s to 180 s",
@@ -38,11 +38,11 @@ def test_partitions_and_loss_are_those_on_record(tmp_path: Path) -> None:
     ]
 
 
-def test_pairs_that_are_all_alike_have_no_lanes(tmp_path: Path) -> None:
+def test_equal_pairs_have_no_lanes(tmp_path: Path) -> None:
     assert drawn(tmp_path / "network.jsonl", asked(0, 0.98)) == ["loss: 98 %, 0 s to 600 s"]
 
 
-def test_what_distance_loses_is_added_and_what_is_out_of_range_is_a_partition(tmp_path: Path) -> None:
+def test_distance_adds_loss_and_a_lost_range_is_a_partition(tmp_path: Path) -> None:
     def flown(at_s: float, **losses: float) -> dict[str, Any]:
         return {
             "at_s": at_s,
@@ -69,7 +69,7 @@ def test_without_a_record_there_is_no_strip(tmp_path: Path) -> None:
     assert strip(read_connectivity(tmp_path / "network.jsonl", (1, 2)), [], 600.0) is None
 
 
-def test_what_was_asked_for_by_hand_stands_among_what_was_scheduled() -> None:
+def test_faults_by_hand_are_listed_among_scheduled_faults() -> None:
     record = RunRecord.model_validate(
         {
             "faults": [

@@ -54,7 +54,7 @@ def report(run_dir: Path, result: dict[str, Any] | None = None) -> Reader:
     return Reader(write_report(RunArchive(write_run(run_dir, CHAINS, result))).read_text(encoding="utf-8"))
 
 
-def test_the_page_says_how_the_run_went_in_its_order(tmp_path: Path) -> None:
+def test_page_has_its_parts_in_order(tmp_path: Path) -> None:
     page = report(tmp_path / "run")
     headings = [
         "15 % loss",
@@ -82,7 +82,7 @@ def test_the_page_says_how_the_run_went_in_its_order(tmp_path: Path) -> None:
         assert said in page.text
 
 
-def test_the_page_says_what_the_losses_of_vehicles_took(tmp_path: Path) -> None:
+def test_page_lists_the_blocks_lost_with_vehicles(tmp_path: Path) -> None:
     page = report(tmp_path / "run")
     for said in (
         "at 300 s vehicle 3 was lost (crash), and with it 1 of 12 completed blocks",
@@ -171,7 +171,7 @@ def test_half_a_character_in_a_name_does_not_stop_the_report(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("outcome", ["interrupted", "failed"])
-def test_a_run_that_did_not_complete_says_so_and_why(tmp_path: Path, outcome: str) -> None:
+def test_page_of_an_incomplete_run_gives_the_reason(tmp_path: Path, outcome: str) -> None:
     page = report(tmp_path / "run", {"outcome": outcome, "outcome_detail": "agent 3 stopped answering"})
     assert f"This run did not complete: {outcome} agent 3 stopped answering" in page.text
     headline = next(a["class"] for tag, a in page.elements if tag == "p" and "headline" in (a.get("class") or ""))
@@ -187,7 +187,7 @@ def test_a_run_file_with_nothing_but_its_schema_is_shown(tmp_path: Path) -> None
     assert "inception block" in page.text
 
 
-def test_agents_without_a_usable_export_are_said_and_the_rest_is_drawn(tmp_path: Path) -> None:
+def test_agents_without_usable_export_are_named_and_the_rest_is_drawn(tmp_path: Path) -> None:
     agents = {"2": {"outcome": "crashed", "detail": "exit status 1"}, "4": {"outcome": "hung"}}
     run_dir = write_run(tmp_path / "run", CHAINS, {"agents": agents})
     (run_dir / "agents" / "2.chain.json").write_text('{"schema": "ucp-chain-')
@@ -199,7 +199,7 @@ def test_agents_without_a_usable_export_are_said_and_the_rest_is_drawn(tmp_path:
     assert "The 3 blocks in chains as a table" in page.text
 
 
-def test_it_says_why_more_blocks_were_completed_than_are_in_chains() -> None:
+def test_page_explains_completed_blocks_that_are_in_no_chain() -> None:
     assert counts(exports({1: "1.1 2.1", 2: "1.1 2.1"}), RunRecord()) is None
     lost = RunRecord(agents={"3": AgentRecord(outcome="killed", completed_before=["a", "b"])})
     assert counts(exports({1: "1.2 2.1"}), lost) == (
@@ -254,7 +254,7 @@ SCENARIO_KEYS = list(result_of([1])["scenario"])
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.dictionaries(st.sampled_from(KEYS), JSON), st.dictionaries(st.sampled_from(SCENARIO_KEYS), JSON))
-def test_whatever_the_result_holds_there_is_a_report(
+def test_any_result_gives_a_report(
     tmp_path: Path, result: dict[str, Any], scenario: dict[str, Any]
 ) -> None:
     (tmp_path / "run.json").write_text(json.dumps({"scenario": scenario, **result, "schema": "ucp-run/1"}))
@@ -266,7 +266,7 @@ def test_template_and_styles_are_in_the_package() -> None:
     assert {"page.html.j2", "page.css", "palette.css", "chain_tree.css", "map.css"} <= shipped
 
 
-def test_what_the_mission_left_is_drawn_beside_what_the_final_reconcile_made_of_it(tmp_path: Path) -> None:
+def test_chains_before_and_after_the_final_reconcile_are_drawn(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path, {1: ["1.1", "2.1"], 2: ["1.1", "2.1"]}, result_of([1, 2]))
     write_exports(run_dir / BEFORE_FINAL_RECONCILE, {1: ["1.1", "2.1"], 2: ["1.1"]})
     page = write_report(RunArchive(run_dir)).read_text()
@@ -276,7 +276,7 @@ def test_what_the_mission_left_is_drawn_beside_what_the_final_reconcile_made_of_
     assert len(identifiers) == len(set(identifiers))
 
 
-def test_a_final_reconcile_that_changed_nothing_is_said_and_drawn_once(tmp_path: Path) -> None:
+def test_final_reconcile_without_changes_gives_one_tree(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path, {1: ["1.1"], 2: ["1.1"]}, result_of([1, 2]))
     write_exports(run_dir / BEFORE_FINAL_RECONCILE, {1: ["1.1"], 2: ["1.1"]})
     page = write_report(RunArchive(run_dir)).read_text()

@@ -65,7 +65,7 @@ def a_line(at_s: float, handler: str, branch: str, **keys: Any) -> dict[str, Any
     return {**line, "changes": [], "sent": [], "state": state, **keys}
 
 
-def test_every_kind_of_thing_is_drawn_with_a_title_and_explained(troubled: Path) -> None:
+def test_every_kind_of_mark_has_a_title_and_a_legend_entry(troubled: Path) -> None:
     html = html_of(troubled)
     for said in (
         "300\u00a0s to 600\u00a0s: A 3\u20135; B 1, 2",
@@ -96,7 +96,7 @@ def test_the_tables_have_every_vote_and_reconcile(troubled: Path) -> None:
     )
 
 
-def test_all_pictures_have_words_and_all_identifiers_are_single(troubled: Path) -> None:
+def test_all_pictures_have_descriptions_and_identifiers_are_unique(troubled: Path) -> None:
     html = html_of(troubled)
     plots = [attributes for _, attributes in Reader(html).elements if attributes.get("class") == "plot"]
     assert len(plots) == 4
@@ -123,7 +123,7 @@ def test_a_run_without_traces_has_neither_timeline_nor_script(tmp_path: Path) ->
     assert "script-src" not in html
 
 
-def test_twenty_minutes_of_five_agents_stay_small_even_if_everything_is_heard(troubled: Path) -> None:
+def test_page_of_twenty_minutes_with_all_messages_stays_small(troubled: Path) -> None:
     assert len(html_of(troubled).encode()) < 1_000_000
 
 
@@ -151,7 +151,7 @@ def test_a_long_restless_run_is_thinned_and_says_so() -> None:
     assert all(len({commit.agent for commit in group}) == 1 for group in groups)
 
 
-def test_charts_are_thinned_to_what_can_be_told_apart_but_keep_the_worst() -> None:
+def test_charts_are_thinned_but_keep_the_worst_moments() -> None:
     spreads = [Replication(float(at_s), 9 - 9 * (at_s == 777), 9, 1, 1, 1.0) for at_s in range(5000)]
     kept = _timeline_charts.thin_states(spreads, 5000.0)
     assert len(kept) <= _timeline_charts.MAX_MOMENTS
@@ -164,7 +164,7 @@ def test_charts_are_thinned_to_what_can_be_told_apart_but_keep_the_worst() -> No
     ("module", "limit", "said"),
     [(archive, "LARGE_BYTES", "traces are too large"), (_timeline_section, "MAX_ARROWS", "too many for a page")],
 )
-def test_messages_above_a_limit_are_left_out_and_that_is_said(
+def test_messages_above_the_limit_are_left_out_with_a_note(
     troubled: Path, monkeypatch: pytest.MonkeyPatch, module: Any, limit: str, said: str
 ) -> None:
     assert 'data-messages="{&#34;kinds' in html_of(troubled)
@@ -207,7 +207,7 @@ def test_the_timeline_of_a_run_that_was_cut_short_ends_with_it(tmp_path: Path, o
     assert f'data-end="{end_s}"' in html
 
 
-def test_a_file_that_is_no_trace_is_said_where_there_is_nothing_to_draw(tmp_path: Path) -> None:
+def test_invalid_trace_is_reported_if_there_is_nothing_to_draw(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", {1: "1.1"})
     (run_dir / "agents" / "1.trace.jsonl").write_text("no trace\n")
     html = html_of(run_dir)
@@ -246,7 +246,7 @@ def test_a_swarm_that_finishes_has_no_brackets(troubled: Path) -> None:
         7,
     ],
 )
-def test_a_cycle_that_cannot_be_is_drawn_as_far_as_it_can(tmp_path: Path, cycle: Any) -> None:
+def test_impossible_cycle_is_drawn_within_the_run(tmp_path: Path, cycle: Any) -> None:
     page = html_of(run_with(tmp_path, a_line(20.0, "build_data_block", "full"), result={"cycle": cycle}))
     assert page.count('class="round"') <= 400
     assert "<script>" not in page.partition("</head>")[2].partition("<script")[0]

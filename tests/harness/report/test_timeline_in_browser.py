@@ -86,7 +86,7 @@ def test_keys_zoom_and_move(browser: Browser, page: Path) -> None:
     assert browser.complaints == []
 
 
-def test_the_wheel_with_ctrl_zooms_where_the_pointer_is_and_without_it_scrolls(browser: Browser, page: Path) -> None:
+def test_ctrl_wheel_zooms_at_the_pointer_and_plain_wheel_scrolls(browser: Browser, page: Path) -> None:
     browser.show(page, width=1280, scheme="light")
     whole = span(browser)
     wheel = """(() => {{ const plot = document.querySelector('.plot'), box = plot.getBoundingClientRect();
@@ -100,7 +100,7 @@ def test_the_wheel_with_ctrl_zooms_where_the_pointer_is_and_without_it_scrolls(b
     assert (quarter - from_s) / (until_s - from_s) == pytest.approx(0.25, abs=0.01)
 
 
-def test_dragging_selects(browser: Browser, page: Path) -> None:
+def test_dragging_selects_a_period(browser: Browser, page: Path) -> None:
     browser.show(page, width=1280, scheme="light")
     whole = span(browser)
     left, top, width = browser.evaluate(
@@ -113,7 +113,7 @@ def test_dragging_selects(browser: Browser, page: Path) -> None:
     assert browser.complaints == []
 
 
-def test_messages_are_drawn_once_they_can_be_told_apart(browser: Browser, page: Path) -> None:
+def test_messages_appear_when_zoom_separates_them(browser: Browser, page: Path) -> None:
     browser.show(page, width=1280, scheme="light")
     assert browser.evaluate(ARROWS) == 0
     assert "zoom in for " in browser.evaluate(SAID)
@@ -131,7 +131,7 @@ def test_messages_are_drawn_once_they_can_be_told_apart(browser: Browser, page: 
     assert browser.evaluate(ARROWS) == 0
 
 
-def test_whatever_the_pointer_meets_has_a_title(browser: Browser, page: Path) -> None:
+def test_every_mark_under_the_pointer_has_a_title(browser: Browser, page: Path) -> None:
     browser.show(page, width=1280, scheme="light")
     met = """(() => { const shape = document.querySelector('.view .vote.approved');
       shape.scrollIntoView({block: 'center'});

@@ -20,7 +20,7 @@ def copy(run: Path, tmp_path: Path) -> Path:
     return shutil.copytree(run, tmp_path / "copy")
 
 
-def test_files_that_are_none_are_named_and_the_rest_is_exported(copy: Path, tmp_path: Path) -> None:
+def test_unreadable_files_are_named_and_the_rest_is_exported(copy: Path, tmp_path: Path) -> None:
     (copy / "vehicles" / "1" / "telemetry.tlog").unlink()
     os.mkfifo(copy / "vehicles" / "1" / "telemetry.tlog")
     os.mkfifo(copy / "agents" / "7.log")
@@ -36,7 +36,7 @@ def test_files_that_are_none_are_named_and_the_rest_is_exported(copy: Path, tmp_
     ]
 
 
-def test_a_run_that_broke_off_is_exported_up_to_there(copy: Path, tmp_path: Path) -> None:
+def test_interrupted_run_is_exported_up_to_its_end(copy: Path, tmp_path: Path) -> None:
     def killed(record: dict[str, Any]) -> None:
         for key in ("characteristics", "mission_s", "steps", "records", "liveness"):
             del record[key]
@@ -57,7 +57,7 @@ def test_a_run_that_broke_off_is_exported_up_to_there(copy: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("room", "package"), [("mcap", "mcap.writer"), ("perfetto", "perfetto"), ("rosbag", "rosbags")]
 )
-def test_a_package_that_is_missing_is_named_with_the_way_to_it(
+def test_missing_package_is_named_with_the_install_command(
     room: str, package: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in [name for name in sys.modules if name.split(".")[0] == package.split(".")[0]]:
@@ -68,7 +68,7 @@ def test_a_package_that_is_missing_is_named_with_the_way_to_it(
         import_module(f"harness.report.export.{room}_file")
 
 
-def test_a_roster_beyond_reason_is_refused(copy: Path, tmp_path: Path) -> None:
+def test_excessive_roster_is_refused(copy: Path, tmp_path: Path) -> None:
     edit(copy / "run.json", lambda record: record.update(roster=list(range(1, 5000))))
     refused = harness("export", copy, "--mcap", tmp_path / "m")
     assert refused.returncode == 2
@@ -77,7 +77,7 @@ def test_a_roster_beyond_reason_is_refused(copy: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["mcap", "perfetto", "rosbag"])
-def test_where_nothing_can_be_written_nothing_is_left(name: str, run: Path, tmp_path: Path) -> None:
+def test_failed_export_leaves_no_file(name: str, run: Path, tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("mine")
     refused = harness("export", run, f"--{name}", file / "below")

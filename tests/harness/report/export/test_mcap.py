@@ -60,7 +60,7 @@ def runs_of(run: Path, agent: int) -> list[HandlerRun]:
     return RunArchive(run).traces[agent].runs
 
 
-def test_every_handler_run_is_there_at_its_mission_second(run: Path, messages: Messages) -> None:
+def test_every_handler_run_is_exported_at_its_mission_second(run: Path, messages: Messages) -> None:
     for agent in (1, 2, 3):
         exported = messages[f"/agents/{agent}/handler_runs"]
         traced = runs_of(run, agent)
@@ -77,7 +77,7 @@ def test_the_chain_can_be_plotted(run: Path, messages: Messages) -> None:
     assert messages["/swarm/replication"][-1][1]["longest_chain"] >= lengths[-1]
 
 
-def test_a_message_says_who_received_it(messages: Messages) -> None:
+def test_message_lists_its_receivers(messages: Messages) -> None:
     told = [told for _, told in messages["/messages"]]
     assert any(message["received_by"] == [2, 3] and message["sender"] == 1 for message in told)
     assert any(message["receivers"] < 2 for message in told)
@@ -117,7 +117,7 @@ def test_links_lose_what_the_network_loses_and_everything_where_it_is_cut(messag
     assert links[75] == 2
 
 
-def test_what_vehicles_said_is_there_without_what_is_no_number(messages: Messages) -> None:
+def test_telemetry_is_exported_and_values_that_are_no_number_are_left_out(messages: Messages) -> None:
     told = messages["/vehicles/1/mavlink/ATTITUDE"]
     assert len(told) == 30
     assert told[7] == (7 * 10**9, {"mission_s": 7.0, "time_boot_ms": 7000, **dict.fromkeys(REST, 0.0), "roll": 0.25})
@@ -137,7 +137,7 @@ def test_faults_and_verdicts_are_in_the_log(messages: Messages) -> None:
     assert len([text for _, name, text in lines if name == "verdicts"]) == 9
 
 
-def test_what_an_operator_commanded_and_what_came_to_nothing_is_in_the_log(copy: Path, tmp_path: Path) -> None:
+def test_log_has_operator_commands_and_unmatched_fates(copy: Path, tmp_path: Path) -> None:
     record = json.loads((copy / "run.json").read_text())
     command = {
         "at_s": 7.0,
@@ -155,7 +155,7 @@ def test_what_an_operator_commanded_and_what_came_to_nothing_is_in_the_log(copy:
     assert "wind at 5 s: vehicle 3 cannot simulate it" in [text for _, name, text in lines if name == "faults"]
 
 
-def test_a_damaged_run_is_exported_and_what_is_damaged_is_said(copy: Path, tmp_path: Path) -> None:
+def test_damaged_run_is_exported_and_the_damage_is_reported(copy: Path, tmp_path: Path) -> None:
     tlog = copy / "vehicles" / "1" / "telemetry.tlog"
     data = tlog.read_bytes()
     tlog.write_bytes(data[:500] + b"\xfd\x00garbage\xfe" * 3 + data[500:])
@@ -188,7 +188,7 @@ def test_a_flight_from_the_field_is_exported(run: Path, tmp_path: Path) -> None:
     assert len(messages["/agents/3/handler_runs"]) == len(runs_of(run, 3))
 
 
-def test_what_cannot_be_is_one_sentence(copy: Path, tmp_path: Path) -> None:
+def test_impossible_exports_are_refused_in_one_sentence(copy: Path, tmp_path: Path) -> None:
     there = tmp_path / "there.mcap"
     there.write_text("mine")
     (empty := tmp_path / "empty").mkdir()

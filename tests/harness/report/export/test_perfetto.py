@@ -52,7 +52,7 @@ def test_every_handler_run_is_on_its_agents_track(run: Path, trace: Read) -> Non
         assert shown == [(round(step.t * 1e9), step.handler) for step in traced.runs]
 
 
-def test_an_arrow_leads_from_the_run_that_sent_a_message_to_each_that_received_it(run: Path, trace: Read) -> None:
+def test_arrow_leads_from_sending_run_to_each_receiving_run(run: Path, trace: Read) -> None:
     starts: dict[int, str] = {}
     arrows: Counter[tuple[str, str]] = Counter()
     for (group, _), _, event in trace.events:
@@ -83,7 +83,7 @@ def test_votes_and_reconciles_are_slices_that_nest(run: Path, trace: Read) -> No
     assert any(name.startswith("vote on 1.") for name in names)
 
 
-def test_counters_are_of_chains_and_losses(run: Path, trace: Read) -> None:
+def test_counters_show_chains_and_losses(run: Path, trace: Read) -> None:
     chain = [event.double_counter_value for _, event in trace.on("agent 3", "chain (blocks)")]
     assert chain[-1] == len(RunArchive(run).exports.by_agent[3].chain)
     assert max(event.double_counter_value for _, event in trace.on("swarm", "connected groups")) == 2

@@ -32,7 +32,7 @@ def messages(bag: Path) -> Messages:
     return by_topic
 
 
-def test_import_makes_the_run_of_it_again(run: Path, bag: Path, tmp_path: Path) -> None:
+def test_import_restores_the_run_from_the_bag(run: Path, bag: Path, tmp_path: Path) -> None:
     imported = harness("import", bag, "--out", tmp_path / "again")
     assert imported.returncode == 0, imported.stderr
     for agent in (1, 2, 3):
@@ -41,7 +41,7 @@ def test_import_makes_the_run_of_it_again(run: Path, bag: Path, tmp_path: Path) 
     assert RunArchive(tmp_path / "again").exports.by_agent == RunArchive(run).exports.by_agent
 
 
-def test_vehicles_and_links_are_where_they_were(run: Path, messages: Messages) -> None:
+def test_bag_has_the_positions_of_vehicles_and_links(run: Path, messages: Messages) -> None:
     last = RunArchive(run).tracks([1, 2, 3]).by_vehicle[1][-1]
     at_ns, fix = messages["/vehicle_1/fix"][-1]
     assert at_ns == round(last.at_s * 1e9) == fix.header.stamp.sec * 10**9 + fix.header.stamp.nanosec

@@ -25,7 +25,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return program
 
 
-def test_one_that_says_much_and_dies_is_told_of_after_the_run(server: Path, tmp_path: Path) -> None:
+def test_dead_server_with_much_output_is_reported_after_the_run(server: Path, tmp_path: Path) -> None:
     server.write_text(f"#!/bin/sh\n{MUCH}\necho http://here/\n{MUCH}\necho 'no more memory' >&2\nkill -9 $$\n")
     with live_page(tmp_path, 0, HAND) as page:
         assert page.address == "http://here/"
@@ -33,7 +33,7 @@ def test_one_that_says_much_and_dies_is_told_of_after_the_run(server: Path, tmp_
         assert page.problem == "the server of the page ended by itself with SIGKILL (no more memory); the run continued"
 
 
-def test_one_that_hangs_ends_with_the_run(server: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hung_server_ends_with_the_run(server: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "LAST_LOOK_S", 0.1)
     monkeypatch.setattr(module, "ENDING_S", 0.1)
     server.write_text("#!/bin/sh\ntrap '' TERM\necho http://here/\nexec sleep 1000\n")
@@ -44,7 +44,7 @@ def test_one_that_hangs_ends_with_the_run(server: Path, tmp_path: Path, monkeypa
         assert page.problem == "the page hung: its server did not answer within 0.1 s after the run"
 
 
-def test_one_that_cannot_begin_says_why(server: Path, tmp_path: Path) -> None:
+def test_server_that_cannot_start_gives_the_reason(server: Path, tmp_path: Path) -> None:
     server.write_text(f"#!/bin/sh\n{MUCH}\necho 'port 80 of 127.0.0.1 cannot be had' >&2\nexit 3\n")
     with pytest.raises(MachineError, match=r"port 80 of 127\.0\.0\.1 cannot be had"), live_page(tmp_path, 0, HAND):
         pass

@@ -51,7 +51,7 @@ def test_a_film_ends_with_the_chains_that_the_agents_exported(run: Path) -> None
     assert len(names) == len(set(names.values())) > 5
 
 
-def test_what_happens_is_in_order_and_all_there(run: Path) -> None:
+def test_changes_are_complete_and_in_time_order(run: Path) -> None:
     told = film(run)
     assert [told[0][0], told[-1][0]] == ["run", "end"]
     timed = [change for change in told if change[0] in ("b", "c", "s", "n", "z", "p")]
@@ -65,7 +65,7 @@ def test_what_happens_is_in_order_and_all_there(run: Path) -> None:
     assert {judgement[0] for judgement in told[-1][1]["judgements"]} >= {"1", "2", "3", "4", "5", "6"}
 
 
-def test_a_message_says_who_took_it_in(run: Path) -> None:
+def test_message_change_names_its_receivers(run: Path) -> None:
     told = film(run)
     sent = sum(len(entry.sent) for trace in RunArchive(run).traces.values() for entry in trace.runs)
     messages = of_kind("m", told)
@@ -74,14 +74,14 @@ def test_a_message_says_who_took_it_in(run: Path) -> None:
     assert max(masks) == 3, "nobody hears itself"
 
 
-def test_the_same_is_told_however_it_is_cut(run: Path) -> None:
+def test_changes_do_not_depend_on_the_size_of_reads(run: Path) -> None:
     def facts(told: list[Change]) -> list[str]:
         return sorted(json.dumps(change) for change in told if change[0] not in "t")
 
     assert facts(film(run)) == facts(film(run, 1e7)) == facts(film(run, 3.3))
 
 
-def test_a_live_run_is_its_files_while_they_grow(run: Path, tmp_path: Path) -> None:
+def test_growing_files_give_the_same_changes(run: Path, tmp_path: Path) -> None:
     """Each file a little at a time, lines cut anywhere; later lives beside the first, as processes have them."""
     growing = tmp_path / "run"
     (growing / "agents").mkdir(parents=True)
@@ -100,7 +100,7 @@ def test_a_live_run_is_its_files_while_they_grow(run: Path, tmp_path: Path) -> N
     assert len(of_kind("m", told)) == len(of_kind("m", film(run)))
 
 
-def test_the_lives_of_a_process_are_read_once_where_they_were_written(run: Path, tmp_path: Path) -> None:
+def test_each_incarnation_of_a_process_is_read_once(run: Path, tmp_path: Path) -> None:
     killed = tmp_path / "run"
     shutil.copytree(run, killed)
     whole = killed / "agents" / f"4{SUFFIX}"
@@ -114,7 +114,7 @@ def test_the_lives_of_a_process_are_read_once_where_they_were_written(run: Path,
     assert chains_of(film(killed)) == chains_of(film(run)), "and before that"
 
 
-def test_a_run_that_was_killed_is_told_up_to_there(run: Path, tmp_path: Path) -> None:
+def test_killed_run_is_shown_up_to_its_end(run: Path, tmp_path: Path) -> None:
     killed = tmp_path / "run"
     shutil.copytree(run, killed)
     record = json.loads((killed / "run.json").read_text())
@@ -129,7 +129,7 @@ def test_a_run_that_was_killed_is_told_up_to_there(run: Path, tmp_path: Path) ->
     assert of_kind("note", told) == []
 
 
-def test_damage_is_said_once_and_the_rest_is_shown(run: Path, tmp_path: Path) -> None:
+def test_damage_is_reported_once_and_the_rest_is_shown(run: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "run"
     shutil.copytree(run, damaged)
     with (damaged / "agents" / f"2{SUFFIX}").open("r+b") as file:
@@ -147,14 +147,14 @@ def test_damage_is_said_once_and_the_rest_is_shown(run: Path, tmp_path: Path) ->
     assert len(chains_of(told)) == 4
 
 
-def test_a_block_that_is_there_twice_is_seen_at_once(run: Path, tmp_path: Path) -> None:
+def test_duplicate_block_is_reported_at_once(run: Path, tmp_path: Path) -> None:
     wrong = played(tmp_path / "run", timeline=[], quirks={"keep_committed_block": True})
     assert of_kind("x", film(run)) == []
     against = of_kind("x", film(wrong))
     assert against, "some wrong agent of ours is wrong at once"
 
 
-def test_what_is_no_run_is_refused_in_a_sentence(tmp_path: Path, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_directory_without_a_run_is_refused_in_one_sentence(tmp_path: Path, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for path, why in ((tmp_path / "nowhere", "does not exist"), (tmp_path, "neither a run directory")):
         with pytest.raises(RunDirectoryError, match=why):
             Feed(path)
@@ -210,7 +210,7 @@ def test_feed_and_report_agree_on_a_reconcile_during_a_vote(tmp_path: Path) -> N
     assert intervals(changes) == [("reconcile", 3.0, 15.0, "vote not approved"), ("vote", 1.0, 11.0, "approved")]
 
 
-def test_a_slow_reader_of_a_live_run_is_not_given_all_of_it() -> None:
+def test_slow_reader_of_a_live_run_skips_messages() -> None:
     log = ChangeLog()
     log.append([["c", number, 1, [], "", ""] for number in range(100)])
     log.append([["m", 0.0, 1, "x" * 1000, None, "0"] for _ in range(FAR_BEHIND_BYTES // 1000)])

@@ -60,7 +60,7 @@ class Page:
         return answer
 
 
-def test_what_a_page_asks_for_happens_and_is_on_record(tmp_path: Path) -> None:
+def test_requests_of_a_page_are_performed_and_recorded(tmp_path: Path) -> None:
     async def visit(address: str) -> None:
         async with aiohttp.ClientSession() as client, client.ws_connect(f"{address}live", max_msg_size=0) as socket:
             page = Page(socket)
@@ -95,7 +95,7 @@ def button(label: str) -> str:
     return f"[...document.querySelectorAll('#hand button')].find(each => each.textContent === '{label}')"
 
 
-def test_buttons_of_the_page(browser: Browser, tmp_path: Path) -> None:
+def test_buttons_of_the_page_control_the_run(browser: Browser, tmp_path: Path) -> None:
     out = tmp_path / "run"
     with page_of("run", scenario(tmp_path), "--backend", "sim", "--watch", "--out", out) as (_, address):
         browser.show(address, width=1280, scheme="dark")
@@ -113,7 +113,7 @@ def test_buttons_of_the_page(browser: Browser, tmp_path: Path) -> None:
 
 
 @pytest.mark.lab
-def test_what_befalls_vehicles_by_hand(browser: Browser, tmp_path: Path) -> None:
+def test_vehicle_faults_can_be_caused_by_hand(browser: Browser, tmp_path: Path) -> None:
     def befall(vehicle: int, what: str) -> None:
         browser.evaluate(f"watch.hand.choose({vehicle})")
         browser.evaluate(f"watch.hand.trouble.querySelector('select').value = '{what}'")

@@ -82,7 +82,7 @@ def test_no_address_leads_to_another_file(tmp_path: Path) -> None:
     asyncio.run(visit())
 
 
-def test_the_report_is_shown_as_if_it_came_from_nowhere(tmp_path: Path) -> None:
+def test_report_is_served_in_a_sandbox(tmp_path: Path) -> None:
     (tmp_path / "report.html").write_text(HOSTILE)
 
     async def visit() -> None:
@@ -93,7 +93,7 @@ def test_the_report_is_shown_as_if_it_came_from_nowhere(tmp_path: Path) -> None:
     asyncio.run(visit())
 
 
-def test_a_page_hears_all_from_the_beginning_and_then_what_is_new(tmp_path: Path) -> None:
+def test_page_receives_all_changes_from_the_start(tmp_path: Path) -> None:
     log = ChangeLog()
     log.append([["run", {"name": HOSTILE}], ["t", 1.0]])
 
@@ -109,7 +109,7 @@ def test_a_page_hears_all_from_the_beginning_and_then_what_is_new(tmp_path: Path
     asyncio.run(visit())
 
 
-def test_a_browser_that_does_not_read_holds_up_nobody(tmp_path: Path) -> None:
+def test_browser_that_does_not_read_delays_no_other_page(tmp_path: Path) -> None:
     log = ChangeLog()
 
     async def visit() -> None:
@@ -142,7 +142,7 @@ def test_a_browser_that_does_not_read_holds_up_nobody(tmp_path: Path) -> None:
     asyncio.run(visit())
 
 
-def test_only_so_many_pages_are_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_open_pages_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(servers, "MAX_READERS", 1)
 
     async def visit() -> None:
@@ -157,7 +157,7 @@ def test_only_so_many_pages_are_open(tmp_path: Path, monkeypatch: pytest.MonkeyP
     asyncio.run(visit())
 
 
-def test_a_port_that_is_in_use_is_said_in_a_sentence(tmp_path: Path) -> None:
+def test_used_port_is_reported_in_one_sentence(tmp_path: Path) -> None:
     async def visit() -> None:
         async with served(tmp_path) as (_, address):
             port = urlsplit(address).port
@@ -169,7 +169,7 @@ def test_a_port_that_is_in_use_is_said_in_a_sentence(tmp_path: Path) -> None:
     asyncio.run(visit())
 
 
-def test_it_listens_on_this_machine_alone(tmp_path: Path) -> None:
+def test_server_listens_on_the_loopback_address_only(tmp_path: Path) -> None:
     async def visit() -> None:
         async with served(tmp_path) as (_, address):
             assert urlsplit(address).hostname == "127.0.0.1"

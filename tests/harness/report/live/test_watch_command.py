@@ -11,14 +11,14 @@ from harness.report.live.server_process import require_packages
 from tests.harness.command import harness, sentences
 
 
-def test_a_directory_that_is_no_run(tmp_path: Path) -> None:
+def test_directory_without_a_run_is_refused(tmp_path: Path) -> None:
     told = harness("watch", tmp_path)
     assert told.returncode == 2
     assert len(sentences(told.stderr)) == 1
     assert "neither a run directory" in told.stderr
 
 
-def test_a_port_that_is_in_use_is_said_before_the_run_begins(tmp_path: Path) -> None:
+def test_used_port_is_reported_before_the_run_begins(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         told = harness("run", "perfect", "--backend", "sim", "--watch", "--watch-port", port, "--out", tmp_path / "run")
@@ -29,13 +29,13 @@ def test_a_port_that_is_in_use_is_said_before_the_run_begins(tmp_path: Path) -> 
     assert not (tmp_path / "run").exists()
 
 
-def test_a_missing_package_is_said_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_is_reported_with_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "aiohttp", None)
     with pytest.raises(MachineError, match=r"pip install ucp-harness\[watch\]"):
         require_packages()
 
 
-def test_with_nobody_watching_a_run_ends_as_ever(tmp_path: Path) -> None:
+def test_run_without_open_pages_ends_normally(tmp_path: Path) -> None:
     told = harness("run", "perfect", "--backend", "sim", "--speedup", 1000, "--watch", "--out", tmp_path / "run")
     assert told.returncode == 0, told.stderr
     assert "watch it at http://127.0.0.1:" in told.stdout
