@@ -256,9 +256,9 @@ def main() -> None:
         found = rows(measure(options.rounds, options.seconds))
         show(found, {"figure": ",.1f", "ratio": ".2f"}, options.json)
         return
-    possible, word = _namespaces.probe()
+    possible, message = _namespaces.probe()
     if not possible:
-        sys.stderr.write(f"This machine does not allow private networks ({word}). {_namespaces.way_out(word)}\n")
+        sys.stderr.write(f"This machine does not allow private networks ({message}). {_namespaces.way_out(message)}\n")
         sys.exit(3)
     argv = [sys.executable, "-m", "benchmarks.link", "--inside", *sys.argv[1:]]
     sys.exit(subprocess.run(_namespaces.command(argv, user_namespace=os.geteuid() != 0), check=False).returncode)

@@ -46,7 +46,7 @@ def doctor_command(
         Console().print(table)
     engines = []
     if measure and able:
-        with capabilities.saying(Console(stderr=True)) as say:
+        with capabilities.progress_line(Console(stderr=True)) as say:
             engines = capabilities.measure_engines(requirements, say)
     records = [requirement.to_json() for requirement in requirements]
     if as_json:

@@ -11,7 +11,7 @@ import typer
 
 from harness.commands.terminal import complain
 from harness.errors import MachineError, RunDirectoryError, ScenarioError
-from harness.play.machine.running_runs import running, way_into
+from harness.play.machine.running_runs import enter_command, running
 from harness.play.machine.uml_kernel import enter, runs_inside
 from harness.play.request_socket import ask_run
 from harness.report.stories.sentences import VERBS, StoryEntries
@@ -126,7 +126,7 @@ def shell_command(
     argv = command or [os.environ.get("SHELL", "/bin/sh")]
     if not command:
         complain(f"in the network of vehicle {vehicle}; `exit` leaves it, and the run continues")
-    way = way_into(vehicles[vehicle])
+    way = enter_command(vehicles[vehicle])
     os.execvp(way[0], [*way, *argv])  # noqa: S606 (Ctrl-C is the shell's, and so is the exit status)
 
 

@@ -1,4 +1,4 @@
-"""UCP in pytest: the fixtures `swarm` and `scenario`; scenarios with an `expect:` section, and stories, as tests.
+"""UCP in pytest: the fixtures `swarm` and `scenario`. Scenarios with an `expect:` section and stories are tests.
 
 pytest loads this module in every session, so it imports the rest of the harness only when a test uses a fixture.
 """
@@ -88,9 +88,9 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
         return StoryFile.from_parent(parent, path=file_path)
     if file_path.suffix not in (".yaml", ".yml"):
         return None
-    from harness.pytest_plugin._yaml_files import is_asked_for, is_ours
+    from harness.pytest_plugin._yaml_files import is_expectation_scenario, is_selected
 
-    if not is_asked_for(file_path, parent.config) or not is_ours(file_path):
+    if not is_selected(file_path, parent.config) or not is_expectation_scenario(file_path):
         return None
     from harness.pytest_plugin._items import ScenarioFile
 

@@ -1,4 +1,4 @@
-"""What the fixtures `swarm` and `scenario` do, imported when a test asks for one of them."""
+"""The implementation of the fixtures `swarm` and `scenario`, imported when a test uses one of them."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,15 +22,15 @@ DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1}
 
 
 def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
-    """The swarm of a test. `Trial` ends and judges it, or it ends here if the test does not come to its end."""
+    """Yield the swarm of a test. `Trial` ends and judges the run. If the test is aborted, the run ends here."""
     with one_sentence():
         options = Options.of(node.config)
         keys = {**DEFAULTS, "name": node.name[:200], "vehicles": {"kind": "none"}}
-        for marker in reversed(list(node.iter_markers("swarm"))):  # the nearest has the last word
+        for marker in reversed(list(node.iter_markers("swarm"))):  # the nearest marker overrides the others
             keys |= marker.kwargs
         backend, seed = _backend_and_seed(keys.pop("backend"), keys.pop("seed"), options)
         options.refuse(backend)
-        scenario = options.laid_over(parse(keys))
+        scenario = options.applied_to(parse(keys))
         directory = new_directory(node, options)
         swarm = Swarm(scenario, seed, backend, directory)
     trial = node.stash[TRIAL] = Trial(scenario, swarm.finish)
@@ -43,13 +43,13 @@ def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
 
 
 def scenario_for(node: pytest.Item) -> Iterator[Findings]:
-    """The findings of the scenario that the marker names, once it has been played."""
+    """Play the scenario that the marker names, and yield its findings."""
     with one_sentence():
         options = Options.of(node.config)
         path, keys = _marked(node)
         backend, seed = _backend_and_seed(keys["backend"], keys["seed"], options)
         options.refuse(backend)
-        scenario = options.laid_over(load_scenario(path))
+        scenario = options.applied_to(load_scenario(path))
         directory = new_directory(node, options)
         finished = play(scenario, seed, backend, directory)
     trial = node.stash[TRIAL] = Trial(scenario, lambda _: finished)
@@ -79,7 +79,7 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
 
 
 def _backend_and_seed(backend: Any, seed: Any, options: Options) -> tuple[BackendName, int]:
-    """What a marker says of them, unless the command line says something else. Raises ScenarioError."""
+    """Return the values of the command line, or else those of the marker. Raises ScenarioError."""
     if backend not in BACKEND_NAMES:
         *names, last = map(repr, BACKEND_NAMES)
         raise ScenarioError(f"`backend` is {backend!r}: use {', '.join(names)} or {last}")

@@ -27,7 +27,7 @@ class ScenarioFile(pytest.File):
     def collect(self) -> Iterator[pytest.Item]:
         try:
             options = Options.of(self.config)
-            scenario = options.laid_over(load_scenario(self.path))
+            scenario = options.applied_to(load_scenario(self.path))
         except HarnessError as error:
             raise self.CollectError(str(error)) from None
         expect = scenario.expect or Expect()
@@ -39,7 +39,7 @@ class ScenarioFile(pytest.File):
 
 
 class ScenarioItem(pytest.Item):
-    """One run; whether it is as expected is judged where that of every test is (`pytest_runtest_call`)."""
+    """One run of a scenario. `pytest_runtest_call` judges it, like the run of every test."""
 
     def __init__(self, *, scenario: Scenario, backend: BackendName, seed: int, **node: Any) -> None:
         super().__init__(**node)
@@ -71,20 +71,20 @@ class StoryFile(pytest.File):
     def collect(self) -> Iterator[pytest.Item]:
         try:
             options = Options.of(self.config)
-            story = read_story(self.path)
+            play = read_story(self.path)
         except HarnessError as error:
             raise self.CollectError(str(error)) from None
-        backends = (story.scenario.expect or Expect()).backends if options.backend is None else [options.backend]
+        backends = (play.scenario.expect or Expect()).backends if options.backend is None else [options.backend]
         for backend in backends:
-            yield StoryItem.from_parent(self, name=backend, story=story, backend=backend)
+            yield StoryItem.from_parent(self, name=backend, play=play, backend=backend)
 
 
 class StoryItem(pytest.Item):
-    """One run; it is judged where that of every test is (`pytest_runtest_call`)."""
+    """One run of a story. `pytest_runtest_call` judges it, like the run of every test."""
 
-    def __init__(self, *, story: Story, backend: BackendName, **node: Any) -> None:
+    def __init__(self, *, play: Story, backend: BackendName, **node: Any) -> None:
         super().__init__(**node)
-        self._story = story
+        self._story = play
         self._backend = backend
         self._directory: Path | None = None
 
@@ -95,16 +95,16 @@ class StoryItem(pytest.Item):
             virtual = in_virtual_time(self._backend)
             if not virtual:
                 self._skip_what_needs_virtual_time()
-            scenario = options.laid_over(self._story.in_virtual_time if virtual else self._story.scenario)
+            scenario = options.applied_to(self._story.in_virtual_time if virtual else self._story.scenario)
             self._directory = new_directory(self, options)
             finished = play(
                 scenario, 1 if options.seed is None else options.seed, self._backend, self._directory, delivers_all=True
             )
         self.stash[TRIAL] = Trial(scenario, lambda _: finished)
         if finished.played.outcome != "completed":
-            return  # whoever judges the run says why
+            return  # the judgement of the run reports the reason
         archive = RunArchive(finished.directory)
-        text = self._told(archive)
+        text = self._played_text(archive)
         if options.rewrite:
             self._rewrite(text)
         elif text != self._story.text:
@@ -129,14 +129,14 @@ class StoryItem(pytest.Item):
         except OSError as error:
             pytest.fail(f"{self.path} cannot be written: {error.strerror}", pytrace=False)
 
-    def _told(self, archive: RunArchive) -> str:
-        """The story as played."""
+    def _played_text(self, archive: RunArchive) -> str:
+        """Return the text of the story with the answers of this run."""
         narrator = Narrator(archive.traces, self._story.scenario.roster)
         answers = [narrator.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
         return self._story.with_answers(answers)
 
     def _unknown_word(self, archive: RunArchive) -> str | None:
-        """What an agent says in another word than stories do; None if all is said in theirs."""
+        """Return a description of the first word of a trace that stories do not know, or None."""
         for agent_id, trace in archive.traces.items():
             if unknown := first_of(unknown_words(trace.runs)):
                 return f"{unknown} in the trace of agent {agent_id}"

@@ -1,4 +1,4 @@
-"""A run of a test: its directory, its verdict, and whether the scenario expected it."""
+"""The run of a test: its directory, its verdict, and the comparison with the scenario's expectations."""
 
 import re
 import shlex
@@ -23,7 +23,7 @@ from harness.scenario.expect import Expect
 
 
 class Trial:
-    """`finish` ends the run, once the agents have settled if its argument says so, and judges it."""
+    """A run of a test. `finish` ends the run and judges it. If its argument is true, the agents settle first."""
 
     def __init__(self, scenario: Scenario, finish: Callable[[bool], Run]) -> None:
         self._expect = scenario.expect or Expect()
@@ -32,7 +32,7 @@ class Trial:
         self.passed = False
 
     def end_of_test(self) -> None:
-        """Raises pytest's Failed if the run is not what is expected of it."""
+        """Raise pytest's Failed if the run differs from its expectations."""
         try:
             finished = self._finish(True)
         except HarnessError as error:
@@ -40,16 +40,16 @@ class Trial:
         if finished.played.outcome == "not supported":
             pytest.skip(finished.played.outcome_detail or "not supported")
         if lines := self._unexpected(finished):
-            pytest.fail("\n".join([*lines, *_where(finished)]), pytrace=False)
+            pytest.fail("\n".join([*lines, *_report_lines(finished)]), pytrace=False)
         self.passed = True
 
     def end_of_failed_test(self) -> str:
-        """What there is to say beside the test's own failure."""
+        """Return the findings about the run, which are printed beside the failure of the test."""
         try:
             finished = self._finish(False)
         except HarnessError as error:
             return str(error)
-        return "\n".join([*self._unexpected(finished), *_where(finished)])
+        return "\n".join([*self._unexpected(finished), *_report_lines(finished)])
 
     def _unexpected(self, finished: Run) -> list[str]:
         played = finished.played
@@ -79,15 +79,18 @@ class Trial:
         return [*self._expect.other_chains({agent: export.top_chain_hash for agent, export in exports.items()})]
 
 
-def _where(finished: Run) -> list[str]:
-    """Where the report is, and what plays the run once more."""
+def _report_lines(finished: Run) -> list[str]:
+    """Return the path of the report, and the command that plays the run again."""
     again = shlex.join(["ucp-harness", "run", str(finished.directory), "--backend", str(finished.record.backend)])
     return [f"report: {finished.report}", f"again, with seed {finished.record.seed}: {again}"]
 
 
 @contextmanager
 def one_sentence() -> Iterator[None]:
-    """Skip what this machine cannot do, and fail for what else is wrong, with the sentence that says it."""
+    """Skip the test if the machine cannot play it, and fail for any other error.
+
+    The message is the error's sentence.
+    """
     try:
         yield
     except MachineError as error:
@@ -100,10 +103,10 @@ MAX_NAME = 100
 
 
 def new_directory(node: pytest.Item, options: Options) -> Path:
-    """An empty directory of its own for a run of this test. Raises RunDirectoryError."""
+    """Create an empty directory for a run of this test. Raises RunDirectoryError."""
     name = re.sub(r"\W+", "-", node.nodeid).strip("-")[-MAX_NAME:]
     if options.keep is None:
-        factory = node.config._tmp_path_factory  # type: ignore[attr-defined] # a file that is a test has no fixtures
+        factory = node.config._tmp_path_factory  # type: ignore[attr-defined] # items of YAML files have no fixtures
         return cast(pytest.TempPathFactory, factory).mktemp(name)
     for number in count(1):
         directory = options.keep / (name if number == 1 else f"{name}-{number}")
@@ -118,6 +121,6 @@ def new_directory(node: pytest.Item, options: Options) -> Path:
 
 
 def discard(directory: Path, options: Options) -> None:
-    """Remove the directory of a run that went as expected, unless it is to be kept."""
+    """Remove the directory of a run without unexpected findings, except with `--ucp-keep`."""
     if options.keep is None:
         shutil.rmtree(directory, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""`--ucp-kernel uml`: the whole session in User Mode Linux, where processes have netem, and need no rights."""
+"""`--ucp-kernel uml`: run the whole session in User Mode Linux, which has netem and needs no root."""
 
 import os
 import shutil
@@ -16,16 +16,16 @@ from netem.errors import UmlError
 
 
 def session_inside(config: pytest.Config) -> int | None:
-    """Run the session there, with the same command line; its exit status, or None if it has to be played here.
+    """Run the session in User Mode Linux with the same command line, and return its exit status.
 
-    That is inside, and on a machine without User Mode Linux, where `refuse_outside` has single tests skipped. What
-    failed tests leave outlives the guest.
+    Return None if the session already runs inside, or if User Mode Linux is missing. In the latter case,
+    `refuse_outside` skips single tests. The files of failed tests are kept after the guest has ended.
     """
     if uml.inside() or _missing() is not None:
         return None
     folder = Path(tempfile.mkdtemp(prefix="pytest-uml-"))
     kept = [] if config.option.basetemp else [f"--basetemp={folder / 'tests'}"]
-    on_path = [] if str(Path.cwd()) in sys.path else ["-P"]  # `python -m pytest` has it there, `pytest` has not
+    on_path = [] if str(Path.cwd()) in sys.path else ["-P"]  # only `python -m pytest` adds it to the path
     command = [sys.executable, *on_path, "-m", "pytest", *config.invocation_params.args, *kept]
     try:
         status = uml.run(command, cwd=config.invocation_params.dir, env=os.environ)
@@ -37,7 +37,7 @@ def session_inside(config: pytest.Config) -> int | None:
 
 
 def refuse_outside(backend: BackendName) -> None:
-    """Raises MachineError if what this backend plays would not be played there; virtual time needs no kernel."""
+    """Raise MachineError if this backend needs User Mode Linux, and it is missing. Virtual time needs no kernel."""
     if in_virtual_time(backend):
         return
     if why := BACKENDS[backend].not_in_uml:

@@ -1,8 +1,8 @@
-"""A mission that is told while it is played: a timeline that grows, sentence by sentence.
+"""A mission that a test controls: its timeline grows action by action during the run.
 
-The sentences come from another thread than that of the mission's loop, so that real processes are watched, and vehicles
-flown, while a test thinks or somebody looks at it in a debugger. Each sentence that changes something becomes an entry
-of the scenario's timeline: it is checked as an entry is, and what was told can be played again.
+The actions come from another thread than the one of the mission's loop. Real processes therefore run on, and vehicles
+fly, while the test computes or stops in a debugger. Each action that changes something becomes an entry of the
+scenario's timeline. The entry is validated like any other, and the recorded scenario can be played again.
 """
 
 import asyncio
@@ -24,54 +24,55 @@ from harness.scenario.timeline import TimelineEntry
 from ucp.agent import HANDLERS
 
 HOLDABLE = ("message", "sender", "receiver", "block", "count")
-"""Keys of a fate that say which messages it is about."""
+"""Keys of a fate that select messages."""
 LOOK_EVERY_S = 5.0
-"""Mission seconds between two looks at who has voted."""
+"""Mission seconds between two checks whether all agents have voted."""
 
 HANDLER_BRANCHES = {name: handler.branches for name, handler in HANDLERS.items()}
 
-Sentence = Callable[[mission.Swarm], Awaitable[Any]]
+Action = Callable[[mission.Swarm], Awaitable[Any]]
 
 
-class Told(GrowingTimeline):
-    """Play its `story`, wait until it has `begun`, then let it `hear` what happens, in the thread that plays it."""
+class LiveTimeline(GrowingTimeline):
+    """Plays the mission and performs actions.
+
+    `story` plays in the thread of the loop, and `begun` is set after the start. `hear` queues an action.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__(scenario)
-        self.begun: Future[Any] = Future()
-        self._sentences: asyncio.Queue[tuple[Sentence, Future[Any]] | None] = asyncio.Queue()
+        self.started: Future[Any] = Future()
+        self._actions: asyncio.Queue[tuple[Action, Future[Any]] | None] = asyncio.Queue()
         self._holds: dict[int, dict[str, Any]] = {}
-        """What is held back, as it was told, by the number of its fate."""
+        """Number of a fate -> its keys, for each active hold."""
         self._completed: dict[int, int] = {}
-        """How many blocks each agent had completed when something was last told."""
+        """Number of completed blocks of each agent at the last action."""
 
-    async def story(self, swarm: mission.Swarm, scenario: Scenario) -> None:
+    async def play(self, swarm: mission.Swarm, scenario: Scenario) -> None:
         first, *_ = timeline_of(scenario)
         await swarm.begin(first)
         swarm.enter("mission")
-        self.begun.set_result(None)
-        while asked := await self._sentences.get():
-            sentence, answer = asked
+        self.started.set_result(None)
+        while queued := await self._actions.get():
+            action, answer = queued
             try:
-                result = await sentence(swarm)
-            except ScenarioError as mistake:  # of whoever tells, who may go on
-                answer.set_exception(mistake)
+                result = await action(swarm)
+            except ScenarioError as error:  # a mistake of the test, which may continue
+                answer.set_exception(error)
             else:
                 answer.set_result(result)
         await self.release(swarm)
 
-    def hear(self, sentence: Sentence, answer: Future[Any]) -> None:
-        """Take the next sentence. What it says, or a mistake in it, is set in `answer`, unless the run ends first."""
-        self._sentences.put_nowait((sentence, answer))
+    def queue_action(self, action: Action, answer: Future[Any]) -> None:
+        """Queue an action. `answer` receives its result or its error, unless the run ends before."""
+        self._actions.put_nowait((action, answer))
 
     def stop(self) -> None:
-        """There are no more sentences."""
-        self._sentences.put_nowait(None)
-
-    # Sentences
+        """End the queue of actions."""
+        self._actions.put_nowait(None)
 
     async def change(self, swarm: mission.Swarm, **entry: Any) -> float:
-        """Make this entry of a timeline happen now; its `at_s`. Raises ScenarioError if it cannot."""
+        """Apply an entry of a timeline now. Return its `at_s`. Raises ScenarioError if it is impossible."""
         at_s = self.next_instant(swarm)
         before, document = self.scenario, self.scenario.model_dump()
         document["timeline"].append({"at_s": at_s, **entry})
@@ -79,14 +80,14 @@ class Told(GrowingTimeline):
         self.retell(document)
         try:
             await self.until(swarm, at_s)
-        except ScenarioError:  # the backend cannot
+        except ScenarioError:  # the backend does not support it
             self.scenario = before
             raise
         self._completed = await swarm.completed()
         return at_s
 
     async def undo(self, swarm: mission.Swarm, at_s: float) -> None:
-        """Have the entry with this `at_s`, which changes the network, last no longer than until now."""
+        """End the network change with this `at_s` now, if it has not ended before."""
         document = self.scenario.model_dump()
         (entry,) = (entry for entry in document["timeline"] if entry["at_s"] == at_s)
         over_s = _next_instant(max(swarm.now(), self._played_s))
@@ -106,7 +107,7 @@ class Told(GrowingTimeline):
         self._completed = await swarm.completed()
 
     async def hold(self, swarm: mission.Swarm, **which: Any) -> int:
-        """From now on hold back the messages that a fate with these keys is about; its number. Raises ScenarioError."""
+        """Delay the messages that match these keys from now on. Return the number of the fate. Raises ScenarioError."""
         if unknown := next((key for key in which if key not in HOLDABLE), None):
             raise ScenarioError(f"`{unknown}` is unknown: use one of {', '.join(HOLDABLE)}")
         if which in self._holds.values():
@@ -118,14 +119,17 @@ class Told(GrowingTimeline):
         self.retell(document)
         try:
             number = await swarm.hold(self.scenario.fates[-1])
-        except ScenarioError:  # the backend cannot
+        except ScenarioError:  # the backend does not support it
             self.scenario = before
             raise
         self._holds[number] = which
         return number
 
     async def release(self, swarm: mission.Swarm, **which: Any) -> None:
-        """Let go of what was held by these words, or of everything. Raises ScenarioError if there is no such hold."""
+        """Deliver the messages of one hold, or of all holds without keys.
+
+        Raises ScenarioError if there is no such hold.
+        """
         if which and which not in self._holds.values():
             held = ", ".join(map(_in_words, self._holds.values())) or "nothing"
             raise ScenarioError(f"{_in_words(which)} is not held; held: {held}")
@@ -133,7 +137,7 @@ class Told(GrowingTimeline):
             await self.let_go(swarm, number)
 
     async def let_go(self, swarm: mission.Swarm, number: int) -> None:
-        """End this hold, if nobody has."""
+        """End this hold, if it is still active."""
         if self._holds.pop(number, None) is None:
             return
         document = self.scenario.model_dump()
@@ -143,7 +147,10 @@ class Told(GrowingTimeline):
         await swarm.release(number, self.scenario.fates[number])
 
     async def until_run(self, swarm: mission.Swarm, sought: Sought, limit_s: float) -> int | None:
-        """Go on until an agent runs what is sought; its ID, or None if that takes longer. Raises ScenarioError."""
+        """Continue until an agent runs this handler and branch. Return its ID, or None after `limit_s`.
+
+        Raises ScenarioError for an unknown handler, branch or agent.
+        """
         self._check(sought)
         end_s = swarm.now() + limit_s
         while swarm.now() <= end_s:
@@ -168,16 +175,16 @@ class Told(GrowingTimeline):
             raise ScenarioError(f"no agent {sought.agent!r}: use one of {_ids(self.scenario.roster)}")
 
     async def from_now_until(self, swarm: mission.Swarm, mission_s: float) -> None:
-        """As `until`. Raises ScenarioError if that is over, or never comes."""
+        """Continue until `mission_s`. Raises ScenarioError if that time has passed or is infinite."""
         if not swarm.now() <= mission_s < math.inf:
             raise ScenarioError(f"a mission cannot run until {mission_s:g} s: it is at {swarm.now():g} s")
         await self.until(swarm, mission_s)
 
     async def until_idle(self, swarm: mission.Swarm, limit_s: float) -> RunOutcome | None:
-        """Go on until everybody has voted since something was last told, and all are idle; None if that takes longer.
+        """Continue until all agents have voted since the last action and are idle. Return None after `limit_s`.
 
-        What has been played by then is taken while nobody stirs: real processes go on. A vote is what makes an agent
-        notice that its chain is another than the others' (Section 3.2).
+        The snapshot is taken while no chain changes, because real processes run on. Only a vote shows an agent that its
+        chain differs from the others' (Section 3.2).
         """
         end_s = swarm.now() + limit_s
         while any(
@@ -197,7 +204,7 @@ class Told(GrowingTimeline):
         return None
 
     def _silent(self) -> set[int]:
-        """Agents that log nothing more, and so will never vote on a block of their own."""
+        """Return the agents that log no more events, and therefore never vote on a block of their own."""
         silent: set[int] = set()
         for fault in self.scenario.faults_in_order():
             if fault.stops_events:
@@ -207,15 +214,15 @@ class Told(GrowingTimeline):
         return silent
 
     async def end(self, swarm: mission.Swarm, *, reconcile_finally: bool) -> None:
-        """The end of the mission, if it has not been. Raises ScenarioError if a second final reconcile is asked for."""
+        """End the mission, if it has not ended. Raises ScenarioError if a second final reconcile is requested."""
         if swarm.played.final_reconcile is not None:
             if reconcile_finally:
                 raise ScenarioError("the final reconcile is over: a mission has one, at its end")
             return
         await self.release(swarm)
-        if not self.scenario.schedule:  # which lasts as long as the mission was meant to
+        if not self.scenario.schedule:  # a schedule lasts for the planned mission
             last_s = max([0.0, *(entry.ends_at_s for entry in self.scenario.timeline)])
-            await self.until(swarm, last_s)  # agents come back, and what is for a while passes
+            await self.until(swarm, last_s)  # agents restart, and temporary changes end
             self._set(duration_s=max(swarm.now(), INSTANT_S))
         self._set(final_reconcile=reconcile_finally or self.scenario.final_reconcile)
         await mission.settle(swarm, self.scenario)
@@ -237,7 +244,7 @@ class Told(GrowingTimeline):
 
 
 def _next_instant(mission_s: float) -> float:
-    """A little later: what is sent by then has been sent."""
+    """Return a slightly later time, at which all earlier messages have been sent."""
     return round(mission_s + INSTANT_S, 3)
 
 
@@ -246,7 +253,7 @@ def _until(mission_s: float) -> dict[str, float]:
 
 
 def _in_words(which: dict[str, Any]) -> str:
-    """As a test says it."""
+    """Return the keys as a test writes them."""
     return ", ".join(f"{key}={value!r}" for key, value in which.items()) or "every message"
 
 
@@ -255,7 +262,7 @@ def _ids(agents: Iterable[int]) -> str:
 
 
 def _entry(at_s: float, keys: dict[str, Any]) -> TimelineEntry:
-    """Raises ScenarioError."""
+    """Return the validated entry. Raises ScenarioError."""
     try:
         return TimelineEntry.model_validate({"at_s": at_s, **keys})
     except ValidationError as error:

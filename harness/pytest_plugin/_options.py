@@ -1,4 +1,4 @@
-"""What the command line of pytest says about runs; it has the last word over tests and scenarios."""
+"""Command-line options of pytest for runs. They override the values of tests and scenarios."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,24 +14,24 @@ from harness.scenario.load import parse
 
 @dataclass(frozen=True)
 class Options:
-    """None where the command line says nothing."""
+    """The options of a session. An option that is not given is None."""
 
     backend: BackendName | None
     seed: int | None
     speedup: float | None
     keep: Path | None
-    """Where all run directories are kept, absolute."""
+    """Absolute path of the directory for all run directories."""
     in_uml: bool
-    """Whether processes are to be played in User Mode Linux."""
+    """True to play processes in User Mode Linux."""
     image_from_host: bool
-    """Whether containers are made of this machine's own files."""
+    """True to make containers from this machine's files."""
     programs: Programs
     rewrite: bool
-    """Whether stories are written anew, not compared."""
+    """True to rewrite stories instead of comparing them."""
 
     @classmethod
     def of(cls, config: pytest.Config) -> "Options":
-        """Raises ScenarioError."""
+        """Return the options of a session. Raises ScenarioError."""
         backend, seed, speedup, keep = (
             config.getoption(f"--ucp-{name}") for name in ("backend", "seed", "speedup", "keep")
         )
@@ -48,8 +48,8 @@ class Options:
             config.getoption("--ucp-rewrite"),
         )
 
-    def laid_over(self, scenario: Scenario) -> Scenario:
-        """The scenario as it is to be played. Raises ScenarioError."""
+    def applied_to(self, scenario: Scenario) -> Scenario:
+        """Return the scenario with these options applied. Raises ScenarioError."""
         document = scenario.model_dump()
         if self.speedup is not None:
             document["speedup"] = self.speedup
@@ -59,7 +59,7 @@ class Options:
         return parse(document) if document != scenario.model_dump() else scenario
 
     def refuse(self, backend: BackendName) -> None:
-        """Raises MachineError, with the reason, for a backend that cannot play where the command line wants it to."""
+        """Raise MachineError if the backend cannot play in the requested kernel."""
         if self.in_uml:
             from harness.pytest_plugin._kernel_option import refuse_outside
 

@@ -1,4 +1,4 @@
-"""Where a test keeps the run that it is about."""
+"""The key under which a test item stores its run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Which YAML files are tests of ours, found out without parsing those that are not: a project has many others."""
+"""Decide which YAML files are scenarios with expectations.
+
+Other files are not parsed, because a project has many of them.
+"""
 
 import os
 import re
@@ -11,11 +14,11 @@ MAX_BYTES = 8 * 1024 * 1024
 TOP_LEVEL_KEY = re.compile(rb"^([A-Za-z_][\w-]*)[ \t]*:", re.MULTILINE)
 PLACES: pytest.StashKey[list[Path]] = pytest.StashKey()
 EXPECTED = re.compile(rb"\b(?:characteristics|figures|chains|backends|seeds)[\"']?[ \t]*:")
-NOTHING_SPECIAL = re.compile(rb"[ \t]*(?:\{[ \t]*\})?[ \t]*(?:#.*)?\s*")
+EMPTY_SECTION = re.compile(rb"[ \t]*(?:\{[ \t]*\})?[ \t]*(?:#.*)?\s*")
 
 
-def is_asked_for(path: Path, config: pytest.Config) -> bool:
-    """Whether it, or a directory round it, is a testpath or named on the command line; `pytest .` names the root."""
+def is_selected(path: Path, config: pytest.Config) -> bool:
+    """Return whether a test path or a path on the command line contains the file; `pytest .` names the root."""
     if PLACES not in config.stash:
         config.stash[PLACES] = _places(config)
     return any(path.is_relative_to(place) for place in config.stash[PLACES])
@@ -31,16 +34,17 @@ def _places(config: pytest.Config) -> list[Path]:
 
 
 def _matching(root: Path, pattern: str) -> Iterable[Path]:
-    """What a testpath stands for, which may be a pattern."""
+    """Return the paths that match a test path, which may be a pattern."""
     path = root / pattern
     return [path] if path.exists() else root.glob(pattern)
 
 
-def is_ours(path: Path) -> bool:
-    """Whether it looks like a scenario with an `expect` section: by its top-level keys, which begin a line.
+def is_expectation_scenario(path: Path) -> bool:
+    """Return whether the file looks like a scenario with an `expect` section, judged by its top-level keys.
 
-    The section has one of its keys. Where it is empty or its keys are misspelt, all top-level keys are a scenario's,
-    and in the second case more than a name: other tools' tests have names and expect things too.
+    The section must contain one of its keys. If it is empty, all top-level keys must be keys of a scenario. If its keys
+    are misspelt, the file must also have more keys than `name` and `expect`, because tests of other tools have these
+    two.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -55,7 +59,7 @@ def is_ours(path: Path) -> bool:
     end = min((key.start() for key in keys.values() if key.start() > begin), default=len(text))
     if EXPECTED.search(text, begin, end):
         return True
-    empty = NOTHING_SPECIAL.fullmatch(text, begin, end) is not None
+    empty = EMPTY_SECTION.fullmatch(text, begin, end) is not None
     return (empty or keys.keys() > {b"name", b"expect"}) and _are_keys_of_a_scenario(keys)
 
 

@@ -1,4 +1,4 @@
-"""What was found about a run, as a test asks for it."""
+"""Verdicts and figures of a run, for tests."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ EVIDENCE_SHOWN = 5
 
 @dataclass(frozen=True, repr=False)
 class JudgementInTest:
-    """What was judged, under its number or key; shown by a failing assert, it says why."""
+    """A verdict under its number or key. In a failing assert, its text contains the reason."""
 
     key: str
     name: str
@@ -29,19 +29,19 @@ class JudgementInTest:
 
     @property
     def title(self) -> str:
-        """ "characteristic 6, one uniform chain", "steps"."""
+        """ "characteristic 6, one uniform chain" or "steps"."""
         return self.key if self.key in BESIDE else f"characteristic {self.key}, {self.name}"
 
     @property
     def holds(self) -> bool:
-        """Whether the verdict is the good one: `holds`, `as specified`, `agree` or `finished`."""
+        """True for the good verdict: `holds`, `as specified`, `agree` or `finished`."""
         return kind_of(self.verdict) == "good"
 
     def __repr__(self) -> str:
         return f"<{self.title}: {self.verdict}: {self.reason}>"
 
     def lines(self) -> list[str]:
-        """The verdict in a line, and its evidence."""
+        """Return the verdict as one line, followed by its evidence."""
         lines = [f"{self.title}: {self.verdict}: {self.reason}"]
         lines += [f"    agent {finding.agent_id}: {finding.detail}" for finding in self.evidence[:EVIDENCE_SHOWN]]
         if len(self.evidence) > EVIDENCE_SHOWN:

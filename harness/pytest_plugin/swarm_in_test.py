@@ -1,4 +1,4 @@
-"""The swarm of a test, which tells what happens to it: any backend, mission seconds, one sentence after another."""
+"""The fixture `swarm`: a swarm on any backend that a test controls, action by action, in mission seconds."""
 
 import asyncio
 import math
@@ -20,7 +20,7 @@ from harness.play.backend import Backend
 from harness.play.backends import BACKENDS
 from harness.play.mission import RunOutcome, Sought
 from harness.play.progress import Silent
-from harness.pytest_plugin._live_story import Sentence, Told
+from harness.pytest_plugin._live_timeline import Action, LiveTimeline
 from harness.pytest_plugin.findings import Findings, JudgementInTest
 from harness.run.run import Recording, Run
 from harness.scenario import Scenario
@@ -31,11 +31,11 @@ _VERBS = [*(kind.what for kind in ASKED_FOR), *INJECTIONS]
 
 
 class RunEndedError(Exception):
-    """The run has ended before the test: an agent or a vehicle failed, or the machine."""
+    """The run ended before the test, because an agent, a vehicle or the machine failed."""
 
 
 class _Block(AbstractContextManager[None]):
-    """What a verb returns, for `with`: at the end of a block that ends well what was told is undone."""
+    """The result of an action, for `with`. It undoes the action at the end of the block, unless the block failed."""
 
     def __init__(self, undo: Callable[[], object]) -> None:
         self._undo = undo
@@ -56,7 +56,7 @@ class Swarm:
     """
 
     def __init__(self, scenario: Scenario, seed: int, backend: BackendName, out: Path) -> None:
-        self._told = Told(scenario)
+        self._timeline = LiveTimeline(scenario)
         chosen = BACKENDS[backend]
         chosen.refuse(scenario)
         self._recording = Recording(scenario, seed, out, backend)
@@ -68,7 +68,7 @@ class Swarm:
         self._thread = ThreadPoolExecutor(1, "ucp-swarm")
         self._playing: Future[Any] = self._thread.submit(self._play, chosen, seed)
         try:
-            wait((self._told.begun, self._playing), return_when=FIRST_COMPLETED)
+            wait((self._timeline.started, self._playing), return_when=FIRST_COMPLETED)
             if self._playing.done():
                 self._playing.result()
         except BaseException:
@@ -79,16 +79,14 @@ class Swarm:
         return f"<swarm, run in {self.directory}>"
 
     def _play(self, backend: Backend, seed: int) -> RunOutcome:
-        scenario, directory = self._told.scenario, self._recording.directory
+        scenario, directory = self._timeline.scenario, self._recording.directory
         with self._runner:
             try:
                 opening = backend.open(scenario, seed, directory, Silent(), self._interrupted, told=True)
-                return self._runner.run(mission.play_on(opening, scenario, self._told.story))
+                return self._runner.run(mission.play_on(opening, scenario, self._timeline.play))
             except HarnessError as error:
                 self._recording.fail(error)
                 raise
-
-    # The network
 
     def partition(self, *groups: list[int], for_s: float | None = None) -> AbstractContextManager[None]:
         """Cut the groups of agents off from each other. Agents in no group form another group.
@@ -102,7 +100,7 @@ class Swarm:
     def _for_a_block(self, **entry: Any) -> AbstractContextManager[None]:
         __tracebackhide__ = True
         at_s = self._change(**entry)
-        return _Block(partial(self._act, lambda swarm: self._told.undo(swarm, at_s)))
+        return _Block(partial(self._act, lambda swarm: self._timeline.undo(swarm, at_s)))
 
     def heal(self) -> None:
         """End the partition."""
@@ -132,7 +130,10 @@ class Swarm:
         for_s: float | None = None,
         **keys: Any,
     ) -> AbstractContextManager[None]:
-        """Set the conditions from one agent to another: `link(1, 2, loss=0.9)`; with `both`, also the way back."""
+        """Set the conditions from one agent to another: `link(1, 2, loss=0.9)`.
+
+        `both` includes the opposite direction.
+        """
         __tracebackhide__ = True
         if not keys:
             raise ScenarioError("a link needs a condition of its own, such as loss=0.9")
@@ -147,15 +148,13 @@ class Swarm:
         """
         __tracebackhide__ = True
         words = _of_message(message, which)
-        number = self._act(lambda swarm: self._told.hold(swarm, **words))
-        return _Block(partial(self._act, lambda swarm: self._told.let_go(swarm, number)))
+        number = self._act(lambda swarm: self._timeline.hold(swarm, **words))
+        return _Block(partial(self._act, lambda swarm: self._timeline.let_go(swarm, number)))
 
     def release(self, message: str | None = None, **which: Any) -> None:
         """Deliver the messages that `hold` delays by these criteria, or all delayed messages."""
         __tracebackhide__ = True
-        self._act(lambda swarm: self._told.release(swarm, **_of_message(message, which)))
-
-    # The agents
+        self._act(lambda swarm: self._timeline.release(swarm, **_of_message(message, which)))
 
     def __getattr__(self, verb: str) -> Callable[..., None]:
         """Return the method of a fault or an injection; it takes the keys of its timeline entry.
@@ -181,29 +180,27 @@ class Swarm:
         return [*super().__dir__(), *_VERBS]
 
     def _inject(self, verb: str, message: str | None = None, **keys: Any) -> None:
-        """A rogue node sends this from now on."""
+        """Let the rogue node send this from now on."""
         __tracebackhide__ = True
         self._change(**{verb: _of_message(message, keys)})
-
-    # Time
 
     @property
     def now_s(self) -> float:
         """Mission seconds since the start."""
         __tracebackhide__ = True
-        return float(self._hear(_now))
+        return float(self._run_action(_now))
 
     def run_for(self, seconds: float) -> None:
         """Let the mission go on for `seconds` mission seconds."""
         __tracebackhide__ = True
         if not 0 <= seconds < math.inf:
             raise ScenarioError(f"a mission cannot run for {seconds:g} s: use a time above 0")
-        self._act(lambda swarm: self._told.until(swarm, swarm.now() + seconds))
+        self._act(lambda swarm: self._timeline.until(swarm, swarm.now() + seconds))
 
     def run_until(self, mission_s: float) -> None:
         """Let the mission go on until `mission_s`, a mission second in the future."""
         __tracebackhide__ = True
-        self._act(lambda swarm: self._told.from_now_until(swarm, mission_s))
+        self._act(lambda swarm: self._timeline.from_now_until(swarm, mission_s))
 
     def wait_for(
         self, handler: str, branch: str | None = None, agent: int | None = None, limit_s: float = 1800.0
@@ -217,7 +214,7 @@ class Swarm:
         if not 0 <= limit_s < math.inf:
             raise ScenarioError(f"a wait needs a limit of 0 s or more, not {limit_s:g} s")
         sought = Sought(handler, branch, agent)
-        found = self._act(lambda swarm: self._told.until_run(swarm, sought, limit_s))
+        found = self._act(lambda swarm: self._timeline.until_run(swarm, sought, limit_s))
         if found is None:
             who = "no agent has" if agent is None else f"agent {agent} has not"
             how = "" if branch is None else f" with the branch {branch!r}"
@@ -231,7 +228,7 @@ class Swarm:
         takes longer than `limit_s` mission seconds.
         """
         __tracebackhide__ = True
-        played = self._act(lambda swarm: self._told.until_idle(swarm, limit_s))
+        played = self._act(lambda swarm: self._timeline.until_idle(swarm, limit_s))
         if played is None:
             raise AssertionError(f"within {limit_s:g} mission seconds not every agent has voted and become idle")
         self._seen = self._judge_by_now(played)
@@ -239,9 +236,9 @@ class Swarm:
     def final_reconcile(self) -> None:
         """End the mission: stop events, lift all conditions, and let one agent after another reconcile."""
         __tracebackhide__ = True
-        self._act(lambda swarm: self._told.end(swarm, reconcile_finally=True))
+        self._act(lambda swarm: self._timeline.end(swarm, reconcile_finally=True))
 
-    # What there is by now
+    # Queries
 
     def characteristic(self, number: int) -> JudgementInTest:
         """Return the verdict by now on a characteristic, 1 to 6: `holds`, `verdict`, `reason` and `evidence`."""
@@ -275,69 +272,70 @@ class Swarm:
         return self.directory / "report.html"
 
     def _findings(self) -> Findings:
-        """As of the first look since the last sentence, or of the moment for which `wait_idle` has waited."""
+        """Return the findings at the first query after the last action, or at the end of `wait_idle`."""
         __tracebackhide__ = True
         if self._seen is None:
-            self._seen = self._judge_by_now(self._hear(_snapshot))
+            self._seen = self._judge_by_now(self._run_action(_snapshot))
         return self._seen
 
     def _judge_by_now(self, played: RunOutcome) -> Findings:
-        self._recording.tell(self._told.scenario)
+        self._recording.tell(self._timeline.scenario)
         self._recording.take_down(played)
         return Findings(self.directory, checker.check(checker.gather(RunArchive(self.directory))))
 
-    # Between the test and the run
-
     def _change(self, **entry: Any) -> float:
         __tracebackhide__ = True
-        return float(self._act(lambda swarm: self._told.change(swarm, **entry)))
+        return float(self._act(lambda swarm: self._timeline.change(swarm, **entry)))
 
-    def _act(self, sentence: Sentence) -> Any:
+    def _act(self, action: Action) -> Any:
         __tracebackhide__ = True
         self._seen = None
-        return self._hear(sentence)
+        return self._run_action(action)
 
-    def _hear(self, sentence: Sentence) -> Any:
+    def _run_action(self, action: Action) -> Any:
         __tracebackhide__ = True
         answer: Future[Any] = Future()
-        self._in_loop(self._told.hear, sentence, answer)
+        self._in_loop(self._timeline.queue_action, action, answer)
         wait((answer, self._playing), return_when=FIRST_COMPLETED)
         if not answer.done():
             ended = self._playing.result()
             if ended.outcome == "not supported":
                 pytest.skip(ended.outcome_detail or ended.outcome)
             raise RunEndedError(ended.outcome_detail or "the run has ended")
-        if mistake := answer.exception():
-            raise ScenarioError(str(mistake)) from None
+        if error := answer.exception():
+            raise ScenarioError(str(error)) from None
         return answer.result()
 
     def _in_loop(self, callback: Callable[..., None], *arguments: Any) -> None:
-        with suppress(RuntimeError):  # the loop has ended, and the run with it
+        with suppress(RuntimeError):  # the loop and the run have ended
             self._loop.call_soon_threadsafe(callback, *arguments)
 
     def finish(self, settle: bool) -> Run:
-        """End the run and judge it: after the agents have settled if `settle`, or at once. Raises MachineError."""
-        with suppress(RunEndedError):  # the record says why
+        """End the run and judge it: after the agents have settled if `settle` is true, otherwise at once.
+
+        Raises MachineError.
+        """
+        with suppress(RunEndedError):  # the record contains the reason
             if settle:
-                self._hear(lambda swarm: self._told.end(swarm, reconcile_finally=False))
+                self._run_action(lambda swarm: self._timeline.end(swarm, reconcile_finally=False))
             else:
-                self._hear(self._told.break_off)
-        self._in_loop(self._told.stop)
+                self._run_action(self._timeline.break_off)
+        self._in_loop(self._timeline.stop)
         return self._judge()
 
     def close(self) -> None:
-        """End the run at once, if nothing has ended it before, and judge what there is."""
+        """End the run at once if it is still active, and judge it."""
         self._in_loop(self._interrupted.set)
-        self._in_loop(self._told.stop)
+        self._in_loop(self._timeline.stop)
         self._thread.shutdown()
         if not self._judged:
-            with suppress(HarnessError):  # it could not even begin, or the disk is full
+            with suppress(HarnessError):  # the run could not start, or the disk is full
                 self._judge()
 
     def _judge(self) -> Run:
         played = self._playing.result()
         self._judged = True
-        self._recording.tell(self._told.scenario)
+        self._recording.tell(self._timeline.scenario)
         return self._recording.end(played)
 
 

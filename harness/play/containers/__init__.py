@@ -1,7 +1,7 @@
-"""The Docker backend: the vehicles and agents of a run in containers, on the network that processes have.
+"""The Docker backend: vehicles and agents in containers, on the same network as processes.
 
-Docker builds no network. A small container for each vehicle holds a network namespace, in which only `lo` exists.
-`netem` puts the end of the vehicle's cable into that namespace before the first program starts. The vehicle, its agent,
-and any replacement of them join the namespace. So conditions and partitions apply from outside, and containers need no
-capability and no tool for them.
+Docker does not build the network. For each vehicle, a small container holds a network namespace with nothing but `lo`.
+`netem` moves the end of the vehicle's cable into this namespace before the first program starts. The vehicle, its agent
+and their replacements join the namespace. Conditions and partitions therefore apply from outside, and containers need
+no capabilities and no network tools.
 """

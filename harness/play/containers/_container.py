@@ -1,4 +1,4 @@
-"""One container as a program of the lab, and the options it is created with."""
+"""A container as a program of the lab, and the options with which it is created."""
 
 import asyncio
 import contextlib
@@ -23,21 +23,21 @@ STDOUT, STDERR = 1, 2
 _FRAME = struct.Struct(">B3xI")
 _READ_BYTES = 1 << 16
 _LAST_WORDS_S = 1.0
-"""Wall time after a container's end in which the last of what it said arrives."""
-_KILLED_BY_SIGNAL = 128  # a shell's and docker-init's way to say which
+"""Wall time after the end of a container in which its last output arrives."""
+_KILLED_BY_SIGNAL = 128  # exit status of a shell or of docker-init after a signal, minus its number
 _NO_SUCH_PROGRAM = 127
 
 
 class Output:
-    """What a container says, read from the stream of `docker attach` and appended to files.
+    """Copies the output of a container from the stream of `docker attach` to files.
 
-    The stream has frames: which output, 3 bytes of nothing, length (u32, big-endian), the bytes (Docker Engine API,
-    "Attach to a container", stream format).
+    The stream consists of frames: number of the output, 3 unused bytes, length (u32, big-endian), content (Docker
+    Engine API, "Attach to a container", stream format).
     """
 
     def __init__(self, stream: Any, stdout: Path, stderr: Path) -> None:
-        """`stream` is what the SDK's attach_socket returns. Raises OSError if a file cannot be had."""
-        self._stream = stream  # and with it the answer that owns the socket
+        """`stream` is the result of the SDK's attach_socket. Raises OSError if a file cannot be opened."""
+        self._stream = stream  # a reference keeps the HTTP response, which owns the socket, alive
         self._socket: socket.socket = stream._sock
         self._socket.setblocking(False)
         self._files: dict[int, BinaryIO] = {STDOUT: stdout.open("ab"), STDERR: stderr.open("ab")}
@@ -57,7 +57,7 @@ class Output:
             self.close()
             return
         self._unread += data
-        with contextlib.suppress(OSError):  # a disk that is full: the container must not wait for it
+        with contextlib.suppress(OSError):  # the disk may be full, and the container must not wait
             self._write()
 
     def _write(self) -> None:
@@ -84,7 +84,7 @@ class Output:
 
 
 class Container:
-    """A `Program`. Its lab tells it of its end (`has_ended`)."""
+    """A container as a `Program`. The lab calls `has_ended` at its end."""
 
     def __init__(self, engine: Engine, identity: str, name: str, output: Output, memory_mib: int | None) -> None:
         self._engine = engine
@@ -116,16 +116,16 @@ class Container:
 
     async def send_signal(self, number: int) -> None:
         if number == signal.SIGKILL and self._paused:
-            await self.resume()  # the engine kills none that stands still
-        await self._tell("signal", self._engine.api.kill, signal.Signals(number).name)
+            await self.resume()  # the engine cannot kill a paused container
+        await self._call_engine("signal", self._engine.api.kill, signal.Signals(number).name)
 
     async def pause(self) -> None:
-        await self._tell("pause", self._engine.api.pause)
+        await self._call_engine("pause", self._engine.api.pause)
         self._paused = True
 
     async def resume(self) -> None:
         if self._paused:
-            await self._tell("resume", self._engine.api.unpause)
+            await self._call_engine("resume", self._engine.api.unpause)
             self._paused = False
 
     async def terminate(self, grace_s: float) -> int:
@@ -137,16 +137,16 @@ class Container:
             await self.send_signal(signal.SIGKILL)
             return await self.wait()
 
-    async def _tell(self, what: str, call: Any, *arguments: Any) -> None:
+    async def _call_engine(self, what: str, call: Any, *arguments: Any) -> None:
         if self._ended.done():
             return
         try:
             await self._engine.ask(f"{what} {self.name}", call, self.identity, *arguments)
         except docker.errors.APIError as error:
-            if error.status_code not in (404, 409):  # it has ended a moment ago
+            if error.status_code not in (404, 409):  # the container has just ended
                 raise
 
-    # What its lab hears of it
+    # Events of the engine, forwarded by the lab
 
     def ran_out_of_memory(self) -> None:
         self._out_of_memory = True
@@ -161,7 +161,7 @@ class Container:
         self.close(returncode)
 
     def close(self, returncode: int = -signal.SIGKILL) -> None:
-        """It has ended, or is of no interest any more."""
+        """Set the return code, and close the files."""
         self._output.close()
         if not self._ended.done():
             self._ended.set_result(returncode)
@@ -173,22 +173,23 @@ def _is_signal(number: int) -> bool:
 
 MEBIBYTE = 1 << 20
 INIT = 1
-"""Processes of a container that are not the program's: docker-init, which passes signals on."""
+"""Number of processes in a container besides the program: docker-init, which forwards signals."""
 
 
 def recipe(
     api: docker.APIClient, image: Image, argv: Sequence[str], kept: Sequence[Path], network_mode: str, limits: Docker
 ) -> dict[str, Any]:
-    """Keywords for the SDK's create_container: no capability, no way to write but into /tmp and what is `kept`.
+    """Return keywords for the SDK's create_container.
 
-    That is the run directory, and where the vehicle has its keys, if it has any.
+    The container has no capabilities. It can write only into /tmp and the directories in `kept`: the run directory, and
+    the vehicle's key directory if it has one.
     """
     command = image.command(argv)
     shared = [Mount(str(path), str(path), type="bind", read_only=True) for path in image.shared(argv)]
     host_config = api.create_host_config(
         network_mode=network_mode,
         mounts=[*shared, *(Mount(str(path), str(path), type="bind") for path in kept)],
-        tmpfs={"/tmp": ""},  # noqa: S108  (the container's own)
+        tmpfs={"/tmp": ""},  # noqa: S108  (inside the container)
         read_only=True,
         init=True,
         cap_drop=["ALL"],
@@ -205,12 +206,12 @@ def recipe(
     }
 
 
-def _limits(asked: Docker) -> dict[str, Any]:
+def _limits(limits_asked: Docker) -> dict[str, Any]:
     limits: dict[str, Any] = {}
-    if asked.memory_mib is not None:
-        limits["mem_limit"] = limits["memswap_limit"] = asked.memory_mib * MEBIBYTE
-    if asked.cpus is not None:
-        limits["nano_cpus"] = round(asked.cpus * 1e9)
-    if asked.pids is not None:
-        limits["pids_limit"] = asked.pids + INIT
+    if limits_asked.memory_mib is not None:
+        limits["mem_limit"] = limits["memswap_limit"] = limits_asked.memory_mib * MEBIBYTE
+    if limits_asked.cpus is not None:
+        limits["nano_cpus"] = round(limits_asked.cpus * 1e9)
+    if limits_asked.pids is not None:
+        limits["pids_limit"] = limits_asked.pids + INIT
     return limits

@@ -1,6 +1,6 @@
-"""The backend of containers: as that of processes, but every vehicle and every agent is in a container of its own.
+"""The Docker backend. It equals the process backend, except that each vehicle and agent runs in its own container.
 
-The docker SDK takes its time to import, which who plays no containers need not wait for.
+The docker SDK is imported only when containers are played, because the import is slow.
 """
 
 from collections.abc import Callable
@@ -24,20 +24,20 @@ class Containers(Processes):
 
     def refuse(self, scenario: Scenario) -> None:
         from harness.play.containers._container_preflight import (
-            refuse_debuggers_that_are_not_in_the_image,
-            refuse_what_docker_cannot,
+            check_debuggers,
+            check_docker,
         )
         from harness.play.process.process_preflight import refuse_what_programs_cannot
 
-        refuse_debuggers_that_are_not_in_the_image(scenario)
+        check_debuggers(scenario)
         refuse_what_programs_cannot(scenario)
-        refuse_what_docker_cannot(scenario)
+        check_docker(scenario)
         self.agent_commands(scenario)
 
     def agent_command(self, scenario: Scenario, agent_id: int) -> list[str]:
         command = scenario.command_of(agent_id)
         if scenario.docker.image is not None and command is not None:
-            return list(command)  # a program in the image
+            return list(command)  # the path of a program in the image
         return super().agent_command(scenario, agent_id)
 
     async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "MissionLab":

@@ -1,10 +1,10 @@
-"""The lab of containers: `netem`'s network, and on it containers in place of processes.
+"""The lab of the Docker backend: the network of `netem`, with containers in place of processes.
 
     async with await ContainerLab.open(scenario, rundir, say) as lab:
         agent = await lab.spawn(7, [...], role="agent", ...)
 
-Every vehicle has a holder, a container that only keeps a network namespace; see the package. Containers share the run
-directory, at the same path, so control sockets and files are where they are for processes.
+Each vehicle has a holder, a container that only keeps a network namespace (see the package). Containers see the run
+directory under the same path, so control sockets and files have the same paths as with processes.
 """
 
 import asyncio
@@ -37,11 +37,11 @@ from netem.errors import SpawnError
 from netem.lab import Lab
 
 LOOK_EVERY_S = 5.0
-"""Wall time between two looks at whether the engine still answers."""
+"""Wall time between two checks that the engine still answers."""
 
 
 class ContainerLab:
-    """Made by `ContainerLab.open` only. Errors are DockerError, and netem's."""
+    """The lab, made by `ContainerLab.open`. Errors are DockerError and those of netem."""
 
     def __init__(self, engine: Engine, rundir: RunDirectory, scenario: Scenario) -> None:
         self._engine = engine
@@ -52,12 +52,12 @@ class ContainerLab:
         self._ours: Image | None = None
         self._named: Image | None = None
         self._holders: dict[str, int] = {}
-        """ID of a holder -> its vehicle."""
+        """Container ID of a holder -> vehicle."""
         self._containers: dict[str, Container] = {}
-        """ID -> those that were started, whether they run or not."""
-        self._lives: Counter[tuple[int, str]] = Counter()
+        """Container ID -> each started container, including ended ones."""
+        self._incarnations: Counter[tuple[int, str]] = Counter()
         self._networks: set[int] = set()
-        """The vehicles' network namespaces, by inode number."""
+        """Inode numbers of the vehicles' network namespaces."""
         self._events: Events | None = None
         self.network: Lab
         self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -65,7 +65,10 @@ class ContainerLab:
 
     @classmethod
     async def open(cls, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "ContainerLab":
-        """Bring up the network with a holder for each vehicle. Raises DockerError, or as netem.lab.Lab.open does."""
+        """Start the network with a holder for each vehicle.
+
+        Raises DockerError, and the errors of netem.lab.Lab.open.
+        """
         engine = await asyncio.to_thread(Engine.connect)
         lab = cls(engine, rundir, scenario)
         try:
@@ -73,44 +76,46 @@ class ContainerLab:
             say("starting containers")
             await lab._hold_networks(scenario)
             say("building the lab")
-            await lab._lay_cables(scenario, rundir.lab_log)
+            await lab._connect_cables(scenario, rundir.lab_log)
         except BaseException:
             with contextlib.suppress(DockerError):
                 await lab._remove_containers()
-            lab._let_go()
+            lab._close_all()
             raise
         return lab
 
     async def _choose_images(self, scenario: Scenario, say: Callable[[str], None]) -> None:
-        asked = scenario.docker
+        requested = scenario.docker
         loop = asyncio.get_running_loop()
-        over = threading.Event()
+        stopped = threading.Event()
 
-        def tell(word: str) -> None:
-            if over.is_set():
+        def report_step(word: str) -> None:
+            if stopped.is_set():
                 raise DockerError("the build of the image was interrupted")
             loop.call_soon_threadsafe(say, word)
 
         def choose() -> tuple[Image | None, Image | None]:
-            named = None if asked.image is None else _images.named(self._engine, asked.image)
+            named = None if requested.image is None else _images.named(self._engine, requested.image)
             if named is not None and scenario.vehicles.kind == "none" and self._in_named == set(scenario.roster):
                 return None, named
-            from_host = asked.image_from_host
-            return _images.from_host(self._engine) if from_host else _images.project(self._engine, tell), named
+            from_host = requested.image_from_host
+            return _images.from_host(self._engine) if from_host else _images.project(self._engine, report_step), named
 
         try:
             self._ours, self._named = await self._engine.in_thread(choose)
         finally:
-            over.set()
+            stopped.set()
 
     async def _hold_networks(self, scenario: Scenario) -> None:
         label = f"{ownership.RUN}={self._name}"
-        self._events = await self._engine.in_thread(Events, self._engine, label, self._hear, asyncio.get_running_loop())
+        self._events = await self._engine.in_thread(
+            Events, self._engine, label, self._on_event, asyncio.get_running_loop()
+        )
         image = await self._engine.in_thread(_images.from_host, self._engine)
-        held = await asyncio.gather(
+        results = await asyncio.gather(
             *(self._hold(vehicle, image) for vehicle in scenario.roster), return_exceptions=True
         )
-        for error in filter(None, held):
+        for error in filter(None, results):
             raise error
 
     async def _hold(self, vehicle: int, image: Image) -> None:
@@ -118,7 +123,7 @@ class ContainerLab:
         self._holders[identity] = vehicle
         await self._start(name, identity)
 
-    async def _lay_cables(self, scenario: Scenario, log: Path) -> None:
+    async def _connect_cables(self, scenario: Scenario, log: Path) -> None:
         networks: dict[int, int] = {}
         try:
             for identity, vehicle in self._holders.items():
@@ -135,18 +140,16 @@ class ContainerLab:
         self.engine = self.network.engine
 
     def _open_network(self, identity: str) -> int:
-        """A descriptor of the network namespace that a holder keeps."""
+        """Return a file descriptor of the network namespace that a holder keeps."""
         state = self._engine.do("look at a container", self._engine.api.inspect_container, identity)["State"]
         pid = state["Pid"]
         with contextlib.suppress(OSError):
-            if identity in Path(f"/proc/{pid}/cgroup").read_text():  # and not some process of the same number
+            if identity in Path(f"/proc/{pid}/cgroup").read_text():  # the process ID may belong to another process
                 return os.open(f"/proc/{pid}/ns/net", os.O_RDONLY | os.O_CLOEXEC)
         raise DockerError(
             "the Docker engine runs in a virtual machine or on another machine, so the harness cannot connect its "
             "containers to a network: use an engine that runs on this machine"
         )
-
-    # As netem.lab.Lab
 
     async def spawn(
         self,
@@ -159,10 +162,10 @@ class ContainerLab:
         stderr: Path,
         role: Role,
     ) -> Container:
-        """Start a program in a container of its own, in the vehicle's network."""
+        """Start a program in its own container, in the vehicle's network."""
         holder = next(identity for identity, held in self._holders.items() if held == vehicle)
         image = self._named if role == "agent" and vehicle in self._in_named else self._ours
-        assert image is not None, "it is there for whoever needs it"
+        assert image is not None, "the image was chosen before"
         name, identity = await self._create(
             vehicle,
             role,
@@ -192,7 +195,7 @@ class ContainerLab:
         return await self.network.read()
 
     async def watch(self) -> None:
-        """Raises DockerError once the engine is gone or silent, or somebody ends a holder."""
+        """Raise DockerError if the engine has stopped or does not answer, or if a holder was stopped from outside."""
         while True:
             await asyncio.wait({self._failure}, timeout=LOOK_EVERY_S)
             if self._failure.done():
@@ -206,10 +209,10 @@ class ContainerLab:
         try:
             await self._remove_containers()
         except DockerError:
-            self._kill_by_hand()
+            self._kill_processes()
             raise
         finally:
-            self._let_go()
+            self._close_all()
             await self.network.close()
 
     async def __aenter__(self) -> Self:
@@ -221,21 +224,19 @@ class ContainerLab:
         with contextlib.suppress(DockerError):
             await self.close()
 
-    # Containers
-
     async def _create(
         self, vehicle: int, role: str, image: Image, argv: Sequence[str], network: str, limits: Docker, **settings: Any
     ) -> tuple[str, str]:
-        """Create a container; its name and ID."""
-        self._lives[vehicle, role] += 1
-        life = self._lives[vehicle, role]
+        """Create a container. Return its name and ID."""
+        self._incarnations[vehicle, role] += 1
+        life = self._incarnations[vehicle, role]
         name = f"{self._name}-{role}-{vehicle}" + (f"-{life}" if life > 1 else "")
         kept = [self._rundir.path, *([self._rundir.keys[vehicle]] if vehicle in self._rundir.keys else [])]
-        given = recipe(self._engine.api, image, argv, kept, network, limits)
+        options = recipe(self._engine.api, image, argv, kept, network, limits)
         labels = ownership.labels(self._name, vehicle, role)
         try:
-            made = await self._engine.ask(
-                f"create {name}", self._engine.api.create_container, name=name, labels=labels, **given, **settings
+            created = await self._engine.ask(
+                f"create {name}", self._engine.api.create_container, name=name, labels=labels, **options, **settings
             )
         except docker.errors.APIError as error:
             if error.status_code == 409:
@@ -244,7 +245,7 @@ class ContainerLab:
                     f"the container with `ucp-harness clean`, otherwise with docker rm -f {name}"
                 ) from None
             raise SpawnError(f"the container {name} cannot be created: {error.explanation}") from None
-        return name, made["Id"]
+        return name, created["Id"]
 
     async def _start(self, name: str, identity: str) -> None:
         try:
@@ -252,8 +253,8 @@ class ContainerLab:
         except docker.errors.APIError as error:
             raise SpawnError(f"the container {name} cannot be started: {error.explanation}") from None
 
-    def _hear(self, event: dict[str, Any]) -> None:
-        """What the engine says of our containers."""
+    def _on_event(self, event: dict[str, Any]) -> None:
+        """Process an event of the engine about a container of this lab."""
         if self._closed or self._failure.done():
             return
         if not event:
@@ -278,10 +279,10 @@ class ContainerLab:
 
     def _fail(self, error: DockerError) -> None:
         self._failure.set_exception(error)
-        self._failure.exception()  # it may be that nobody asks for it
+        self._failure.exception()  # otherwise asyncio would report an exception that is not retrieved
 
     async def _remove_containers(self) -> None:
-        """All of the run, also those that were under way when somebody stopped waiting for them."""
+        """Remove all containers of the run, including those whose creation was interrupted."""
         self._closed = True
         await self._engine.settle()
         containers = await self._engine.ask(
@@ -297,15 +298,15 @@ class ContainerLab:
         for error in filter(None, removed):
             raise error
 
-    def _kill_by_hand(self) -> None:
-        """End every process in our networks: the engine does not answer."""
+    def _kill_processes(self) -> None:
+        """Kill all processes in the lab's networks, because the engine does not answer."""
         for process in Path("/proc").iterdir():
             if process.name.isdecimal():
                 with contextlib.suppress(OSError):
                     if (process / "ns/net").stat().st_ino in self._networks:
                         os.kill(int(process.name), signal.SIGKILL)
 
-    def _let_go(self) -> None:
+    def _close_all(self) -> None:
         self._closed = True
         if self._events is not None:
             self._events.close()

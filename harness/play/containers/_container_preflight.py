@@ -1,4 +1,4 @@
-"""What containers on this machine cannot do, found out before anything starts."""
+"""Check before a run that this machine can play it in containers."""
 
 import os
 import shutil
@@ -9,8 +9,8 @@ from harness.play.containers.docker_engine import DockerError, Engine
 from harness.scenario import Scenario
 
 
-def refuse_what_docker_cannot(scenario: Scenario) -> None:
-    """Raises DockerError if there is no engine here that we may use, or not the image that is asked for."""
+def check_docker(scenario: Scenario) -> None:
+    """Raise DockerError if no usable engine exists here, or if the requested image is missing."""
     engine = Engine.connect()
     try:
         require_root()
@@ -20,8 +20,11 @@ def refuse_what_docker_cannot(scenario: Scenario) -> None:
         engine.close()
 
 
-def refuse_debuggers_that_are_not_in_the_image(scenario: Scenario) -> None:
-    """Raises DockerError. Vehicles are in the project's image, which has none, or share this machine's directories."""
+def check_debuggers(scenario: Scenario) -> None:
+    """Raise DockerError if a vehicle's debugger is missing in its image.
+
+    The project's image has no debuggers. An image from the host has those in the shared directories.
+    """
     setups = (scenario.vehicles.setup_of(vehicle) for vehicle in scenario.roster)
     for debugger in sorted({setup.debugger for setup in setups if setup.debugger is not None}):
         if not scenario.docker.image_from_host:
@@ -38,6 +41,6 @@ def refuse_debuggers_that_are_not_in_the_image(scenario: Scenario) -> None:
 
 
 def require_root() -> None:
-    """Raises DockerError."""
+    """Raise DockerError unless this user is root."""
     if os.geteuid() != 0:
         raise DockerError("the Docker backend must be root to add network interfaces to containers: use sudo")

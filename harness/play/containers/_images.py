@@ -1,8 +1,8 @@
-"""What containers are made from.
+"""The images of containers.
 
-project     built from the Dockerfile beside this file, out of the installed packages `ucp` and `sitl`
+project     built from the Dockerfile beside this file, with the installed packages `ucp` and `sitl`
 named       an image that the scenario names
-from_host   an empty image, with this machine's programs, interpreter and packages mounted read-only: no registry needed
+from_host   an empty image with this machine's programs and packages mounted read-only; it needs no registry
 """
 
 import hashlib
@@ -34,9 +34,9 @@ INSTEAD = "use this machine's files (--image-from-host, `docker.image_from_host`
 
 @dataclass(frozen=True)
 class Image:
-    """`python` is the interpreter in it; `mounted` are directories of this machine that it shares, read-only.
+    """An image. `python` is its interpreter, and `mounted` are directories of this machine that it shares read-only.
 
-    Into an image that is `foreign` nothing is mounted: a path there is a path in the image.
+    Nothing is mounted into a `foreign` image, because paths refer to files in the image.
     """
 
     name: str
@@ -45,21 +45,24 @@ class Image:
     foreign: bool = False
 
     def command(self, argv: Sequence[str]) -> list[str]:
-        """What starts there that which `argv` starts here."""
+        """Return the command that starts the same program inside."""
         return [self.python if word == sys.executable else word for word in argv]
 
     def environment(self, env: Mapping[str, str]) -> dict[str, str]:
-        """Of a program whose environment here would be `env`: an image has its own, but for what was set for it."""
+        """Return the environment inside.
+
+        Without shared directories, it has only variables that differ from this process.
+        """
         return {key: value for key, value in env.items() if self.mounted or os.environ.get(key) != value}
 
     def shared(self, argv: Sequence[str]) -> list[Path]:
-        """What of this machine to mount so that `argv` can be started: programs and scripts by their paths."""
+        """Return the paths of this machine to mount so that `argv` can start."""
         files = [Path(word) for word in self.command(argv) if Path(word).is_absolute() and Path(word).is_file()]
         return outermost([*self.mounted, *([] if self.foreign else map(_with_environment, files))])
 
 
 def from_host(engine: Engine) -> Image:
-    """Raises DockerError."""
+    """Return the image from the host, and create it if necessary. Raises DockerError."""
     if not _exists(engine, HOST_IMAGE):
         repository, tag = HOST_IMAGE.split(":")
         engine.do(
@@ -78,27 +81,27 @@ def host_image() -> Image:
 
 
 def is_shared(program: Path) -> bool:
-    """Whether a program of this machine is also one of an image from the host."""
+    """Return whether an image from the host contains this program."""
     mounted = host_image().mounted
     return all(any(path.is_relative_to(outer) for outer in mounted) for path in (program, program.resolve()))
 
 
 def named(engine: Engine, name: str) -> Image:
-    """Raises DockerError if it is not here."""
+    """Return the image with this name. Raises DockerError if it is missing."""
     if not _exists(engine, name):
         raise DockerError(f"this machine has no image {name}: docker pull {name}, or build it")
     return Image(name, "python3", foreign=True)
 
 
 def agents_in_named(scenario: Scenario) -> Iterable[int]:
-    """The agents that run in the image that the scenario names: all, or those whose commands are programs in it."""
+    """Return the agents that run in the scenario's image: those with a command of their own if it names any, or all."""
     if scenario.docker.image is None:
         return ()
     return scenario.foreign if isinstance(scenario.agent_command, dict) else scenario.roster
 
 
 def project(engine: Engine, say: Callable[[str], object]) -> Image:
-    """The project's image; built, with a word of every step, if it is not here. Raises DockerError."""
+    """Return the project's image. If it is missing, build it and report each step. Raises DockerError."""
     name = project_name()
     if not _exists(engine, name):
         say("building the image")
@@ -107,15 +110,15 @@ def project(engine: Engine, say: Callable[[str], object]) -> Image:
 
 
 def project_name() -> str:
-    """Of other packages, or another Dockerfile, it is another image."""
+    """Return a name that depends on the contents of the image."""
     made_of = _tar(context()) + json.dumps(build_arguments()).encode("ascii")
     return f"{PROJECT_IMAGE}:{version('ucp-harness')}-{hashlib.sha256(made_of).hexdigest()[:12]}"
 
 
 def build_arguments() -> dict[str, str]:
-    """Versions of the packages in it: those that are here."""
+    """Return the versions of packages for the image, which equal those installed here."""
     arguments = {"PYMAVLINK": version("pymavlink")}
-    with suppress(PackageNotFoundError):  # without it there are no missions with keys
+    with suppress(PackageNotFoundError):  # optional: needed only for secure missions
         arguments["CRYPTOGRAPHY"] = version("cryptography")
     return arguments
 
@@ -144,7 +147,7 @@ def _build(engine: Engine, name: str, say: Callable[[str], object]) -> None:
 
 
 def context() -> dict[str, bytes]:
-    """What the project's image is built from: the Dockerfile and the packages, as files by name."""
+    """Return the files from which the project's image is built: the Dockerfile and the packages."""
     files = {"Dockerfile": Path(__file__).with_name("Dockerfile").read_bytes()}
     for package in PACKAGES:
         root = _package(package)
@@ -155,7 +158,7 @@ def context() -> dict[str, bytes]:
 
 
 def _tar(files: Mapping[str, bytes]) -> bytes:
-    """The same files, the same bytes."""
+    """Return a reproducible archive."""
     archive = io.BytesIO()
     with tarfile.open(fileobj=archive, mode="w") as tar:
         for name, content in files.items():
@@ -166,7 +169,7 @@ def _tar(files: Mapping[str, bytes]) -> bytes:
 
 
 def _with_environment(program: Path) -> Path:
-    """The Python environment that it is a program of, for without that it is another program; else itself."""
+    """Return the virtual environment of the program if it has one, otherwise the program."""
     environment = program.parent.parent
     return environment if (environment / "pyvenv.cfg").is_file() else program
 
@@ -175,7 +178,7 @@ def _exists(engine: Engine, name: str) -> bool:
     try:
         engine.do(f"look for the image {name}", engine.api.inspect_image, name)
     except docker.errors.APIError as error:
-        if error.status_code in (400, 404):  # 400: no name that an image could have
+        if error.status_code in (400, 404):  # 400: the name is invalid
             return False
         raise DockerError(f"the image {name} cannot be used: {error.explanation}") from None
     return True
@@ -195,7 +198,7 @@ def _package(name: str) -> Path:
 
 
 def outermost(paths: Iterable[Path]) -> list[Path]:
-    """Each directory once, without those that lie in another."""
+    """Return the directories without those inside other ones."""
     roots: list[Path] = []
     for path in sorted(set(paths)):
         if not any(path.is_relative_to(outer) for outer in roots):
@@ -204,7 +207,7 @@ def outermost(paths: Iterable[Path]) -> list[Path]:
 
 
 def idle_command() -> list[str]:
-    """A program of this machine that does nothing, for ever. Raises DockerError."""
+    """Return a command that sleeps forever. Raises DockerError."""
     sleep = shutil.which("sleep")
     if sleep is None:
         raise DockerError("sleep(1) is not on PATH, and containers that hold a network run it: install coreutils")

@@ -1,7 +1,7 @@
-"""A compose file with the vehicles and agents of a scenario, to start them by hand and look inside.
+"""Write a compose file with the vehicles and agents of a scenario, to start them by hand.
 
-It stands alone: beside it lies a directory with the mission files, and with what the image is built from. Docker
-builds the network, so there are no conditions and no faults, and the containers are the same otherwise.
+The file needs no harness. A directory beside it holds the mission files and the build context of the image. Docker
+builds the network, so there are no conditions and no faults. Otherwise the containers equal those of the backend.
 """
 
 import os
@@ -16,7 +16,7 @@ from harness.errors import RunDirectoryError, ScenarioError
 from harness.play._vehicle_keys import FRESH, FRESH_BYTES, MissionKeys, keys_of
 from harness.play.containers import _images, ownership
 from harness.play.containers._container_backend import Containers
-from harness.play.containers._container_preflight import refuse_debuggers_that_are_not_in_the_image
+from harness.play.containers._container_preflight import check_debuggers
 from harness.play.containers._images import Image
 from harness.play.process.agent_mission import mission_file
 from harness.scenario import Scenario
@@ -25,9 +25,9 @@ from sitl.vehicle import VehicleKind
 from ucp.agent_files import write_json_atomically
 
 INSIDE = "/ucp"
-"""Where the directory beside the compose file is in every container."""
+"""Path in each container of the directory beside the compose file."""
 SECRETS = "/run/secrets"
-"""Where compose puts the files that only some containers see."""
+"""Directory in which compose places files for single containers."""
 
 TOP = """\
 # {name}: {count} agents{vehicles}, to start by hand and look inside:
@@ -46,20 +46,23 @@ SECURED = """
 def write_compose(
     scenario: Scenario, seed: int, kinds: dict[int, VehicleKind], system_ids: dict[int, int], file: Path
 ) -> Path:
-    """Write `file` and the directory beside it, which is returned. Raises RunDirectoryError if one is there already."""
+    """Write `file` and the directory beside it.
+
+    Return this directory. Raises RunDirectoryError if one of them exists.
+    """
     keys = _keys(scenario)
     if scenario.gcs:
         raise ScenarioError(
             "`gcs` does not work with --emit-compose, because a compose file has no run: leave out one of them"
         )
-    refuse_debuggers_that_are_not_in_the_image(scenario)
-    beside = file.with_suffix("")
-    for path in (file, beside):
+    check_debuggers(scenario)
+    folder = file.with_suffix("")
+    for path in (file, folder):
         if path.exists():
             raise RunDirectoryError(f"{path} exists: choose another name; existing files are not overwritten")
     try:
-        (beside / "agents").mkdir(parents=True)
-        services = _services(scenario, seed, kinds, system_ids, beside, keys)
+        (folder / "agents").mkdir(parents=True)
+        services = _services(scenario, seed, kinds, system_ids, folder, keys)
         document = {"services": services, "networks": {"air": _network()}, **_secrets(scenario, keys)}
         top = TOP.format(
             name=scenario.name.replace("\n", " "),
@@ -67,18 +70,21 @@ def write_compose(
             vehicles=" on their vehicles" if kinds else "",
             grounded="; and the vehicles have no pilot" if kinds else "",
             file=file.name,
-            directory=beside.name,
+            directory=folder.name,
             speedup=scenario.speedup,
             secured=SECURED if keys else "",
         )
         file.write_text(top + yaml.safe_dump(document, sort_keys=False, width=120), encoding="utf-8")
     except OSError as error:
         raise RunDirectoryError(f"{error.filename or file} cannot be written: {error.strerror}") from None
-    return beside
+    return folder
 
 
 def _keys(scenario: Scenario) -> MissionKeys | None:
-    """Those of the bundles that the user handed out, which stay where they are; None of a mission that has none."""
+    """Return the mission keys from the user's bundles, which stay in their directory;
+
+    None for a mission without keys.
+    """
     if scenario.security is None:
         return None
     bundles = [Path(scenario.security.keys) / _bundle(vehicle) for vehicle in scenario.roster]
@@ -91,7 +97,7 @@ def _keys(scenario: Scenario) -> MissionKeys | None:
 
 
 def _secrets(scenario: Scenario, keys: MissionKeys | None) -> dict[str, Any]:
-    """Each vehicle's bundle, which compose shows to its agent alone, and to nobody for writing."""
+    """Return the bundles as secrets. Compose shows each one only to its agent, read-only."""
     if keys is None or scenario.security is None:
         return {}
     directory = Path(scenario.security.keys).absolute()
@@ -112,21 +118,21 @@ def _services(
     seed: int,
     kinds: dict[int, VehicleKind],
     system_ids: dict[int, int],
-    beside: Path,
+    folder: Path,
     keys: MissionKeys | None,
 ) -> dict[str, Any]:
-    ours, build = _our_image(scenario, beside)
-    asked = scenario.docker.image
+    ours, build = _our_image(scenario, folder)
+    docker = scenario.docker.image
     in_named = set(_images.agents_in_named(scenario))
     services: dict[str, Any] = {}
     initial_data = f"{scenario.name}, seed {seed}, by hand".encode()
     if keys is not None:
         initial_data = keys.sealed_to_depot(initial_data)
-        write_json_atomically(beside / "agents" / PUBLIC_KEYS_FILE, keys.public.to_json())
+        write_json_atomically(folder / "agents" / PUBLIC_KEYS_FILE, keys.public.to_json())
     for number, vehicle in enumerate(scenario.roster):
         mission = f"{vehicle}.mission.json"
         write_json_atomically(
-            beside / "agents" / mission,
+            folder / "agents" / mission,
             mission_file(
                 vehicle,
                 scenario,
@@ -140,60 +146,60 @@ def _services(
         )
         network: dict[str, Any] = {"networks": {"air": {"ipv4_address": addresses.address(vehicle)}}}
         if kinds:
-            directory = beside / "vehicles" / str(vehicle)
+            directory = folder / "vehicles" / str(vehicle)
             directory.mkdir(parents=True)
             home = scenario.vehicles.home_of(vehicle, number)
             launch = kinds[vehicle].launch(system_ids[vehicle], home, scenario.speedup, directory)
             name = f"vehicle-{vehicle}"
-            services[name] = _service(scenario, ours, launch.argv, f"vehicles/{vehicle}", beside) | build | network
+            services[name] = _service(scenario, ours, launch.argv, f"vehicles/{vehicle}", folder) | build | network
             services[name] |= {"environment": dict(launch.env)} if launch.env else {}
             network = {"network_mode": f"service:{name}", "depends_on": [name]}
         argv = [*Containers().agent_command(scenario, vehicle), mission]
-        image = Image(str(asked), "python3", foreign=True) if vehicle in in_named else ours
-        services[f"agent-{vehicle}"] = _service(scenario, image, argv, "agents", beside) | network
+        image = Image(str(docker), "python3", foreign=True) if vehicle in in_named else ours
+        services[f"agent-{vehicle}"] = _service(scenario, image, argv, "agents", folder) | network
         services[f"agent-{vehicle}"] |= {} if vehicle in in_named else build
         services[f"agent-{vehicle}"] |= {"secrets": [_bundle(vehicle)]} if keys else {}
     waits = {"network_mode": "none", "depends_on": [f"agent-{vehicle}" for vehicle in scenario.roster]}
-    (beside / "start.py").write_bytes(Path(__file__).with_name("start.py").read_bytes())
+    (folder / "start.py").write_bytes(Path(__file__).with_name("start.py").read_bytes())
     argv = [sys.executable, f"{INSIDE}/start.py", f"{INSIDE}/agents"]
-    services["start"] = _service(scenario, ours, argv, "agents", beside) | build | waits
+    services["start"] = _service(scenario, ours, argv, "agents", folder) | build | waits
     return services
 
 
-def _our_image(scenario: Scenario, beside: Path) -> tuple[Image, dict[str, Any]]:
-    """The image, and how compose gets it: from a directory beside the file."""
-    context = beside / "image"
+def _our_image(scenario: Scenario, folder: Path) -> tuple[Image, dict[str, Any]]:
+    """Return the image, and the build section of the compose file."""
+    context = folder / "image"
     context.mkdir()
     if scenario.docker.image_from_host:
         image = _images.host_image()
         (context / "Dockerfile").write_text(f"FROM scratch\nLABEL {ownership.PROJECT}=host\n", encoding="utf-8")
-        return image, {"build": f"./{beside.name}/image"}
+        return image, {"build": f"./{folder.name}/image"}
     for name, content in _images.context().items():
         (context / name).parent.mkdir(parents=True, exist_ok=True)
         (context / name).write_bytes(content)
-    build = {"context": f"./{beside.name}/image", "network": "host", "args": _images.build_arguments()}
+    build = {"context": f"./{folder.name}/image", "network": "host", "args": _images.build_arguments()}
     return Image(_images.project_name(), "python3"), {"build": build}
 
 
-def _service(scenario: Scenario, image: Image, argv: list[str], directory: str, beside: Path) -> dict[str, Any]:
+def _service(scenario: Scenario, image: Image, argv: list[str], directory: str, folder: Path) -> dict[str, Any]:
     command = image.command(argv)
-    asked = scenario.docker
+    docker = scenario.docker
     service: dict[str, Any] = {
         "image": image.name,
         "entrypoint": command[:1],
         "command": command[1:],
         "working_dir": f"{INSIDE}/{directory}",
         "user": f"{os.getuid()}:{os.getgid()}",
-        "volumes": [f"./{beside.name}:{INSIDE}", *(f"{path}:{path}:ro" for path in image.shared(argv))],
-        "tmpfs": ["/tmp"],  # noqa: S108  (the container's own)
+        "volumes": [f"./{folder.name}:{INSIDE}", *(f"{path}:{path}:ro" for path in image.shared(argv))],
+        "tmpfs": ["/tmp"],  # noqa: S108  (inside the container)
         "read_only": True,
         "init": True,
         "cap_drop": ["ALL"],
         "security_opt": ["no-new-privileges"],
     }
     limits = {
-        "mem_limit": None if asked.memory_mib is None else f"{asked.memory_mib}m",
-        "cpus": asked.cpus,
-        "pids_limit": asked.pids,
+        "mem_limit": None if docker.memory_mib is None else f"{docker.memory_mib}m",
+        "cpus": docker.cpus,
+        "pids_limit": docker.pids,
     }
     return service | {key: value for key, value in limits.items() if value is not None}

@@ -1,6 +1,6 @@
-"""The container engine, through the docker SDK: calls in threads, each with a time limit, and errors in one sentence.
+"""The Docker engine through the docker SDK. Calls run in threads with a time limit, and errors are one sentence.
 
-An engine that does not answer once is not asked again: what waits for it would wait that long every time.
+If the engine fails to answer once, all later calls fail at once. Otherwise each of them would wait for the time limit.
 """
 
 import asyncio
@@ -27,35 +27,35 @@ GREETING_LIMIT_S = 10.0
 ANSWER_LIMIT_S = 30.0
 CLEAN = "`ucp-harness clean` removes what is left"
 AT_ONCE = 8
-"""Calls at the same time; more of them make no machine faster."""
+"""Maximum number of simultaneous calls. More would not be faster."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 class DockerError(MachineError, LabError):
-    """The container engine cannot do what was asked, or is not there."""
+    """The engine is missing, or refuses a request."""
 
 
 class Engine:
-    """`api` is the SDK's; ask it through `do`, or `ask` where others must not wait."""
+    """The engine. `api` belongs to the SDK. Call it through `do`, or through `ask` in asynchronous code."""
 
     def __init__(self, api: docker.APIClient) -> None:
         self.api = api
         self._threads = ThreadPoolExecutor(AT_ONCE, "docker")
-        self._under_way: set[Future[Any]] = set()
-        self._gone: DockerError | None = None
+        self._pending: set[Future[Any]] = set()
+        self._failure: DockerError | None = None
 
     @classmethod
     def connect(cls) -> "Engine":
-        """The engine of this machine. Raises DockerError."""
+        """Connect to the engine of this machine. Raises DockerError."""
         host = os.environ.get("DOCKER_HOST") or DEFAULT_HOST
         if not host.startswith("unix://"):
             raise DockerError(
                 f"DOCKER_HOST is {host}: the harness connects only containers on this machine to a network: unset it, "
                 "or name the socket of a local engine (unix://...)"
             )
-        _knock(host.removeprefix("unix://"))
+        _check_socket(host.removeprefix("unix://"))
         try:
             api = docker.APIClient(host, version="auto", timeout=round(GREETING_LIMIT_S))
         except docker.errors.DockerException as error:
@@ -66,9 +66,12 @@ class Engine:
         return cls(api)
 
     def do(self, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call the SDK; `what` names it in an error. Raises DockerError, or the SDK's APIError if it is refused."""
-        if self._gone is not None:
-            raise self._gone
+        """Call the SDK.
+
+        `what` names the call in an error. Raises DockerError, or the SDK's APIError if it is refused.
+        """
+        if self._failure is not None:
+            raise self._failure
         try:
             return call(*args, **kwargs)
         except docker.errors.APIError as error:
@@ -82,24 +85,24 @@ class Engine:
             raise self.give_up(sentence) from None
 
     def give_up(self, sentence: str) -> DockerError:
-        """It is gone: whoever asks it hears of the first reason, which is returned."""
-        self._gone = self._gone or DockerError(sentence)
-        return self._gone
+        """Make all later calls fail. Return the first error."""
+        self._failure = self._failure or DockerError(sentence)
+        return self._failure
 
     async def ask(self, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """As `do`, in a thread."""
+        """Run `do` in a thread."""
         return await self.in_thread(partial(self.do, what, call, *args, **kwargs))
 
     async def in_thread(self, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Something that speaks to the engine. It goes on if whoever waits for it is cancelled: see `settle`."""
+        """Run a call in a thread. It continues if the waiting task is cancelled: see `settle`."""
         future = self._threads.submit(partial(call, *args, **kwargs))
-        self._under_way.add(future)
-        future.add_done_callback(self._under_way.discard)
+        self._pending.add(future)
+        future.add_done_callback(self._pending.discard)
         return await asyncio.wrap_future(future)
 
     async def settle(self) -> None:
-        """Wait until nothing is under way that nobody waits for any more."""
-        await asyncio.to_thread(concurrent.futures.wait, set(self._under_way))
+        """Wait for all calls, including those of cancelled tasks."""
+        await asyncio.to_thread(concurrent.futures.wait, set(self._pending))
 
     def close(self) -> None:
         self._threads.shutdown(wait=False, cancel_futures=True)
@@ -107,40 +110,40 @@ class Engine:
 
 
 class Events:
-    """What the engine says of containers with a label, from now on, in the order in which it happens."""
+    """Follows the engine's events about containers with a label, from now on and in order."""
 
     def __init__(
-        self, engine: Engine, label: str, take: Callable[[dict[str, Any]], None], loop: asyncio.AbstractEventLoop
+        self, engine: Engine, label: str, on_event: Callable[[dict[str, Any]], None], loop: asyncio.AbstractEventLoop
     ) -> None:
-        """`take` is called in the loop; with an empty event when the engine ends them."""
+        """`take` is called in the loop for each event, and with an empty event when the stream ends."""
         filters = {"type": "container", "label": label}
         self._stream = engine.do("events", engine.api.events, since=int(time.time()) - 1, filters=filters, decode=True)
-        self._take = take
+        self._on_event = on_event
         self._loop = loop
         self._closed = False
         threading.Thread(target=self._follow, name="docker events", daemon=True).start()
 
     def _follow(self) -> None:
-        with suppress(Exception):  # whatever the SDK makes of a connection that breaks, or that we close
+        with suppress(Exception):  # the SDK may raise anything when the connection ends
             for event in self._stream:
-                self._tell(event)
-        self._tell({})
+                self._emit(event)
+        self._emit({})
 
-    def _tell(self, event: dict[str, Any]) -> None:
+    def _emit(self, event: dict[str, Any]) -> None:
         if not self._closed:
-            self._loop.call_soon_threadsafe(self._take, event)
+            self._loop.call_soon_threadsafe(self._on_event, event)
 
     def close(self) -> None:
         self._closed = True
         self._stream.close()
 
 
-def _knock(path: str) -> None:
-    """Raises DockerError if nobody answers the door, and why."""
+def _check_socket(path: str) -> None:
+    """Raise DockerError with the reason if no process answers at the socket."""
     try:
-        with socket.socket(socket.AF_UNIX) as door:
-            door.settimeout(GREETING_LIMIT_S)
-            door.connect(path)
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.settimeout(GREETING_LIMIT_S)
+            connection.connect(path)
     except FileNotFoundError:
         raise DockerError(
             f"there is no Docker engine: {path} does not exist; install it (Debian, Ubuntu: apt install docker.io) and "

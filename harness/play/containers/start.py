@@ -1,7 +1,8 @@
-"""Gives the agents of a compose file their start, all the same one: `python start.py DIRECTORY`.
+"""Start all agents of a compose file at the same time: `python start.py DIRECTORY`.
 
-Runs in a container of its own, so it is a file by itself. The control sockets in the directory tell which agents there
-are to be; each gets the command `start` (see ucp/contract/CONTRACT.md) once all of them answer.
+The file runs in its own container, so it imports nothing from the project. The mission files in the directory determine
+the agents. When the control sockets of all agents exist, each agent gets the command `start` (see
+ucp/contract/CONTRACT.md).
 """
 
 import json
@@ -17,7 +18,7 @@ ANSWER_LIMIT_S = 10.0
 
 
 def main(directory: Path) -> int:
-    os.chdir(directory)  # a socket's address holds 107 bytes
+    os.chdir(directory)  # the path of a Unix socket may have at most 107 bytes
     names = [path.name.replace(".mission.json", ".control") for path in sorted(Path().glob("*.mission.json"))]
     deadline = time.monotonic() + LIMIT_S
     while missing := [name for name in names if not Path(name).exists()]:

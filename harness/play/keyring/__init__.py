@@ -1,6 +1,6 @@
-"""Keys at home: the one directory where a mission's keys are made and kept, and what is handed out of it.
+"""The keyring: the directory that holds the keys of a mission, and the files that vehicles receive from it.
 
-What a vehicle does with its bundle is `ucp.secure`.
+`ucp.secure` describes how a vehicle uses its bundle.
 """
 
 from harness.play.keyring.key_directory import Home, KeysError, load_depot_key

@@ -1,4 +1,4 @@
-"""What a file of keys is, and of which mission: all that can be told of it without telling a secret."""
+"""Describe files of keys without revealing a secret."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -28,11 +28,11 @@ from ucp.secure.bundle import (
 from ucp.secure.keyfile import KeyFileError, key_in, read_any_key_file
 
 Facts = dict[str, Any]
-"""What `--json` says of a file: `file`, `kind`, `mission`, and what only this kind has."""
+"""The JSON output for a file: `file`, `kind`, `mission`, and further keys for some kinds."""
 
 
 def inspect(path: Path) -> list[Facts]:
-    """What can be told of a file of keys, or of each in a directory. Raises KeysError for one that cannot be used."""
+    """Return the facts about a key file, or about each in a directory. Raises KeysError for an unusable file."""
     files = [path]
     if path.is_dir():
         candidates = sorted(path.iterdir(), key=lambda file: (len(file.name), file.name))
@@ -43,7 +43,7 @@ def inspect(path: Path) -> list[Facts]:
 
 
 def in_words(facts: Facts) -> str:
-    """A line for people. Of public keys they see the beginning."""
+    """Return the facts as one line. Public keys are shortened."""
     more = [f"{name.replace('_', ' ')} {_shown(value)}" for name, value in facts.items() if name not in _HEAD]
     return f"{facts['file']}: {facts['kind']}, mission {facts['mission']}" + "".join(f", {words}" for words in more)
 
@@ -67,7 +67,7 @@ def _shown(value: Any) -> str:
 
 def _inspect(path: Path) -> Facts:
     def private(document: Facts) -> Facts:
-        """Of a private key the mission, and the public one that belongs to it."""
+        """Return the mission of a private key, and the matching public key."""
         mission = key_in(document, "mission", MISSION_ID_BYTES).hex()
         private_key = key_in(document, "private_key", KEY_BYTES)
         if document["schema"] == DEPOT_SCHEMA:
@@ -88,8 +88,13 @@ def _inspect(path: Path) -> Facts:
         public = path.with_name(PUBLIC_NAME)
         if not public.exists():
             return {"kind": "a revocation, not checked because public.json is missing", "mission": mission}
-        told = load_revocation(path, load_public(public))
-        return {"kind": "a revocation", "mission": mission, "number": told.number, "revoked": sorted(told.revoked)}
+        revocation = load_revocation(path, load_public(public))
+        return {
+            "kind": "a revocation",
+            "mission": mission,
+            "number": revocation.number,
+            "revoked": sorted(revocation.revoked),
+        }
 
     kinds: dict[str, tuple[bool, Callable[[Facts], Facts]]] = {
         PUBLIC_SCHEMA: (False, lambda document: {"kind": "public keys", **_public(PublicKeys.of_json(document))}),

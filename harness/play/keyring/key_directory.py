@@ -1,7 +1,8 @@
-"""The directory of a mission's keys, and the authority that revokes them.
+"""The directory of a mission's keys, and the authority that revokes keys.
 
-The authority's and the depot's keys never leave it. Each is a file of its own, as whoever opens what was sealed to the
-depot need not be able to speak for the authority. Others can neither enter the directory nor read what is secret in it.
+The keys of the authority and of the depot never leave the directory. They are separate files, because the person who
+opens sealed events does not need the right to revoke keys. Other users can neither enter the directory nor read the
+secret files.
 """
 
 import base64
@@ -42,18 +43,18 @@ T = TypeVar("T")
 
 
 class KeysError(HarnessError):
-    """Keys that cannot be used, or must not be made."""
+    """Keys that are unusable, or that must not be created."""
 
 
 @dataclass(frozen=True)
 class Home:
-    """A directory of keys. All that reads it raises KeysError, all that writes it MachineError."""
+    """A directory of keys. Methods that read raise KeysError, and methods that write raise MachineError."""
 
     directory: Path
 
     @classmethod
     def new(cls, directory: Path, roster: Iterable[int], *, seals: bool, epoch_s: float) -> "Home":
-        """New keys in a new directory; with a depot key if it `seals`."""
+        """Create keys in a new directory. If `seals` is true, they include a depot key."""
         keys = KeySet.derived(os.urandom(KEY_BYTES), roster, seals=seals, epoch_s=epoch_s)
         home, mission = cls(directory), keys.public.mission.hex()
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
@@ -76,26 +77,26 @@ class Home:
                 write_key_file(directory / name, document, secret=True)
             write_public(directory / PUBLIC_NAME, keys.public)
         except OSError as error:
-            raise _refused(directory, error) from None
+            raise _write_error(directory, error) from None
         return home
 
     def public(self) -> PublicKeys:
-        """What everybody may know."""
-        return _sound(lambda: load_public(self.directory / PUBLIC_NAME))
+        """Return the public keys of the mission."""
+        return _as_keys_error(lambda: load_public(self.directory / PUBLIC_NAME))
 
     def bundle(self, agent_id: int) -> Bundle:
-        """What this vehicle is given, in epoch 0. A revoked one is given nothing."""
+        """Return the bundle of a vehicle, in epoch 0. Raises KeysError for a revoked vehicle."""
         return self.bundles([agent_id])[agent_id]
 
     def bundles(self, agents: Sequence[int] | None = None, *, also_revoked: bool = False) -> dict[int, Bundle]:
-        """What these vehicles are given, or all that are not revoked."""
+        """Return the bundles of these vehicles, by default of all vehicles that are not revoked."""
         public, path = self.public(), self.directory / VEHICLES_NAME
         revocation = None if also_revoked else self.revocation()
         revoked = revocation.revoked if revocation else frozenset[int]()
         wanted = sorted({*public.vehicles} - revoked) if agents is None else agents
         for agent_id in wanted:
             if agent_id not in public.vehicles:
-                raise _stranger(agent_id, public)
+                raise _unknown_agent(agent_id, public)
             if agent_id in revoked:
                 raise KeysError(f"agent {agent_id} is revoked: use another vehicle, or make new keys")
 
@@ -113,12 +114,12 @@ class Home:
                 bundles[agent_id] = Bundle(public, agent_id, key, group_secret)
             return bundles
 
-        return _sound(lambda: read_key_file(path, VEHICLES_SCHEMA, parse, secret=True))
+        return _as_keys_error(lambda: read_key_file(path, VEHICLES_SCHEMA, parse, secret=True))
 
     def write_bundles(
         self, directory: Path, agents: Sequence[int] | None = None, *, overwrite: bool = False
     ) -> list[Path]:
-        """A file for each vehicle, which nobody else can read; which files those are."""
+        """Write a file for each vehicle, readable only by the owner. Return the paths."""
         bundles = self.bundles(agents)
         paths = {agent_id: directory / bundle_name(agent_id) for agent_id in bundles}
         for path in paths.values():
@@ -129,22 +130,25 @@ class Home:
             for agent_id, path in paths.items():
                 write_bundle(path, bundles[agent_id])
         except OSError as error:
-            raise _refused(directory, error) from None
+            raise _write_error(directory, error) from None
         return [*paths.values()]
 
     def revocation(self, public: PublicKeys | None = None) -> Revocation | None:
-        """The last one that was made here, with these `public` keys or those that are here; None if nobody is."""
+        """Return the last revocation in the directory, checked with `public` or with the keys here;
+
+        None if there is none.
+        """
         path = self.directory / REVOCATION_NAME
         return load_revocation(path, public or self.public()) if path.exists() else None
 
     def revoke(self, agents: Sequence[int]) -> Revocation:
-        """Revoke these, too: a new revocation, one number on, which says all that are revoked so far."""
+        """Revoke further vehicles. The new revocation has the next number, and lists all vehicles revoked so far."""
         public, last = self.public(), self.revocation()
         before = last.revoked if last else frozenset[int]()
         revoked = before.union(agents)
-        strangers = sorted(revoked - {*public.vehicles})
-        if strangers:
-            raise _stranger(strangers[0], public)
+        unknown = sorted(revoked - {*public.vehicles})
+        if unknown:
+            raise _unknown_agent(unknown[0], public)
         if revoked == before:
             raise KeysError(f"{listed(agents)}: already revoked in {self.directory / REVOCATION_NAME}")
         number = last.number + 1 if last else 1
@@ -155,11 +159,11 @@ class Home:
         try:
             write_revocation(self.directory / REVOCATION_NAME, revocation, public)
         except OSError as error:
-            raise _refused(self.directory, error) from None
+            raise _write_error(self.directory, error) from None
         return revocation
 
     def authority(self, public: PublicKeys) -> bytes:
-        """The authority's private key, which is that of these public ones."""
+        """Return the private key of the authority. It must match these public keys."""
 
         def parse(document: dict[str, Any]) -> bytes:
             key = key_in(document, "private_key", KEY_BYTES)
@@ -167,21 +171,23 @@ class Home:
                 raise KeyFileError(f"this key of the authority does not match {PUBLIC_NAME}")
             return key
 
-        return _sound(lambda: read_key_file(self.directory / AUTHORITY_NAME, AUTHORITY_SCHEMA, parse, secret=True))
+        return _as_keys_error(
+            lambda: read_key_file(self.directory / AUTHORITY_NAME, AUTHORITY_SCHEMA, parse, secret=True)
+        )
 
 
 def load_depot_key(path: Path) -> Depot:
-    """Who opens what was sealed: by the key in a file, or in the directory of a mission's keys. Raises KeysError."""
+    """Return the depot that opens sealed events, from a key file or a directory of keys. Raises KeysError."""
     file = path / DEPOT_NAME if path.is_dir() else path
 
     def parse(document: dict[str, Any]) -> Depot:
         return Depot(key_in(document, "mission", MISSION_ID_BYTES), key_in(document, "private_key", KEY_BYTES))
 
-    return _sound(lambda: read_key_file(file, DEPOT_SCHEMA, parse, secret=True))
+    return _as_keys_error(lambda: read_key_file(file, DEPOT_SCHEMA, parse, secret=True))
 
 
 def load_revocation(path: Path, public: PublicKeys) -> Revocation:
-    """The revocation in a file, if the authority of this mission signed it. Raises KeysError."""
+    """Return the revocation in a file, if the authority of this mission signed it. Raises KeysError."""
 
     def parse(document: dict[str, Any]) -> Revocation:
         _check_mission(document, public)
@@ -192,11 +198,11 @@ def load_revocation(path: Path, public: PublicKeys) -> Revocation:
             reason = error if isinstance(error, RevocationError) else "not base64"
             raise KeyFileError(f"`message` is {reason}") from None
 
-    return _sound(lambda: read_key_file(path, REVOCATION_SCHEMA, parse, secret=False))
+    return _as_keys_error(lambda: read_key_file(path, REVOCATION_SCHEMA, parse, secret=False))
 
 
 def write_revocation(path: Path, revocation: Revocation, public: PublicKeys) -> None:
-    """Raises OSError."""
+    """Write a revocation. Raises OSError."""
     message = base64.b64encode(revocation.encode()).decode("ascii")
     document = {"schema": REVOCATION_SCHEMA, "mission": public.mission.hex(), "message": message}
     write_key_file(path, document, secret=False)
@@ -207,34 +213,34 @@ def _check_mission(document: Mapping[str, Any], public: PublicKeys) -> None:
         raise KeyFileError(f"this file belongs to another mission than {PUBLIC_NAME}")
 
 
-def _sound(read: Callable[[], T]) -> T:
-    """Raises KeysError."""
+def _as_keys_error(read: Callable[[], T]) -> T:
+    """Return the result of `read`. Raises KeysError in place of KeyFileError."""
     try:
         return read()
     except KeyFileError as error:
         raise KeysError(str(error)) from None
 
 
-def _refused(directory: Path, error: OSError) -> MachineError:
+def _write_error(directory: Path, error: OSError) -> MachineError:
     return MachineError(f"{directory} cannot be written: {error.strerror}; choose another directory")
 
 
-def _stranger(agent_id: int, public: PublicKeys) -> KeysError:
+def _unknown_agent(agent_id: int, public: PublicKeys) -> KeysError:
     return KeysError(f"agent {agent_id} is not in this mission, which has {listed(public.vehicles)}")
 
 
 def listed(agents: Iterable[int]) -> str:
-    """Some agents, in words."""
+    """Return the agents as text."""
     first, *others = sorted({*agents})
     shown = ", ".join(map(str, [first, *others[:MOST_NAMED]])) + (", ..." if len(others) > MOST_NAMED else "")
     return f"agents {shown}" if others else f"agent {shown}"
 
 
 class Authority:
-    """Each revocation says all that were revoked so far; `last` was made before, if any was.
+    """The authority that signs revocations. Each revocation lists all vehicles revoked so far; `last` is the latest.
 
-    Without its `private_key` there are no others. What is revoked here is written nowhere: a mission that is played
-    leaves what is at home as it was.
+    Without a `private_key`, only `last` is available. New revocations are not stored, because a mission must not change
+    the directory of its keys.
     """
 
     def __init__(self, public: PublicKeys, private_key: bytes | None, last: Revocation | None = None) -> None:
@@ -244,22 +250,25 @@ class Authority:
 
     @classmethod
     def of(cls, keys: KeySet) -> "Authority":
-        """Of keys that were made just now."""
+        """Return the authority of newly made keys."""
         return cls(keys.public, keys.authority)
 
     @classmethod
     def in_directory(cls, home: Home, public: PublicKeys) -> "Authority":
-        """By what is there: the authority's key, the last revocation, both, or nothing. Raises KeysError."""
+        """Return the authority of a directory, which may lack the private key, a revocation, or both.
+
+        Raises KeysError.
+        """
         private_key = home.authority(public) if (home.directory / AUTHORITY_NAME).exists() else None
         return cls(public, private_key, home.revocation(public))
 
     @property
     def revoked(self) -> frozenset[int]:
-        """All by now."""
+        """The vehicles revoked so far."""
         return self._last.revoked if self._last else frozenset()
 
     def refuse(self, agents: Iterable[int], directory: object) -> None:
-        """Raises KeysError if it cannot revoke these. `directory` is where its keys were looked for."""
+        """Raise KeysError if the authority cannot revoke these agents. `directory` appears in the message."""
         lacking = {*agents} - self.revoked
         if self._private_key is not None or not lacking:
             return
@@ -271,7 +280,7 @@ class Authority:
         )
 
     def revoke(self, agent_id: int) -> bytes:
-        """The revocation of this one, as a message's body: that which was made before if it says so, or the next."""
+        """Return a revocation of this agent as the body of a message. A new one is made only if needed."""
         if self._last is None or agent_id not in self._last.revoked:
             assert self._private_key is not None, "was refused"
             signer = Ed25519PrivateKey.from_private_bytes(self._private_key)

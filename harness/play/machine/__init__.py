@@ -1,1 +1,1 @@
-"""What this machine can do: the doctor, the calibration of its network, and another kernel where it needs one."""
+"""Properties of this machine: the doctor, the calibration of the network, and User Mode Linux."""

@@ -1,4 +1,4 @@
-"""What this machine can do, and what its network really does to packets."""
+"""Examine what this machine can play, and measure how exactly its network applies conditions."""
 
 import contextlib
 import os
@@ -15,9 +15,9 @@ from rich.text import Text
 from harness.errors import MachineError
 from netem import lab_doctor, uml
 from netem.errors import NetemError, UmlError
-from netem.estimates import Estimate, Heard
+from netem.estimates import Estimate, ReceivedStream
 from netem.lab import EngineName
-from netem.measure import Measured, Observer, Study, measure, studies
+from netem.measure import EngineMeasurement, Observer, Study, measure, studies
 from netem.observers import in_lab
 from sitl.ardupilot import ArduPilot
 from sitl.vehicle import VehicleError
@@ -25,9 +25,9 @@ from sitl.vehicle import VehicleError
 
 @dataclass(frozen=True)
 class Requirement:
-    """What runs need of a machine, and what of it is there; `way_out` is what would mend it.
+    """A property of the machine that runs need. `way_out` is the remedy if it is missing.
 
-    Without what is `needed` there is no run.
+    Without a `needed` property, no run is possible.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Requirement:
 
 
 def examine() -> list[Requirement]:
-    """Look at this machine; builds and removes a small lab to find out what the kernel allows."""
+    """Return all requirements. Builds and removes a small lab to test the kernel."""
     python = Requirement(
         "Python", sys.version_info >= (3, 11), True, platform.python_version(), "install Python 3.11 or newer"
     )
@@ -92,33 +92,33 @@ def _ardupilot() -> Requirement:
 
 
 _SHOWN = {"": (100.0, "%"), "s": (1000.0, "ms"), "bit/s": (0.001, "kbit/s"), "packets": (1.0, "packets")}
-"""How people read a unit of `netem.measure`: times what, and its name."""
+"""Unit of `netem.measure` -> factor and name of the printed unit."""
 
 
-def measure_engines(requirements: Iterable[Requirement], say: Callable[[str], None]) -> list[Measured]:
-    """Measure every engine that works here, 10 to 30 seconds each; MachineError if the machine is too busy for it."""
+def measure_engines(requirements: Iterable[Requirement], say: Callable[[str], None]) -> list[EngineMeasurement]:
+    """Measure each working engine, 10 to 30 seconds each. Raises MachineError if the machine is too busy."""
     working = {requirement.name for requirement in requirements if requirement.ok}
     engines = [engine for engine in get_args(EngineName) if engine in working]
     try:
-        return [measure(engine, studies(engine), _telling(engine, in_lab(engine), say)) for engine in engines]
+        return [measure(engine, studies(engine), _with_progress(engine, in_lab(engine), say)) for engine in engines]
     except NetemError as error:
         raise MachineError(str(error)) from None
 
 
-def _telling(engine: str, observe: Observer, say: Callable[[str], None]) -> Observer:
-    """The same observer, which says what it looks at."""
+def _with_progress(engine: str, observe: Observer, say: Callable[[str], None]) -> Observer:
+    """Return an observer that also reports each study."""
 
-    def observe_and_tell(study: Study, packets: int) -> Mapping[tuple[int, int], Heard]:
+    def observe_and_report(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         asked = len(study.questions)
         say(f"{engine}: {packets} packets for {asked} question{'' if asked == 1 else 's'}")
         return observe(study, packets)
 
-    return observe_and_tell
+    return observe_and_report
 
 
 @contextlib.contextmanager
-def saying(console: Console) -> Iterator[Callable[[str], None]]:
-    """A function that says what goes on: on one line of a terminal, which is gone afterwards, else in lines."""
+def progress_line(console: Console) -> Iterator[Callable[[str], None]]:
+    """Yield a function that prints progress: on a temporary line of a terminal, or else as lines."""
     if not console.is_terminal:
         yield lambda words: console.print(words, highlight=False, soft_wrap=True)
         return
@@ -126,12 +126,12 @@ def saying(console: Console) -> Iterator[Callable[[str], None]]:
         yield status.update
 
 
-def render(engines: Sequence[Measured]) -> RenderableType:
-    """A table for each engine, a row for each question, and how late the machine was by itself."""
+def render(engines: Sequence[EngineMeasurement]) -> RenderableType:
+    """Return a table for each engine with a row for each question, and the machine's own lateness."""
     return Group(*(part for measured in engines for part in (_table(measured), Text(_lateness(measured), style="dim"))))
 
 
-def _table(measured: Measured) -> Table:
+def _table(measured: EngineMeasurement) -> Table:
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("")
     table.add_column(measured.engine)
@@ -153,7 +153,7 @@ def _found(answer: Estimate, factor: float) -> tuple[str, str, str]:
     return f"{answer.measured * factor:.4g}", interval, str(answer.packets)
 
 
-def _lateness(measured: Measured) -> str:
+def _lateness(measured: EngineMeasurement) -> str:
     late = measured.to_json()["lateness"]
     way, timers = (
         f"{late[key]['median_s'] * 1000:.2g} ms (1 in 100: {late[key]['p99_s'] * 1000:.2g} ms or more)"

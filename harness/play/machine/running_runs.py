@@ -1,8 +1,8 @@
-"""Which runs go on at this machine, and who lives where in them: from the processes' own working directories.
+"""Find the active runs of this machine from the working directories of processes.
 
-A run needs no register for that: a vehicle works in RUN/vehicles/ID, an agent in RUN/agents and in a later life in
-RUN/agents/ID-LIFE, with ID.mission.json as its last argument; and either is in the network namespace of its vehicle, as
-a process as in a container.
+A vehicle works in RUN/vehicles/ID. An agent works in RUN/agents, and in a later incarnation in RUN/agents/ID-NUMBER;
+its last argument is ID.mission.json. Both are in the network namespace of their vehicle, as a process or in a
+container. Therefore runs need no register.
 """
 
 import contextlib
@@ -17,34 +17,34 @@ _MISSION = re.compile(rb"(?:.*/)?([1-9][0-9]{0,4})\.mission\.json")
 
 
 def running(proc: Path = Path("/proc")) -> dict[Path, dict[int, int]]:
-    """Of each run directory whose programs we may see: vehicle -> the process ID of one that lives in it."""
+    """Return for each visible run directory: vehicle -> process ID of one of its programs."""
     runs: defaultdict[Path, dict[int, int]] = defaultdict(dict)
     for entry in proc.iterdir():
         if not entry.name.isdigit():
             continue
         with contextlib.suppress(OSError):  # gone meanwhile, or another user's
             place = _PLACE.fullmatch(str((entry / "cwd").readlink()))
-            if place and Path(place["run"], RUN_FILE).is_file() and _is_elsewhere(entry, proc):
-                vehicle = place["vehicle"] or _of_its_mission(entry)
+            if place and Path(place["run"], RUN_FILE).is_file() and _in_another_network(entry, proc):
+                vehicle = place["vehicle"] or _agent_of(entry)
                 if vehicle is not None:
                     runs[Path(place["run"])].setdefault(int(vehicle), int(entry.name))
     return {run: dict(sorted(vehicles.items())) for run, vehicles in sorted(runs.items())}
 
 
-def _of_its_mission(entry: Path) -> bytes | None:
-    """Whose mission file an agent was started with; None if with none."""
+def _agent_of(entry: Path) -> bytes | None:
+    """Return the agent ID in the name of the process's mission file, or None."""
     *_, last = (entry / "cmdline").read_bytes().removesuffix(b"\0").split(b"\0")
     named = _MISSION.fullmatch(last)
     return named[1] if named else None
 
 
-def _is_elsewhere(entry: Path, proc: Path) -> bool:
-    """Whether it is in another network than ours: somebody who looks into its directory in a shell is not."""
+def _in_another_network(entry: Path, proc: Path) -> bool:
+    """Return whether the process is in another network than this one. A user's shell in the directory is not."""
     return (entry / "ns/net").readlink() != (proc / "self/ns/net").readlink()
 
 
-def way_into(pid: int) -> list[str]:
-    """What runs a command in the network of a process, and in its user namespace where that is another (nsenter(1))."""
+def enter_command(pid: int) -> list[str]:
+    """Return the nsenter(1) command that runs a command in the network and user namespace of a process."""
     target, ours = Path(f"/proc/{pid}/ns/user"), Path("/proc/self/ns/user")
     user = ["--user", "--preserve-credentials"] if target.readlink() != ours.readlink() else []
     return ["nsenter", f"--target={pid}", *user, "--net", "--"]

@@ -1,4 +1,4 @@
-"""`--kernel uml`: the same command line in User Mode Linux, for machines without netem, or without any privilege."""
+"""`--kernel uml`: run the same command line in User Mode Linux, on machines without netem or without root."""
 
 import contextlib
 import os
@@ -12,7 +12,7 @@ from netem import uml, uml_shell
 from netem.errors import UmlError
 
 OUT = "--out="
-"""How a run that is played inside is told its directory."""
+"""Option that passes the run directory to the command inside."""
 
 
 class Kernel(StrEnum):
@@ -21,9 +21,9 @@ class Kernel(StrEnum):
 
 
 def run_inside(arguments: list[str]) -> int:
-    """Run `ucp-harness` with these arguments in User Mode Linux, from where we are; its exit status.
+    """Run `ucp-harness` with these arguments in User Mode Linux, in the current directory. Return its exit status.
 
-    Raises MachineError if User Mode Linux is not here, or fails.
+    Raises MachineError if User Mode Linux is missing or fails.
     """
     try:
         return uml.run(_command(arguments), cwd=Path.cwd(), env=_environment())
@@ -32,7 +32,7 @@ def run_inside(arguments: list[str]) -> int:
 
 
 def runs_inside() -> dict[Path, Path]:
-    """The directories of the runs that go on in User Mode Linux, as far as we may see, and their guests' folders."""
+    """Return the directories of visible active runs in User Mode Linux, with the folders of their guests."""
     runs: dict[Path, Path] = {}
     for folder in uml_shell.guests():
         with contextlib.suppress(OSError, ValueError):
@@ -42,7 +42,7 @@ def runs_inside() -> dict[Path, Path]:
 
 
 def enter(folder: Path, arguments: list[str]) -> int:
-    """Run `ucp-harness` with these arguments in a guest that runs; its exit status. Raises MachineError."""
+    """Run `ucp-harness` with these arguments in a running guest. Return its exit status. Raises MachineError."""
     try:
         return uml_shell.enter(folder, _command(arguments), cwd=Path.cwd(), env=_environment())
     except UmlError as error:
@@ -54,6 +54,6 @@ def _command(arguments: list[str]) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    """Wherever we were imported from, so is the command inside."""
+    """Return an environment in which the command inside imports the same package."""
     path = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")]))
     return {**os.environ, "PYTHONPATH": path}

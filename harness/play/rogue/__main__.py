@@ -1,8 +1,8 @@
-"""The rogue node as a process on the air: `python -m harness.play.rogue`, spawned in its own place in the lab.
+"""The rogue node as a process in the lab: `python -m harness.play.rogue`.
 
-It hears UCP's broadcasts on a UDP socket, and sends whole Ethernet frames (packet(7)) under MAC and IP addresses of the
-agents that it imitates. In its working directory it has `rogue.control`, which takes `start` and `inject`, and writes
-`rogue.jsonl`. SIGTERM ends it.
+It receives UCP broadcasts on a UDP socket, and sends complete Ethernet frames (packet(7)) with the MAC and IP addresses
+of the agents that it imitates. Its working directory contains `rogue.control`, a socket for the commands `start` and
+`inject`, and its journal `rogue.jsonl`. SIGTERM ends it.
 """
 
 import json
@@ -35,18 +35,18 @@ MAX_READ_BYTES = 65536
 
 
 class RogueNode:
-    """Works in `directory`. Raises OSError if a socket or a file cannot be had."""
+    """The process in `directory`. Raises OSError if a socket or a file cannot be opened."""
 
     def __init__(self, directory: Path) -> None:
         self._rogue: Rogue | None = None
         self._clock = MissionClock(1.0)
         self._timer: Timer | None = None
         self._loop = Loop()
-        self._ear = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._ear.setblocking(False)
-        self._ear.bind(("", PORT))
-        self._mouth = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)  # protocol 0 receives nothing
-        self._mouth.bind((LINK, 0))
+        self._receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._receiver.setblocking(False)
+        self._receiver.bind(("", PORT))
+        self._sender = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)  # protocol 0 receives nothing
+        self._sender.bind((LINK, 0))
         self._file = (directory / ROGUE_FILE).open("a", encoding="utf-8", buffering=1)
         self._journal = Journal(self._write)
         self._control = ControlServer(
@@ -58,7 +58,7 @@ class RogueNode:
     def run(self) -> None:
         """Serve until SIGTERM or SIGINT."""
         self._loop.stop_on(signal.SIGTERM, signal.SIGINT)
-        self._loop.watch(self._ear, readable=self._hear)
+        self._loop.watch(self._receiver, readable=self._read_datagrams)
         self._control.start()
         self._loop.run()
         self._journal.close()
@@ -66,14 +66,14 @@ class RogueNode:
         self._control.close()
         self._loop.close()
 
-    def _hear(self) -> None:
+    def _read_datagrams(self) -> None:
         for _ in range(DATAGRAMS_PER_TURN):
             try:
-                data = self._ear.recv(MAX_READ_BYTES)
+                data = self._receiver.recv(MAX_READ_BYTES)
             except BlockingIOError:
                 return
             if self._rogue is not None:
-                self._rogue.hears(data, self._clock.now())
+                self._rogue.receive(data, self._clock.now())
                 self._send()
 
     def _due(self) -> None:
@@ -83,11 +83,11 @@ class RogueNode:
         self._send()
 
     def _send(self) -> None:
-        """Send what there is to send, and wait for what is due next."""
+        """Send all pending datagrams, and set a timer for the next ones."""
         assert self._rogue is not None, "no messages to send before the start"
         for injected in self._rogue.to_send():
             now = self._clock.now()
-            self._mouth.send(udp_broadcast(injected.source, PORT, injected.datagram))
+            self._sender.send(udp_broadcast(injected.source, PORT, injected.datagram))
             self._journal.add(injected, now)
         if self._timer is not None:
             self._timer.cancel()
@@ -100,14 +100,16 @@ class RogueNode:
     def _write(self, record: dict[str, Any]) -> None:
         self._file.write(json.dumps(record, separators=(",", ":")) + "\n")
 
-    # Commands of the control socket, which the orchestrator alone gives
+    # Commands of the control socket. Only the harness sends them.
 
     def _start(self, request: dict[str, Any]) -> dict[str, Any]:
         epoch_us = request["epoch_us"]
         self._clock = MissionClock(request["speedup"])
         self._clock.start(epoch_us)
         captured = request.get("captured")
-        self._rogue = Rogue(request["roster"], request["seed"], epoch_us, _keys(Path(captured)) if captured else None)
+        self._rogue = Rogue(
+            request["roster"], request["seed"], epoch_us, _load_keys(Path(captured)) if captured else None
+        )
         return {}
 
     def _inject(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -127,7 +129,7 @@ class RogueNode:
         return {"sent": dict(self._rogue.sent) if self._rogue is not None else {}}
 
 
-def _keys(path: Path) -> "CapturedKeys":
+def _load_keys(path: Path) -> "CapturedKeys":
     from harness.play.rogue._captured_bundle import CapturedKeys  # needs the extra `secure`
     from ucp.secure.bundle import load_bundle
 
@@ -135,7 +137,7 @@ def _keys(path: Path) -> "CapturedKeys":
 
 
 def main() -> int:
-    """Exit status 0; 1 if it cannot be on the air."""
+    """Run the node. Return exit status 1 if it has no access to the network."""
     try:
         RogueNode(Path.cwd()).run()
     except OSError as error:

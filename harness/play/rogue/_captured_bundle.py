@@ -1,8 +1,8 @@
-"""What whoever captured a vehicle can do with its bundle: open what is on the air, and seal with the vehicle's keys.
+"""The abilities of an attacker with the bundle of a captured vehicle: open datagrams, and seal new ones.
 
-The group's secret opens everybody's datagrams, and makes the keys of any sender. What it does not make is another
-vehicle's signature: so what is sealed here in another's name is signed with the captured vehicle's key, as there is no
-other.
+The group secret opens the datagrams of all senders, and derives the sealing keys of any sender. It does not contain the
+signature keys of other vehicles. A block sealed in another vehicle's name is therefore signed with the captured
+vehicle's key.
 """
 
 from collections.abc import Callable
@@ -18,25 +18,31 @@ from ucp.secure.session import Session
 
 
 class CapturedKeys:
-    """`chance` gives 8 bytes for each life that is made up. Times are mission seconds, and microseconds UTC."""
+    """The keys of a captured vehicle. `chance` returns 8 random bytes for each forged incarnation.
 
-    def __init__(self, bundle: Bundle, chance: Callable[[], bytes]) -> None:
+    Times are mission seconds; `now_us` is UTC in microseconds.
+    """
+
+    def __init__(self, bundle: Bundle, random_bytes: Callable[[], bytes]) -> None:
         self.agent_id = bundle.agent_id
         self._bundle = bundle
-        self._chance = chance
-        self._ear = self._session(bundle.agent_id, 0)
-        self._mouths: dict[int, Session] = {}
-        """By the sender in whose name it speaks."""
+        self._random_bytes = random_bytes
+        self._receiver = self._session(bundle.agent_id, 0)
+        self._sessions: dict[int, Session] = {}
+        """Forged sender -> its session."""
         self._signatures: dict[bytes, bytes] = {}
-        """The makers', of all blocks that were on the air."""
+        """Block hash -> the genuine signature, from received datagrams."""
 
     def opened(self, datagram: bytes, now: float) -> tuple[Message, Request] | None:
-        """What a datagram says, and how an answer would name it; None if it is nothing new that can be opened."""
-        self._ear.epochs.look_at(now)
+        """Return the message of a datagram, and the identification that an answer needs.
+
+        Return None if it cannot be opened.
+        """
+        self._receiver.epochs.look_at(now)
         try:
             clear = read_clear(datagram)
-            opened = self._ear.open(datagram, clear)
-        except (MalformedDatagramError, KeyError):  # of a sender of another mission
+            opened = self._receiver.open(datagram, clear)
+        except (MalformedDatagramError, KeyError):  # the sender belongs to another mission
             return None
         message = opened.said.message
         if type(message) in CARRY_A_BLOCK:
@@ -46,18 +52,18 @@ class CapturedKeys:
     def sealed(
         self, sender: int, sequence: int, message: Message, request: Request | None, now: float, now_us: int
     ) -> bytes:
-        """A datagram in the name of `sender`, as good as these keys can make it; each sequence is used once."""
-        mouth = self._mouths.get(sender)
-        if mouth is None:
-            mouth = self._mouths[sender] = self._session(sender, now_us)
-        mouth.epochs.look_at(now)
+        """Return a datagram in the name of `sender`, as genuine as these keys allow. Each sequence may be used once."""
+        session = self._sessions.get(sender)
+        if session is None:
+            session = self._sessions[sender] = self._session(sender, now_us)
+        session.epochs.look_at(now)
         signature = None
         if type(message) in CARRY_A_BLOCK:
             block = message.block  # type: ignore[union-attr]
-            heard = self._signatures.get(block.block_hash)
-            signature = heard or sign_block(mouth.private_key, mouth.mission, block.block_data())
-        return mouth.seal(sequence, message, request, signature, 0)
+            received = self._signatures.get(block.block_hash)
+            signature = received or sign_block(session.private_key, session.mission, block.block_data())
+        return session.seal(sequence, message, request, signature, 0)
 
     def _session(self, sender: int, now_us: int) -> Session:
-        """A life of that sender, which began now: it is newer than its own."""
-        return Session(replace(self._bundle, agent_id=sender), boot_of(now_us, self._chance()))
+        """Return a forged incarnation of the sender that begins now, and is therefore newer than the genuine one."""
+        return Session(replace(self._bundle, agent_id=sender), boot_of(now_us, self._random_bytes()))

@@ -1,4 +1,4 @@
-"""Datagrams that no agent has sent, crafted with `ucp.scapy`."""
+"""Datagrams that no agent sent, made with `ucp.scapy`."""
 
 from collections.abc import Callable, Sequence
 from random import Random
@@ -22,18 +22,21 @@ def datagram(sender: int, sequence: int, message: Message | Packet) -> bytes:
 
 
 def forged_block(agent_id: int, timestamp_us: int) -> Block:
-    """A block that claims to be the agent's."""
+    """Return a block in the agent's name."""
     event = LoggableEvent(timestamp_us=timestamp_us, event_id=FORGED_EVENT_ID, data=FORGED_DATA)
     return Block(agent_id=agent_id, events=[event])
 
 
 def forged_commit(block: Block, chain_hash: bytes) -> CommitBlock:
-    """`chain_hash` is the block's own at its place in the chain."""
+    """Return a Commit Block. `chain_hash` is the chain hash of the block's own position."""
     return CommitBlock(chain_hash=chain_hash, block=block)
 
 
 def random_message(name: str | None, roster: Sequence[int], timestamp_us: int, rng: Random) -> Packet:
-    """A well-formed message of this type (None: of any), with whatever content; a block in it is of the roster's."""
+    """Return a well-formed message with random content, of type `name` or of any type.
+
+    Its block is in a roster agent's name.
+    """
 
     def block() -> Block:
         data = rng.randbytes(rng.randint(1, MAX_EVENT_BYTES))
@@ -52,7 +55,7 @@ def random_message(name: str | None, roster: Sequence[int], timestamp_us: int, r
 
 
 def corrupted(data: bytes, bits: int, rng: Random) -> bytes:
-    """With so many of its bits flipped, or all if it has fewer."""
+    """Return the datagram with `bits` random bits flipped."""
     flipped = bytearray(data)
     for bit in rng.sample(range(8 * len(data)), min(bits, 8 * len(data))):
         flipped[bit // 8] ^= 1 << bit % 8

@@ -1,6 +1,6 @@
-"""The rogue node's journal, `rogue.jsonl`: a line for each datagram.
+"""The journal of the rogue node, `rogue.jsonl`.
 
-Of one injection the first LINES datagrams have a line each. Those after them are counted by mission second: their line
+The first LINES datagrams of an injection have one line each. Later datagrams are counted by mission second. Such a line
 has `count` and `bytes`, and `messages` and `refused` by type and reason.
 """
 
@@ -18,7 +18,7 @@ class Journal:
         self._write = write
         self._lines: Counter[int] = Counter()
         self._counted: dict[int, dict[str, Any]] = {}
-        """The line of each injection that is not written yet."""
+        """Injection -> its line of counts that is not written yet."""
 
     def add(self, injected: RogueDatagram, at_s: float) -> None:
         number, record = injected.injection, injected.to_json(at_s)

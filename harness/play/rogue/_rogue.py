@@ -1,11 +1,11 @@
-"""What the rogue node sends: the injections of a timeline, made from what it has heard.
+"""The rogue node without I/O: it makes the datagrams of injections from the messages that it receives.
 
-It does no I/O, as `ucp.agent`: it is driven by `hears`, `begin` and `handle_timer`, and answers with `to_send`. Times
-are mission seconds. Equal inputs and seed give equal outputs.
+Like `ucp.agent`, it is driven by calls (`receive`, `begin`, `handle_timer`), and `to_send` returns the results. Times
+are mission seconds. Equal inputs and seeds give equal outputs.
 
-It follows the swarm's chain from the outside: a Block Add Request names the chain hash that its sender's chain ends in,
-and a Commit Block the one that it ends in then. A block forged on top of the last of these meets the conditions of
-Algorithm 6 wherever an agent has heard the same: the thesis leaves signatures to the platform (Section 3.3).
+It follows the chain of the swarm from outside. A Block Add Request contains the top chain hash of its sender before the
+commit, and a Commit Block the one after it. A forged block on top of the last of these meets the conditions of
+Algorithm 6 at all agents with this chain. The thesis leaves signatures to the platform (Section 3.3).
 """
 
 from collections import Counter, deque
@@ -16,7 +16,7 @@ from random import Random
 from typing import TYPE_CHECKING, Any
 
 from harness.play.rogue import _crafted
-from harness.play.rogue.lies import Overheard, UnheardError
+from harness.play.rogue.lies import KnownBlocks, UnknownBlockError
 from harness.play.rogue.rogue_line import forged_sequence, line_of
 from harness.scenario.injection import Corrupt, DelayedCopy, Duplicate, Flood, Forge, Injection, Lie, Replay
 from ucp.block import HASH_BYTES, next_chain_hash
@@ -40,30 +40,30 @@ if TYPE_CHECKING:
     from harness.play.rogue._captured_bundle import CapturedKeys
     from ucp.secure.sealed_datagrams import Request
 
-REMEMBERED = 10_000
-"""Datagrams that it keeps to replay."""
+MAX_REMEMBERED = 10_000
+"""Maximum number of datagrams that are kept for replays."""
 MAX_WAITING = 100_000
-"""Copies that wait to be sent; more are not made."""
-FLOODED_AT_ONCE = 64
-"""Messages of a flood between two looks at anything else."""
+"""Maximum number of copies that wait to be sent. Further copies are not made."""
+FLOOD_BATCH = 64
+"""Maximum number of messages of a flood without returning to other work."""
 
 
-QUESTIONS = {NAMES[answer]: NAMES[question] for answer, question in REQUEST_OF.items()}
-"""Type of an answer -> type of the question, by their names."""
+QUERY_OF_ANSWER = {NAMES[answer]: NAMES[query] for answer, query in REQUEST_OF.items()}
+"""Type of an answer -> type of its query or request, by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class RogueDatagram:
-    """One datagram of the rogue: `what` it is, of the injection with this number, under the address of `source`."""
+    """A datagram of the rogue node. `what` is its kind, `injection` its number, and `source` the imitated address."""
 
     injection: int
     what: str
     source: int
     datagram: bytes
     plain: bytes | None = None
-    """What it says in plain, if it is sealed and the rogue made it."""
+    """The datagram before sealing, if the rogue node sealed it."""
     receivers: Sequence[int] | None = None
-    """Who alone hears it; None: everybody."""
+    """The only receivers, or None for a broadcast."""
 
     def to_json(self, at_s: float) -> dict[str, Any]:
         said = self.plain or self.datagram
@@ -71,8 +71,8 @@ class RogueDatagram:
 
 
 @dataclass(frozen=True, slots=True)
-class _Heard:
-    """A datagram of an agent; `message` is None if it is sealed, and `request` how an answer to it names it."""
+class _ReceivedDatagram:
+    """A received datagram. `message` is None if it is sealed. `request` identifies it in an answer."""
 
     sender: int
     name: str
@@ -83,7 +83,7 @@ class _Heard:
 
 @dataclass(slots=True)
 class _Window:
-    """An injection that goes on until `until`; a flood sends next at `next_at`."""
+    """An injection that lasts until `until`. A flood sends its next message at `next_at`."""
 
     number: int
     injection: Injection
@@ -92,9 +92,10 @@ class _Window:
 
 
 class Rogue:
-    """`epoch_us` is mission second 0 on the agents' clocks, in microseconds; `captured` are a vehicle's keys.
+    """The state of the rogue node.
 
-    It tells lies about chains if it knows `initial_data`, that of the mission.
+    `epoch_us` is mission second 0 on the agents' clocks, in microseconds. `captured` are the keys of a captured
+    vehicle. `initial_data` is that of the mission, and is needed for lies about chains.
     """
 
     def __init__(
@@ -106,35 +107,35 @@ class Rogue:
         initial_data: bytes = b"",
     ) -> None:
         self.sent: Counter[int] = Counter()
-        """How many datagrams each injection that has begun has made."""
+        """Number of datagrams of each injection that has begun."""
         self._roster = tuple(roster)
         self._rng = Random(f"{seed}/rogue")
         self._epoch_us = epoch_us
         self._captured = captured
         self._secured = captured is not None
-        """Whether the mission is, by what is on the air, or as it has its keys."""
-        self._heard: deque[tuple[int, str, bytes]] = deque(maxlen=REMEMBERED)
+        """True if the node has keys, or has received a sealed datagram."""
+        self._received: deque[tuple[int, str, bytes]] = deque(maxlen=MAX_REMEMBERED)
         self._top_chain_hash: bytes | None = None
         self._votes_name_chain = False
-        self._overheard = Overheard(initial_data, epoch_us)
-        self._asked: dict[tuple[int, str], Request] = {}
-        """By sender and type of a question, sealed ones: how an answer to the last names it."""
+        self._known_blocks = KnownBlocks(initial_data, epoch_us)
+        self._queries: dict[tuple[int, str], Request] = {}
+        """(sender, type of a query) -> identification of the last sealed query, for an answer."""
         self._windows: list[_Window] = []
         self._waiting: list[tuple[float, int, RogueDatagram]] = []
         self._outbox: list[RogueDatagram] = []
         self._made = 0
 
-    def hears(self, datagram: bytes, now: float) -> None:
-        """An agent has sent `datagram`. What is not a message of UCP tells a rogue nothing."""
+    def receive(self, datagram: bytes, now: float) -> None:
+        """Receive a datagram of an agent. Datagrams that are no UCP messages are ignored."""
         try:
-            sender, name, message, request = self._understood(datagram, now)
+            sender, name, message, request = self._read(datagram, now)
         except MalformedDatagramError:
             return
-        self._heard.append((sender, name, datagram))
+        self._received.append((sender, name, datagram))
         if message is not None:
-            self._overheard.hears(sender, message)
+            self._known_blocks.receive(sender, message)
         if request is not None:
-            self._asked[sender, name] = request
+            self._queries[sender, name] = request
         if isinstance(message, BlockAddRequest | CommitBlock):
             self._top_chain_hash = message.chain_hash
         elif isinstance(message, BlockAddResponse):
@@ -142,10 +143,10 @@ class Rogue:
         if self._windows:
             self._windows = [window for window in self._windows if window.until > now]
             for window in self._windows:
-                self._react(window, _Heard(sender, name, message, request, datagram), now)
+                self._react(window, _ReceivedDatagram(sender, name, message, request, datagram), now)
 
-    def _understood(self, datagram: bytes, now: float) -> tuple[int, str, Message | None, "Request | None"]:
-        """Sender and type; and what it says, and how it is answered, if it is in plain, or the rogue has keys.
+    def _read(self, datagram: bytes, now: float) -> tuple[int, str, Message | None, "Request | None"]:
+        """Return sender and type, and the message with its identification if it can be read.
 
         Raises MalformedDatagramError.
         """
@@ -158,7 +159,7 @@ class Rogue:
         return clear.sender, NAMES.get(clear.type, ""), *(opened or (None, None))
 
     def begin(self, number: int, injection: Injection, now: float) -> None:
-        """The injection with this number, from 1, begins. Some end at once, some last."""
+        """Begin the injection with this number, counted from 1. Some end at once, and others last."""
         self.sent[number] += 0
         if isinstance(injection, Replay):
             self._replay(number, injection)
@@ -171,12 +172,12 @@ class Rogue:
             self.handle_timer(now)
 
     def next_timer(self) -> float | None:
-        """When `handle_timer` has something to do next; None if it has not."""
+        """Return the time of the next `handle_timer`, or None."""
         times = [window.next_at for window in self._windows if isinstance(window.injection, Flood)]
         return min([*times, *(at for at, _, _ in self._waiting[:1])], default=None)
 
     def handle_timer(self, now: float) -> None:
-        """Send what is due by now."""
+        """Queue the datagrams that are due."""
         while self._waiting and self._waiting[0][0] <= now:
             self._outbox.append(heappop(self._waiting)[2])
         for window in list(self._windows):
@@ -184,19 +185,19 @@ class Rogue:
                 self._flood(window, window.injection, now)
 
     def to_send(self) -> list[RogueDatagram]:
-        """What to send now, in order; empties the outbox."""
+        """Return the queued datagrams in order, and clear the queue."""
         outbox, self._outbox = self._outbox, []
         return outbox
 
-    # What it makes of what it hears
+    # Reactions to received datagrams
 
-    def _react(self, window: _Window, heard: "_Heard", now: float) -> None:
-        injection, sender, datagram = window.injection, heard.sender, heard.datagram
+    def _react(self, window: _Window, received: "_ReceivedDatagram", now: float) -> None:
+        injection, sender, datagram = window.injection, received.sender, received.datagram
         if isinstance(injection, Forge):
-            answer = None if heard.message is None else self._answer(injection, heard.message)
+            answer = None if received.message is None else self._answer(injection, received.message)
             if sender != injection.sender and answer is not None:
-                self._forge(window.number, "forge", injection.sender, answer, now, heard.request)
-        elif isinstance(injection, Lie) or not injection.matches(heard.name, sender):
+                self._forge(window.number, "forge", injection.sender, answer, now, received.request)
+        elif isinstance(injection, Lie) or not injection.matches(received.name, sender):
             return
         elif isinstance(injection, Duplicate):
             for _ in range(injection.copies):
@@ -214,47 +215,47 @@ class Rogue:
             copy = RogueDatagram(window.number, "delay", sender, datagram)
             heappush(self._waiting, (now + injection.by_s, self._made, copy))
 
-    def _answer(self, forge: Forge, question: Message) -> Message | None:
-        """What the forged answer to `question` is, if it is one to answer."""
+    def _answer(self, forge: Forge, query: Message) -> Message | None:
+        """Return the forged answer to a message, or None if this forgery does not answer it."""
         approve = bool(forge.approve)
-        match question:
+        match query:
             case BlockAddRequest() if forge.message == BlockAddResponse.NAME:
-                named = question.chain_hash if self._votes_name_chain else None
-                return BlockAddResponse(question.block_hash, approve, named)
+                named = query.chain_hash if self._votes_name_chain else None
+                return BlockAddResponse(query.block_hash, approve, named)
             case ChainContainQuery() if forge.message == ChainContainResponse.NAME:
-                return ChainContainResponse(question.chain_hash, approve)
+                return ChainContainResponse(query.chain_hash, approve)
             case ChainHashSuccessorQuery() if forge.message == NextInSequenceResponse.NAME:
-                return NextInSequenceResponse(question.chain_hash, None, 0)
+                return NextInSequenceResponse(query.chain_hash, None, 0)
         return None
 
     def _replay(self, number: int, replay: Replay) -> None:
-        matching = ((sender, data) for sender, name, data in reversed(self._heard) if replay.matches(name, sender))
-        last = [heard for heard, _ in zip(matching, range(replay.count), strict=False)]
+        matching = ((sender, data) for sender, name, data in reversed(self._received) if replay.matches(name, sender))
+        last = [received for received, _ in zip(matching, range(replay.count), strict=False)]
         for sender, data in reversed(last):
             self._send(RogueDatagram(number, "replay", sender, data))
 
     def _lie(self, number: int, lie: Lie, now: float) -> None:
         try:
-            message = self._overheard.message(lie)
-        except UnheardError:
-            return  # that nothing was sent is told in the end
-        question = QUESTIONS.get(lie.message, "")
+            message = self._known_blocks.message(lie)
+        except UnknownBlockError:
+            return  # the summary of the injection reports that it sent nothing
+        query = QUERY_OF_ANSWER.get(lie.message, "")
         asking = self._roster if lie.receivers is None else lie.receivers
-        request = next((self._asked[agent, question] for agent in asking if (agent, question) in self._asked), None)
+        request = next((self._queries[agent, query] for agent in asking if (agent, query) in self._queries), None)
         self._forge(number, "lie", lie.sender, message, now, request, lie.receivers)
 
     def _forge_commit(self, number: int, forge: Forge, now: float) -> None:
         if self._secured and self._top_chain_hash is None:
-            self._top_chain_hash = bytes(HASH_BYTES)  # what the chain ends in is sealed: it can but guess
+            self._top_chain_hash = bytes(HASH_BYTES)  # the top chain hash is sealed, so it can only guess
         if self._top_chain_hash is None:
-            return  # nobody has said yet what the chain ends in
+            return  # no agent has sent its top chain hash yet
         block = _crafted.forged_block(forge.sender, self._timestamp_us(now))
         self._top_chain_hash = next_chain_hash(self._top_chain_hash, block.block_hash)
         self._forge(number, "forge", forge.sender, _crafted.forged_commit(block, self._top_chain_hash), now)
 
     def _flood(self, window: _Window, flood: Flood, now: float) -> None:
         messages = round(flood.for_s * flood.per_s)
-        for _ in range(FLOODED_AT_ONCE):
+        for _ in range(FLOOD_BATCH):
             if self.sent[window.number] == messages or now >= window.until:
                 self._windows.remove(window)
                 return

@@ -1,4 +1,4 @@
-"""What a lie of the timeline is as a message: block and chain by name, as the rogue has heard of them."""
+"""Turn a lie of the timeline into a message. Blocks and chains are given by name, as the rogue node knows them."""
 
 from collections.abc import Sequence
 
@@ -20,18 +20,19 @@ from ucp.messages import (
 )
 
 NOBODYS = b"\xff" * HASH_BYTES
-"""A hash of an unknown trigger."""
+"""A hash that no block has."""
 MADE = "made "
 
 
-class UnheardError(Exception):
-    """The rogue has not heard of what a lie is about."""
+class UnknownBlockError(Exception):
+    """A block or chain of a lie that the rogue node has not received."""
 
 
-class Overheard:
-    """Blocks by name: the order in which each agent proposed them. `initial_data` is the inception block's.
+class KnownBlocks:
+    """The known blocks by name, in the order in which each agent proposed them.
 
-    `made_at_us` is mission second 0 on the agents' clocks.
+    `initial_data` belongs to the inception block. `epoch_us` is mission second 0 on the agents' clocks, in
+    microseconds.
     """
 
     def __init__(self, initial_data: bytes, epoch_us: int = 0) -> None:
@@ -40,8 +41,8 @@ class Overheard:
         self._proposed: dict[int, list[bytes]] = {}
         self._blocks: dict[bytes, Block] = {}
 
-    def hears(self, sender: int, message: Message) -> None:
-        """An agent has sent this."""
+    def receive(self, sender: int, message: Message) -> None:
+        """Receive a message of an agent."""
         if isinstance(message, BlockAddRequest):
             proposed = self._proposed.setdefault(sender, [])
             if message.block_hash not in proposed:
@@ -50,7 +51,7 @@ class Overheard:
             self._blocks[message.block.block_hash] = message.block
 
     def message(self, lie: Lie) -> Message:
-        """What it says. Raises UnheardError."""
+        """Return the message of a lie. Raises UnheardError."""
         of_block = NOBODYS if lie.block is None else self._hash(lie.sender, lie.block)
         of_chain = None if lie.chain is None else self._chain_hash(lie.sender, lie.chain)
         approve = bool(lie.approve)
@@ -94,15 +95,15 @@ class Overheard:
         try:
             return self._proposed[maker][number - 1]
         except (KeyError, IndexError):
-            raise UnheardError(name) from None
+            raise UnknownBlockError(name) from None
 
     def _block(self, block_hash: bytes) -> Block:
         try:
             return self._blocks[block_hash]
         except KeyError:
-            raise UnheardError(block_hash.hex()) from None
+            raise UnknownBlockError(block_hash.hex()) from None
 
 
 def made_block(agent_id: int, timestamp_us: int) -> Block:
-    """A block in the agent's name that it never completed."""
+    """Return a block in the agent's name that the agent never completed."""
     return Block(agent_id, timestamp_us, LoggableEvent(timestamp_us, 1, b"made by its captor").encode())

@@ -7,11 +7,11 @@ from ucp.secure.envelope import NAMES, read_clear
 from ucp.secure.envelope import VERSION as SECURED
 
 OF_NO_INJECTION = -1
-"""The number of the injection of a datagram that the scenario itself has (`harness.scenario.injection`)."""
+"""Injection number of a datagram that the scenario itself contains (`harness.scenario.injection`)."""
 
 
 def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes) -> dict[str, Any]:
-    """The record of a datagram, sent at `at_s`; `refused` is why no agent would take it for a message."""
+    """Return the record of a datagram sent at `at_s`. `refused` is the reason why every agent drops it."""
     record = {"at_s": round(at_s, 6), "injection": injection, "what": what, "source": source}
     if datagram[2:3] == bytes([SECURED]):
         return {**record, "bytes": len(datagram), **_secured(datagram)}
@@ -25,7 +25,7 @@ def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes
 
 
 def _secured(datagram: bytes) -> dict[str, Any]:
-    """What is in clear of a sealed datagram."""
+    """Return the unencrypted fields of a sealed datagram."""
     try:
         clear = read_clear(datagram)
     except MalformedDatagramError as malformed:
@@ -36,16 +36,16 @@ def _secured(datagram: bytes) -> dict[str, Any]:
 
 
 FORGED_FROM = 1 << 31
-"""No agent counts its datagrams up to this; from here on they are the rogue's."""
+"""First sequence number of forged datagrams. Agents never reach it."""
 _EACH = 1 << 17
-"""Of one injection: more than a flood has datagrams."""
+"""Sequence numbers for each injection, more than a flood has datagrams."""
 
 
 def forged_sequence(injection: int, count: int) -> int:
-    """That of the datagram with this count, from 0, of the injection with this number, from 1."""
+    """Return the sequence number of datagram `count` (from 0) of injection `injection` (from 1)."""
     return FORGED_FROM + (injection - 1) * _EACH + count % _EACH
 
 
 def injection_of(sequence: int) -> int | None:
-    """The number of the injection that forged the datagram; None if an agent sent it."""
+    """Return the number of the injection that forged a datagram, or None if an agent sent it."""
     return (sequence - FORGED_FROM) // _EACH + 1 if sequence >= FORGED_FROM else None

@@ -48,7 +48,7 @@ class VirtualRogue:
         self.hears_datagram(encode(sender, sequence, message), now)
 
     def hears_datagram(self, datagram: bytes, now: float) -> None:
-        self._rogue.hears(datagram, now)
+        self._rogue.receive(datagram, now)
         self._send(now)
 
     def begin(self, injected: Injected, now: float) -> None:

@@ -1,8 +1,8 @@
-"""What pytest loads wherever the harness is installed: the plugin, if its packages are ours.
+"""The entry point that pytest loads in each environment with the harness. It loads the plugin if the packages are ours.
 
-A project may have a folder with the name of one of our packages, and two of one name cannot be in one process. Then
-there is no plugin, and the project's tests run as they would without it; a test that asks for a fixture of the harness
-is told why there is none.
+A project may have a folder with the name of one of our packages, and one process can import only one of both. In this
+case the plugin is not loaded, and the project's tests run as without it. A test that uses a fixture of the harness
+fails with the reason.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import NoReturn
 import pytest
 
 OURS = {"harness": "pytest_plugin", "ucp": "quirks", "sitl": "pilot.py", "netem": "lab.py"}
-"""Each package, and what is in ours."""
+"""Package -> a file or folder that only our package contains."""
 
 
-def others() -> list[Path]:
-    """Packages that have the name of one of ours, and are where Python looks before, or will."""
+def find_foreign_packages() -> list[Path]:
+    """Return other packages with the name of one of ours that Python imports first."""
     here = Path.cwd()
     places = [here / name for name in OURS if (here / name / "__init__.py").exists()]
     for name in OURS:
@@ -27,7 +27,7 @@ def others() -> list[Path]:
     return [place for place in dict.fromkeys(places) if not (place / OURS[place.name]).exists()]
 
 
-if hidden := others():
+if hidden := find_foreign_packages():
     WHY = (
         f"ucp-harness is not importable: {' and '.join(map(str, hidden))} "
         f"{'has the name of one' if len(hidden) == 1 else 'have names'} of its packages; "
@@ -43,12 +43,12 @@ if hidden := others():
 
     @pytest.fixture
     def swarm() -> NoReturn:
-        """Is not there."""
+        """Fail with the reason."""
         pytest.fail(WHY, pytrace=False)
 
     @pytest.fixture
     def scenario() -> NoReturn:
-        """Is not there."""
+        """Fail with the reason."""
         pytest.fail(WHY, pytrace=False)
 
 else:

@@ -15,7 +15,7 @@ from harness.play.machine import capabilities
 from harness.play.machine.capabilities import Requirement
 from netem.conditions import NetworkConditions
 from netem.errors import LabError
-from netem.estimates import Heard, Lateness, lost
+from netem.estimates import Lateness, ReceivedStream, lost
 from netem.measure import Observer, Question, Study
 
 WORKS = [
@@ -31,10 +31,10 @@ def losing(*shares: float) -> Observer:
     """Loses such shares, one stream after the other."""
     streams = iter(shares)
 
-    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], Heard]:
+    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         first = round(next(streams) * packets)
         lateness = Lateness([0.0001] * packets, [0.0002] * 10)
-        return {(1, 4): Heard([0.0] * packets, [(number, 0.1) for number in range(first, packets)], lateness)}
+        return {(1, 4): ReceivedStream([0.0] * packets, [(number, 0.1) for number in range(first, packets)], lateness)}
 
     return observe
 
@@ -113,7 +113,7 @@ def test_without_an_engine_there_is_nothing_to_measure_and_status_3(monkeypatch:
 def test_a_machine_that_is_too_busy_is_one_sentence_and_status_3(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def too_busy(study: Study, packets: int) -> Mapping[tuple[int, int], Heard]:
+    def too_busy(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         raise LabError("A receive buffer overflowed")
 
     fake(monkeypatch, too_busy)

@@ -161,19 +161,19 @@ def test_user_mode_linux_has_no_engine(tmp_path: Path) -> None:
 
 
 def test_a_run_is_its_orchestrators_as_long_as_that_lives() -> None:
-    assert ownership.lives(ownership.this_process())
+    assert ownership.is_alive(ownership.this_process())
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     boot, _, _ = ownership.this_process().split()
     started = Path(f"/proc/{child.pid}/stat").read_text().rsplit(")", 1)[1].split()[19]
-    assert ownership.lives(f"{boot} {child.pid} {started}")
-    assert not ownership.lives(f"{boot} {child.pid} {int(started) + 1}"), "another process of the same number"
-    assert not ownership.lives(f"another-boot {child.pid} {started}")
+    assert ownership.is_alive(f"{boot} {child.pid} {started}")
+    assert not ownership.is_alive(f"{boot} {child.pid} {int(started) + 1}"), "another process of the same number"
+    assert not ownership.is_alive(f"another-boot {child.pid} {started}")
     child.kill()
     os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
-    assert not ownership.lives(f"{boot} {child.pid} {started}"), "dead, if not buried"
+    assert not ownership.is_alive(f"{boot} {child.pid} {started}"), "dead, if not buried"
     child.wait()
     for nonsense in ("", "x", f"{boot} -1 5", f"{boot} {child.pid} None"):
-        assert not ownership.lives(nonsense)
+        assert not ownership.is_alive(nonsense)
 
 
 @pytest.mark.parametrize("name", ["loss 15 %", "..", "é", "-x-", "a" * 300])

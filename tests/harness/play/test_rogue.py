@@ -132,13 +132,13 @@ def test_a_forged_commit_goes_on_top_of_what_was_heard_last() -> None:
         ({}, ChainHashSuccessorQuery(TOP), NextInSequenceResponse(TOP, None, 0)),
     ],
 )
-def test_it_answers_every_question_in_an_agent_s_name(keys: dict[str, Any], query: Message, answer: Message) -> None:
+def test_it_answers_every_question_in_an_agent_s_name(keys: dict[str, Any], question: Message, answer: Message) -> None:
     one = rogue()
     begin(one, "forge", message=answer.NAME, sender=2, for_s=10, **keys)
-    assert [(it.source, said(it)) for it in receive(one, encode(1, 1, query), 101.0)] == [(2, answer)]
-    assert receive(one, encode(2, 1, query), 101.0) == []
+    assert [(it.source, said(it)) for it in receive(one, encode(1, 1, question), 101.0)] == [(2, answer)]
+    assert receive(one, encode(2, 1, question), 101.0) == []
     assert receive(one, encode(1, 2, RequestForBlock(TOP)), 101.0) == []
-    assert receive(one, encode(1, 3, query), 110.0) == []
+    assert receive(one, encode(1, 3, question), 110.0) == []
 
 
 def test_a_forged_vote_names_the_chain_where_votes_do() -> None:

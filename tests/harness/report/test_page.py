@@ -254,9 +254,7 @@ SCENARIO_KEYS = list(result_of([1])["scenario"])
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.dictionaries(st.sampled_from(KEYS), JSON), st.dictionaries(st.sampled_from(SCENARIO_KEYS), JSON))
-def test_any_result_gives_a_report(
-    tmp_path: Path, result: dict[str, Any], scenario: dict[str, Any]
-) -> None:
+def test_any_result_gives_a_report(tmp_path: Path, result: dict[str, Any], scenario: dict[str, Any]) -> None:
     (tmp_path / "run.json").write_text(json.dumps({"scenario": scenario, **result, "schema": "ucp-run/1"}))
     assert write_report(RunArchive(tmp_path)).stat().st_size > 0
 

@@ -154,7 +154,9 @@ def test_duplicate_block_is_reported_at_once(run: Path, tmp_path: Path) -> None:
     assert against, "some wrong agent of ours is wrong at once"
 
 
-def test_directory_without_a_run_is_refused_in_one_sentence(tmp_path: Path, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_directory_without_a_run_is_refused_in_one_sentence(
+    tmp_path: Path, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for path, why in ((tmp_path / "nowhere", "does not exist"), (tmp_path, "neither a run directory")):
         with pytest.raises(RunDirectoryError, match=why):
             Feed(path)
