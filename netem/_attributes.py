@@ -1,6 +1,7 @@
 """Netlink attributes (RFC 3549; linux/netlink.h) as bytes.
 
-A lab of 100 vehicles with a condition for each pair is 20,000 requests, and 10,000 answers when it is read back.
+The package has its own small codec for speed. A lab of 100 vehicles with a condition for each pair needs 20,000
+requests, and 10,000 answers when it is read back.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ def nested(kind: int, *attributes: bytes) -> bytes:
 
 
 def number(kind: int, value: int) -> bytes:
-    """An attribute of 32 bits."""
+    """Return an attribute with 32 bits."""
     return attribute(kind, struct.pack("=I", value))
 
 
@@ -31,7 +32,7 @@ def text(kind: int, value: str) -> bytes:
 
 
 def parse(data: bytes) -> dict[int, bytes]:
-    """Payloads by kind; of a kind that comes again, the last."""
+    """Return the payloads by kind. If a kind occurs twice, the last one counts."""
     payloads = {}
     offset = 0
     while offset + _HEADER.size <= len(data):
@@ -42,5 +43,5 @@ def parse(data: bytes) -> dict[int, bytes]:
 
 
 def parse_number(payload: bytes | None) -> int | None:
-    """The value of an attribute of 32 bits, if it is there."""
+    """Return the value of an attribute with 32 bits, or None if it is missing."""
     return None if payload is None else int.from_bytes(payload[:4], sys.byteorder)

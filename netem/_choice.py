@@ -1,4 +1,4 @@
-"""Which engine a lab uses: the one asked for, or the first that this kernel can run."""
+"""Choose the engine of a lab: the requested one, or the first that works on this kernel."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from netem.tc import NetemEngine
 
 
 def choose(preference: str | None, fabric: Fabric, needs: Sequence[str] = ()) -> tuple[Engine, str]:
-    """The engine to use on this machine, installed, and why it is this one.
+    """Return an installed engine for this machine, and the reason for the choice.
 
-    Without a preference tc netem goes first, because it can do more; `needs` are what conditions will ask beyond
-    loss and partition. An engine is tried by installing it: nothing else tells whether a kernel can. Raises
-    EngineError with what each one lacks if none works.
+    Without a preference, tc netem comes first, because it supports more. `needs` lists conditions other than loss and
+    partition. Only the installation of an engine shows whether the kernel supports it. Raises EngineError with the
+    reason of each engine if none works.
     """
     engines: dict[str, type[Engine]] = {kind.name: kind for kind in (NetemEngine, NftablesEngine)}
     if preference is not None and preference not in engines:

@@ -1,7 +1,7 @@
-"""How delays vary: quantiles of tc-netem(8)'s distributions, in the form of netem's own tables.
+"""Distributions of delays: quantiles of tc-netem(8)'s distributions, in the form of netem's own tables.
 
-netem draws an entry of a table and multiplies it with the jitter. iproute2 has such tables as files (normal.dist,
-pareto.dist, paretonormal.dist), which not every machine has: ours are computed.
+netem draws an entry of a table and multiplies it by the jitter. iproute2 contains such tables as files (normal.dist,
+pareto.dist, paretonormal.dist), but not every machine has them. Therefore the tables are computed here.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ from statistics import NormalDist
 from netem.link import Distribution
 
 SCALE = 8192
-"""Entries are in 1/SCALE of a standard deviation (of the uniform one: of half the width)."""
+"""Entries are multiples of 1/SCALE of a standard deviation; for the uniform distribution, of half the width."""
 
 
 @cache
 def table(distribution: Distribution, size: int) -> tuple[int, ...]:
-    """`size` quantiles, equally probable, ascending, as whole numbers of 16 bits with a sign.
+    """Return `size` equally probable quantiles in ascending order, as signed 16-bit numbers.
 
-    Pareto is that of shape 3, shifted to mean 0; the mixed one is a quarter normal and three quarters Pareto.
+    The Pareto distribution has shape 3 and is shifted to mean 0. The mixed one is a quarter normal and three quarters
+    Pareto.
     """
     at = [(index + 0.5) / size for index in range(size)]
     normal = [NormalDist().inv_cdf(share) for share in at]

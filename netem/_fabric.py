@@ -1,10 +1,10 @@
-"""The switch and the cables: bridge `air`, and for every vehicle a network namespace on a veth pair.
+"""The switch and the cables: bridge `air`, and for each vehicle a network namespace with a veth pair.
 
-A vehicle sees `eth0` with its address and a default route on it (ArduPilot built with CAN needs a route
-for its multicast). The other end, `v<ID>`, is a port of the bridge in the lab's own namespace, where the
-engines meet every packet on its way to that vehicle. The vehicles' namespaces have no names: they live as
-long as this process holds them open or someone lives in them. One that is there already, a container's, can
-be a vehicle's too: the cable then ends in it.
+A vehicle has the interface `eth0` with its address and a default route (ArduPilot built with CAN needs a route for its
+multicast). The other end, `v<ID>`, is a port of the bridge in the lab's own namespace. There the engines handle each
+packet on its way to the vehicle. The vehicles' namespaces have no names. They exist as long as this process holds them
+open or a process runs in them. An existing namespace, such as that of a container, can also belong to a vehicle. The
+cable then ends in it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from netem.errors import LabError
 
 BRIDGE = "air"
 
-# Interface numbers are ours to choose in a fresh namespace, which saves asking the kernel for them.
+# A fresh namespace lets us choose interface numbers, so we need not ask the kernel for them.
 _LO = 1
 _ETH0 = 2
 _BRIDGE_INDEX = 2
@@ -31,14 +31,14 @@ _CARRIER_DEADLINE_S = 5.0
 
 
 class Fabric:
-    """The lab's network; built in the network namespace that the calling thread is in."""
+    """The lab's network, built in the network namespace of the calling thread."""
 
     def __init__(self, vehicles: Sequence[int], networks: Mapping[int, int]) -> None:
         self.vehicles = tuple(vehicles)
         self.home = _namespaces.open_network()
         self.netlink = Netlink()
         self._namespaces = dict(networks)
-        _silence_ipv6()
+        _disable_ipv6()
         _bypass_firewall()
         self.netlink.send([set_up("lo", _LO), bridge(BRIDGE, _BRIDGE_INDEX)])
         inside = {vehicle: self._namespace(vehicle) for vehicle in self.vehicles}
@@ -46,10 +46,10 @@ class Fabric:
         for vehicle, netlink in inside.items():
             netlink.send(_configure(vehicle))
             netlink.close()
-        self._await_carrier()
+        self._wait_for_carrier()
 
     def port_index(self, vehicle: int) -> int:
-        """Interface number of a vehicle's switch port `v<ID>` in the lab's namespace."""
+        """Return the interface number of a vehicle's switch port `v<ID>` in the lab's namespace."""
         return _FIRST_PORT_INDEX + self.vehicles.index(vehicle)
 
     def inside(self, vehicle: int | None) -> AbstractContextManager[None]:
@@ -61,14 +61,14 @@ class Fabric:
         return {vehicle: os.fstat(namespace).st_ino for vehicle, namespace in self._namespaces.items()}
 
     def _namespace(self, vehicle: int) -> Netlink:
-        """Make a vehicle's namespace, if there is none yet, and return a netlink socket that stays in it."""
+        """Make a vehicle's namespace unless it exists. Return a netlink socket inside it."""
         if vehicle in self._namespaces:
             _namespaces.enter_network(self._namespaces[vehicle])
         else:
             _namespaces.unshare_network()
             self._namespaces[vehicle] = _namespaces.open_network()
         try:
-            _silence_ipv6()
+            _disable_ipv6()
             return Netlink()
         finally:
             _namespaces.enter_network(self.home)
@@ -84,8 +84,8 @@ class Fabric:
             network=self._namespaces[vehicle],
         )
 
-    def _await_carrier(self) -> None:
-        """Wait until the bridge forwards on every port: the kernel notices a cable a moment later."""
+    def _wait_for_carrier(self) -> None:
+        """Wait until the bridge forwards on each port. The kernel detects a new cable after a short time."""
         deadline = time.monotonic() + _CARRIER_DEADLINE_S
         while True:
             ready = forwarding(self.netlink)
@@ -98,19 +98,19 @@ class Fabric:
                 return
 
 
-def _silence_ipv6() -> None:
-    """No IPv6 on links made from here on: an idle link is impossible that nobody asked for."""
+def _disable_ipv6() -> None:
+    """Disable IPv6 on new links, because it would send packets on an idle link."""
     _sysctl("ipv6/conf/default/disable_ipv6", b"1")
 
 
 def _bypass_firewall() -> None:
-    """Where br_netfilter is loaded (by Docker, often), keep it from judging what our bridge carries."""
+    """Keep br_netfilter, which Docker often loads, from filtering packets of the bridge."""
     for protocol in ("iptables", "ip6tables", "arptables"):
         _sysctl(f"bridge/bridge-nf-call-{protocol}", b"0")
 
 
 def _sysctl(name: str, value: bytes) -> None:
-    """Set a value of the network namespace that we are in, if its kernel has such a thing."""
+    """Set a value of the current network namespace, if the kernel has it."""
     try:
         fd = os.open(f"/proc/sys/net/{name}", os.O_WRONLY | os.O_CLOEXEC)
     except FileNotFoundError:

@@ -1,6 +1,6 @@
-"""The requests of the fabric: what it says to the kernel about links, addresses and routes, and what it reads there.
+"""The netlink requests of the fabric about links, addresses and routes.
 
-Messages and numbers are those of linux/rtnetlink.h, if_link.h, if_addr.h and veth.h; see rtnetlink(7).
+Messages and numbers come from linux/rtnetlink.h, if_link.h, if_addr.h and veth.h. See rtnetlink(7).
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import struct
 from netem._attributes import attribute, nested, number, parse, text
 from netem._netlink import NEW, RTM_GETLINK, RTM_NEWADDR, RTM_NEWLINK, RTM_NEWROUTE, Netlink, Request
 
-_IFINFOMSG = struct.Struct("=BxHiII")  # family, type, index, flags, which of them change
-_IFADDRMSG = struct.Struct("=4BI")  # family, length of the prefix, flags, scope, index
-_RTMSG = struct.Struct("=8BI")  # family, two lengths of prefixes, TOS, table, protocol, scope, type, flags
+_IFINFOMSG = struct.Struct("=BxHiII")  # family, type, index, flags, mask of changed flags
+_IFADDRMSG = struct.Struct("=4BI")  # family, prefix length, flags, scope, index
+_RTMSG = struct.Struct("=8BI")  # family, two prefix lengths, TOS, table, protocol, scope, type, flags
 
 _IFF_UP = 1
 _IFLA_ADDRESS, _IFLA_IFNAME, _IFLA_MASTER, _IFLA_PROTINFO, _IFLA_LINKINFO, _IFLA_NET_NS_FD = 1, 3, 10, 12, 18, 28
@@ -31,8 +31,10 @@ def set_up(what: str, index: int) -> Request:
 
 
 def bridge(name: str, index: int) -> Request:
-    """A switch that is up: without spanning tree and delay, so that a port forwards at once, and without snooping, so
-    that multicast reaches everyone, as it does over the air.
+    """Return a request for an active bridge.
+
+    Without spanning tree and forward delay, ports forward at once. Without multicast snooping, multicast reaches all
+    vehicles, as it does by radio.
     """
     settings = (
         number(_IFLA_BR_STP_STATE, 0),
@@ -43,8 +45,9 @@ def bridge(name: str, index: int) -> Request:
 
 
 def veth_pair(name: str, index: int, bridge: int, *, far_name: str, far_index: int, mac: str, network: int) -> Request:
-    """A cable from a port of the bridge, which is up, to the namespace that the file `network` is; its far end has that
-    MAC address.
+    """Return a request for a cable from an active port of the bridge to a network namespace.
+
+    `network` is a file descriptor of the namespace, and `mac` is the address of the cable's far end.
     """
     far_end = (
         _IFINFOMSG.pack(0, 0, far_index, 0, 0),
@@ -57,7 +60,7 @@ def veth_pair(name: str, index: int, bridge: int, *, far_name: str, far_index: i
 
 
 def address(what: str, index: int, own: str, prefix_length: int, broadcast: str) -> Request:
-    """An IPv4 address for a link."""
+    """Return a request for an IPv4 address of a link."""
     attributes = [
         attribute(kind, socket.inet_aton(each))
         for kind, each in ((_IFA_LOCAL, own), (_IFA_ADDRESS, own), (_IFA_BROADCAST, broadcast))
@@ -67,13 +70,13 @@ def address(what: str, index: int, own: str, prefix_length: int, broadcast: str)
 
 
 def default_route(what: str, index: int) -> Request:
-    """Whoever is on that link is next door, whatever the address."""
+    """Return a request for a default route without a gateway: all addresses are neighbours on that link."""
     kind = (_RT_TABLE_MAIN, _RTPROT_STATIC, _RT_SCOPE_LINK, _RTN_UNICAST)
     return Request(what, RTM_NEWROUTE, _RTMSG.pack(socket.AF_INET, 0, 0, 0, *kind, 0) + number(_RTA_OIF, index), NEW)
 
 
 def forwarding(netlink: Netlink) -> set[int]:
-    """Interface numbers of the ports on which their bridge forwards."""
+    """Return the interface numbers of the ports on which the bridge forwards."""
     ports = netlink.dump("list the ports of the bridge", RTM_GETLINK, _IFINFOMSG.pack(socket.AF_BRIDGE, 0, 0, 0, 0))
     return {_IFINFOMSG.unpack_from(port)[2] for port in ports if _forwards(port)}
 

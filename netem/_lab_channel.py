@@ -1,4 +1,4 @@
-"""The orchestrator's end of the control socket: questions and answers, and news of children that ended."""
+"""The orchestrator's end of the control socket: requests, answers, and reports of ended processes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Answer = tuple[dict[str, Any], socket.socket | None]
 
 
 @dataclass
-class _Question:
+class _Request:
     what: str
     answer: asyncio.Future[Answer]
 
 
 class Channel:
-    """Speaks to one `netem.init`; when that is gone, every question ends with the same clear error."""
+    """The connection to one `netem.init`. When that process has ended, each request fails with the same error."""
 
     def __init__(self, control: socket.socket, log: Path) -> None:
         control.setblocking(False)
@@ -33,7 +33,7 @@ class Channel:
         self._loop = asyncio.get_running_loop()
         self._receiver = Receiver()
         self._numbers = itertools.count(1)
-        self._questions: dict[int, _Question] = {}
+        self._requests: dict[int, _Request] = {}
         self._children: dict[int, asyncio.Future[int]] = {}
         self._inside: asyncio.Future[bool] = self._loop.create_future()
         self._writing = asyncio.Lock()
@@ -45,11 +45,11 @@ class Channel:
         return self._end is None
 
     async def inside(self) -> bool:
-        """Wait for the first process to say that it lives; False if it is gone instead."""
+        """Wait for the first report of the lab's first process. Return False if it has ended instead."""
         return await asyncio.shield(self._inside)
 
     async def ask(self, what: str, **arguments: Any) -> Answer:
-        """Send a request, and return its result and the socket that came with it."""
+        """Send a request. Return its result, and the socket that came with it, if any."""
         if self._end is not None:
             raise LabError(self._end)
         number = next(self._numbers)
@@ -58,28 +58,28 @@ class Channel:
             data = encode({"id": number, "request": what, **arguments})
         except WireError as error:
             raise LabError(f"The lab cannot be asked to {what}: {error}") from error
-        self._questions[number] = _Question(what, answer)
+        self._requests[number] = _Request(what, answer)
         try:
             async with self._writing:
-                # A torn message would spoil the stream: once begun, it is sent, whoever is cancelled.
+                # A partial message would corrupt the stream, so it is sent completely even if the caller is cancelled.
                 await asyncio.shield(self._loop.create_task(self._write(data)))
             return await answer
         finally:
-            self._questions.pop(number, None)
+            self._requests.pop(number, None)
 
     async def _write(self, data: bytes) -> None:
-        with contextlib.suppress(OSError):  # the reader sees the end too, and says so to everybody
+        with contextlib.suppress(OSError):  # the reader also detects the end, and reports it
             await self._loop.sock_sendall(self._control, data)
 
     def close(self) -> None:
-        """Hang up, on which the lab ends."""
+        """Close the connection, which ends the lab."""
         self._finish("The lab is closed")
 
     def _receive(self) -> None:
         try:
             alive = self._receiver.read(self._control)
             for message in self._receiver.messages():
-                self._take(message)
+                self._handle(message)
         except BlockingIOError:
             return
         except (ConnectionError, WireError):
@@ -90,34 +90,34 @@ class Channel:
                 f"{self._log}"
             )
 
-    def _take(self, message: dict[str, Any]) -> None:
+    def _handle(self, message: dict[str, Any]) -> None:
         event = message.get("event")
         if event == "inside" and not self._inside.done():
             self._inside.set_result(True)
         elif event == "exited":
-            ended = self._children.pop(message["pid"], None)
-            if ended is not None and not ended.done():
-                ended.set_result(message["returncode"])
+            end_future = self._children.pop(message["pid"], None)
+            if end_future is not None and not end_future.done():
+                end_future.set_result(message["returncode"])
         elif "id" in message:
-            self._take_answer(message)
+            self._handle_answer(message)
 
-    def _take_answer(self, message: dict[str, Any]) -> None:
+    def _handle_answer(self, message: dict[str, Any]) -> None:
         connection = None
         if message.get("descriptors"):
             connection = socket.socket(fileno=self._receiver.descriptors.popleft())
-        question = self._questions.get(message["id"])
-        if question is None or question.answer.done():  # whoever asked was cancelled
+        request = self._requests.get(message["id"])
+        if request is None or request.answer.done():  # the caller was cancelled
             if connection is not None:
                 connection.close()
             return
         if error := message.get("error"):
-            question.answer.set_exception(_exception(question.what, error))
+            request.answer.set_exception(_exception(request.what, error))
             return
         result = message["result"]
-        if question.what == "spawn":
-            # Here and not where the answer is awaited: the news of its end may be the next message.
+        if request.what == "spawn":
+            # Here and not where the answer is awaited, because the report of its end may be the next message.
             result["ended"] = self._children[result["pid"]] = self._loop.create_future()
-        question.answer.set_result((result, connection))
+        request.answer.set_result((result, connection))
 
     def _finish(self, reason: str) -> None:
         if self._end is not None:
@@ -129,12 +129,12 @@ class Channel:
         self._receiver.close()
         if not self._inside.done():
             self._inside.set_result(False)
-        for ended in self._children.values():
-            if not ended.done():
-                ended.set_result(-signal.SIGKILL)
-        for question in self._questions.values():
-            if not question.answer.done():
-                question.answer.set_exception(LabError(reason))
+        for end_future in self._children.values():
+            if not end_future.done():
+                end_future.set_result(-signal.SIGKILL)
+        for request in self._requests.values():
+            if not request.answer.done():
+                request.answer.set_exception(LabError(reason))
 
 
 def _exception(what: str, error: dict[str, Any]) -> Exception:
@@ -142,7 +142,7 @@ def _exception(what: str, error: dict[str, Any]) -> Exception:
     if what == "spawn" and kind == "os":
         return SpawnError(message)
     if what == "connect" and kind == "os":
-        # OSError with a number is of the right class: ConnectionRefusedError, TimeoutError.
+        # OSError with a number becomes the right subclass: ConnectionRefusedError, TimeoutError.
         exception = OSError(code, message.split("] ", 1)[-1])
         return exception if isinstance(exception, (ConnectionError, TimeoutError)) else ConnectionError(*exception.args)
     kinds: dict[str, type[NetemError]] = {"conditions": ConditionsError, "engine": EngineError}

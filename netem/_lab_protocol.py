@@ -1,7 +1,7 @@
-"""How orchestrator and lab talk: JSON objects, each after its length, over a Unix stream socket.
+"""The protocol between orchestrator and lab: JSON objects with length prefixes on a Unix stream socket.
 
-Sockets travel beside a message as SCM_RIGHTS (unix(7)); a message that carries one says so in its key
-`descriptors`, and both sides keep the order.
+Sockets accompany a message as SCM_RIGHTS (unix(7)). Such a message has their number in its key `descriptors`. Both
+sides keep the order.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _MAX_DESCRIPTORS = 64
 
 
 class WireError(Exception):
-    """The stream is not ours; nothing after this point can be trusted."""
+    """Invalid data in the stream. Everything after it is unusable."""
 
 
 def encode(message: dict[str, Any]) -> bytes:
@@ -32,14 +32,14 @@ def encode(message: dict[str, Any]) -> bytes:
 
 
 class Receiver:
-    """Takes in what a socket has, and gives out whole messages and the descriptors that came along."""
+    """Splits the stream of a socket into messages and descriptors."""
 
     def __init__(self) -> None:
         self._data = bytearray()
         self.descriptors: deque[int] = deque()
 
     def read(self, source: socket.socket) -> bool:
-        """Take in what has arrived; False at the end of the stream. Raises BlockingIOError if nothing."""
+        """Read available data. Return False at the end of the stream. Raises BlockingIOError without data."""
         room = socket.CMSG_SPACE(_MAX_DESCRIPTORS * array.array("i").itemsize)
         data, ancillary, _, _ = source.recvmsg(1 << 16, room, socket.MSG_CMSG_CLOEXEC)
         for level, kind, payload in ancillary:
@@ -49,7 +49,7 @@ class Receiver:
         return bool(data)
 
     def messages(self) -> list[dict[str, Any]]:
-        """The messages that are complete; raises WireError if the stream makes no sense."""
+        """Return the complete messages. Raises WireError for an invalid stream."""
         messages = []
         while len(self._data) >= _LENGTH.size:
             (length,) = _LENGTH.unpack_from(self._data)

@@ -1,9 +1,8 @@
-"""How a process gets a private network: unshare(1) around the lab's first process, setns(2) inside it.
+"""Private networks for processes: unshare(1) around the lab's first process, and setns(2) inside it.
 
-The first process is PID 1 of a PID namespace of its own, so its end, for whatever reason, is the end of
-every process in the lab, and with the last of them the kernel removes namespaces, links and rules.
-Three things end it: the orchestrator closes the control socket (or dies, which closes it), the death
-signal that setpriv(1) asks for, and `--kill-child`, which ties it to the unshare process.
+The first process is PID 1 of its own PID namespace. Its end therefore ends each process of the lab, and afterwards the
+kernel removes namespaces, links and rules. Three mechanisms end it: the orchestrator closes the control socket or dies,
+the death signal that setpriv(1) requests, and `--kill-child`, which ties it to the unshare process.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ def unshare_network() -> None:
 
 
 def open_network() -> int:
-    """A descriptor of the network namespace that this thread is in."""
+    """Return a file descriptor of this thread's network namespace."""
     return os.open("/proc/thread-self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
 
 
@@ -54,11 +53,11 @@ def _check(result: int) -> None:
 
 
 def command(argv: Sequence[str], *, user_namespace: bool, die_with_parent: bool = True) -> list[str]:
-    """The command line that runs `argv` as first process of a private network (unshare(1)).
+    """Return the command that runs `argv` as the first process of a private network (unshare(1)).
 
-    With `user_namespace` it needs no rights but ends up with all of them over what it creates.
-    The death signal follows the *thread* that started the command (PR_SET_PDEATHSIG in prctl(2)):
-    without `die_with_parent`, the command is for a thread that may end before the lab does.
+    With `user_namespace`, it needs no rights, and has all rights over the objects that it creates. The death signal
+    follows the *thread* that started the command (PR_SET_PDEATHSIG in prctl(2)). Set `die_with_parent` to false if this
+    thread may end before the lab.
     """
     setpriv = ["setpriv", "--pdeathsig", "KILL"] if die_with_parent else []
     user = ["--user", "--map-root-user"] if user_namespace else []
@@ -66,15 +65,18 @@ def command(argv: Sequence[str], *, user_namespace: bool, die_with_parent: bool 
             "--mount-proc", *argv]  # fmt: skip
 
 
-def ways_in() -> tuple[bool, ...]:
-    """Values of `user_namespace` worth trying, in order: root needs none unless its rights are clipped."""
+def user_namespace_choices() -> tuple[bool, ...]:
+    """Return the values of `user_namespace` to try, in order.
+
+    Root needs no user namespace unless its rights are limited.
+    """
     return (False, True) if os.geteuid() == 0 else (True,)
 
 
 def probe() -> tuple[bool, str]:
-    """Whether this machine lets us make the namespaces; if not, the words of the tool that was refused."""
-    word = ""
-    for user_namespace in ways_in():
+    """Return whether this machine allows the namespaces, with the mode, or with the message of the refused tool."""
+    message = ""
+    for user_namespace in user_namespace_choices():
         argv = command(["true"], user_namespace=user_namespace, die_with_parent=False)
         try:
             done = subprocess.run(argv, capture_output=True, text=True, timeout=10, check=False)
@@ -84,18 +86,18 @@ def probe() -> tuple[bool, str]:
             return False, "unshare did not come back within 10 s"
         if done.returncode == 0:
             return True, "own user namespace, no root needed" if user_namespace else "as root"
-        word = done.stderr.strip().splitlines()[-1] if done.stderr.strip() else f"status {done.returncode}"
-    return False, word
+        message = done.stderr.strip().splitlines()[-1] if done.stderr.strip() else f"status {done.returncode}"
+    return False, message
 
 
-def not_executed(word: str) -> tuple[str, str] | None:
-    """The program that a tool did not start, and why, if that is what its `word` says: namespaces were allowed."""
-    match = re.fullmatch(r"(?:unshare|setpriv): failed to execute (.+): (.+)", word)
+def not_executed(message: str) -> tuple[str, str] | None:
+    """Return program and reason from a tool's message about a program that it could not start, or None."""
+    match = re.fullmatch(r"(?:unshare|setpriv): failed to execute (.+): (.+)", message)
     return (match[1], match[2]) if match else None
 
 
 def user() -> str:
-    """Who executes what we execute: "user nobody"; the one outside, where we are root of a user namespace."""
+    """Return the user who executes programs, such as "user mail". Root of a user namespace is the user outside."""
     uid = os.geteuid()
     for line in Path("/proc/self/uid_map").read_text().splitlines():
         inside, outside, count = map(int, line.split())
@@ -108,11 +110,11 @@ def user() -> str:
         return f"user {uid}"
 
 
-def way_out(word: str) -> str:
-    """What to do about namespaces that were refused with `word`, from what this machine says of itself."""
-    if "not installed" in word:
+def way_out(message: str) -> str:
+    """Return advice for namespaces that were refused with this message, from the settings of this machine."""
+    if "not installed" in message:
         return "Install util-linux (Debian, Ubuntu: apt install util-linux)."
-    if not_executed(word):
+    if not_executed(message):
         return "Let that user reach it, or use a Python that every user can execute (Debian, Ubuntu: /usr/bin/python3)."
     as_root = "or run as root"
     if _sysctl("user/max_user_namespaces") == 0:

@@ -1,7 +1,7 @@
-"""A netlink socket that sends requests in batches: rtnetlink(7), without a round trip for each request.
+"""A netlink socket that sends requests in batches (rtnetlink(7)), without a round trip for each request.
 
-A lab of 100 vehicles is some 900 requests; one system call and one wait for each of them would be most
-of the time it takes to come up. The socket stays with the namespace in which it was opened.
+A lab of 100 vehicles needs about 900 requests. One system call and one wait for each of them would take most of its
+start time. The socket belongs to the namespace in which it was opened.
 """
 
 from __future__ import annotations
@@ -37,27 +37,27 @@ NEW = NLM_F_CREATE | NLM_F_EXCL
 
 _HEADER = struct.Struct("=IHHII")
 _BATCH = 50
-_BATCH_BYTES = 64 << 10  # a socket takes about three times as much at once
+_BATCH_BYTES = 64 << 10  # a socket accepts about three times as much at once
 
 
 @dataclass(frozen=True)
 class Request:
-    """One change asked of the kernel; `what` names it in an error."""
+    """One change for the kernel. `what` names it in an error."""
 
     what: str
     type: int
-    message: bytes  # what comes after the header
+    message: bytes  # content after the header
     flags: int = 0
 
 
 class Netlink:
-    """A NETLINK_ROUTE socket of the network namespace that the caller is in."""
+    """A NETLINK_ROUTE socket of the caller's network namespace."""
 
     def __init__(self) -> None:
         kind = socket.SOCK_RAW | socket.SOCK_CLOEXEC
         self._socket = socket.socket(socket.AF_NETLINK, kind, socket.NETLINK_ROUTE)
         self._socket.bind((0, 0))
-        # The kernel's own sentence beside the error number, and no echo of the request.
+        # Request the kernel's error message in addition to the number, and no copy of the request.
         for option in (_NETLINK_EXT_ACK, _NETLINK_CAP_ACK):
             self._socket.setsockopt(_SOL_NETLINK, option, 1)
         self._sequence = 0
@@ -66,9 +66,9 @@ class Netlink:
         self._socket.close()
 
     def send(self, requests: Sequence[Request]) -> None:
-        """Send the requests in order, and wait until the kernel has done all of them.
+        """Send the requests in order, and wait until the kernel has processed all of them.
 
-        Raises NetlinkError for the first one refused; those after it in its batch were tried too.
+        Raises NetlinkError for the first refused request. Later requests of the same batch were tried, too.
         """
         batch: list[Request] = []
         encoded = bytearray()
@@ -97,7 +97,7 @@ class Netlink:
             raise error
 
     def dump(self, what: str, kind: int, message: bytes) -> list[bytes]:
-        """Everything that the kernel lists for a GET request; of each what comes after the header."""
+        """Return all entries that the kernel lists for a GET request, without their headers."""
         self._socket.send(self._encode(message, kind, NLM_F_DUMP))
         entries: list[bytes] = []
         while True:

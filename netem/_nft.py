@@ -1,8 +1,8 @@
 """Engine "nftables": loss and partitions as rules of `table bridge air`, for kernels without sch_netem.
 
-Rules stand in the forward hook of the bridge, which sees every packet whatever its protocol, once per
-receiver: the switch has copied a broadcast already, so each receiver draws its own lot. A packet is first
-marked with the group of the port it came from, then judged in its receiver's chain:
+The rules are in the forward hook of the bridge. It handles each packet of any protocol once per receiver, because the
+switch has already copied broadcasts. Each receiver therefore has its own random draws. A packet is first marked with
+the group of its incoming port, and then judged in its receiver's chain:
 
     chain forward { meta mark set iifname map @group
                     oifname vmap { "v7" : jump cut_v7, ... }
@@ -13,11 +13,11 @@ marked with the group of the port it came from, then judged in its receiver's ch
     chain to_v7_0 { numgen random mod 1000000000 < 150000000 counter name "lost_v7" drop
                     counter name "passed_v7" }
 
-so the cost of a packet does not grow with the number of vehicles. Chain 0 is for all senders but those whose
-loss differs; there is one more for each loss that differs. A change is one nft transaction: no packet meets
-half of it. Only one with thousands of links, which is more than an ordinary user may send at once, goes
-receiver by receiver. The counters are objects of their own and outlive the rules.
-See nft(8) and libnftables-json(5).
+The cost of a packet therefore does not grow with the number of vehicles. Chain 0 applies to all senders except those
+with a different loss. Each different loss has a further chain. A change is one nft transaction, so no packet meets a
+partial change. Only a change of thousands of links exceeds the amount that an ordinary user may send at once. It is
+made receiver by receiver. The counters are separate objects and survive changes of rules. See nft(8) and
+libnftables-json(5).
 """
 
 from __future__ import annotations
@@ -43,15 +43,18 @@ _TO = {"meta": {"key": "oifname"}}
 _STAGES = ("cut", "to")
 _COUNTERS = ("passed", "lost", "cut")
 _PATH = "/usr/sbin:/sbin:/usr/bin:/bin:/usr/local/sbin"  # an ordinary user's PATH has no sbin
-_STDIN = ["-f", "/proc/self/fd/0"]  # what "-" means to nft, /dev/stdin, is not there in every container
+_STDIN = ["-f", "/proc/self/fd/0"]  # nft translates "-" to /dev/stdin, which some containers lack
 _DEADLINE_S = 20.0
 _TOO_LONG = "Message too long"
 _COMMANDS_AT_ONCE = 500
-"""About 200 KB, which is what net.core.wmem_max lets an ordinary user send at once."""
+"""Number of commands in about 200 KB, which is the limit of net.core.wmem_max for an ordinary user."""
 
 
 class NftablesEngine(Engine):
-    """Independent loss per sender and receiver, and partitions; nothing that needs a queue or a memory."""
+    """Independent loss per sender and receiver, and partitions.
+
+    Conditions that need a queue or a memory are not supported.
+    """
 
     name = "nftables"
     has_queues = False
@@ -78,20 +81,20 @@ class NftablesEngine(Engine):
             jumps = [[port, {"jump": {"target": f"{stage}_{port}"}}] for port in self._ports]
             commands.append(_rule("forward", {"vmap": {"key": _TO, "data": {"set": jumps}}}))
         self._run(_STDIN, commands)
-        self._lossy: NetworkConditions | None = None  # what the rules of loss stand for
+        self._lossy: NetworkConditions | None = None  # the conditions of the present loss rules
         self.change(NetworkConditions())
 
     def change(self, conditions: NetworkConditions) -> None:
         lossy = conditions.healed()
         parts = [self._partition(conditions)]
-        if lossy != self._lossy:  # a partition alone is quick
+        if lossy != self._lossy:  # a change of the partition alone is fast
             parts += self._loss(conditions)
         try:
             self._run(_STDIN, [*chain.from_iterable(parts)])
         except EngineError as error:
             if _TOO_LONG not in str(error):
                 raise
-            self._lossy = None  # half-way nobody knows
+            self._lossy = None  # unknown until all parts have succeeded
             for part in _grouped(parts):
                 self._run(_STDIN, part)
         self._lossy = lossy
@@ -109,7 +112,7 @@ class NftablesEngine(Engine):
         return commands
 
     def _loss(self, conditions: NetworkConditions) -> list[list[dict[str, Any]]]:
-        """What to do for each receiver."""
+        """Return the commands for each receiver."""
         differing: dict[int, dict[float, list[int]]] = {}
         for sender, receiver, link in conditions.differing_links():
             differing.setdefault(receiver, {}).setdefault(link.independent_loss, []).append(sender)
@@ -117,13 +120,17 @@ class NftablesEngine(Engine):
         for vehicle, port in zip(self._vehicles, self._ports, strict=True):
             own = f"to_{port}"
             commands = [_flush("chain", own)]
-            usual = conditions.link(vehicle, vehicle).independent_loss
-            losses = {usual: [], **differing.get(vehicle, {})}
+            default_loss = conditions.link(vehicle, vehicle).independent_loss
+            losses = {default_loss: [], **differing.get(vehicle, {})}
             elements = []
             for number, (loss, senders) in enumerate(losses.items()):
-                lots = f"{own}_{number}"
-                commands += [_add("chain", **_TABLE, name=lots), _flush("chain", lots), *_lots(lots, port, loss)]
-                elements += [[addresses.port(sender), {"goto": {"target": lots}}] for sender in senders]
+                draws = f"{own}_{number}"
+                commands += [
+                    _add("chain", **_TABLE, name=draws),
+                    _flush("chain", draws),
+                    *_loss_rules(draws, port, loss),
+                ]
+                elements += [[addresses.port(sender), {"goto": {"target": draws}}] for sender in senders]
             if elements:
                 commands.append(_rule(own, {"vmap": {"key": _FROM, "data": {"set": elements}}}))
             receivers.append([*commands, _rule(own, {"goto": {"target": f"{own}_0"}})])
@@ -141,7 +148,7 @@ class NftablesEngine(Engine):
                 marks = dict(mapping.get("elem", []))
             elif rule := item.get("rule"):
                 rules.setdefault(rule["chain"], []).append(rule["expr"])
-        # A chain that nothing jumps to does nothing, whatever it says.
+        # A chain without a jump to it has no effect.
         jumps = set(_verdicts(rules.get("forward", [])))
         marking = any("mangle" in expression for expressions in rules.get("forward", []) for expression in expressions)
         senders = {addresses.port(sender): sender for sender in self._vehicles}
@@ -154,9 +161,9 @@ class NftablesEngine(Engine):
             mark = _only_mark(cut) if marking else None
             cut_from = [s for s in self._vehicles if mark is not None and marks[addresses.port(s)] != mark]
             differing = dict(_verdicts(own))
-            usual = next((e["goto"]["target"] for expressions in own for e in expressions if "goto" in e), "")
+            default_loss = next((e["goto"]["target"] for expressions in own for e in expressions if "goto" in e), "")
             held = {
-                sender: LinkConditions(_loss(rules.get(differing.get(name, usual), [])))
+                sender: LinkConditions(_loss(rules.get(differing.get(name, default_loss), [])))
                 for name, sender in senders.items()
                 if name != port or len(senders) == 1
             }
@@ -184,7 +191,7 @@ class NftablesEngine(Engine):
 
 
 def _grouped(parts: list[list[dict[str, Any]]]) -> Iterator[list[dict[str, Any]]]:
-    """The parts in order, as few together as an ordinary user's socket takes; none is divided."""
+    """Combine consecutive parts into groups of at most `_COMMANDS_AT_ONCE` commands. No part is divided."""
     together: list[dict[str, Any]] = []
     for part in parts:
         if together and len(together) + len(part) > _COMMANDS_AT_ONCE:
@@ -210,22 +217,22 @@ def _match(operator: str, left: dict[str, Any], right: int) -> dict[str, Any]:
     return {"match": {"op": operator, "left": left, "right": right}}
 
 
-def _lots(chain: str, port: str, loss: float) -> list[dict[str, Any]]:
-    """Rules that lose packets to a port with this probability, and let the others through."""
+def _loss_rules(chain: str, port: str, loss: float) -> list[dict[str, Any]]:
+    """Return rules that lose packets to a port with this probability, and pass the others."""
     drop: list[dict[str, Any]] = [{"counter": f"lost_{port}"}, {"drop": None}]
     if loss == 1.0:
         return [_rule(chain, *drop)]
     rules = []
     if loss > 0.0:
-        # What is neither 0 nor 1 must not become it by rounding.
+        # A probability other than 0 and 1 must not become 0 or 1 by rounding.
         threshold = min(max(round(loss * _MODULUS), 1), _MODULUS - 1)
-        lot = {"numgen": {"mode": "random", "mod": _MODULUS, "offset": 0}}
-        rules.append(_rule(chain, _match("<", lot, threshold), *drop))
+        draw = {"numgen": {"mode": "random", "mod": _MODULUS, "offset": 0}}
+        rules.append(_rule(chain, _match("<", draw, threshold), *drop))
     return [*rules, _rule(chain, {"counter": f"passed_{port}"})]
 
 
 def _verdicts(rules: list[list[dict[str, Any]]]) -> Iterator[tuple[str, str]]:
-    """The chain that each port's packets are sent to by verdict maps."""
+    """Yield each port of a verdict map with the chain that its packets go to."""
     for expressions in rules:
         for expression in expressions:
             if "vmap" in expression:
@@ -234,13 +241,13 @@ def _verdicts(rules: list[list[dict[str, Any]]]) -> Iterator[tuple[str, str]]:
 
 
 def _only_mark(rules: list[list[dict[str, Any]]]) -> int | None:
-    """The mark of the only group that a receiver's rules let in (None: all)."""
+    """Return the mark of the only group that the receiver accepts, or None if it accepts all."""
     marks = [e["match"]["right"] for expressions in rules for e in expressions if "match" in e]
     return marks[0] if marks else None
 
 
 def _loss(rules: list[list[dict[str, Any]]]) -> float:
-    """The loss that rules with lots make."""
+    """Return the loss that these rules cause."""
     for expressions in rules:
         if any("drop" in expression for expression in expressions):
             matches = [expression["match"] for expression in expressions if "match" in expression]

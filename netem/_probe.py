@@ -1,12 +1,12 @@
-"""Packets on the air, sent and received from inside vehicles: standard library only, one file, started by its path.
+"""Send and receive test packets inside vehicles. This file needs only the standard library, and is started by its path.
 
-    _probe.py receive PORT      every UDP datagram that arrives on a port, until SIGTERM
+    _probe.py receive PORT      receive the UDP datagrams of a port until SIGTERM
     _probe.py broadcast PORT COUNT FIRST BROADCAST_ADDRESS [BYTES [PAUSE_S]]
 
-`broadcast` numbers its datagrams from FIRST on, writes into each when it was sent, and pauses after every 20; in the
-end it says by how many seconds each pause was too long. `receive` says "ready", and on SIGTERM what it got: each one
-JSON object. Times are those of the real-time clock, which every process of a kernel shares; those of arrival are the
-kernel's own (SO_TIMESTAMPNS, socket(7)).
+`broadcast` numbers its datagrams from FIRST, writes the sending time into each, and pauses after every 20. At its end
+it prints by how many seconds each pause was too long. `receive` prints "ready", and its results on SIGTERM. Each output
+is one JSON object. Times are those of the real-time clock, which all processes of a kernel share. Arrival times come
+from the kernel (SO_TIMESTAMPNS, socket(7)).
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ from pathlib import Path
 _BURST = 20
 _PAUSE_S = 0.002
 _QUIET_S = 0.3
-_LOOK_EVERY_S = 0.01
-_LAST = 19  # nice(2)
+_POLL_S = 0.01
+_LOWEST_PRIORITY = 19  # nice(2)
 _SO_RCVBUFFORCE = 33  # socket(7)
 _SO_TIMESTAMPNS = 35
 _SO_MEMINFO = 55
-_BUFFER = 4 << 20  # bytes, enough for seconds: one CPU may run the sender first
-_DATAGRAM = struct.Struct("!IQ")  # its number, and when it was sent, in ns
+_BUFFER = 4 << 20  # bytes, enough for seconds, because a single CPU may run the sender first
+_DATAGRAM = struct.Struct("!IQ")  # number, and sending time in ns
 _STAMP = struct.Struct("@ll")
-_MEMORY = struct.Struct("=2I")  # of a receive buffer: used, and how much there is, in bytes (sock_diag(7))
+_MEMORY = struct.Struct("=2I")  # receive buffer: used and available bytes (sock_diag(7))
 
 
-def say(what: object) -> None:
-    """One line of JSON on standard output."""
+def print_json(what: object) -> None:
+    """Print one line of JSON."""
     sys.stdout.write(f"{json.dumps(what)}\n")
     sys.stdout.flush()
 
 
 def collect(source: socket.socket, size: int) -> list[tuple[bytes, int]]:
-    """All that arrives until SIGTERM, and after it until the air is quiet; each with its time of arrival in ns.
+    """Return all packets until SIGTERM and a short silence after it, each with its arrival time in ns.
 
-    It leaves what arrives in the socket's buffer as long as there is room, and lets everybody else go first: what it
-    takes of the processor would hold up the packets that it is there to see.
+    The packets stay in the socket's buffer as long as it has room, and the process has the lowest priority. Otherwise
+    its own use of the processor would delay the packets that it measures.
     """
-    os.nice(_LAST)
+    os.nice(_LOWEST_PRIORITY)
     source.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-    asked, wake = socket.socketpair()
+    stop_pipe, wake = socket.socketpair()
     signal.signal(signal.SIGTERM, lambda *_: wake.send(b"x"))
-    say("ready")
+    print_json("ready")
     packets: list[tuple[bytes, int]] = []
-    while not select.select([asked], [], [], _LOOK_EVERY_S)[0]:
+    while not select.select([stop_pipe], [], [], _POLL_S)[0]:
         if _filled(source) > 0.25:
             packets += _drain(source, size)
     while True:
@@ -65,7 +65,7 @@ def collect(source: socket.socket, size: int) -> list[tuple[bytes, int]]:
 
 
 def _filled(source: socket.socket) -> float:
-    """The share of a socket's receive buffer that is in use."""
+    """Return the used share of a socket's receive buffer."""
     used, room = map(int, _MEMORY.unpack_from(source.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 64)))
     return used / room
 
@@ -84,13 +84,13 @@ def receive(port: str) -> None:
     source = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         source.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER)
-    except PermissionError:  # for the machine's own root only; another has what net.core.rmem_max gives
+    except PermissionError:  # only root outside of user namespaces may exceed net.core.rmem_max
         source.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
     source.bind(("", int(port)))
     packets = [(*_DATAGRAM.unpack_from(data), at_ns) for data, at_ns in collect(source, 2048)]
     lines = [line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")]
     counters = dict(zip(*lines, strict=True))
-    say(
+    print_json(
         {
             "numbers": [number for number, _, _ in packets],
             "delays_s": [(at_ns - sent_ns) / 1e9 for _, sent_ns, at_ns in packets],
@@ -107,11 +107,11 @@ def broadcast(port: str, count: str, first: str, address: str, size: str = "12",
     late_s = []
     for number in range(int(first), int(first) + int(count)):
         out.sendto(_DATAGRAM.pack(number, time.time_ns()).ljust(int(size), b"\0"), (address, int(port)))
-        if number % _BURST == 0:  # receivers' buffers are small, and they say so if they overflow
+        if number % _BURST == 0:  # receivers have small buffers, and report overflows
             before_s = time.perf_counter()
             time.sleep(float(pause_s))
             late_s.append(time.perf_counter() - before_s - float(pause_s))
-    say({"late_s": late_s})
+    print_json({"late_s": late_s})
 
 
 if __name__ == "__main__":

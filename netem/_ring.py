@@ -1,12 +1,12 @@
-"""All frames that cross one switch port, by AF_PACKET and a ring of memory that we share with the kernel (TPACKET_V3).
+"""Capture all frames of one switch port with AF_PACKET, through a ring buffer shared with the kernel (TPACKET_V3).
 
-The kernel fills a ring's blocks, and hands over a block when it is full or 100 ms old; a reader that is late finds them
-all, as long as there is room. The kernel counts what crosses the port and what it had no room for, so that nobody has
-to trust a reader. See packet(7), and packet_mmap in the kernel's documentation.
+The kernel fills the blocks of the ring. It hands over a block when it is full or 100 ms old. A late reader finds all
+blocks that fit into the ring. The kernel counts the frames of the port and the frames that did not fit, so losses are
+always known. See packet(7), and packet_mmap in the kernel's documentation.
 
-What leaves the port has passed netem and nftables: it reaches the vehicle. What enters it has met neither. The kernel
-leaves the checksums of what veth pairs carry for later, which never comes: it says where they are missing, and they
-are put in here.
+Frames that leave the port have passed netem and nftables, and reach the vehicle. Frames that enter it have not passed
+them yet. The kernel does not compute checksums of packets on veth pairs. It marks such packets, and the checksums are
+added here.
 """
 
 from __future__ import annotations
@@ -25,39 +25,39 @@ _RX_RING, _STATISTICS, _VERSION, _VNET_HDR = 5, 6, 10, 15
 _TPACKET_V3 = 2
 _ETH_P_ALL = 3
 _SO_ATTACH_FILTER = 26
-_OUTGOING = 4  # of sll_pkttype
-_KERNEL_S, _OURS = 0, 1  # whose a block is
-_CHECKSUM_MISSING, _VLAN = 1 << 3, 1 << 4  # of tp_status
+_OUTGOING = 4  # value of sll_pkttype
+_KERNEL_S, _OURS = 0, 1  # owner of a block
+_CHECKSUM_MISSING, _VLAN = 1 << 3, 1 << 4  # bits of tp_status
 _RETURN = 6  # BPF_RET | BPF_K
 
 _REQUEST = struct.Struct("=7I")
-_BLOCK = struct.Struct("=8xIII")  # status, number of frames, where the first is
+_BLOCK = struct.Struct("=8xIII")  # status, number of frames, offset of the first
 _STATUS_AT = 8
-_FRAME = struct.Struct("=IIIIIIH6xIH20xB")  # tpacket3_hdr, and of the sockaddr_ll behind it sll_pkttype
+_FRAME = struct.Struct("=IIIIIIH6xIH20xB")  # tpacket3_hdr, and sll_pkttype of the sockaddr_ll behind it
 _CHECKSUM = struct.Struct("=6xHH")  # virtio_net_hdr: csum_start, csum_offset
 _COUNTS = struct.Struct("=III")
 _MACS = 12  # bytes of both addresses, before a VLAN tag
 
-BLOCK_BYTES = 1 << 17  # more than any frame, also those that veth pairs carry before TCP has cut them up
-_SLOT_BYTES = 2048  # means nothing to TPACKET_V3, but has to divide a block
+BLOCK_BYTES = 1 << 17  # larger than any frame, including those that veth pairs carry before TCP segmentation
+_SLOT_BYTES = 2048  # without meaning in TPACKET_V3, but it must divide a block
 RETIRE_MS = 100
-"""Age at which a block is handed over, full or not: what is quiet fills a ring in as many blocks times this."""
+"""Age at which the kernel hands over a block that is not full."""
 
 
 class Ring:
-    """The frames that cross the port, from now on, in `blocks` blocks of memory.
+    """The frames that cross the port from now on, in a ring of `blocks` blocks.
 
-    Raises OSError if the kernel has no AF_PACKET, no such port, or not the memory.
+    Raises OSError if the kernel lacks AF_PACKET, the port or the memory.
     """
 
     def __init__(self, port: str, blocks: int) -> None:
         self.received = 0
-        """Frames that have crossed the port, as of the last `count`."""
+        """Number of frames that crossed the port, at the last call of `count`."""
         self.taken = 0
         self._dropped = 0
         self._blocks = blocks
         self._next = 0
-        self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)  # that protocol hears nothing yet
+        self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)  # protocol 0 receives nothing yet
         self._socket.setsockopt(_SOL_PACKET, _VERSION, _TPACKET_V3)
         self._socket.setsockopt(_SOL_PACKET, _VNET_HDR, 1)
         size = blocks * BLOCK_BYTES
@@ -67,11 +67,11 @@ class Ring:
         self._socket.bind((port, _ETH_P_ALL))
 
     def fileno(self) -> int:
-        """Readable when a block is ours."""
+        """Return the file descriptor. It is readable when a block is available."""
         return self._socket.fileno()
 
     def take(self) -> Iterator[tuple[int, bytes, bool]]:
-        """(ns since the Unix epoch, frame, whether it leaves the port) of what there is: at most one ring full."""
+        """Yield (time in Unix ns, frame, whether it leaves the port) of the available frames, at most one ring."""
         memory = self._memory
         for _ in range(self._blocks):
             block = self._next * BLOCK_BYTES
@@ -94,20 +94,20 @@ class Ring:
             self._next = (self._next + 1) % self._blocks
 
     def stop(self) -> None:
-        """Let no more frames in."""
+        """Accept no more frames."""
         nothing = array("Q", struct.pack("=HBBI", _RETURN, 0, 0, 0))
         address, _ = nothing.buffer_info()
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(nothing), address))
 
     def count(self) -> int:
-        """Ask the kernel what has crossed the port; how many of these frames can still be taken."""
+        """Update the counters from the kernel. Return the number of frames that can still be taken."""
         counts = self._socket.getsockopt(_SOL_PACKET, _STATISTICS, _COUNTS.size)
-        received, dropped, _ = _COUNTS.unpack(counts)  # since they were last asked for
+        received, dropped, _ = _COUNTS.unpack(counts)  # since the last call
         self.received += received
         self._dropped += dropped
         return self.received - self._dropped - self.taken
 
 
 def _with_checksum(frame: bytes, start: int, at: int) -> bytes:
-    """What the hardware would do to it: the field holds the sum of what is not from `start` on."""
+    """Fill in a checksum as the hardware would. The field contains the sum of the data before `start`."""
     return frame[:at] + checksum(frame[start:]).to_bytes(2, "big") + frame[at + 2 :]

@@ -1,10 +1,10 @@
-"""The requests of engine "netem": what it says to the kernel about one switch port, and what it reads there.
+"""The netlink requests of engine "netem" for one switch port.
 
-Numbers are those of linux/pkt_sched.h, pkt_cls.h and tc_act/. HTB is here for its classes alone: their rate is the
-highest that the interface takes without its 64-bit attribute (34 Gbit/s), beyond what a veth pair carries.
+Numbers come from linux/pkt_sched.h, pkt_cls.h and tc_act/. HTB is used only for its classes. Their rate is the highest
+without the 64-bit attribute (34 Gbit/s), which is more than a veth pair carries.
 
-netem keeps what a change does not name (corruption, rate, reordering, the table of a distribution) or forgets it (the
-model of loss), so a change names everything. It says again what it holds, except for the table.
+If a change leaves out an option, netem keeps some (corruption, rate, reordering, distribution table) and forgets others
+(loss model). Therefore each change contains all options. netem reports all options except for the table.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from netem._netlink import (
 from netem.link import MAX_LIMIT, Delay, Distribution, GilbertElliott, LinkConditions
 
 MAX_KIND = 0x7FFF
-"""The highest number of a class that leaves a number for its netem."""
+"""Highest class number for which a number remains for its netem."""
 
-_SET = NLM_F_CREATE | 0x100  # NLM_F_REPLACE: make it so, whether it is there or not
+_SET = NLM_F_CREATE | 0x100  # NLM_F_REPLACE: create or replace
 _ROOT = 0xFFFFFFFF
 _CLSACT = 0xFFFFFFF1
 _CLSACT_HANDLE = 0xFFFF0000
@@ -48,13 +48,13 @@ _RATE = 0xFFFFFFFF  # bytes/s
 _BURST = 15625  # 1 ms in ticks of 64 ns
 _QUANTUM = 60000  # bytes
 _ETH_P_ALL = socket.htons(3)
-_ONLY = 1  # handle of a port's only basic filter in one direction
-_HEARD, _NOT_HEARD = 1, 2  # priorities of filters at egress
+_ONLY = 1  # handle of a port's only basic filter in each direction
+_ACCEPT_PRIORITY, _DROP_PRIORITY = 1, 2  # priorities of filters at egress
 _TICK_NS = 64
 _ALWAYS = 0xFFFFFFFF  # netem's probability 1
 _NANO = 1_000_000_000
-_NO_LIMIT = MAX_LIMIT + 1  # packets: unlimited, as far as a memory allows
-_TABLE_SIZE = 4094  # with its length 8 KB in the kernel
+_NO_LIMIT = MAX_LIMIT + 1  # packets: unlimited within available memory
+_TABLE_SIZE = 4094  # 8 KB in the kernel, with its length
 
 _KIND, _OPTIONS, _STATISTICS = 1, 2, 7  # TCA_KIND, TCA_OPTIONS, TCA_STATS2
 _NETEM_CORR, _NETEM_TABLE, _NETEM_REORDER, _NETEM_CORRUPT, _NETEM_LOSS, _NETEM_RATE = range(1, 7)
@@ -68,7 +68,7 @@ _NETEM = struct.Struct("=6I")
 
 @dataclass(frozen=True)
 class Class:
-    """What one class does and has counted, in packets; of its delay's distribution the kernel does not speak."""
+    """The conditions and packet counters of one class. The kernel does not report the distribution of its delay."""
 
     link: LinkConditions
     passed: int
@@ -77,20 +77,20 @@ class Class:
 
 
 class TrafficControl:
-    """Speaks of one switch port, by its interface number."""
+    """Requests for one switch port, given by its interface number."""
 
     def __init__(self, index: int) -> None:
         self.index = index
 
     def install(self) -> list[Request]:
-        """An HTB without classes."""
+        """Return requests for an HTB without classes."""
         settings = struct.pack("=5I", 3, 10, 0, 0, 0)  # version, rate2quantum, default class, debug, direct packets
         return [Request("add qdisc htb", RTM_NEWQDISC, self._message("htb", _ROOT, _HTB, attribute(2, settings)), NEW)]
 
     def guard(self) -> list[Request]:
-        """Places for filters; nothing is heard at this port from here on, until it is said what."""
+        """Return requests for filters that drop all packets at this port until `hear` allows a group."""
         drop = nested(1, text(1, "gact"), nested(2, attribute(2, struct.pack("=IIiii", 0, 0, _ACT_SHOT, 0, 0))))
-        message = self._filter("basic", _EGRESS, _NOT_HEARD, _ONLY, nested(3, drop))
+        message = self._filter("basic", _EGRESS, _DROP_PRIORITY, _ONLY, nested(3, drop))
         return [
             Request("add qdisc clsact", RTM_NEWQDISC, self._message("clsact", _CLSACT, _CLSACT_HANDLE), NEW),
             Request("add filter basic with action gact", RTM_NEWTFILTER, message, NEW),
@@ -109,7 +109,7 @@ class TrafficControl:
         return [Request("set class of htb", RTM_NEWTCLASS, message, _SET), self.change_class(kind, link)]
 
     def change_class(self, kind: int, link: LinkConditions, *, table: bool = True) -> Request:
-        """Set the netem of a class, in place if there is one; without a `table` its distribution stays as it is."""
+        """Set the netem of a class, in place if it exists. Without `table`, its distribution stays."""
         options = _options(link, table)
         message = self._header(_HTB | kind, (0x8000 | kind) << 16) + text(_KIND, "netem") + options
         return Request("set qdisc netem", RTM_NEWQDISC, message, _SET)
@@ -118,21 +118,21 @@ class TrafficControl:
         return Request("delete class of htb", RTM_DELTCLASS, self._message("htb", _HTB, _HTB | kind))
 
     def mark(self, kind: int, group: int) -> Request:
-        """From here on, packets that enter at this port are of a kind and a group; one step, in place."""
+        """Assign a kind and a group to packets that enter at this port, in one step."""
         parameters = attribute(2, struct.pack("=IIiii", 0, 0, _ACT_OK, 0, 0))
         edit = nested(1, text(1, "skbedit"), nested(2, parameters, number(3, _HTB | kind), number(5, group)))
         message = self._filter("basic", _INGRESS, 1, _ONLY, nested(3, edit))
         return Request("set filter basic with action skbedit", RTM_NEWTFILTER, message, _SET)
 
-    def hear(self, group: int) -> Request:
+    def accept_group(self, group: int) -> Request:
         """Let packets of a group leave at this port."""
-        return Request("add filter fw", RTM_NEWTFILTER, self._filter("fw", _EGRESS, _HEARD, group), NEW)
+        return Request("add filter fw", RTM_NEWTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group), NEW)
 
-    def hear_no_more(self, group: int) -> Request:
-        return Request("delete filter fw", RTM_DELTFILTER, self._filter("fw", _EGRESS, _HEARD, group))
+    def reject_group(self, group: int) -> Request:
+        return Request("delete filter fw", RTM_DELTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group))
 
-    def marked(self, netlink: Netlink) -> tuple[int, int] | None:
-        """The kind and the group that the kernel gives to packets that enter at this port."""
+    def read_mark(self, netlink: Netlink) -> tuple[int, int] | None:
+        """Return the kind and group that the kernel gives to packets that enter at this port."""
         for entry in netlink.dump("list filters", RTM_GETTFILTER, self._header(_INGRESS, 0)):
             edit = _inside(parse(entry[_TCMSG.size :]), _OPTIONS, 3, 1, 2)
             kind, group = parse_number(edit.get(3)), parse_number(edit.get(5))
@@ -140,8 +140,8 @@ class TrafficControl:
                 return kind & 0xFFFF, group
         return None
 
-    def heard(self, netlink: Netlink) -> tuple[set[int], int]:
-        """The groups whose packets leave at this port, and how many packets of others did not."""
+    def accepted_groups(self, netlink: Netlink) -> tuple[set[int], int]:
+        """Return the groups whose packets leave at this port, and the number of dropped packets of other groups."""
         groups = set()
         cut = 0
         for entry in netlink.dump("list filters", RTM_GETTFILTER, self._header(_EGRESS, 0)):
@@ -155,7 +155,7 @@ class TrafficControl:
 
     @staticmethod
     def classes(netlink: Netlink) -> dict[int, dict[int, Class]]:
-        """For every port by interface number, what its classes do: one question for the whole switch."""
+        """Return the classes of all ports by interface number, from one request for the whole switch."""
         classes: dict[int, dict[int, Class]] = {}
         for entry in netlink.dump("list qdiscs", RTM_GETQDISC, bytes(_TCMSG.size)):
             _, _, _, index, _, parent, _ = _TCMSG.unpack_from(entry)
@@ -181,7 +181,7 @@ class TrafficControl:
 
 
 def _inside(attributes: Mapping[int, bytes], *path: int) -> Mapping[int, bytes]:
-    """The attributes at the end of a path of nested ones; none if it does not lead anywhere."""
+    """Return the attributes at the end of a path of nested attributes, or none if the path is missing."""
     for kind in path:
         attributes = parse(attributes.get(kind, b""))
     return attributes
@@ -189,7 +189,7 @@ def _inside(attributes: Mapping[int, bytes], *path: int) -> Mapping[int, bytes]:
 
 @lru_cache(maxsize=1 << 12)
 def _options(link: LinkConditions, table: bool) -> bytes:
-    """What the conditions are to netem (TCA_OPTIONS)."""
+    """Return the conditions as netem's TCA_OPTIONS."""
     delay = link.delay or Delay(0)
     latency_ns, jitter_ns = _nanoseconds(delay.mean_s), _nanoseconds(delay.jitter_s)
     loss = 0 if isinstance(link.loss, GilbertElliott) else _share(link.loss)
@@ -228,7 +228,7 @@ def _table(distribution: Distribution) -> bytes:
 
 
 def _link(options: bytes) -> LinkConditions:
-    """What netem's options are as conditions; the inverse of `_options`, but for the distribution."""
+    """Return netem's options as conditions. It is the inverse of `_options`, except for the distribution."""
     _, limit, loss, _, duplicate, _ = _NETEM.unpack_from(options)
     attributes = parse(options[_NETEM.size :])
     shares = (loss, duplicate, *(parse_number(attributes.get(key)) or 0 for key in (_NETEM_REORDER, _NETEM_CORRUPT)))
@@ -242,7 +242,7 @@ def _link(options: bytes) -> LinkConditions:
 def _conditions(
     shares: tuple[int, ...], times_ns: tuple[int, ...], rate: int, limit: int, bursts: bytes | None
 ) -> LinkConditions:
-    # Nine digits: the kernel's own steps are a quarter of the last one.
+    # Nine digits, because a step of the kernel is a quarter of the last one.
     loss, duplicate, reorder, corrupt = (round(share / _ALWAYS, 9) for share in shares)
     model = None
     if bursts is not None:
@@ -261,12 +261,12 @@ def _conditions(
 
 
 def _share(probability: float) -> int:
-    """A probability in netem's steps; what is neither 0 nor 1 does not become it by rounding."""
+    """Return a probability in netem's steps. A probability other than 0 and 1 does not become 0 or 1 by rounding."""
     if not 0.0 < probability < 1.0:
         return _ALWAYS if probability else 0
     return min(max(round(probability * _ALWAYS), 1), _ALWAYS - 1)
 
 
 def _nanoseconds(seconds: float) -> int:
-    """A time in netem's steps; what is not 0 does not become it by rounding."""
+    """Return a time in nanoseconds. A time above 0 does not become 0 by rounding."""
     return max(round(seconds * _NANO), 1) if seconds else 0

@@ -1,14 +1,14 @@
-"""What lets programs in User Mode Linux keep their floating point and vector registers, on any x86-64 processor.
+"""Preserve the floating point and vector registers of programs in User Mode Linux on any x86-64 processor.
 
-A kernel older than 6.13 (Debian 12 has 6.1) knows registers up to AVX. On newer processors it falls short twice:
+A kernel older than 6.13 (Debian 12 has 6.1) supports registers up to AVX. On newer processors it fails in two ways:
 
-- It has 2,696 bytes for the state of a process, which is 11,008 with AMX (Intel since Sapphire Rapids), and the host
-  takes a state only whole: it panics as it boots.
-- It puts 832 bytes of the state into the frame of a signal. What AVX-512 has beyond them is after the signal as its
-  handler left it. The C library copies memory with it, in handlers too: copies came out wrong.
+- It has 2,696 bytes for the registers of a process. With AMX (Intel since Sapphire Rapids) they take 11,008 bytes, and
+  the host transfers them only as a whole. The kernel panics at its start.
+- It stores 832 bytes of the registers in the frame of a signal. After a signal, the additional registers of AVX-512
+  have the values of its handler. The C library uses them to copy memory, also in handlers, so copies become corrupt.
 
-There a library is preloaded into it, uml_registers.c, that does better than its ptrace(2). It is compiled for each
-guest, in a tenth of a second, as machines differ and nothing should be left behind.
+On these processors a library is preloaded, uml_registers.c, which replaces ptrace(2). It is compiled for each guest in
+a tenth of a second, because machines differ and no files should remain.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from netem.errors import UmlError
 
 SOURCE = Path(__file__).with_name("uml_registers.c")
 FORCE = "UCP_UML_REGISTERS"
-"""With this variable set, the library is preloaded on any processor: there it keeps what would be kept without it."""
+"""If this variable is set, the library is preloaded on any processor. It then has no visible effect."""
 
-_MENDED = (6, 13)
+_FIXED_IN = (6, 13)
 _FLAGS = {"avx512f", "amx_tile"}
 _COMPILE = ("cc", "-O2", "-shared", "-fPIC", "-ffreestanding", "-nostdlib")
 
 
 def needed(kernel: Path | None) -> bool:
-    """Whether this processor has registers that this User Mode Linux would not keep by itself; None: any of today's."""
+    """Return whether User Mode Linux needs the library on this processor; for None, whether any known version does."""
     if os.environ.get(FORCE):
         return True
     if _FLAGS.isdisjoint(Path("/proc/cpuinfo").read_text().split()):
@@ -40,16 +40,16 @@ def needed(kernel: Path | None) -> bool:
         return True
     text = subprocess.run([kernel, "--version"], capture_output=True, text=True, errors="replace", check=False).stdout
     version = re.match(r"(\d+)\.(\d+)", text)
-    return version is None or (int(version[1]), int(version[2])) < _MENDED
+    return version is None or (int(version[1]), int(version[2])) < _FIXED_IN
 
 
 def has_compiler() -> bool:
-    """Whether the library can be made here."""
+    """Return whether the library can be compiled here."""
     return shutil.which(_COMPILE[0]) is not None
 
 
 def preload(folder: Path) -> dict[str, str]:
-    """Compile the library into `folder`; the variables of a kernel that is started there. Raises UmlError."""
+    """Compile the library into `folder`. Return environment variables for a kernel started there. Raises UmlError."""
     library = folder / "registers.so"
     done = subprocess.run(
         [*_COMPILE, "-o", library, SOURCE], capture_output=True, text=True, errors="replace", check=False
@@ -60,5 +60,5 @@ def preload(folder: Path) -> dict[str, str]:
             f"User Mode Linux needs a library to keep this processor's registers, which cc could not compile ({word}); "
             "mend the compiler (Debian, Ubuntu: apt install --reinstall gcc)"
         )
-    # A relative path, for the folder's may have spaces and colons, which part the paths of this list.
+    # A relative path, because the folder's may contain spaces and colons, which separate the entries of this list.
     return {"LD_PRELOAD": ":".join(filter(None, [f"./{library.name}", os.environ.get("LD_PRELOAD")]))}

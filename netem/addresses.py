@@ -1,8 +1,8 @@
-"""Who is who on the air: a vehicle's ID gives its address, its MAC and its port, and nothing is stored.
+"""The addresses of vehicles. IP address, MAC address and port follow from the vehicle's ID.
 
-IDs are free in 1..65535, one more than a /16 has room for: ID 65535 would be its broadcast address.
-So the ID is written out in the last two bytes of 10.77.x.y, and the network is the wider
-10.76.0.0/14, whose network and broadcast addresses (10.76.0.0, 10.79.255.255) no ID can reach.
+IDs may be 1 to 65535. A /16 network cannot hold all of them, because ID 65535 would be its broadcast address. The last
+two bytes of 10.77.x.y are therefore the ID, and the network is the larger 10.76.0.0/14. No ID reaches its network and
+broadcast addresses (10.76.0.0 and 10.79.255.255).
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ BROADCAST = "10.79.255.255"
 
 
 def address(vehicle: int) -> str:
-    """IPv4 address of a vehicle: 258 is 10.77.1.2."""
+    """Return the IPv4 address of a vehicle, such as 10.77.1.2 for 258."""
     return f"10.77.{vehicle >> 8}.{vehicle & 0xFF}"
 
 
 def mac(vehicle: int) -> str:
-    """Ethernet address of a vehicle: locally administered, "UCP" in ASCII, then the ID."""
+    """Return the Ethernet address of a vehicle: locally administered, "UCP" in ASCII, then the ID."""
     return f"02:55:43:50:{vehicle >> 8:02x}:{vehicle & 0xFF:02x}"
 
 
 def port(vehicle: int) -> str:
-    """Name of the switch port that leads to a vehicle."""
+    """Return the name of the switch port that leads to a vehicle."""
     return f"v{vehicle}"

@@ -1,10 +1,9 @@
-"""What an engine is: it makes the kernel do to packets what conditions say, and reports what it did.
+"""The interface of engines. An engine lets the kernel apply conditions to packets, and reports the results.
 
-Two engines stand behind this interface: `netem.tc` (tc-netem(8)) and `netem._nft` (nft(8)). Both count per
-receiver, as the kernel does, every packet passed, lost and cut off; counts live as long as the lab and are
-not reset by a change. After every change the kernel is asked what it holds, and a difference to what was
-asked is an error, not a note: the conditions before are then put back. Packets that are under way when
-conditions change arrive as they would have.
+There are two engines: `netem.tc` (tc-netem(8)) and `netem._nft` (nft(8)). For each receiver, both report the kernel's
+counts of passed, lost and cut packets. The counts start with the lab and are not reset by a change. After each change,
+the engine reads the state of the kernel. A difference from the requested conditions is an error, and the previous
+conditions are restored. Packets that are on their way at a change arrive under the old conditions.
 """
 
 from __future__ import annotations
@@ -22,21 +21,22 @@ from netem.errors import EngineError
 from netem.link import GilbertElliott, LinkConditions
 
 RESOLUTION = 1.5e-9
-"""Engines hold probabilities as fractions of 2^32-1 or 10^9 and delays in ns; finer than this nothing is promised."""
+"""Engines store probabilities as fractions of 2^32-1 or 10^9, and delays in ns. Smaller differences are not guaranteed.
+"""
 RATE_RESOLUTION = 4.01
-"""Bits per second: rates are held in whole bytes per second."""
+"""Bits per second. Rates are stored in whole bytes per second."""
 
 _COUNTS = ("passed", "lost", "cut")
-_MAX_WORDS = 600  # characters of an error's account of conditions
+_MAX_WORDS = 600  # characters of conditions in an error message
 
 
 @dataclass(frozen=True)
 class ReceiverFigures:
-    """What the kernel holds and has counted on the way to one vehicle.
+    """The kernel's conditions and counters for packets to one vehicle.
 
-    `link` is what happens to packets from all senders but those in `links`, and `cut_from` are the senders that a
-    partition keeps away. `passed`, `lost` (by chance, or for want of room) and `cut` are packets since the lab came
-    up: a broadcast counts once for every receiver, a duplicate as one more, a packet on its way not yet.
+    `link` applies to all senders except those in `links`. `cut_from` lists the senders that a partition separates.
+    `passed`, `lost` (by chance or a full queue) and `cut` count packets since the start of the lab. A broadcast counts
+    once for each receiver, a duplicate counts again, and a packet on its way does not count yet.
     """
 
     link: LinkConditions
@@ -48,18 +48,18 @@ class ReceiverFigures:
 
     @classmethod
     def of(cls, held: Mapping[int, LinkConditions], cut_from: tuple[int, ...], *counts: int) -> ReceiverFigures:
-        """From what is held for each sender; `counts` in the order of the fields."""
+        """Return the figures from the conditions of each sender. `counts` are in the order of the fields."""
         ((usual, _),) = Counter(held.values()).most_common(1) or [(LinkConditions(), 0)]
         differing = {sender: link for sender, link in held.items() if link != usual}
         return cls(usual, differing, cut_from, *counts)
 
     @property
     def loss(self) -> float | GilbertElliott:
-        """That of `link`."""
+        """The loss of `link`."""
         return self.link.loss
 
     def from_sender(self, sender: int) -> LinkConditions:
-        """What happens to a packet of this sender that is not cut off."""
+        """Return the conditions for packets of this sender, without regard to the partition."""
         return self.links.get(sender, self.link)
 
     def to_json(self) -> dict[str, Any]:
@@ -69,7 +69,7 @@ class ReceiverFigures:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ReceiverFigures:
-        """The inverse of `to_json`."""
+        """Return the value of a JSON object that `to_json` made."""
         own = {field.name for field in fields(cls)}
         return cls(
             LinkConditions.from_json({key: figure for key, figure in value.items() if key not in own}),
@@ -81,7 +81,7 @@ class ReceiverFigures:
 
 @dataclass(frozen=True)
 class Applied:
-    """The state of the air as read back from the kernel."""
+    """The state of the network as the kernel reports it."""
 
     engine: str
     receivers: Mapping[int, ReceiverFigures]
@@ -92,7 +92,7 @@ class Applied:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Applied:
-        """The inverse of `to_json`."""
+        """Return the value of a JSON object that `to_json` made."""
         figures = {int(vehicle): ReceiverFigures.from_json(entry) for vehicle, entry in value["receivers"].items()}
         return cls(value["engine"], figures)
 
@@ -102,28 +102,28 @@ class Engine(ABC):
 
     name: ClassVar[str]
     has_queues: ClassVar[bool]
-    """Knows all conditions, not only independent loss and partitions."""
+    """True if the engine supports all conditions. Otherwise it supports only independent loss and partitions."""
 
     def __init__(self, fabric: Fabric) -> None:
-        """Install the engine with perfect conditions; raises EngineError where the kernel cannot."""
+        """Install the engine with perfect conditions. Raises EngineError if the kernel does not support it."""
         self._fabric = fabric
         self._vehicles = fabric.vehicles
         self._in_force = NetworkConditions()
 
     @abstractmethod
     def change(self, conditions: NetworkConditions) -> None:
-        """Ask the kernel for the conditions; raises EngineError with its own word if it refuses."""
+        """Request conditions from the kernel. Raises EngineError with the kernel's message if it refuses."""
 
     @abstractmethod
     def read(self) -> Applied:
-        """Ask the kernel what it holds and has counted."""
+        """Return the conditions and counters of the kernel."""
 
     def apply(self, conditions: NetworkConditions) -> Applied:
-        """Change the conditions and return what the kernel then holds.
+        """Change the conditions, and return the state of the kernel afterwards.
 
-        Raises ConditionsError for an unknown vehicle, EngineError if the engine cannot do it, or if the kernel
-        refuses or holds something else than asked; the conditions before are then in force, or the error says
-        what is.
+        Raises ConditionsError for an unknown vehicle. Raises EngineError if the engine does not support the conditions,
+        if the kernel refuses them, or if its state differs from them. Then the previous conditions are restored, or the
+        error names the present ones.
         """
         conditions.validate(self._vehicles)
         if not self.has_queues and (needs := conditions.needs()):
@@ -170,11 +170,11 @@ class Engine(ABC):
 
 @lru_cache(maxsize=1 << 15)
 def _differing(asked: LinkConditions, held: LinkConditions) -> tuple[str, ...]:
-    """The keys of what is held in other values than asked, beyond the resolution of engines."""
+    """Return the keys whose values differ by more than the engines' resolution."""
     wanted, actual = _flat(asked.to_json()), _flat(held.to_json())
     if not (asked.delay and asked.delay.jitter_s and held.delay and held.delay.jitter_s):
         for flat in (wanted, actual):
-            flat.pop("delay.distribution", None)  # of what does not vary
+            flat.pop("delay.distribution", None)  # meaningless without jitter
     return tuple(key for key in wanted | actual if not _close(key, wanted.get(key, 0), actual.get(key, 0)))
 
 

@@ -1,10 +1,10 @@
-"""The one error family of this package; every message is a sentence that says what to do next."""
+"""The errors of this package. Each message is a sentence that says what to do."""
 
 from __future__ import annotations
 
 
 class NetemError(Exception):
-    """The base of all errors that `netem` raises for its callers."""
+    """Base class of all errors that `netem` raises for its callers."""
 
 
 class ConditionsError(NetemError, ValueError):
@@ -12,7 +12,7 @@ class ConditionsError(NetemError, ValueError):
 
 
 class NetlinkError(NetemError):
-    """The kernel refused a netlink request; `errno` and the message carry its own word."""
+    """The kernel refused a netlink request. `errno` and the message come from the kernel."""
 
     def __init__(self, message: str, errno: int) -> None:
         super().__init__(message)
@@ -24,25 +24,25 @@ class EngineError(NetemError):
 
 
 class LabError(NetemError):
-    """The lab, or something asked of it, failed."""
+    """The lab failed, or a request to it failed."""
 
 
 class LabUnavailable(LabError):  # noqa: N818  (a state of the machine)
-    """This machine cannot run the lab or the requested engine. `way_out` says what the user can do."""
+    """This machine cannot run the lab or the requested engine. `way_out` is the remedy."""
 
     def __init__(self, reason: str, way_out: str, stage: str = "namespaces") -> None:
         super().__init__(f"{reason.rstrip('.')}. {way_out}")
         self.reason = reason
         self.way_out = way_out
-        self.stage = stage  # "namespaces", "fabric" or "engine": how far the lab came
+        self.stage = stage  # "namespaces", "fabric" or "engine": the step that failed
 
 
 class SpawnError(LabError):
-    """A program could not be started in the lab; the message carries the operating system's word."""
+    """A program could not be started in the lab. The message contains that of the operating system."""
 
 
 class UmlError(NetemError):
-    """User Mode Linux is not here, did not boot, hung or panicked."""
+    """User Mode Linux is missing, did not boot, hung or panicked."""
 
 
 class LiveCaptureError(NetemError):

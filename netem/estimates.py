@@ -1,15 +1,15 @@
-"""What a receiver heard of a stream of packets, as figures with their 99.9 % intervals.
+"""Figures of a received stream of packets, with their 99.9 % intervals.
 
-Shares have Wilson's interval, means and deviations the normal one. What is lost in bursts is not drawn packet by
-packet: a stream is then worth as many independent packets as its correlation leaves. Rate and limit are not drawn at
-all: their intervals are what the times of arrival leave open.
+Shares have Wilson's interval. Means and deviations have the normal interval. Losses in bursts are not independent, so
+such a stream counts as a smaller number of independent packets, according to its correlation. Rate and limit are not
+random. Their intervals contain all values that the arrival times allow.
 
-Every time contains how late the machine is by itself, in two ways. *On the way*: from the sender's stamp to the
-receiver's, a packet that nothing holds up takes a while. A receiver without conditions hears the same packets at the
-same time, so its times are subtracted, packet by packet. *Timers*: a packet that waits leaves when a timer of the
-kernel expires, which is late too. The sender sleeps between its packets and notes how late it wakes. Nobody can tell
-that from a delay, so the intervals of delays reach so much lower, by the upper bound of what was noted. On a slow
-machine intervals are wide; a kernel is not found wrong there.
+Each time contains the lateness of the machine, which has two parts. *Way*: even without conditions, a packet takes some
+time from the sender's timestamp to the receiver's. A receiver without conditions receives the same packets at the same
+time, and its times are subtracted packet by packet. *Timers*: a delayed packet leaves when a timer of the kernel
+expires, which is also late. The sender sleeps between its packets, and notes how late it wakes up. This lateness cannot
+be separated from a delay. Therefore the upper limit of the noted lateness is subtracted from the lower limit of a
+delay. On a slow machine the intervals are wide, and no kernel is found wrong.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _Z = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure, the bounds of its 99.9 % interval, and how many packets it was taken from; of none, all 0."""
+    """A figure with its 99.9 % interval, and the number of packets behind it. Without packets, all are 0."""
 
     measured: float
     low: float
@@ -37,17 +37,17 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Lateness:
-    """How late the machine is by itself, in seconds: each packet of a stream on the way, and each of many timers."""
+    """The lateness of the machine in seconds: for each packet of a stream on its way, and for each timer."""
 
     way_s: Sequence[float]
     timers_s: Sequence[float]
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What one receiver heard of one sender's packets, which are numbered from 0.
+class ReceivedStream:
+    """The packets of one sender that one receiver received. Packets are numbered from 0.
 
-    `sent_s` says when each was sent; `arrivals` are (number, time), ascending in time, of every copy that came.
+    `sent_s` are the sending times. `arrivals` are (number, time) of each received copy, in order of time.
     """
 
     sent_s: Sequence[float]
@@ -58,100 +58,100 @@ class Heard:
 _NOTHING = Estimate(0.0, 0.0, 0.0, 0)
 
 
-def lost(heard: Heard) -> Estimate:
-    """The share of packets that never came, each drawn on its own."""
-    return share(sum(_losses(heard)), len(heard.sent_s))
+def lost(received: ReceivedStream) -> Estimate:
+    """Return the share of lost packets, for independent losses."""
+    return share(sum(_losses(received)), len(received.sent_s))
 
 
-def lost_in_bursts(heard: Heard) -> Estimate:
-    """The share of packets that never came, where losses come as a Markov chain of two states has them."""
-    losses = _losses(heard)
+def lost_in_bursts(received: ReceivedStream) -> Estimate:
+    """Return the share of lost packets, for losses of a Markov chain with two states."""
+    losses = _losses(received)
     return share(sum(losses), len(losses), worth=_independence(losses))
 
 
-def burst_length(heard: Heard) -> Estimate:
-    """How many packets in a row are lost, on average; a burst that goes on at the end of the stream does not count."""
-    runs = [(gone, sum(1 for _ in run)) for gone, run in groupby(_losses(heard))]
+def burst_length(received: ReceivedStream) -> Estimate:
+    """Return the mean number of successive lost packets. A burst at the end of the stream does not count."""
+    runs = [(gone, sum(1 for _ in run)) for gone, run in groupby(_losses(received))]
     lengths = [length for gone, length in runs[:-1] if gone]
-    return mean(lengths, packets=len(heard.sent_s))
+    return mean(lengths, packets=len(received.sent_s))
 
 
-def passed(heard: Heard) -> Estimate:
-    """The share of packets that came."""
-    return share(len(heard.sent_s) - sum(_losses(heard)), len(heard.sent_s))
+def passed(received: ReceivedStream) -> Estimate:
+    """Return the share of received packets."""
+    return share(len(received.sent_s) - sum(_losses(received)), len(received.sent_s))
 
 
-def came_twice(heard: Heard) -> Estimate:
-    """The share of packets that came twice."""
-    copies = Counter(number for number, _ in heard.arrivals)
-    return share(sum(count > 1 for count in copies.values()), len(heard.sent_s))
+def duplicated(received: ReceivedStream) -> Estimate:
+    """Return the share of packets that arrived twice."""
+    copies = Counter(number for number, _ in received.arrivals)
+    return share(sum(count > 1 for count in copies.values()), len(received.sent_s))
 
 
-def came_at_once(heard: Heard, delay_s: float) -> Estimate:
-    """Of the packets that came, the share that took less than half the delay."""
-    sent_s = heard.sent_s
-    return share(sum(at_s - sent_s[number] < delay_s / 2 for number, at_s in heard.arrivals), len(heard.arrivals))
+def undelayed(received: ReceivedStream, delay_s: float) -> Estimate:
+    """Return the share of received packets that took less than half the delay."""
+    sent_s = received.sent_s
+    return share(sum(at_s - sent_s[number] < delay_s / 2 for number, at_s in received.arrivals), len(received.arrivals))
 
 
-def delay_mean(heard: Heard) -> Estimate:
-    """Seconds, without what packets take on the way by themselves."""
-    estimate = mean(_delays(heard))
-    timers = mean(heard.lateness.timers_s)
+def delay_mean(received: ReceivedStream) -> Estimate:
+    """Return the mean delay in seconds, without the time that packets take by themselves."""
+    estimate = mean(_delays(received))
+    timers = mean(received.lateness.timers_s)
     return Estimate(estimate.measured, estimate.low - max(0.0, timers.high), estimate.high, estimate.packets)
 
 
-def delay_deviation(heard: Heard) -> Estimate:
-    """The standard deviation in seconds, of which the machine may have added its own."""
-    estimate = deviation(_delays(heard))
-    own = sum(deviation(late_s).high ** 2 for late_s in (heard.lateness.way_s, heard.lateness.timers_s))
+def delay_deviation(received: ReceivedStream) -> Estimate:
+    """Return the standard deviation in seconds. The interval allows for the machine's own deviation."""
+    estimate = deviation(_delays(received))
+    own = sum(deviation(late_s).high ** 2 for late_s in (received.lateness.way_s, received.lateness.timers_s))
     low = math.sqrt(max(0.0, estimate.low**2 - own))
     return Estimate(estimate.measured, low, estimate.high, estimate.packets)
 
 
-def rate(heard: Heard, packet_bits: int) -> Estimate:
-    """Bits per second, over the longest run of packets that each came when the one before had not yet left.
+def rate(received: ReceivedStream, packet_bits: int) -> Estimate:
+    """Return bits per second, from the longest run of packets each of which arrived while the next one was waiting.
 
-    The ends of the run may be as late as the latest of all.
+    The limits assume that both ends of the run may be as late as the latest packet.
     """
     run: list[float] = []
     longest: list[float] = []
-    for number, at_s in heard.arrivals:
-        if run and heard.sent_s[number] >= run[-1]:
+    for number, at_s in received.arrivals:
+        if run and received.sent_s[number] >= run[-1]:
             run = []
         run.append(at_s)
         longest = max(longest, run, key=len)
     if len(longest) < 2:
         return _NOTHING
     bits, took_s = packet_bits * (len(longest) - 1), longest[-1] - longest[0]
-    late_s = max(heard.lateness.way_s) + max(heard.lateness.timers_s)
+    late_s = max(received.lateness.way_s) + max(received.lateness.timers_s)
     return Estimate(bits / took_s, bits / (took_s + late_s), bits / max(took_s - late_s, 1e-9), len(longest))
 
 
-def waiting_when_lost(heard: Heard, delay_s: float) -> Estimate:
-    """How many packets waited for their delay when one was lost: a limit.
+def waiting_when_lost(received: ReceivedStream, delay_s: float) -> Estimate:
+    """Return the number of packets that waited for their delay when one was lost: the limit.
 
-    For each packet lost there are those that must still have waited, as their delay was not over, and those that may
-    have, as they had not come yet. The medians of both are the bounds.
+    For each lost packet, some packets must still have waited, because their delay was not over. Others may have waited,
+    because they had not arrived yet. The medians of both numbers are the limits.
     """
-    came = dict(heard.arrivals)
+    received_packets = dict(received.arrivals)
     must: list[int] = []
     may: list[int] = []
     waiting: list[int] = []
-    for number, sent_s in enumerate(heard.sent_s):
-        waiting = [earlier for earlier in waiting if came[earlier] > sent_s]
-        if number in came:
+    for number, sent_s in enumerate(received.sent_s):
+        waiting = [earlier for earlier in waiting if received_packets[earlier] > sent_s]
+        if number in received_packets:
             waiting.append(number)
         else:
             may.append(len(waiting))
-            must.append(sum(sent_s < heard.sent_s[earlier] + delay_s for earlier in waiting))
+            must.append(sum(sent_s < received.sent_s[earlier] + delay_s for earlier in waiting))
     if not must:
         return _NOTHING
     low, high = median(must), median(may)
-    return Estimate((low + high) / 2, low, high, len(heard.sent_s))
+    return Estimate((low + high) / 2, low, high, len(received.sent_s))
 
 
 def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
-    """The share that `hits` are of `count` draws, each of which is worth so many independent ones (Wilson, 1927)."""
+    """Return the share of `hits` in `count` draws, each worth `worth` independent draws (Wilson, 1927)."""
     if count == 0:
         return _NOTHING
     ratio, draws = hits / count, count * worth
@@ -162,7 +162,7 @@ def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
 
 
 def mean(values: Sequence[float], *, packets: int | None = None) -> Estimate:
-    """The mean of independent values, which were taken from so many `packets` (None: one each)."""
+    """Return the mean of independent values, taken from `packets` packets, by default one each."""
     if len(values) < 2:
         return _NOTHING
     average, margin = fmean(values), _Z * math.sqrt(variance(values) / len(values))
@@ -170,7 +170,7 @@ def mean(values: Sequence[float], *, packets: int | None = None) -> Estimate:
 
 
 def deviation(values: Sequence[float]) -> Estimate:
-    """The standard deviation of independent values of any shape: that of a mean of squares."""
+    """Return the standard deviation of independent values of any distribution, as the root of a mean of squares."""
     if len(values) < 2:
         return _NOTHING
     middle = fmean(values)
@@ -179,13 +179,13 @@ def deviation(values: Sequence[float]) -> Estimate:
     return Estimate(math.sqrt(squares.measured), low, high, len(values))
 
 
-def _losses(heard: Heard) -> list[bool]:
-    came = {number for number, _ in heard.arrivals}
-    return [number not in came for number in range(len(heard.sent_s))]
+def _losses(received: ReceivedStream) -> list[bool]:
+    received_packets = {number for number, _ in received.arrivals}
+    return [number not in received_packets for number in range(len(received.sent_s))]
 
 
 def _independence(losses: Sequence[bool]) -> float:
-    """How many independent draws one of a chain is worth for its mean: (1 - c) / (1 + c), c from one to the next."""
+    """Return the worth of one draw of a chain in independent draws: (1 - c) / (1 + c), with the correlation c."""
     loss = fmean(losses)
     if not 0 < loss < 1:
         return 1.0
@@ -194,6 +194,6 @@ def _independence(losses: Sequence[bool]) -> float:
     return (1 - correlation) / (1 + correlation)
 
 
-def _delays(heard: Heard) -> list[float]:
-    sent_s, way_s = heard.sent_s, heard.lateness.way_s
-    return [at_s - sent_s[number] - way_s[number] for number, at_s in heard.arrivals]
+def _delays(received: ReceivedStream) -> list[float]:
+    sent_s, way_s = received.sent_s, received.lateness.way_s
+    return [at_s - sent_s[number] - way_s[number] for number, at_s in received.arrivals]

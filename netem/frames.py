@@ -1,4 +1,4 @@
-"""Frames as vehicles put them on the air: what Linux makes of a UDP broadcast, and the checksums in them."""
+"""Ethernet frames of UDP broadcasts as Linux makes them, with their checksums."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ _TTL = 64
 
 
 def checksum(data: bytes) -> int:
-    """The Internet checksum (RFC 1071), as UDP has it: 0xFFFF in the place of 0.
+    """Return the Internet checksum (RFC 1071) as in UDP, with 0xFFFF in place of 0.
 
-    The sum of 16-bit words with the carry brought around is the rest of a division by 0xFFFF.
+    The sum of 16-bit words with end-around carry equals the remainder of a division by 0xFFFF.
     """
     return 0xFFFF - (int.from_bytes(data, "big") << 8 * (len(data) % 2)) % 0xFFFF
 
 
 def udp_broadcast(sender: int, port: int, data: bytes) -> bytes:
-    """The Ethernet frame in which a vehicle of the lab broadcasts a datagram, from `port` to `port`."""
+    """Return the Ethernet frame in which a vehicle broadcasts a datagram, from `port` to `port`."""
     source, everyone = (socket.inet_aton(address) for address in (addresses.address(sender), addresses.BROADCAST))
     length = _UDP.size + len(data)
     pseudo_header = source + everyone + struct.pack("!HH", socket.IPPROTO_UDP, length)
     whole = checksum(pseudo_header + _UDP.pack(port, port, length, 0) + data)
     udp = _UDP.pack(port, port, length, whole)
     fields = (0x45, 0, _IP.size + length, 0, _DONT_FRAGMENT, _TTL, socket.IPPROTO_UDP)
-    # An IP header's may be 0.
+    # The checksum of an IP header may be 0.
     ip = _IP.pack(*fields, checksum(_IP.pack(*fields, 0, source, everyone)) % 0xFFFF, source, everyone)
     return _EVERYONE + bytes.fromhex(addresses.mac(sender).replace(":", "")) + _IPV4 + ip + udp + data

@@ -1,9 +1,9 @@
-"""The lab's first process: builds the network, then serves the orchestrator until it hangs up.
+"""The lab's first process. It builds the network, and then serves the orchestrator until that closes the connection.
 
-Run as `python -m netem.init FD` inside fresh namespaces (see `netem._namespaces`), where it is PID 1; `FD`
-is its end of the control socket. One thread and one loop, because setns(2) moves a thread and every child
-must be born in the right network. Nothing here waits for anything but the kernel: a TCP connection is
-made without blocking, and a child's end is reported when it happens.
+It is started as `python -m netem.init FD` inside fresh namespaces (see `netem._namespaces`), where it is PID 1. `FD` is
+its end of the control socket. It has one thread and one loop, because setns(2) moves a thread, and each child must
+start in the right network. It waits for nothing but the kernel: TCP connections are made without blocking, and the end
+of a child is reported when it happens.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from netem.conditions import NetworkConditions
 from netem.engine import Engine
 from netem.errors import ConditionsError, EngineError, NetemError
 
-_MAX_UNREAD = 64 << 20  # bytes waiting for an orchestrator that does not read
+_MAX_UNREAD = 64 << 20  # maximum of unread bytes for the orchestrator
 
 
 @dataclass
 class _Connection:
-    """A TCP connection that is being made for the orchestrator."""
+    """A TCP connection that is being opened for the orchestrator."""
 
     request: int
     socket: socket.socket
@@ -44,7 +44,7 @@ class _Connection:
 
 
 class Server:
-    """Serves one orchestrator, which is trusted; what it sends is still checked."""
+    """Serves one orchestrator. The orchestrator is trusted, but its requests are still checked."""
 
     def __init__(self, control: socket.socket) -> None:
         control.setblocking(False)
@@ -58,14 +58,14 @@ class Server:
         self._open = True
         self._selector = selectors.DefaultSelector()
         self._selector.register(control, selectors.EVENT_READ, self._converse)
-        # A child's end wakes the loop through this pipe; a handler must exist for that.
+        # The end of a child wakes the loop through this pipe, which requires a signal handler.
         self._wake, wake_writer = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         signal.signal(signal.SIGCHLD, lambda *_: None)
         signal.set_wakeup_fd(wake_writer, warn_on_full_buffer=False)
         self._selector.register(self._wake, selectors.EVENT_READ, self._reap)
 
     def run(self) -> None:
-        """Serve until the orchestrator hangs up, by intent or by dying."""
+        """Serve until the orchestrator closes the connection or dies."""
         self._send({"event": "inside"})
         while self._open:
             deadlines = [connection.deadline for connection in self._connections.values()]
@@ -75,8 +75,6 @@ class Server:
             now = time.monotonic()
             for connection in [c for c in self._connections.values() if c.deadline <= now]:
                 self._connected(connection, ETIMEDOUT)
-
-    # The conversation
 
     def _converse(self, events: int) -> None:
         if events & selectors.EVENT_WRITE:
@@ -92,7 +90,7 @@ class Server:
             print(f"The control socket broke: {error}", file=sys.stderr)  # noqa: T201  (the lab's log)
             self._open = False
             return
-        self._receiver.close()  # nobody has a reason to send us descriptors
+        self._receiver.close()  # the orchestrator never sends descriptors
         for message in messages:
             self._serve(message)
 
@@ -112,12 +110,12 @@ class Server:
             if handler is None:
                 raise NetemError(f"request: {message.get('request')!r} is not one of {', '.join(handlers)}")
             result = handler(message)
-        except Exception as error:  # whatever goes wrong with one request, the lab stays
+        except Exception as error:  # a failed request must not end the lab
             if not isinstance(error, (NetemError, OSError)):
                 traceback.print_exc()
             self._send({"id": request, "error": _error(error)})
         else:
-            if result is not None:  # None: the answer comes later
+            if result is not None:  # None: the answer follows later
                 self._send({"id": request, "result": result})
 
     def _send(self, message: dict[str, Any], descriptor: socket.socket | None = None) -> None:
@@ -170,7 +168,7 @@ class Server:
             for name in ("stdout", "stderr"):
                 files.append(os.open(message[name], mode, 0o644))
             with self._require_fabric().inside(message["vehicle"]):
-                # Everything that we hold open is close-on-exec, and `close_fds` closes it again.
+                # All open files are close-on-exec, and `close_fds` closes them again.
                 child = subprocess.Popen(
                     message["argv"],
                     cwd=message["cwd"],
@@ -190,7 +188,7 @@ class Server:
 
     def _signal(self, message: dict[str, Any]) -> dict[str, Any]:
         pid = message["pid"]
-        if pid not in self._children:  # ended, or never ours: its number may be somebody else's by now
+        if pid not in self._children:  # ended or unknown: another process may have this ID now
             return {"sent": False}
         os.killpg(pid, message["signal"])
         return {"sent": True}
@@ -247,7 +245,7 @@ class Server:
     # Children
 
     def _reap(self, _: int) -> None:
-        """Report children that ended; orphans of theirs, which the kernel gives to PID 1, just go."""
+        """Report children that ended. Orphans, which the kernel assigns to PID 1, are only removed."""
         with contextlib.suppress(BlockingIOError):
             os.read(self._wake, 4096)
         while True:

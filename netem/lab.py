@@ -1,16 +1,16 @@
-"""The lab as the orchestrator sees it: vehicles in namespaces of their own on one switch, called `air`.
+"""A lab: vehicles in namespaces of their own, connected to one switch called `air`.
 
     async with await Lab.open([1, 2, 3], log=run_dir / "lab.log") as lab:
         agent = await lab.spawn(1, ["my-agent"], cwd=..., env=..., stdout=..., stderr=...)
         await lab.apply(NetworkConditions(LinkConditions(loss=0.15)))
 
-Nothing of it is visible from outside: no interface, rule or name in the caller's network. Files and Unix
-sockets are shared with the caller. The lab ends with `close`, or with the caller's process, however that
-ends. Processes have the lab's own numbers: `LabProcess.pid` means nothing outside.
+The lab is not visible from outside: the caller's network has no interface, rule or name of it. Files and Unix sockets
+are shared with the caller. The lab ends with `close`, or with the caller's process. Process IDs belong to the lab, so
+`LabProcess.pid` has no meaning outside.
 
-Open it from the main thread: the death signal that guards it (see `netem._namespaces`) follows the thread
-that opened it. From another thread it is left out, and the closing of the control socket alone ends the
-lab, which a stopped (SIGSTOP) lab would not notice.
+Open a lab in the main thread. The death signal that guards the lab (see `netem._namespaces`) follows the thread that
+opened it. In another thread the signal is left out. Then only the end of the control socket ends the lab, and a stopped
+(SIGSTOP) lab would not notice it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from netem.errors import ConditionsError, LabError, LabUnavailable, SpawnError
 
 EngineName = Literal["netem", "nftables"]
 
-_WAYS_OUT: dict[EngineName, str] = {
+_REMEDIES: dict[EngineName, str] = {
     "netem": "Use a kernel with sch_netem, sch_htb, sch_ingress, cls_basic, cls_fw, act_skbedit and act_gact (Debian: "
     "linux-image-amd64; Ubuntu: linux-modules-extra-$(uname -r); Fedora, RHEL: kernel-modules-extra; Arch: every "
     "kernel; Alpine: linux-lts; WSL2: a kernel of your own, with CONFIG_NET_SCH_NETEM), or run it "
@@ -84,7 +84,7 @@ class LabProcess:
     async def terminate(self, grace_s: float) -> int:
         """End the process by SIGTERM, or by SIGKILL after `grace_s` seconds. Return its return code."""
         await self.send_signal(signal.SIGTERM)
-        await self.resume()  # a stopped process could not obey
+        await self.resume()  # a stopped process cannot react to SIGTERM
         try:
             return await asyncio.wait_for(self.wait(), grace_s)
         except TimeoutError:
@@ -124,12 +124,12 @@ class Lab:
         run a lab, or has no engine for these needs.
         """
         ids = _checked(vehicles)
-        given = dict(networks or {})
-        word = ""
-        for user_namespace in (False,) if given else _namespaces.ways_in():
-            lab = await cls._enter(ids, user_namespace, given, log)
+        namespaces = dict(networks or {})
+        message = ""
+        for user_namespace in (False,) if namespaces else _namespaces.user_namespace_choices():
+            lab = await cls._enter(ids, user_namespace, namespaces, log)
             try:
-                refusal = await asyncio.wait_for(lab._start(engine, needs, given, log), _OPEN_DEADLINE_S)
+                refusal = await asyncio.wait_for(lab._start(engine, needs, namespaces, log), _OPEN_DEADLINE_S)
             except TimeoutError:
                 await lab.close()
                 raise LabError(f"The lab was not up within {_OPEN_DEADLINE_S:g} s; see {log}") from None
@@ -138,47 +138,47 @@ class Lab:
                 raise
             if refusal is None:
                 return lab
-            word = refusal
-        if (failure := _namespaces.not_executed(word)) is not None:
+            message = refusal
+        if (failure := _namespaces.not_executed(message)) is not None:
             program, why = failure
             reason = f"{_namespaces.user()} cannot execute {program} ({why})"
-            raise LabUnavailable(f"The lab's first process cannot be started: {reason}", _namespaces.way_out(word))
+            raise LabUnavailable(f"The lab's first process cannot be started: {reason}", _namespaces.way_out(message))
         raise LabUnavailable(
-            f"This machine does not let us make a private network ({word})",
-            f"{_namespaces.way_out(word)} Or run it inside User Mode Linux: --kernel uml.",
+            f"This machine does not let us make a private network ({message})",
+            f"{_namespaces.way_out(message)} Or run it inside User Mode Linux: --kernel uml.",
         )
 
     @classmethod
     async def _enter(
         cls, vehicles: tuple[int, ...], user_namespace: bool, networks: Mapping[int, int], log: Path
     ) -> Lab:
-        ours, theirs = socket.socketpair()
+        own_end, lab_end = socket.socketpair()
         argv = _namespaces.command(
-            [sys.executable, "-P", "-m", "netem.init", str(theirs.fileno())],
+            [sys.executable, "-P", "-m", "netem.init", str(lab_end.fileno())],
             user_namespace=user_namespace,
             die_with_parent=threading.current_thread() is threading.main_thread(),
         )
-        # Wherever we were imported from, so is the lab's first process; what it starts gets its own.
+        # The lab's first process imports the same package as this one. Programs in the lab have their own environment.
         path = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")]))
         try:
-            with theirs, log.open("ab") as output:
+            with lab_end, log.open("ab") as output:
                 process = await asyncio.create_subprocess_exec(
                     *argv,
                     stdin=asyncio.subprocess.DEVNULL,
                     stdout=output,
                     stderr=output,
-                    env={**os.environ, "PYTHONPATH": path, "LC_ALL": "C.UTF-8"},  # the tools' words are in English
-                    pass_fds=[theirs.fileno(), *networks.values()],
-                    start_new_session=True,  # the terminal's Ctrl-C is for the orchestrator alone
+                    env={**os.environ, "PYTHONPATH": path, "LC_ALL": "C.UTF-8"},  # tools print English messages
+                    pass_fds=[lab_end.fileno(), *networks.values()],
+                    start_new_session=True,  # Ctrl-C in the terminal reaches only the orchestrator
                 )
         except FileNotFoundError as error:
-            ours.close()
-            word = f"{error.filename} is not installed"
-            raise LabUnavailable(word, _namespaces.way_out(word)) from None
+            own_end.close()
+            message = f"{error.filename} is not installed"
+            raise LabUnavailable(message, _namespaces.way_out(message)) from None
         except BaseException:
-            ours.close()
+            own_end.close()
             raise
-        return cls(vehicles, process, Channel(ours, log))
+        return cls(vehicles, process, Channel(own_end, log))
 
     async def _start(
         self, engine: EngineName | None, needs: Sequence[str], networks: Mapping[int, int], log: Path
@@ -186,10 +186,10 @@ class Lab:
         """Build the network. Return the message of the tool if it could not enter namespaces, otherwise None."""
         if not await self._channel.inside():
             await self.close()
-            word = _last_line(log)
-            if word.startswith(("unshare:", "setpriv:")):
-                return word
-            raise LabError(f"The lab's first process ended before it began ({word}); see {log}")
+            message = _last_line(log)
+            if message.startswith(("unshare:", "setpriv:")):
+                return message
+            raise LabError(f"The lab's first process ended before it began ({message}); see {log}")
         try:
             result, _ = await self._channel.ask(
                 "open", vehicles=self.vehicles, engine=engine, needs=[*needs], networks={**networks}
@@ -203,7 +203,7 @@ class Lab:
                 "fabric",
             ) from error
         if result["engine"] is None:
-            wanted = [_WAYS_OUT[engine]] if engine else [_WAYS_OUT["netem"]] if needs else [*_WAYS_OUT.values()]
+            wanted = [_REMEDIES[engine]] if engine else [_REMEDIES["netem"]] if needs else [*_REMEDIES.values()]
             if needs:
                 wanted.append("play it in virtual time: --backend sim.")
             work = f"No engine {engine} works" if engine else "No engine at all works"

@@ -1,7 +1,7 @@
-"""What this machine can do for the lab, as facts; who prints them is not decided here.
+"""Examine whether this machine can run a lab.
 
-Every fact comes from trying, in a lab of two vehicles that is gone a moment later: configuration files
-and module lists say what might work, not what does.
+Each fact comes from a real lab of two vehicles that is removed afterwards. Configuration files and lists of modules
+show only what might work.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from netem.lab import Lab, LabError
 
 @dataclass(frozen=True)
 class LabRequirement:
-    """What a lab needs of a machine: whether it is there, what was seen, and what to do if not (else empty).
+    """A requirement of a lab: its state, an observation, and the remedy if it is missing.
 
-    Without what is `needed` there is no lab; of the engines any one will do.
+    Without a `needed` requirement there is no lab. One engine is sufficient.
     """
 
     name: str
@@ -31,9 +31,9 @@ class LabRequirement:
 
 
 def examine() -> list[LabRequirement]:
-    """Everything that the lab needs, in the order in which it needs it. Takes about half a second."""
-    ok, word = _namespaces.probe()
-    requirements = [LabRequirement("namespaces", ok, word, "" if ok else _namespaces.way_out(word))]
+    """Return all requirements of a lab in order of dependence. Takes about half a second."""
+    ok, message = _namespaces.probe()
+    requirements = [LabRequirement("namespaces", ok, message, "" if ok else _namespaces.way_out(message))]
     if not ok:
         return requirements
     with tempfile.TemporaryDirectory() as folder:
@@ -59,7 +59,7 @@ def examine() -> list[LabRequirement]:
 
 
 def _try(engine: Literal["netem", "nftables"] | None, log: Path) -> str | LabError:
-    """The engine that a lab came up with, or why it did not."""
+    """Return the engine of a test lab, or the reason why it could not be opened."""
 
     async def attempt() -> str:
         async with await Lab.open((1, 2), engine=engine, log=log) as lab:

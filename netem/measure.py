@@ -1,16 +1,17 @@
-"""What a network does to packets, beside what was asked of it: the same questions to every engine.
+"""Measure how a network treats packets, and compare the results with the requested conditions.
 
-A *study* is a network, broadcasts in it, and questions: of the packets from this sender to this receiver, what is that
-figure? Every receiver has conditions of its own, so that one stream answers many questions. `measure` plays studies
-before an observer (`netem.observers`: real packets, or those of virtual time) and judges each answer: the 99.9 %
-interval of what was measured (`netem.estimates`) holds what was asked, or not.
+A *study* consists of a network, broadcasts in it, and questions about figures of the packets from one sender to one
+receiver. Each receiver has its own conditions, so one stream answers many questions. `measure` gives studies to an
+observer (`netem.observers`: real packets, or packets in virtual time). An answer is right if the 99.9 % interval of the
+measurement (`netem.estimates`) contains the requested value.
 
-Of a thousand right answers one lies outside such an interval, and of thirty rows one in thirty runs. So what lies
-outside is measured once more, with a fresh stream: the second answer counts, the first stays beside it. A right kernel
-fails a run of thirty rows once in 30,000; what is really wrong is wrong twice.
+One of a thousand right answers lies outside such an interval. With thirty rows, this happens in one of about thirty
+measurements. An answer outside is therefore measured again with a new stream. The second answer counts, and the first
+is shown beside it. A right kernel fails a measurement of thirty rows once in 30,000 cases, and a wrong one fails twice
+in a row.
 
-Asked is what the engine promises, to the last digit: of a delay the mean and the deviation of the table that netem is
-given (`netem._distributions`), of corruption what a checksum can find.
+The requested value is exactly that of the engine: for a delay, mean and deviation of netem's table
+(`netem._distributions`), and for corruption, the share that checksums can detect.
 """
 
 from __future__ import annotations
@@ -26,39 +27,40 @@ from netem import estimates
 from netem._distributions import SCALE, table
 from netem.conditions import NetworkConditions
 from netem.engine import RESOLUTION
-from netem.estimates import Estimate, Heard, Lateness
+from netem.estimates import Estimate, Lateness, ReceivedStream
 from netem.link import Delay, Distribution, GilbertElliott, LinkConditions
 
 PACKETS = 10_000
 DATA_BYTES = 12
-"""Of every datagram."""
+"""Size of each datagram."""
 REFERENCE = 3
-"""The vehicle that hears everything, whatever is asked."""
+"""The vehicle that receives all packets in each study."""
 
 _FRAME_BITS = (DATA_BYTES + 42) * 8
 _UNPROTECTED_BITS = 95
-"""Of a frame no checksum covers the Ethernet addresses, 96 bits; a broadcast that loses its group bit is lost."""
-_TABLE_SIZE = 4094  # of the tables that the kernel is given
+"""Bits of a frame without a checksum: the Ethernet addresses, without the group bit, whose corruption loses a
+broadcast."""
+_TABLE_SIZE = 4094  # size of the kernel's tables
 _SENDER, _OTHER_SENDER = 1, 2
 _FIRST_FREE = 4
 
 
 @dataclass(frozen=True)
 class Question:
-    """What `estimate` finds of the packets from one vehicle to another is asked to be so much."""
+    """A question: `estimate` of the packets from `sender` to `receiver` should equal `asked`."""
 
     sender: int
     receiver: int
     condition: str
     quantity: str
     asked: float
-    estimate: Callable[[Heard], Estimate]
+    estimate: Callable[[ReceivedStream], Estimate]
     unit: str = ""
 
 
 @dataclass(frozen=True)
 class Study:
-    """Conditions, under which all who are a `sender` in a question broadcast, and the questions."""
+    """Conditions and questions. All senders of questions broadcast."""
 
     conditions: NetworkConditions
     questions: tuple[Question, ...]
@@ -73,19 +75,19 @@ class Study:
 
     @property
     def vehicles(self) -> tuple[int, ...]:
-        """All that are in it, with the reference, which no conditions and no partition may touch."""
+        """All vehicles, including the reference, which no condition and no partition may affect."""
         conditions = self.conditions
         named = {*conditions.receivers, *chain(*conditions.links), *chain(*conditions.partition)}
         return tuple(sorted({*self.senders, *self.receivers, *named, REFERENCE}))
 
 
-Observer = Callable[[Study, int], Mapping[tuple[int, int], Heard]]
-"""Has every sender of a study broadcast so many packets; what was heard, by sender and receiver of each question."""
+Observer = Callable[[Study, int], Mapping[tuple[int, int], ReceivedStream]]
+"""Lets each sender broadcast a number of packets. Returns the received packets by (sender, receiver)."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """A question of an engine and its answer; `before` is the first answer if it lay outside."""
+class AnswerRow:
+    """A question and its answer. `before` is the first answer if it was outside the interval."""
 
     engine: str
     question: Question
@@ -94,7 +96,7 @@ class Row:
 
     @property
     def ok(self) -> bool:
-        """What was asked lies in the interval of what was measured, to the digits that engines hold."""
+        """True if the interval contains the requested value, within the resolution of engines."""
         asked = self.question.asked
         margin = RESOLUTION * max(1.0, asked)
         return self.answer.low - margin <= asked <= self.answer.high + margin
@@ -106,11 +108,11 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Measured:
-    """All rows of one engine, and how late the machine was by itself, in seconds."""
+class EngineMeasurement:
+    """All rows of one engine, and the machine's lateness in seconds."""
 
     engine: str
-    rows: tuple[Row, ...]
+    rows: tuple[AnswerRow, ...]
     lateness: Lateness
 
     @property
@@ -118,58 +120,61 @@ class Measured:
         return all(row.ok for row in self.rows)
 
     def to_json(self) -> dict[str, Any]:
-        """`lateness` in seconds: median and 99th percentile, of packets without conditions on the way and of timers."""
+        """Return a JSON object.
+
+        `lateness` has median and 99th percentile in seconds, for packets on their way and for timers.
+        """
         late = {"way": self.lateness.way_s, "timers": self.lateness.timers_s}
         lateness = {key: {"median_s": median(each), "p99_s": quantiles(each, n=100)[-1]} for key, each in late.items()}
         return {"engine": self.engine, "lateness": lateness, "rows": [row.to_json() for row in self.rows]}
 
 
-def measure(engine: str, studies: Sequence[Study], observe: Observer, packets: int = PACKETS) -> Measured:
-    """Answer every question of the studies; what lies outside is asked once more. Raises what `observe` raises."""
-    rows: list[Row] = []
+def measure(engine: str, studies: Sequence[Study], observe: Observer, packets: int = PACKETS) -> EngineMeasurement:
+    """Answer the questions of the studies. Answers outside are measured again. Raises the errors of `observe`."""
+    rows: list[AnswerRow] = []
     late: list[Lateness] = []
     for study in studies:
-        heard = observe(study, packets)
-        late.append(next(iter(heard.values())).lateness)
-        answers = [Row(engine, question, _answer(question, heard)) for question in study.questions]
+        streams = observe(study, packets)
+        late.append(next(iter(streams.values())).lateness)
+        answers = [AnswerRow(engine, question, _answer(question, streams)) for question in study.questions]
         if outside := tuple(row.question for row in answers if not row.ok):
-            again = observe(replace(study, questions=outside), packets)
+            second_streams = observe(replace(study, questions=outside), packets)
             answers = [
-                row if row.ok else replace(row, answer=_answer(row.question, again), before=row.answer)
+                row if row.ok else replace(row, answer=_answer(row.question, second_streams), before=row.answer)
                 for row in answers
             ]
         rows += answers
     ways, timers = (
         [*chain.from_iterable(values)] for values in zip(*((o.way_s, o.timers_s) for o in late), strict=True)
     )
-    return Measured(engine, tuple(rows), Lateness(ways, timers))
+    return EngineMeasurement(engine, tuple(rows), Lateness(ways, timers))
 
 
-def _answer(question: Question, heard: Mapping[tuple[int, int], Heard]) -> Estimate:
-    return question.estimate(heard[question.sender, question.receiver])
+def _answer(question: Question, streams: Mapping[tuple[int, int], ReceivedStream]) -> Estimate:
+    return question.estimate(streams[question.sender, question.receiver])
 
 
-# What is asked
+# Studies
 
 
 def studies(engine: str) -> tuple[Study, ...]:
-    """All that an engine is asked: "nftables" loss and partitions; "netem" and "medium" everything.
+    """Return the studies of an engine: loss and partitions for "nftables", all conditions for "netem" and "medium".
 
-    Duplicates have a study of their own: some kernels want them alone (see `netem.tc`).
+    Duplicates have their own study, because some kernels do not allow them beside other conditions (see `netem.tc`).
     """
     if engine == "nftables":
         return (_receivers(_losses()), _pairs())
     noticed = 1.0 if engine == "medium" else 1 - _UNPROTECTED_BITS / _FRAME_BITS
-    return (_receivers([*_losses(), *_rest(noticed)]), _receivers(_duplicates()), _pairs())
+    return (_receivers([*_losses(), *_other_conditions(noticed)]), _receivers(_duplicates()), _pairs())
 
 
 @dataclass(frozen=True)
 class _Case:
-    """One link, and what to ask of it: (quantity, asked, estimate, unit)."""
+    """Conditions of a link, and its questions as (quantity, asked, estimate, unit)."""
 
     condition: str
     link: LinkConditions
-    figures: tuple[tuple[str, float, Callable[[Heard], Estimate], str], ...]
+    figures: tuple[tuple[str, float, Callable[[ReceivedStream], Estimate], str], ...]
 
 
 def _losses() -> list[_Case]:
@@ -177,8 +182,8 @@ def _losses() -> list[_Case]:
     return [_Case(f"loss {share:g}", LinkConditions(share), (("lost", share, estimates.lost, ""),)) for share in shares]
 
 
-def _rest(noticed: float) -> list[_Case]:
-    """All else but duplicates; `noticed` is the share of corruptions that a receiver notices."""
+def _other_conditions(noticed: float) -> list[_Case]:
+    """Return the cases of all other conditions except duplicates. `noticed` is the share of detected corruptions."""
     bursts = GilbertElliott(p=0.05, r=0.25)
     fixed, jitter_s = Delay(0.1), 0.02
     rate, limit = 500_000.0, 50
@@ -197,7 +202,7 @@ def _rest(noticed: float) -> list[_Case]:
         _Case(
             "reorder 0.25, delay 100 ms",
             LinkConditions(delay=fixed, reorder=0.25),
-            (("came at once", 0.25, partial(estimates.came_at_once, delay_s=fixed.mean_s), ""),),
+            (("came at once", 0.25, partial(estimates.undelayed, delay_s=fixed.mean_s), ""),),
         ),
         _Case("corrupt 0.2", LinkConditions(corrupt=0.2), (("lost", 0.2 * noticed, estimates.lost, ""),)),
         _Case(
@@ -225,11 +230,11 @@ def _jittered(delay: Delay) -> _Case:
 
 
 def _duplicates() -> list[_Case]:
-    return [_Case("duplicate 0.3", LinkConditions(duplicate=0.3), (("came twice", 0.3, estimates.came_twice, ""),))]
+    return [_Case("duplicate 0.3", LinkConditions(duplicate=0.3), (("came twice", 0.3, estimates.duplicated, ""),))]
 
 
 def _receivers(cases: Sequence[_Case]) -> Study:
-    """One sender, and a receiver for each case."""
+    """Return a study with one sender, and a receiver for each case."""
     numbered = dict(enumerate(cases, _FIRST_FREE))
     questions = [
         Question(_SENDER, receiver, case.condition, *figure)
@@ -241,7 +246,7 @@ def _receivers(cases: Sequence[_Case]) -> Study:
 
 
 def _pairs() -> Study:
-    """Two senders at the same time, a loss for each direction between them and for the rest, and one cut off."""
+    """Return a study with two simultaneous senders, different losses for single links, and one separated vehicle."""
     there, back, rest = 0.4, 0.1, 0.2
     conditions = NetworkConditions(
         LinkConditions(rest),

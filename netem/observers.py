@@ -1,4 +1,4 @@
-"""Who looks at a study for `netem.measure`: real packets between the vehicles of a lab, or those of virtual time."""
+"""Observers for `netem.measure`: real packets between vehicles of a lab, or packets in virtual time."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from typing import Any, NamedTuple
 from netem import _probe
 from netem.engine import Applied
 from netem.errors import LabError
-from netem.estimates import Heard, Lateness
+from netem.estimates import Lateness, ReceivedStream
 from netem.lab import EngineName, Lab, LabProcess
 from netem.measure import DATA_BYTES, REFERENCE, Observer, Study
 from netem.medium import Medium
 
 PAUSES_S = (0.005, 0.01, 0.02)
-"""What a sender sleeps after every 20 packets: the first, if the machine can take it."""
+"""Pauses of a sender after every 20 packets. Longer ones are used if the machine is too slow."""
 SPACING_S = 0.0003
-"""In virtual time, from one packet to the next."""
+"""Seconds between packets in virtual time."""
 
 _PORT = 14600
 _DEADLINE_S = 180.0  # of a stream
@@ -34,45 +34,45 @@ _TRY_AGAIN = "this machine is too busy to measure just now: try again when it is
 
 
 def in_medium(seed: int) -> Observer:
-    """An observer of `netem.medium`, where nothing is late; every stream is another, and all follow from the seed."""
+    """Return an observer of `netem.medium` without any lateness. Each stream differs, and all depend on the seed."""
     streams = itertools.count()
 
-    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], Heard]:
+    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         medium = Medium(study.vehicles, seed << 32 | next(streams))
         medium.apply(study.conditions)
         sent_s = [number * SPACING_S for number in range(packets)]
-        came: dict[tuple[int, int], list[tuple[float, int]]] = {
+        received_packets: dict[tuple[int, int], list[tuple[float, int]]] = {
             (sender, receiver): [] for sender in study.senders for receiver in study.vehicles
         }
         for number, at_s in enumerate(sent_s):
             for sender in study.senders:
                 for receiver, delay_s in medium.draw(study.vehicles.index(sender), at_s, DATA_BYTES).to_all():
-                    came[sender, study.vehicles[receiver]].append((at_s + delay_s, number))
+                    received_packets[sender, study.vehicles[receiver]].append((at_s + delay_s, number))
         never = Lateness([0.0] * packets, [0.0] * packets)
         return {
-            link: Heard(sent_s, [(number, at_s) for at_s, number in sorted(arrivals)], never)
-            for link, arrivals in came.items()
+            link: ReceivedStream(sent_s, [(number, at_s) for at_s, number in sorted(arrivals)], never)
+            for link, arrivals in received_packets.items()
         }
 
     return observe
 
 
 def in_lab(engine: EngineName) -> Observer:
-    """An observer of real packets, in a lab of its own for every stream.
+    """Return an observer of real packets. Each stream has its own lab.
 
-    Packets that the kernel's engine let pass and that nobody heard were lost by the machine itself: a receive buffer or
-    the backlog of a processor was full. Such a stream says nothing of the engine and is sent again, slower. Raises
-    LabError if that does not help, or if the lab fails; LabUnavailable if this machine has no such lab.
+    If the kernel's engine passed more packets than arrived, the machine lost them, because a receive buffer or a
+    processor's backlog was full. Such a stream says nothing about the engine, and is sent again more slowly. Raises
+    LabError if this does not help or the lab fails, and LabUnavailable if this machine cannot run the lab.
     """
 
-    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], Heard]:
+    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         *quicker, slowest = PAUSES_S
         for pause_s in quicker:
             with contextlib.suppress(DisturbedError):
                 return stream(study, packets, pause_s)
         return stream(study, packets, slowest)
 
-    def stream(study: Study, packets: int, pause_s: float) -> Mapping[tuple[int, int], Heard]:
+    def stream(study: Study, packets: int, pause_s: float) -> Mapping[tuple[int, int], ReceivedStream]:
         try:
             return asyncio.run(asyncio.wait_for(_observe(engine, study, packets, pause_s), _DEADLINE_S))
         except TimeoutError:
@@ -82,10 +82,12 @@ def in_lab(engine: EngineName) -> Observer:
 
 
 class DisturbedError(LabError):
-    """The machine itself lost packets: what arrived says nothing of the engine."""
+    """The machine itself lost packets, so the stream says nothing about the engine."""
 
 
-async def _observe(engine: EngineName, study: Study, packets: int, pause_s: float) -> dict[tuple[int, int], Heard]:
+async def _observe(
+    engine: EngineName, study: Study, packets: int, pause_s: float
+) -> dict[tuple[int, int], ReceivedStream]:
     vehicles = {*study.receivers, REFERENCE}
     numbers = {sender: range(i * packets, (i + 1) * packets) for i, sender in enumerate(study.senders)}
     with tempfile.TemporaryDirectory() as name:
@@ -100,46 +102,46 @@ async def _observe(engine: EngineName, study: Study, packets: int, pause_s: floa
                 stream = (_PORT, packets, own.start, lab.broadcast, DATA_BYTES, pause_s)
                 senders[sender] = await _Program.start(lab, folder, sender, "broadcast", *stream)
             timers_s = {sender: (await program.end())["late_s"] for sender, program in senders.items()}
-            counted = await _quiet(lab)
+            counted = await _wait_until_quiet(lab)
             reports = {vehicle: await listener.stop() for vehicle, listener in listeners.items()}
-    came = {
+    received_packets = {
         (sender, vehicle): _arrivals(reports[vehicle], own)
         for vehicle in vehicles
         for sender, own in numbers.items()
-        if sender != vehicle  # whose own broadcasts come back to it at once
+        if sender != vehicle  # its own broadcasts return to it at once
     }
-    check(study, reports, came, counted)
-    heard = {}
+    check(study, reports, received_packets, counted)
+    streams = {}
     for sender in study.senders:
-        reference = sorted(came[sender, REFERENCE])
+        reference = sorted(received_packets[sender, REFERENCE])
         sent_s, way_s = [packet.sent_s for packet in reference], [packet.at_s - packet.sent_s for packet in reference]
         if missing := packets - len(reference):
             raise DisturbedError(f"{missing} of {packets} packets were lost where nothing is asked; {_TRY_AGAIN}")
         for receiver in study.receivers:
             if receiver != sender:
-                arrivals = [(packet.number, packet.at_s) for packet in came[sender, receiver]]
-                heard[sender, receiver] = Heard(sent_s, arrivals, Lateness(way_s, timers_s[sender]))
-    return heard
+                arrivals = [(packet.number, packet.at_s) for packet in received_packets[sender, receiver]]
+                streams[sender, receiver] = ReceivedStream(sent_s, arrivals, Lateness(way_s, timers_s[sender]))
+    return streams
 
 
 def check(
     study: Study,
     reports: Mapping[int, Mapping[str, Any]],
-    came: Mapping[tuple[int, int], Sequence[Arrival]],
+    received_packets: Mapping[tuple[int, int], Sequence[Arrival]],
     counted: Applied,
 ) -> None:
-    """Raises DisturbedError if the machine itself lost packets; of corrupted ones nobody can say who lost them."""
+    """Raise DisturbedError if the machine lost packets. With corruption, the cause of a loss is unknown."""
     for vehicle, report in reports.items():
-        links = [link for link in came if link[1] == vehicle]
+        links = [link for link in received_packets if link[1] == vehicle]
         if report["overflow"]:
             raise DisturbedError(f"The receive buffer of vehicle {vehicle} overflowed; {_TRY_AGAIN}")
-        missing = counted.receivers[vehicle].passed - sum(len(came[link]) for link in links)
+        missing = counted.receivers[vehicle].passed - sum(len(received_packets[link]) for link in links)
         if missing and not any(study.conditions.link(*link).corrupt for link in links):
             raise DisturbedError(f"The machine itself lost {missing} of the packets to vehicle {vehicle}; {_TRY_AGAIN}")
 
 
 class Arrival(NamedTuple):
-    """One copy of a packet, by its number from 0; times in seconds."""
+    """A received copy of a packet with its number from 0. Times are in seconds."""
 
     number: int
     sent_s: float
@@ -147,13 +149,13 @@ class Arrival(NamedTuple):
 
 
 def _arrivals(report: Mapping[str, Any], own: range) -> list[Arrival]:
-    """Those of one sender, which has these numbers."""
+    """Return the packets of the sender with these numbers."""
     each = zip(report["numbers"], report["at_s"], report["delays_s"], strict=True)
     return [Arrival(number - own.start, at_s - delay_s, at_s) for number, at_s, delay_s in each if number in own]
 
 
-async def _quiet(lab: Lab) -> Applied:
-    """Wait until no packet is on its way any more; returns what the kernel then has counted."""
+async def _wait_until_quiet(lab: Lab) -> Applied:
+    """Wait until no packet is on its way. Return the counters of the kernel."""
     before = None
     while before != (now := await lab.read()):
         before = now
@@ -162,7 +164,7 @@ async def _quiet(lab: Lab) -> Applied:
 
 
 class _Program:
-    """A program of `netem._probe` that runs in a vehicle."""
+    """A program of `netem._probe` in a vehicle."""
 
     def __init__(self, process: LabProcess, output: Path) -> None:
         self._process = process
@@ -177,17 +179,17 @@ class _Program:
         return cls(process, output)
 
     async def wait_for(self, word: str) -> None:
-        """Wait until it says that, or ends."""
+        """Wait until the output contains the word, or until the program ends."""
         while word not in self._output.read_text() and self._process.returncode is None:
             await asyncio.sleep(0.01)
 
     async def stop(self) -> Any:
-        """Have it end, and return its last word."""
+        """End the program, and return its results."""
         await self._process.send_signal(signal.SIGTERM)
         return await self.end()
 
     async def end(self) -> Any:
-        """Wait for its end, and return its last word."""
+        """Wait for the end, and return the results."""
         status = await self._process.wait()
         last = (self._output.read_text().splitlines() or [""])[-1]
         if status != 0:

@@ -1,6 +1,7 @@
-"""Capture files of one Ethernet interface in the pcapng format (draft-ietf-opsawg-pcapng), written block by block.
+"""Write captures of one Ethernet interface in the pcapng format (draft-ietf-opsawg-pcapng), block by block.
 
-A file is only ever appended to, and after each `flush` it is whole: whatever ends the writer, what was written is read.
+The writer only appends, and the file is valid after each `flush`. A crash of the writer therefore loses only unwritten
+packets.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ _BYTE_ORDER_MAGIC = 0x1A2B3C4D
 _UNKNOWN_LENGTH = -1
 _ETHERNET = 1
 _ANY_LENGTH = 0
-_INBOUND, _OUTBOUND = 1, 2  # of epb_flags
-_AT_ONCE = 1 << 20  # bytes that wait to be written, at most
+_INBOUND, _OUTBOUND = 1, 2  # values of epb_flags
+_AT_ONCE = 1 << 20  # maximum number of waiting bytes
 
 _COMMENT, _USERAPPL = 1, 4
 _IF_NAME, _IF_TSRESOL = 2, 9
@@ -42,7 +43,7 @@ _PACKET_BYTES = _PACKET_HEAD.size + len(_DIRECTIONS[True]) + _BLOCK_LENGTH.size 
 
 
 def header(interface: str, comment: str) -> bytes:
-    """What a file begins with: the section, which has the comment, and its only interface."""
+    """Return the start of a file: a section with this comment, and its only interface."""
     section = struct.pack("<IHHq", _BYTE_ORDER_MAGIC, 1, 0, _UNKNOWN_LENGTH)
     about = _option(_COMMENT, comment.encode()) + _option(_USERAPPL, WRITER.encode())
     named = _option(_IF_NAME, interface.encode()) + _option(_IF_TSRESOL, _NANOSECONDS)
@@ -58,8 +59,8 @@ def _block(kind: int, body: bytes) -> bytes:
 class PcapngFile:
     """Appends to a file that begins with `header`. Times are nanoseconds since the Unix epoch.
 
-    `packet`, `flush` and `close` raise OSError, with the file's name, if it cannot be written; it then ends with the
-    last packet that is whole, and those that waited are lost.
+    `packet`, `flush` and `close` raise OSError with the file's name if writing fails. The file then ends with the last
+    complete packet, and waiting packets are lost.
     """
 
     def __init__(self, path: Path) -> None:
@@ -70,7 +71,7 @@ class PcapngFile:
         self.packets = 0
 
     def packet(self, at_ns: int, frame: bytes, *, outbound: bool) -> None:
-        """A frame that left by the interface, or reached it."""
+        """Append a frame that left by the interface (`outbound`) or reached it."""
         captured = len(frame)
         padding = -captured % 4
         length = _PACKET_BYTES + captured + padding
@@ -79,7 +80,7 @@ class PcapngFile:
         self._append(b"".join((head, frame, bytes(padding), _DIRECTIONS[outbound], _BLOCK_LENGTH.pack(length))))
 
     def statistics(self, at_ns: int, received: int, dropped: int) -> None:
-        """How many frames crossed the interface until then, and how many of them are not in the file."""
+        """Append the number of frames that crossed the interface, and the number missing in this file."""
         counts = _option(_ISB_IFRECV, struct.pack("<Q", received)) + _option(_ISB_IFDROP, struct.pack("<Q", dropped))
         at = struct.pack("<III", 0, at_ns >> 32, at_ns & 0xFFFFFFFF)
         self._append(_block(_STATISTICS, at + counts + _END_OF_OPTIONS))
@@ -91,7 +92,7 @@ class PcapngFile:
             self.flush()
 
     def flush(self) -> None:
-        """Write what waits, whole or not at all."""
+        """Write all waiting blocks, or none."""
         if not self._pending:
             return
         data = memoryview(b"".join(self._pending))

@@ -1,10 +1,10 @@
-"""The program that captures: `python -m netem.tap FOLDER VEHICLE...`, in the lab's own network, where the ports are.
+"""The capture program: `python -m netem.tap FOLDER VEHICLE...`, started in the lab's own network with the ports.
 
-It says "ready" as soon as every port is tapped. What crosses the ports then waits in memory until SIGUSR1 says that
-FOLDER/<ID>.pcapng have been begun, and is appended to them. On SIGTERM no more is let in; what there is is written, and
-how much that was: last in each file, and for all in one JSON object on standard output. Of a process that stood still
-SIGTERM may be seen first; that the mission began then is to be seen from the files. On a port directions are the
-switch's; in a file they are the vehicle's.
+It prints "ready" when all ports are captured. Frames then wait in memory until SIGUSR1. At that time, the files
+FOLDER/<ID>.pcapng exist, and frames are appended to them. SIGTERM ends the capture. The remaining frames are written,
+then the counters: at the end of each file, and for all files as one JSON object on standard output. A process that was
+stopped may receive SIGTERM before SIGUSR1. Then the existence of the files shows that the mission began. Directions at
+a port are those of the switch, and directions in a file are those of the vehicle.
 """
 
 from __future__ import annotations
@@ -24,37 +24,37 @@ from netem._ring import BLOCK_BYTES, RETIRE_MS, Ring
 from netem.pcapng import PcapngFile
 
 _MEMORY = 256 << 20
-"""Bytes of all rings together, at most: the faster one port is, the slower are the others, on one machine."""
+"""Maximum size of all rings together in bytes. On one machine, a faster port makes the others slower."""
 _RING_MEMORY = 16 << 20
-"""Bytes of one ring, at most: a second of 10,000 of the largest frames."""
-_FEWEST_BLOCKS = 8  # of a ring, even if that is more for all
+"""Maximum size of one ring in bytes: 10,000 of the largest frames, which is one second."""
+_FEWEST_BLOCKS = 8  # for each ring, even above the total maximum
 _DRAIN_S = 10.0
-"""After a block's age at most, if the kernel keeps its word."""
+"""Maximum time for the last frames. The kernel hands over each block after `RETIRE_MS`."""
 
 
 class Tap:
-    """One vehicle's port, and its file."""
+    """One vehicle's port and file."""
 
     def __init__(self, vehicle: int, blocks: int) -> None:
         self.vehicle = vehicle
         self.ring = Ring(addresses.port(vehicle), blocks)
 
     def open(self, folder: Path) -> bool:
-        """Whether its file has been begun; raises OSError."""
+        """Open the file if it exists, and return whether it does. Raises OSError."""
         path = folder / f"{self.vehicle}.pcapng"
-        begun = path.exists()
-        if begun:
+        exists = path.exists()
+        if exists:
             self._file = PcapngFile(path)
-        return begun
+        return exists
 
     def write(self) -> None:
-        """Raises OSError."""
+        """Write the available frames. Raises OSError."""
         for at_ns, frame, leaves_port in self.ring.take():
             self._file.packet(at_ns, frame, outbound=not leaves_port)
         self._file.flush()
 
     def end(self) -> dict[str, int]:
-        """Raises OSError."""
+        """Write the counters, and close the file. Raises OSError."""
         counted = {"received": self.ring.received, "dropped": self.ring.received - self._file.packets}
         self._file.statistics(time.time_ns(), **counted)
         self._file.close()
@@ -62,16 +62,16 @@ class Tap:
 
 
 def capture(folder: Path, vehicles: Sequence[int]) -> None:
-    """Raises OSError."""
-    asked, wake = socket.socketpair()
+    """Capture until SIGTERM. Raises OSError."""
+    signals, wake = socket.socketpair()
     for number in (signal.SIGUSR1, signal.SIGTERM):
         signal.signal(number, lambda number, _: wake.send(bytes([number])))
     blocks = max(_FEWEST_BLOCKS, min(_RING_MEMORY, _MEMORY // len(vehicles)) // BLOCK_BYTES)
     taps = [Tap(vehicle, blocks) for vehicle in vehicles]
-    _say("ready")
-    stopping = asked.recv(1)[0] == signal.SIGTERM
-    taps = [tap for tap in taps if tap.open(folder)]  # if there are none, the mission never began
-    while not (stopping or select.select([asked], [], [], RETIRE_MS / 1000)[0]):
+    _print_json("ready")
+    stopping = signals.recv(1)[0] == signal.SIGTERM
+    taps = [tap for tap in taps if tap.open(folder)]  # without files, the mission never began
+    while not (stopping or select.select([signals], [], [], RETIRE_MS / 1000)[0]):
         for tap in taps:
             tap.write()
     for tap in taps:
@@ -85,11 +85,11 @@ def capture(folder: Path, vehicles: Sequence[int]) -> None:
         waiting = sum(tap.ring.count() for tap in taps)
     counted = {tap.vehicle: tap.end() for tap in taps}
     used = resource.getrusage(resource.RUSAGE_SELF)
-    _say({"vehicles": counted, "processor_s": used.ru_utime + used.ru_stime})
+    _print_json({"vehicles": counted, "processor_s": used.ru_utime + used.ru_stime})
 
 
-def _say(what: object) -> None:
-    """One line of JSON on standard output."""
+def _print_json(what: object) -> None:
+    """Print one line of JSON."""
     sys.stdout.write(f"{json.dumps(what)}\n")
     sys.stdout.flush()
 

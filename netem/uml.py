@@ -1,21 +1,22 @@
-"""Runs one command inside User Mode Linux, a kernel that has netem and is an ordinary process.
+"""Run one command inside User Mode Linux, a kernel with netem that runs as an ordinary process.
 
     status = uml.run(["my-command", "--flag"], cwd=Path.cwd(), env=os.environ)
 
-linux.uml (Debian: user-mode-linux) boots on the host's own files (hostfs), so the command finds every program and
-directory where it was, and writes with the caller's rights; it needs none beyond them, and is root inside. Only /run,
-with TMPDIR in it, is the guest's own. It has one processor, and a system call costs about twenty of the host's.
+linux.uml (Debian: user-mode-linux) boots from the host's own files (hostfs). The command finds all programs and
+directories at their usual paths, and writes with the caller's rights. It needs no other rights, and is root inside.
+Only /run, with TMPDIR in it, belongs to the guest. The guest has one processor, and a system call takes about twenty
+times as long as on the host.
 
-What the command prints comes out here as it comes. Its terminal is a console of the guest, where Ctrl-C and SIGTERM
-are typed as Ctrl-C, and nothing else is; a further one is for shells (`netem.uml_shell`). On another console the guest
-says an empty line every few seconds, and at last the command's exit status: without that last word there is an error,
-never a status.
+The output of the command is copied as it comes. Its terminal is a console of the guest. Ctrl-C and SIGTERM are typed
+there as Ctrl-C, and there is no other input. Another console is for shells (`netem.uml_shell`). On a further console,
+the guest prints an empty line every few seconds, and finally the exit status of the command. Without this status, `run`
+raises an error.
 
-Its programs keep their floating point and vector registers also on processors that it does not know
+Programs inside keep their floating point and vector registers, also on processors that the kernel does not support
 (`netem._uml_registers`).
 
-Whatever happens to the caller, nothing stays: User Mode Linux is one process group of the host, led by a shell that
-kills the group and removes its directory as soon as the caller closes its end of a pipe, or dies.
+Nothing remains after the caller ends. User Mode Linux is one process group of the host, led by a shell. The shell kills
+the group and removes its directory as soon as the caller closes its end of a pipe, or dies.
 """
 
 from __future__ import annotations
@@ -41,15 +42,16 @@ from netem.errors import UmlError
 MODULES = Path("/usr/lib/uml/modules")
 SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 MEMORY = "2G"
-"""At most: the host gives what is used."""
+"""Maximum memory. The host provides only the memory that is used."""
 
 BEAT_S = 5
 SILENCE_LIMIT_S = 90.0
-"""A guest from which nothing comes for so long hangs: it boots within a few seconds, and then beats."""
+"""Seconds without output after which a guest counts as hung. It boots within a few seconds, and then prints regularly.
+"""
 
 POLL_S = 0.05
 SHELLS_KEYS, SHELLS_SCREEN = "keys", "screen"
-"""Files of a guest's folder: what is typed at the console of shells (`netem.uml_shell`), and what is shown there."""
+"""Files in a guest's folder: the input and the output of the console for shells (`netem.uml_shell`)."""
 INTERRUPTED = 128 + signal.SIGINT
 CTRL_C = b"\x03"
 
@@ -103,12 +105,12 @@ env -i {environment} {argv}
 
 
 def inside() -> bool:
-    """Whether this is User Mode Linux."""
+    """Return whether this process runs in User Mode Linux."""
     return "User Mode Linux" in Path("/proc/cpuinfo").read_text()
 
 
 def find() -> Path:
-    """The kernel. Raises UmlError, naming the packages, if it is not here, or a program that it needs."""
+    """Return the kernel. Raises UmlError with the names of missing packages."""
     kernel = shutil.which("linux.uml")
     path = os.pathsep.join([os.environ.get("PATH", ""), SYSTEM_PATH])
     packages = {
@@ -119,13 +121,13 @@ def find() -> Path:
     }
     missing = [package for package, here in packages.items() if not here]
     if kernel is None or missing:
-        what = "User Mode Linux is not installed" if kernel is None else "User Mode Linux lacks a requirement here"
-        raise UmlError(f"{what} (Debian, Ubuntu: apt install {' '.join(missing)})")
+        problem = "User Mode Linux is not installed" if kernel is None else "User Mode Linux lacks a requirement here"
+        raise UmlError(f"{problem} (Debian, Ubuntu: apt install {' '.join(missing)})")
     return Path(kernel).absolute()
 
 
 def examine() -> str:
-    """Boot it; which it is, and how it keeps registers. Raises UmlError, as `run` does."""
+    """Boot User Mode Linux. Return its path, and how it preserves registers. Raises UmlError, as `run` does."""
     kernel = find()
     status = run(["true"], cwd=Path("/"), env={"PATH": SYSTEM_PATH})
     if status != 0:
@@ -135,11 +137,11 @@ def examine() -> str:
 
 
 def run(argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
-    """Run a command in a kernel of its own and return its exit status; of a signal 128 and its number, as shells do.
+    """Run a command in its own kernel. Return its exit status; after a signal, 128 plus its number, as in shells.
 
-    `env` is its environment but for TMPDIR. In the main thread, Ctrl-C and SIGTERM are the command's; before the guest
-    is up they end everything, with status 130. Raises UmlError if User Mode Linux is not here, does not boot, hangs or
-    panics.
+    `env` is its environment, except for TMPDIR. In the main thread, Ctrl-C and SIGTERM go to the command. Before the
+    guest has booted, they end everything with status 130. Raises UmlError if User Mode Linux is missing, does not boot,
+    hangs or panics.
     """
     kernel = find()
     with tempfile.TemporaryDirectory(prefix="uml-", ignore_cleanup_errors=True) as name:
@@ -149,7 +151,7 @@ def run(argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
         (folder / "init").chmod(0o755)
         guest = _Guest(kernel, folder, _uml_registers.preload(folder) if _uml_registers.needed(kernel) else {})
         try:
-            with _typing_ctrl_c(guest):
+            with _forwarding_interrupts(guest):
                 return guest.follow()
         except KeyboardInterrupt:
             return INTERRUPTED
@@ -184,16 +186,16 @@ def _init(command: Path) -> str:
 
 
 class _Guest:
-    """A User Mode Linux that has been started; `end` it.
+    """A started User Mode Linux. The caller must `end` it.
 
-    Its consoles write to files of `folder`, which we read as they grow: where a pipe is full, this kernel's consoles
-    refuse to write instead of waiting.
+    Its consoles write to files in `folder`, which are read while they grow. Pipes are unsuitable, because this kernel's
+    consoles drop output if a pipe is full.
     """
 
     def __init__(self, kernel: Path, folder: Path, preload: Mapping[str, str]) -> None:
         self.up = False
         self._folder = folder
-        typed, self._keyboard = os.pipe()
+        keyboard_input, self._keyboard = os.pipe()
         caller, self._lifeline = os.pipe()
         with contextlib.ExitStack() as stack:
             kernel_log, terminal, stdout, stderr, word, screen = (
@@ -205,7 +207,7 @@ class _Guest:
             options = [
                 f"mem={MEMORY}", "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw",
                 f'init="{folder / "init"}"', f"uml_dir={folder}", "con=null", "con0=null,fd:1",
-                f"con1=fd:{typed},fd:{terminal}", f"con2=null,fd:{stdout}", f"con3=null,fd:{stderr}",
+                f"con1=fd:{keyboard_input},fd:{terminal}", f"con2=null,fd:{stdout}", f"con3=null,fd:{stderr}",
                 f"con4=null,fd:{word}", f"con5=fd:{keys},fd:{screen}", "quiet", "selinux=0", "panic=-1",
             ]  # fmt: skip
             self._process = subprocess.Popen(
@@ -215,52 +217,52 @@ class _Guest:
                 stderr=kernel_log,
                 cwd=folder,
                 env={**os.environ, **preload, "UML_CALLER": str(caller), "UML_FOLDER": str(folder)},
-                pass_fds=(typed, terminal, stdout, stderr, word, keys, screen, caller),
+                pass_fds=(keyboard_input, terminal, stdout, stderr, word, keys, screen, caller),
                 start_new_session=True,
             )
-        os.close(typed)
+        os.close(keyboard_input)
         os.close(caller)
 
     def type(self, keys: bytes) -> None:
         os.write(self._keyboard, keys)
 
     def follow(self) -> int:
-        """Bring out what the command prints until it ends; its exit status. Raises UmlError."""
+        """Copy the output of the command until it ends. Return its exit status. Raises UmlError."""
         with contextlib.ExitStack() as stack:
             stdout, stderr, word = (
                 stack.enter_context((self._folder / name).open("rb", buffering=0))
                 for name in ("stdout", "stderr", "word")
             )
             received = b""
-            heard = time.monotonic()
+            last_output_s = time.monotonic()
             while True:
                 ended = self._process.poll() is not None
                 chunk = word.read()
                 received += chunk
-                printed, complained = stdout.read(), stderr.read()
+                printed, errors = stdout.read(), stderr.read()
                 # The command's first output can precede the first beat, and the caller may act on it at once.
-                self.up = self.up or bool(received or printed or complained)
+                self.up = self.up or bool(received or printed or errors)
                 _write(sys.stdout.buffer, printed)
-                _write(sys.stderr.buffer, complained)
-                if chunk or printed or complained:
-                    heard = time.monotonic()
-                elif (status := _last_word(received)) is not None:
+                _write(sys.stderr.buffer, errors)
+                if chunk or printed or errors:
+                    last_output_s = time.monotonic()
+                elif (status := _exit_status(received)) is not None:
                     return status
                 elif ended:
                     raise self._failed("it ended" if self.up else "it did not boot")
-                elif time.monotonic() > heard + SILENCE_LIMIT_S:
+                elif time.monotonic() > last_output_s + SILENCE_LIMIT_S:
                     raise self._failed(f"nothing came from it for {SILENCE_LIMIT_S:g} s")
                 else:
                     time.sleep(POLL_S)
 
-    def _failed(self, what: str) -> UmlError:
+    def _failed(self, problem: str) -> UmlError:
         lines = (self._folder / "kernel").read_text(errors="replace").splitlines()
         printed = [line.strip() for line in lines if line.strip()] or ["nothing"]
         last = next((line for line in printed if "LD_PRELOAD" in line or "panic" in line), printed[-1])
-        return UmlError(f"User Mode Linux failed: {what}; it last said: {last}")
+        return UmlError(f"User Mode Linux failed: {problem}; it last said: {last}")
 
     def end(self) -> None:
-        """Kill all of it; may have ended by itself."""
+        """Kill the guest, which may already have ended."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -274,15 +276,15 @@ def _write(target: BinaryIO, data: bytes) -> None:
         target.flush()
 
 
-def _last_word(received: bytes) -> int | None:
-    """The exit status, once its line is whole; the lines before it are empty."""
+def _exit_status(received: bytes) -> int | None:
+    """Return the exit status if its line is complete. The lines before it are empty."""
     *lines, _ = received.split(b"\n")
     return next((int(line) for line in lines if line.strip()), None)
 
 
 @contextlib.contextmanager
-def _typing_ctrl_c(guest: _Guest) -> Iterator[None]:
-    """Have Ctrl-C and SIGTERM typed at the guest's console, as far as this thread may."""
+def _forwarding_interrupts(guest: _Guest) -> Iterator[None]:
+    """Type Ctrl-C at the guest's console on Ctrl-C and SIGTERM. Only the main thread can do this."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if not guest.up:

@@ -1,11 +1,12 @@
-"""A program inside a User Mode Linux that somebody else has started (`netem.uml`), at a console of its own.
+"""Run a program inside a running User Mode Linux that another process started (`netem.uml`), at its own console.
 
     for folder in uml_shell.guests():
         status = uml_shell.enter(folder, ["ip", "address"], cwd=Path.cwd(), env=os.environ)
 
-What is typed goes into a named pipe of the guest's folder, and what the console shows is a file there that grows. The
-guest waits at that console for the name of a script in its folder, and runs it with the console as its terminal. When
-it begins a zero byte and that name are shown, and these with the exit status at its end. One program at a time.
+Input goes into a named pipe in the guest's folder. The output of the console is a growing file there. At this console,
+the guest waits for the name of a script in its folder, and runs the script with the console as its terminal. A zero
+byte and the name mark the start of the output. The same with the exit status marks its end. Only one program can run at
+a time.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ from netem.errors import UmlError
 from netem.uml import CTRL_C, POLL_S, SHELLS_KEYS, SHELLS_SCREEN
 
 READ_BYTES = 4096
-ASK_AGAIN_S = 2.0
-"""A guest that boots has no console yet, and is told nothing of what was typed before."""
-LAST_WORD_BYTES = 32
+RETRY_S = 2.0
+"""Seconds between requests. A booting guest has no console yet, and loses earlier input."""
+END_MARK_BYTES = 32
 _LOCK = "shell"
 
 _SCRIPT = r"""
@@ -46,7 +47,7 @@ exec env --default-signal=INT,QUIT -i {environment} {argv}
 
 
 def guests(proc: Path = Path("/proc")) -> list[Path]:
-    """The folders of those that run and that we may enter."""
+    """Return the folders of running guests that this user may enter."""
     folders: set[Path] = set()
     for cmdline in proc.glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
@@ -56,7 +57,7 @@ def guests(proc: Path = Path("/proc")) -> list[Path]:
 
 
 def enter(folder: Path, argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
-    """Run a program there with our terminal as its own; its exit status. Raises UmlError if it cannot be, or ends."""
+    """Run a program there with this terminal, and return its exit status. Raises UmlError if this fails."""
     try:
         with (folder / _LOCK).open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -78,7 +79,7 @@ def _at_console(folder: Path, argv: Sequence[str], cwd: Path, env: Mapping[str, 
     try:
         with (folder / SHELLS_SCREEN).open("rb", buffering=0) as screen, _raw_terminal():
             screen.seek(0, os.SEEK_END)
-            return _until_it_ends(folder, token.encode(), keys, screen)
+            return _copy_until_end(folder, token.encode(), keys, screen)
     finally:
         os.close(keys)
 
@@ -95,47 +96,47 @@ def _script(token: str, argv: Sequence[str], cwd: Path, env: Mapping[str, str]) 
     )
 
 
-def _until_it_ends(folder: Path, token: bytes, keys: int, screen: io.FileIO) -> int:
-    """Carry what is typed there, and here what is shown between the two words of the console's."""
-    shown, begun = b"", False
+def _copy_until_end(folder: Path, token: bytes, keys: int, screen: io.FileIO) -> int:
+    """Copy input to the guest, and output between the start and end marks from the guest."""
+    output, started = b"", False
     typing = sys.stdin.isatty()
-    asked_at = -math.inf
+    requested_at = -math.inf
     while True:
         try:
-            if not begun and time.monotonic() - asked_at > ASK_AGAIN_S:
+            if not started and time.monotonic() - requested_at > RETRY_S:
                 os.write(keys, token + b"\n")
-                asked_at = time.monotonic()
-            if select.select([0] if typing and begun else [], [], [], POLL_S)[0]:
+                requested_at = time.monotonic()
+            if select.select([0] if typing and started else [], [], [], POLL_S)[0]:
                 typed = os.read(0, READ_BYTES)
                 typing = bool(typed)
                 os.write(keys, typed)
-            shown += screen.readall()
+            output += screen.readall()
         except KeyboardInterrupt:
             os.write(keys, CTRL_C)
             continue
-        if not begun and (start := re.search(rb"\x00%b\r?\n" % token, shown)):
-            shown, begun = shown[start.end() :], True
-        ended = re.search(rb"\x00%b (\d+)\r?\n" % token, shown)
-        if begun:
-            end = ended.start() if ended else _last_word_may_begin(shown)
-            sys.stdout.buffer.write(shown[:end])
+        if not started and (start := re.search(rb"\x00%b\r?\n" % token, output)):
+            output, started = output[start.end() :], True
+        ended = re.search(rb"\x00%b (\d+)\r?\n" % token, output)
+        if started:
+            end = ended.start() if ended else _certain_length(output)
+            sys.stdout.buffer.write(output[:end])
             sys.stdout.buffer.flush()
-            shown = shown[end:]
+            output = output[end:]
         if ended:
             return int(ended[1])
         if not folder.exists():
             raise UmlError("User Mode Linux has ended")
 
 
-def _last_word_may_begin(shown: bytes) -> int:
-    """Up to where it is certain that this is no part of it."""
-    at = shown.rfind(b"\0", -LAST_WORD_BYTES)
-    return at if at >= 0 else len(shown)
+def _certain_length(output: bytes) -> int:
+    """Return the length of the output that cannot belong to the end mark."""
+    at = output.rfind(b"\0", -END_MARK_BYTES)
+    return at if at >= 0 else len(output)
 
 
 @contextlib.contextmanager
 def _raw_terminal() -> Iterator[None]:
-    """Inside, each key is the guest's, Ctrl-C, too."""
+    """Pass all keys to the guest, including Ctrl-C."""
     if not sys.stdin.isatty():
         yield
         return

@@ -17,7 +17,7 @@ import struct
 import sys
 import time
 
-from netem._probe import broadcast, collect, receive, say
+from netem._probe import broadcast, collect, print_json, receive
 
 _STREAM_PAUSE_S = 0.005
 
@@ -32,7 +32,7 @@ def listen() -> None:
         counts.setdefault(sender, {})[kind] = counts.get(sender, {}).get(kind, 0) + 1
         sent_ns = struct.unpack_from("!Q", frame, 14)[0]
         times.setdefault(sender, {}).setdefault(kind, []).append((sent_ns, came_ns))
-    say({"frames": counts, "times_ns": times})
+    print_json({"frames": counts, "times_ns": times})
 
 
 def frames(destinations: str, *kinds: str) -> None:
@@ -50,7 +50,7 @@ def stream(*kinds: str) -> None:
     out = socket.socket(socket.AF_PACKET, socket.SOCK_RAW)
     out.bind(("eth0", 0))
     addresses = bytes.fromhex("ffffffffffff") + out.getsockname()[4]
-    say("ready")
+    print_json("ready")
     while not ended:
         for kind in kinds:
             out.send(addresses + bytes.fromhex(kind) + struct.pack("!Q", time.time_ns()) + bytes(38))
@@ -59,7 +59,7 @@ def stream(*kinds: str) -> None:
 
 def serve(port: str) -> None:
     server = socket.create_server(("127.0.0.1", int(port)))
-    say("ready")
+    print_json("ready")
     while True:
         client, _ = server.accept()
         client.sendall(b"hello")

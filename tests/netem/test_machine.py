@@ -35,8 +35,8 @@ def require_nobody_can() -> None:
     except PermissionError as error:
         pytest.skip(f"the user nobody cannot execute {error.filename}: {error.strerror}")
     if done.returncode != 0:
-        word = (done.stderr.strip().splitlines() or ["it gave no reason"])[-1]
-        pytest.skip(f"the user nobody cannot run {sys.executable} with this checkout: {word}")
+        message = (done.stderr.strip().splitlines() or ["it gave no reason"])[-1]
+        pytest.skip(f"the user nobody cannot run {sys.executable} with this checkout: {message}")
 
 
 def run_script(script: str, *, prefix: list[str] | None = None) -> subprocess.CompletedProcess[str]:

@@ -14,10 +14,10 @@ import pytest
 from netem import estimates
 from netem.conditions import NetworkConditions
 from netem.engine import Applied, ReceiverFigures
-from netem.estimates import Estimate, Heard, Lateness
+from netem.estimates import Estimate, Lateness, ReceivedStream
 from netem.lab import EngineName, Lab
 from netem.link import Delay, GilbertElliott, LinkConditions
-from netem.measure import Measured, Question, Study, measure, studies
+from netem.measure import EngineMeasurement, Question, Study, measure, studies
 from netem.observers import Arrival, DisturbedError, check, in_lab, in_medium
 from tests.machine import require
 from tests.netem.conftest import PORT, Air, play
@@ -27,8 +27,8 @@ SOME = 3000
 Z = 3.2905267314919255  # of 99.9 %, two-sided
 
 
-def heard(arrivals: list[tuple[int, float]], sent_s: list[float], lateness: Lateness = NEVER_LATE) -> Heard:
-    return Heard(sent_s, sorted(arrivals, key=lambda arrival: arrival[1]), lateness)
+def received(arrivals: list[tuple[int, float]], sent_s: list[float], lateness: Lateness = NEVER_LATE) -> ReceivedStream:
+    return ReceivedStream(sent_s, sorted(arrivals, key=lambda arrival: arrival[1]), lateness)
 
 
 # Statistics
@@ -68,7 +68,7 @@ def test_the_interval_of_losses_in_bursts_knows_that_they_come_together() -> Non
             if not bad:
                 arrivals.append((number, float(number)))
             bad = random.random() >= bursts.r if bad else random.random() < bursts.p
-        one = heard(arrivals, [0.0] * count)
+        one = received(arrivals, [0.0] * count)
         for key, estimate, asked in (
             ("chain", estimates.lost_in_bursts(one), bursts.mean),
             ("independent", estimates.lost(one), bursts.mean),
@@ -82,7 +82,7 @@ def test_the_interval_of_losses_in_bursts_knows_that_they_come_together() -> Non
 
 def test_bursts_are_counted_whole() -> None:
     gone = {2, 3, 4, 7, 9, 10, 17, 18, 19}
-    one = heard([(number, 0.0) for number in range(20) if number not in gone], [0.0] * 20)
+    one = received([(number, 0.0) for number in range(20) if number not in gone], [0.0] * 20)
     assert estimates.burst_length(one).measured == 2.0  # 3, 1 and 2: the last one goes on
 
 
@@ -90,13 +90,13 @@ def test_delays_are_measured_without_what_the_machine_takes_itself() -> None:
     way_s = [0.001, 0.004] * 50
     sent_s = [float(number) for number in range(100)]
     arrivals = [(number, sent_s[number] + 0.1 + way_s[number]) for number in range(100)]
-    mean = estimates.delay_mean(heard(arrivals, sent_s, Lateness(way_s, [0.002, 0.002])))
+    mean = estimates.delay_mean(received(arrivals, sent_s, Lateness(way_s, [0.002, 0.002])))
     assert (mean.measured, mean.high) == pytest.approx((0.1, 0.1))
     assert mean.low == pytest.approx(0.098)  # timers may have been late by so much
-    deviation = estimates.delay_deviation(heard(arrivals, sent_s, Lateness(way_s, [0.0, 0.0])))
+    deviation = estimates.delay_deviation(received(arrivals, sent_s, Lateness(way_s, [0.0, 0.0])))
     assert (deviation.low, deviation.high) == pytest.approx((0, 0), abs=1e-9)
     jittered = [(number, sent_s[number] + (0.09, 0.11)[number % 2]) for number in range(100)]
-    deviation = estimates.delay_deviation(heard(jittered, sent_s, Lateness([0.0] * 100, [0.0, 0.004])))
+    deviation = estimates.delay_deviation(received(jittered, sent_s, Lateness([0.0] * 100, [0.0, 0.004])))
     assert (deviation.measured, deviation.high) == pytest.approx((0.01, 0.01))
     assert deviation.low == pytest.approx(math.sqrt(0.01**2 - 0.002**2))  # timers may have added theirs
 
@@ -105,26 +105,26 @@ def test_a_rate_is_measured_while_packets_wait_for_each_other() -> None:
     # Five that queue for 10 ms each; a pause; and two more.
     sent_s = [0.0, 0.001, 0.002, 0.003, 0.004, 1.0, 1.001]
     at_s = [0.01, 0.02, 0.03, 0.04, 0.05, 1.01, 1.02]
-    found = estimates.rate(heard(list(enumerate(at_s)), sent_s), packet_bits=1000)
+    found = estimates.rate(received(list(enumerate(at_s)), sent_s), packet_bits=1000)
     assert (found.measured, found.packets) == (pytest.approx(100_000), 5)
     late = Lateness([0.0, 0.003], [0.001])
-    found = estimates.rate(heard(list(enumerate(at_s)), sent_s, late), packet_bits=1000)
+    found = estimates.rate(received(list(enumerate(at_s)), sent_s, late), packet_bits=1000)
     assert (found.low, found.high) == pytest.approx((4000 / 0.044, 4000 / 0.036))
 
 
 def test_a_limit_is_what_waits_when_a_packet_is_lost() -> None:
     sent_s = [number * 0.01 for number in range(100)]
-    came: list[tuple[int, float]] = []
+    received_packets: list[tuple[int, float]] = []
     for number, now in enumerate(sent_s):  # each waits 95 ms; three may
-        if sum(at > now for _, at in came) < 3:
-            came.append((number, now + 0.095))
-    found = estimates.waiting_when_lost(heard(came, sent_s), delay_s=0.095)
+        if sum(at > now for _, at in received_packets) < 3:
+            received_packets.append((number, now + 0.095))
+    found = estimates.waiting_when_lost(received(received_packets, sent_s), delay_s=0.095)
     assert (found.low, found.measured, found.high) == (3, 3, 3)
-    late = [(number, at + 0.01) for number, at in came]  # a fourth seems to wait still, now and then
-    found = estimates.waiting_when_lost(heard(late, sent_s), delay_s=0.095)
+    late = [(number, at + 0.01) for number, at in received_packets]  # a fourth seems to wait still, now and then
+    found = estimates.waiting_when_lost(received(late, sent_s), delay_s=0.095)
     assert found.low <= 3 <= found.high
-    rarely = [(number, at + 0.01 * (number < 9)) for number, at in came]
-    found = estimates.waiting_when_lost(heard(rarely, sent_s), delay_s=0.095)
+    rarely = [(number, at + 0.01 * (number < 9)) for number, at in received_packets]
+    found = estimates.waiting_when_lost(received(rarely, sent_s), delay_s=0.095)
     assert (found.low, found.high) == (3, 3)
 
 
@@ -136,15 +136,15 @@ def one_question(asked: float) -> Study:
     return Study(NetworkConditions(LinkConditions(asked), {3: LinkConditions()}), (question,))
 
 
-def losing(*shares: float) -> tuple[list[tuple[Study, int]], Measured]:
+def losing(*shares: float) -> tuple[list[tuple[Study, int]], EngineMeasurement]:
     """What is asked of an observer that loses such shares, one stream after the other, and what comes of it."""
     asked: list[tuple[Study, int]] = []
     kept = iter(shares)
 
-    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], Heard]:
+    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         asked.append((study, packets))
         first = round(next(kept) * packets)
-        stream = heard([(number, 0.0) for number in range(first, packets)], [0.0] * packets)
+        stream = received([(number, 0.0) for number in range(first, packets)], [0.0] * packets)
         return {(1, receiver): stream for receiver in study.receivers}
 
     other = Question(1, 5, "nothing", "lost", shares[0], estimates.lost)
@@ -257,11 +257,11 @@ def test_a_receiver_says_how_many_packets_it_had_no_room_for(tmp_path: Path) -> 
 def test_packets_that_the_machine_lost_are_an_error_unless_corruption_hides_them() -> None:
     study = one_question(0.15)
     one, two = (Applied("test", {4: ReceiverFigures.of({}, (), passed, 0, 0)}) for passed in (1, 2))
-    came = {(1, 4): [Arrival(0, 0.0, 0.1)]}
-    check(study, {4: {"overflow": 0}}, came, one)
+    received_packets = {(1, 4): [Arrival(0, 0.0, 0.1)]}
+    check(study, {4: {"overflow": 0}}, received_packets, one)
     with pytest.raises(DisturbedError, match="itself lost 1 of the packets to vehicle 4"):
-        check(study, {4: {"overflow": 0}}, came, two)
+        check(study, {4: {"overflow": 0}}, received_packets, two)
     with pytest.raises(DisturbedError, match="overflowed"):
-        check(study, {4: {"overflow": 1}}, came, one)
+        check(study, {4: {"overflow": 1}}, received_packets, one)
     corrupting = replace(study, conditions=NetworkConditions(LinkConditions(corrupt=0.2)))
-    check(corrupting, {4: {"overflow": 0}}, came, two)
+    check(corrupting, {4: {"overflow": 0}}, received_packets, two)
