@@ -20,7 +20,7 @@ from harness.errors import CANNOT_HERE
 from netem.errors import NetemError
 from netem.lab import EngineName
 from netem.lab_doctor import examine
-from netem.measure import PACKETS, Measured, Observer, measure, studies
+from netem.measure import PACKETS, EngineMeasurement, Observer, measure, studies
 from netem.observers import in_lab, in_medium
 
 
@@ -31,7 +31,7 @@ def observers() -> dict[str, Observer]:
     return {**kernel, "medium": in_medium(seed=1)}
 
 
-def show(rounds: Mapping[str, list[Measured]]) -> None:
+def show(rounds: Mapping[str, list[EngineMeasurement]]) -> None:
     sys.stdout.write(
         f"{'engine':10}{'condition':42}{'quantity':22}{'asked':>11}{'mean':>11}{'min..max':>24}   inside\n"
     )
@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print all rows of all rounds as JSON")
     options = parser.parse_args()
     engines = observers()
-    rounds: dict[str, list[Measured]] = {engine: [] for engine in engines}
+    rounds: dict[str, list[EngineMeasurement]] = {engine: [] for engine in engines}
     try:
         for _ in range(options.rounds):
             for engine, observe in engines.items():
