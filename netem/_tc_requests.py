@@ -88,7 +88,7 @@ class TrafficControl:
         return [Request("add qdisc htb", RTM_NEWQDISC, self._message("htb", _ROOT, _HTB, attribute(2, settings)), NEW)]
 
     def guard(self) -> list[Request]:
-        """Return requests for filters that drop all packets at this port until `hear` allows a group."""
+        """Return requests for filters that drop all packets at this port until `accept_group` allows a group."""
         drop = nested(1, text(1, "gact"), nested(2, attribute(2, struct.pack("=IIiii", 0, 0, _ACT_SHOT, 0, 0))))
         message = self._filter("basic", _EGRESS, _DROP_PRIORITY, _ONLY, nested(3, drop))
         return [

@@ -24,7 +24,7 @@ from netem._ring import BLOCK_BYTES, RETIRE_MS, Ring
 from netem.pcapng import PcapngFile
 
 _MEMORY = 256 << 20
-"""Maximum size of all rings together in bytes. On one machine, a faster port makes the others slower."""
+"""Maximum size of all rings together in bytes. All ports share the speed of one machine."""
 _RING_MEMORY = 16 << 20
 """Maximum size of one ring in bytes: 10,000 of the largest frames, which is one second."""
 _FEWEST_BLOCKS = 8  # for each ring, even above the total maximum

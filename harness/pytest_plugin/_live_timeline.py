@@ -36,7 +36,8 @@ Action = Callable[[mission.Swarm], Awaitable[Any]]
 class LiveTimeline(GrowingTimeline):
     """Plays the mission and performs actions.
 
-    `story` plays in the thread of the loop, and `begun` is set after the start. `hear` queues an action.
+    `play` runs in the thread of the loop, and `started` is set when the mission begins. `queue_action` queues an
+    action.
     """
 
     def __init__(self, scenario: Scenario) -> None:

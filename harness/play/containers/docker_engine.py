@@ -115,7 +115,10 @@ class Events:
     def __init__(
         self, engine: Engine, label: str, on_event: Callable[[dict[str, Any]], None], loop: asyncio.AbstractEventLoop
     ) -> None:
-        """`take` is called in the loop for each event, and with an empty event when the stream ends."""
+        """Start to follow.
+
+        `on_event` is called in the loop for each event, and with an empty event when the stream ends.
+        """
         filters = {"type": "container", "label": label}
         self._stream = engine.do("events", engine.api.events, since=int(time.time()) - 1, filters=filters, decode=True)
         self._on_event = on_event

@@ -18,7 +18,7 @@ from ucp.secure.session import Session
 
 
 class CapturedKeys:
-    """The keys of a captured vehicle. `chance` returns 8 random bytes for each forged incarnation.
+    """The keys of a captured vehicle. `random_bytes` returns 8 bytes for each forged incarnation.
 
     Times are mission seconds; `now_us` is UTC in microseconds.
     """

@@ -46,7 +46,7 @@ class SentMessage(NamedTuple):
 
 
 class AgentCourse:
-    """The actions of one agent. The caller takes `changes`, `sent` and `heard`, and clears them."""
+    """The actions of one agent. The caller takes `changes`, `sent` and `receipts`, and clears them."""
 
     def __init__(self, agents: Path, agent_id: int) -> None:
         self.agent_id = agent_id

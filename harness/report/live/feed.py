@@ -167,7 +167,7 @@ class Feed:
             changes.clear()
 
     def _messages(self, *, report_all: bool) -> Iterator[Change]:
-        """Yield the messages whose receivers have had time to record them, or all messages with `told_now`."""
+        """Yield the messages whose receivers have had time to record them. With `report_all`, yield all messages."""
         happened: list[tuple[float, int, int, SentMessage | Receipt]] = []
         for course in self._courses:
             happened += [(sent.t, 0, course.agent_id, sent) for sent in course.sent]

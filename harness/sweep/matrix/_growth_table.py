@@ -84,7 +84,7 @@ def in_one_line(label: str) -> str:
 
 
 def size_row(cell: Cell) -> list[str]:
-    """Return the means of a cell, in the order of `SIZED`."""
+    """Return the means of a cell, in the order of `SIZE_METRICS`."""
     share = Metric("finished", "", lambda _: None, "share of runs")
     return [
         say(share, cell.finished) if name == "finished" else say(BY_NAME[name], cell.estimates.get(name, Estimate(n=0)))
@@ -93,7 +93,7 @@ def size_row(cell: Cell) -> list[str]:
 
 
 def law_row(variable: Variable, laws: dict[str, Law]) -> list[tuple[str, str]]:
-    """Return the exponents of `variable` in the order of `GROWN`, each with the quality of its law."""
+    """Return the exponents of `variable` in the order of `LAW_METRICS`, each with the quality of its law."""
     return [
         (say_exponent(law.exponents[variable]), say_quality(law)) if (law := laws.get(name)) else (UNKNOWN, "")
         for name in LAW_METRICS

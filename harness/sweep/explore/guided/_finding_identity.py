@@ -20,7 +20,7 @@ TIMERS = {ON_TIMER[timer].name: timer for timer in ("voting", "phase one", "phas
 """Handler that runs at the end of a timer -> the timer."""
 ORDER = [*TIMERS.values()]
 MAX_FORM = 250
-"""Maximum length of a readable form, in characters."""
+"""Maximum number of characters of a described cycle. A longer description is left out."""
 SIZE_SETTINGS = frozenset(("max_block_bytes", "max_event_bytes"))
 
 

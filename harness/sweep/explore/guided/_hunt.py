@@ -72,7 +72,7 @@ class Candidate(NamedTuple):
 
 @dataclass
 class Kept:
-    """A kept candidate. It reached `gave` new local states, or their equivalent, in `steps` handler runs."""
+    """A kept candidate. It reached `new_states` new local states, or their equivalent, in `steps` handler runs."""
 
     candidate: Candidate
     new_states: int
@@ -242,7 +242,7 @@ class Hunt:
 
 
 def _count_new(numbers: Iterable[int], exact: Collection[int], overflow: DigestSet) -> int:
-    """Return how many of the numbers are new. If `told_apart` is full, add the new ones to `beyond`."""
+    """Return how many of the numbers are new. If `exact` is full, add the new ones to `overflow`."""
     new = [number for number in numbers if number not in exact and number not in overflow]
     if len(exact) >= MOST:
         for number in new:

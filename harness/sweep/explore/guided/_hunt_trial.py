@@ -35,7 +35,7 @@ from ucp.trigger import TimerTrigger
 
 APPROVED = (ON_TIMER["voting"].name, "approved")
 MOST = 16
-"""Maximum number of timers of a pattern that are compared. The last ones count."""
+"""Maximum number of timers in a pattern. Only the last ones are kept."""
 
 TimerPatterns = tuple[tuple[str, ...], ...]
 """The timers that ended, in order, for each agent."""

@@ -217,7 +217,10 @@ class _NightRun:
             return sum(outcome is True for _, outcome in outcomes), len(seeds)
 
     def _hunt(self, initial: list[Candidate]) -> None:
-        """Hunt from the kept runs. If all were played and one of them reaches nothing new any more, it is dropped."""
+        """Hunt from the kept runs.
+
+        Runs that reach nothing new any more are dropped, if there was time to play all of them.
+        """
         hunt, before = self._night.hunt, self._corpus.runs()
         kept = set(map(id, self._kept_runs(hunt.begin([*initial, *before], self._jobs))))
         if not hunt.kept:
