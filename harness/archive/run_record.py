@@ -232,15 +232,18 @@ class Counters(_Model):
 
 
 class DatagramsRead(_Model):
-    """UDP datagrams that programs in the network of a vehicle read, as the kernel counted them over the whole run.
+    """UDP datagrams in the network of a vehicle, as the kernel counted them over the whole run.
 
-    `before_start` of them were read before the mission began. The kernel discarded `overflowed` datagrams, because the
-    buffer of their socket was full.
+    `broadcasts` datagrams arrived, also the agent's own ones. `read` datagrams were read, `before_start` of them before
+    the mission began. The kernel discarded `overflowed` datagrams, because the buffer of their socket was full, and
+    `unreachable` datagrams, because no socket was open.
     """
 
     read: int
     before_start: int
     overflowed: int
+    unreachable: int
+    broadcasts: int
 
 
 class BlockHolders(_Model):

@@ -100,16 +100,19 @@ def test_an_idle_lab_is_silent(tmp_path: Path) -> None:
 
 
 def test_kernel_counts_datagrams_that_programs_read(tmp_path: Path) -> None:
-    """Vehicle 2 reads three datagrams of its own and leaves the fourth in its socket."""
+    """Vehicle 2 reads three datagrams of its own, and leaves its broadcast in the socket. Vehicle 1 has no socket."""
     program = (
         "import socket, sys; s = socket.socket(type=socket.SOCK_DGRAM); s.bind(('', 9)); "
-        "[s.sendto(b'x', ('127.0.0.1', 9)) for _ in range(4)]; [s.recv(1) for _ in range(3)]"
+        "s.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1); "
+        "[s.sendto(b'x', ('127.0.0.1', 9)) for _ in range(3)]; s.sendto(b'x', (sys.argv[1], 9)); "
+        "[s.recv(1) for _ in range(3)]"
     )
 
     async def story(lab: Lab) -> None:
-        await output(lab, tmp_path, 2, sys.executable, "-c", program)
+        await output(lab, tmp_path, 2, sys.executable, "-c", program, lab.broadcast)
         counted = await lab.datagrams()
-        assert {vehicle: (udp.read, udp.overflowed) for vehicle, udp in counted.items()} == {1: (0, 0), 2: (3, 0)}
+        figures = {v: (udp.read, udp.overflowed, udp.unreachable, udp.broadcasts) for v, udp in counted.items()}
+        assert figures == {1: (0, 0, 1, 1), 2: (3, 0, 0, 1)}
 
     in_lab(tmp_path, story)
 

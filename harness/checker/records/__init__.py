@@ -43,7 +43,8 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
     _losses.compare,
     _captures_vs_traces.compare_counters,
     _captures_vs_traces.compare_captures,
-    _datagrams_vs_traces.compare,
+    _datagrams_vs_traces.find_unrecorded,
+    _datagrams_vs_traces.find_unread,
 )
 
 

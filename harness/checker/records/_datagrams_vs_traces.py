@@ -1,8 +1,11 @@
-"""Compare the datagrams that an agent read, as the kernel counted them, with its trace.
+"""Compare the datagrams that an agent read, as the kernel counted them, with its trace and with those that arrived.
 
 A trace has a line for each datagram that its agent handled or dropped. The agent also reads its own broadcasts, which
 it ignores. Any further datagram that it read is missing in its trace. A datagram that was read at the end of an
 incarnation may be missing, because the agent ended before it handled the datagram.
+
+An agent that reads nothing has a complete trace. The kernel also counts the broadcasts that arrived at each vehicle. A
+broadcast that was neither read nor discarded by the kernel is left in the socket.
 """
 
 from bisect import bisect_left, bisect_right
@@ -17,10 +20,12 @@ from ucp.trigger import MessageTrigger
 
 UNDER_WAY_WALL_S = 0.25
 """Seconds of wall time before the end of an incarnation, in which a datagram may be read and not handled."""
+UNREAD_WALL_S = 1.0
+"""Seconds of wall time before the end of an incarnation, in which a datagram may be delivered and not read."""
 
 
-def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Each agent recorded all datagrams that it read."""
+def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
+    """Find agents that read datagrams and recorded them neither as handled nor as dropped."""
     record = evidence.record
     if record is None or set(record.roster) - set(evidence.traces):
         return
@@ -38,8 +43,26 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         dropped = sum(isinstance(aside, Dropped) for _, aside in trace.asides)
         own = sum(len(run.sent) for run in trace.runs)
         unrecorded = counted.read - counted.before_start - handled - dropped - own
-        if unrecorded > _at_the_end(evidence, agent_id, trace):
+        if unrecorded > _at_the_end(evidence, agent_id, trace, UNDER_WAY_WALL_S):
             yield of_agent(agent_id, _sentence(counted, unrecorded, handled, dropped, own), short=True)
+
+
+def find_unread(evidence: Evidence) -> Iterator[Contradiction]:
+    """Find agents that left datagrams in their sockets, although they were not paused."""
+    record = evidence.record
+    if record is None or set(record.roster) - set(evidence.traces):
+        return
+    for agent_id, trace in evidence.traces.items():
+        counted = record.datagrams.get(str(agent_id))
+        if counted is None or (evidence.injected.messages and _killed_at(evidence, agent_id)):
+            continue
+        ends = [*_killed_at(evidence, agent_id), evidence.end_of(agent_id) or 0.0]
+        if any(evidence.was_paused(agent_id, end - _mission_s(trace, UNREAD_WALL_S), end) for end in ends):
+            continue
+        unread = counted.broadcasts - counted.read - counted.overflowed - counted.unreachable
+        if unread > _at_the_end(evidence, agent_id, trace, UNREAD_WALL_S):
+            detail = f"{unread} of {counted.broadcasts} datagrams that arrived were left unread in its socket"
+            yield of_agent(agent_id, detail)
 
 
 def _is_revocation(aside: Dropped | Commanded) -> bool:
@@ -54,15 +77,19 @@ def _sentence(counted: DatagramsRead, unrecorded: int, handled: int, dropped: in
     )
 
 
-def _at_the_end(evidence: Evidence, agent_id: int, trace: Trace) -> int:
-    """Return the maximum number of datagrams that the agent read at the ends of its incarnations and did not handle."""
-    speedup = trace.header.clock.get("speedup")
-    before_s = UNDER_WAY_WALL_S * speedup if isinstance(speedup, int | float) else 0.0
+def _at_the_end(evidence: Evidence, agent_id: int, trace: Trace, wall_s: float) -> int:
+    """Return the maximum number of datagrams that were under way to the agent when its incarnations ended."""
+    before_s = _mission_s(trace, wall_s)
     ends = _killed_at(evidence, agent_id)
     if (last_s := evidence.end_of(agent_id)) is not None:
         ends.append(last_s)
     sent = evidence.once(_sent_at)
     return sum(1 + bisect_right(sent, end + before_s) - bisect_left(sent, end - before_s) for end in set(ends))
+
+
+def _mission_s(trace: Trace, wall_s: float) -> float:
+    speedup = trace.header.clock.get("speedup")
+    return wall_s * speedup if isinstance(speedup, int | float) else 0.0
 
 
 def _killed_at(evidence: Evidence, agent_id: int) -> list[float]:

@@ -452,6 +452,8 @@ class ProcessRun:
                 "read": counted[agent].read,
                 "before_start": self._read_before_start[agent].read,
                 "overflowed": counted[agent].overflowed,
+                "unreachable": counted[agent].unreachable,
+                "broadcasts": counted[agent].broadcasts,
             }
             for agent in agents
             if agent not in self._kinds or not self._kinds[agent].uses_udp

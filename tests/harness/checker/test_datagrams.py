@@ -1,4 +1,4 @@
-"""An agent that discards datagrams without a record is found by the counters of the kernel."""
+"""An agent that discards datagrams without a record, or reads none, is found by the counters of the kernel."""
 
 import json
 import shutil
@@ -33,6 +33,19 @@ class Silent(node.Node):
 sys.exit(node.main(sys.argv[1:], Silent))
 """
 
+STOPS_READING = """
+import sys
+from ucp import node
+
+class Deaf(node.Node):
+    def _receive(self):
+        super()._receive()
+        if self.clock.now() > 20:
+            self._loop.watch(self._socket)
+
+sys.exit(node.main(sys.argv[1:], Deaf))
+"""
+
 OFTEN = {"source": "random", "mean_s": 2}
 
 
@@ -48,13 +61,15 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run(asked, 1, tmp_path_factory.mktemp("whole") / "run", Silent(), backend="sim", delivers_all=True).directory
 
 
-def judged(directory: Path, tmp_path: Path, agent: int, more: int) -> Result:
+def judged(directory: Path, tmp_path: Path, agent: int, more: int, unread: int = 0) -> Result:
     """Judge the run if the kernel had counted the recorded datagrams of an agent, and some more."""
     shutil.copytree(directory, tmp_path / "run")
     lines = [json.loads(line) for line in (directory / f"agents/{agent}.trace.jsonl").read_text().splitlines()]
     received = sum("message" in line.get("trigger", {}) for line in lines)
     sent = sum(len(line.get("sent", ())) for line in lines)
-    counted = {str(agent): {"read": received + sent + more + 2, "before_start": 2, "overflowed": 0}}
+    read = received + sent + more + 2
+    counters = {"before_start": 2, "read": read, "overflowed": 3, "unreachable": 5, "broadcasts": read + 8 + unread}
+    counted = {str(agent): counters}
     edit(tmp_path / "run" / "run.json", lambda record: record.update(datagrams=counted))
     return check(gather(RunArchive(tmp_path / "run")))
 
@@ -91,6 +106,39 @@ def test_datagram_that_was_read_needs_a_line_in_the_trace(whole: Path, tmp_path:
     found = judged(whole, tmp_path, 1, more).beside["records"]
     assert (found.verdict == "agree") == agrees, found
     assert agrees or "it read 20 datagrams that its trace lacks" in found.evidence[0].detail
+
+
+@pytest.mark.lab
+def test_agent_that_stops_reading_is_found(tmp_path: Path) -> None:
+    program = tmp_path / "agent.py"
+    program.write_text(STOPS_READING)
+    asked = scenario(
+        agents=3,
+        duration_s=120,
+        speedup=20,
+        vehicles={"kind": "none"},
+        events=OFTEN,
+        agent_command={2: [sys.executable, str(program)]},
+        timeline=[{"at_s": 30, "kill": [3]}, {"at_s": 50, "restart": [3]}],
+    )
+    records = run(asked, 1, tmp_path / "run", Silent(), backend="process").result.beside["records"]
+    assert records.verdict == "contradict"
+    assert {finding.agent_id for finding in records.evidence} == {2}
+    assert "were left unread in its socket" in records.evidence[0].detail
+
+
+def test_datagram_that_arrived_needs_a_reader(whole: Path, tmp_path: Path) -> None:
+    found = judged(whole, tmp_path, 1, 0, unread=60).beside["records"]
+    assert "60 of" in found.evidence[0].detail
+    assert "datagrams that arrived were left unread in its socket" in found.evidence[0].detail
+
+
+def test_datagram_of_a_paused_agent_may_stay_unread(whole: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole, tmp_path / "paused")
+    pause = {"at_s": 100.0, "what": "pause", "detail": "agent 1", "agents": [1]}
+    edit(tmp_path / "paused" / "run.json", lambda record: record["faults"].append(pause))
+    details = [finding.detail for finding in judged(tmp_path / "paused", tmp_path, 1, 0, 60).beside["records"].evidence]
+    assert not any("unread" in detail for detail in details)
 
 
 def test_datagram_under_way_at_a_kill_may_lack_its_line(whole: Path, tmp_path: Path) -> None:
