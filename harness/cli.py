@@ -133,6 +133,9 @@ COMMANDS = {
 }
 """All commands in the order of the help. A command's module is imported when the command is called."""
 
+WITH_VARIANT = ("run", "check", "report", "watch", "diff", "replay", "coverage", "explore", "prove", "conformance")
+"""Commands with the option --variant: they play agents or judge them. `matrix` has one of its own."""
+
 OLD_NAMES = {
     "again": "`ucp-harness bisect --once`",
     "scale": "`ucp-harness matrix growth_matrix`",
@@ -171,7 +174,12 @@ def loaded(name: str) -> Any:
         return typer.main.get_group(command)
     alone = typer.Typer(add_completion=False)
     alone.command(name)(command)
-    return typer.main.get_command(alone)
+    made = typer.main.get_command(alone)
+    if name in WITH_VARIANT:
+        from harness.commands._shared_options import variant_option
+
+        made.params.append(variant_option())
+    return made
 
 
 app = typer.Typer(cls=Commands, no_args_is_help=True, pretty_exceptions_enable=False)

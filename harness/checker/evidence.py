@@ -23,6 +23,7 @@ from harness.checker._trace_replay import Life, replay
 from harness.checker.reference.state import State
 from harness.errors import RunDirectoryError
 from harness.play.rogue.rogue_line import OF_NO_INJECTION
+from harness.play.variant import VariantError, variant_in_use
 from harness.scenario import Scenario
 from harness.scenario.changes import NO_MORE_FATES
 from netem.conditions import NetworkConditions
@@ -330,7 +331,8 @@ class Evidence:
 
 
 def gather(archive: RunArchive) -> Evidence:
-    """All that an archive has of it."""
+    """All that an archive has of it. Raises VariantError if the run was made with another variant than is in use."""
+    check_variant(archive)
     problems = list(archive.problems)
     if archive.record_problems and archive.judged_record is None:
         problems[0] += "; the exports are checked without it"
@@ -349,6 +351,22 @@ def gather(archive: RunArchive) -> Evidence:
         scenario=archive.record.scenario,
         link_losses=[*archive.link_losses(archive.roster)],
         stores=archive.stores,
+    )
+
+
+def check_variant(archive: RunArchive) -> None:
+    """Raise VariantError if the run was made with another variant of the protocol than is in use, or without one."""
+    if not archive.recorded:
+        return
+    made_with, variant = archive.record.versions.get("variant"), variant_in_use()
+    if made_with == (variant and variant.version):
+        return
+    if made_with is None:
+        raise VariantError(f"{archive.directory}: the run was made without a variant: leave out --variant")
+    given = "" if variant is None else f", not with {variant.version}"
+    raise VariantError(
+        f"{archive.directory}: the run was made with the variant {str(made_with)[:80]}{given}: name its file with "
+        "--variant"
     )
 
 

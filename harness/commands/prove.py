@@ -14,6 +14,7 @@ from harness.commands._shared_options import RARE
 from harness.commands.terminal import Watcher, complain, print_json
 from harness.errors import INTERRUPTED
 from harness.play.core_version import edited_files
+from harness.play.variant import variant_in_use
 from harness.proof import Bounds, BoundsError, Limits, Progress, original, specification
 from harness.run.parallel import cores, terminated_is_interrupted
 
@@ -128,8 +129,11 @@ def prove_command(
             "--lies needs --captured, and does not apply to --network any, where the number of lies is "
             "unlimited: leave it out"
         )
+    variant = variant_in_use()
     if edited := edited_files():
         complain(f"state reduction is disabled: it assumes the released core, and {', '.join(edited)} was edited")
+    elif variant is not None:
+        complain(f"state reduction is disabled: it assumes the released core, and the variant is {variant.in_words}")
     bounds = Bounds(
         agents,
         blocks,
@@ -139,7 +143,7 @@ def prove_command(
         coincidences,
         _pairs("--settings", settings),
         quirks,
-        reduced=not (whole or quirks or edited),
+        reduced=not (whole or quirks or edited or variant),
         steps=steps,
         stagger=_pairs("--stagger", stagger),  # type: ignore[arg-type]  # it is checked
         captured=captured,

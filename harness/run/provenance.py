@@ -11,6 +11,7 @@ from pathlib import Path
 
 from harness.checker import reference
 from harness.play.core_version import core_version
+from harness.play.variant import variant_in_use
 from netem import uml
 
 PACKAGES = ("ucp-harness", "pymavlink")
@@ -19,7 +20,7 @@ GIT_LIMIT_S = 5.0
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of agent core, reference, packages, Python, kernel and platform.
+    """Return the versions of agent core, reference, variant, packages, Python, kernel and platform.
 
     `commit` is there if the harness runs from a clone. "-dirty" at its end means that files were modified.
     """
@@ -29,6 +30,7 @@ def versions() -> dict[str, str]:
         **({"commit": commit} if commit else {}),
         "core": core_version(),
         "reference": _reference_version(),
+        **({"variant": variant.version} if (variant := variant_in_use()) is not None else {}),
         "python": platform.python_version(),
         "kernel": f"{platform.release()} (User Mode Linux)" if uml.inside() else platform.release(),
         "platform": sys.platform,

@@ -12,6 +12,7 @@ from harness.archive.exports import RUN_FILE, Export, agents_directory
 from harness.archive.packets.pcap import MAGICS
 from harness.archive.run_record import JudgedRecord
 from harness.archive.traces import HEADER, MAX_LINE_BYTES, SUFFIX, Trace, read_trace
+from harness.checker.evidence import check_variant
 from harness.errors import FieldError, RunDirectoryError
 from harness.field.ingest import Flight, Homecoming, sort_out
 from harness.field.replay._agent_record import Record
@@ -26,6 +27,7 @@ class _Run:
 
     def __init__(self, directory: Path) -> None:
         self._archive = RunArchive(directory)
+        check_variant(self._archive)
 
     @property
     def exports(self) -> Mapping[int, Export]:

@@ -36,6 +36,7 @@ from harness.play.agent_control import (
 from harness.play.child_processes import ChildProcesses
 from harness.play.process._run_lab import MissionLab, Program
 from harness.play.process.agent_mission import mission_file
+from harness.play.variant import variant_in_use
 from harness.scenario import Scenario
 from netem.errors import SpawnError
 from ucp.features import UNSUPPORTED
@@ -56,7 +57,9 @@ def agent_command(scenario: Scenario, agent_id: int) -> list[str]:
     """
     command = scenario.command_of(agent_id)
     if command is None:
-        return [sys.executable, "-P", "-m", "ucp.node"]
+        variant = variant_in_use()
+        program = ["ucp.node"] if variant is None else ["harness.play.variant_agent", str(variant.file)]
+        return [sys.executable, "-P", "-m", *program]
     of_whom = f" of agent {agent_id}" if isinstance(scenario.agent_command, dict) else ""
     return located(command, f"`agent_command`{of_whom}")
 

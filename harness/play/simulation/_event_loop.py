@@ -24,6 +24,7 @@ from harness.play.simulation.fate_script import FateScript, LateTimers, NameOf
 from harness.play.simulation.incarnations import BlockNames, Incarnation, Secured
 from harness.play.simulation.run_files import Recorder
 from harness.play.simulation.seals import seals_of
+from harness.play.variant import variant_in_use
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
 from netem.medium import AT_ONCE, LATENCY, Medium
@@ -84,7 +85,7 @@ class Clockwork:
         if self._keys is not None:
             self._initial_data = self._keys.mission.sealed_to_depot(initial_data)
         anything_counts = self._anybody_is_unknown or (self._keys is not None and not self._keys.nothing_is_dropped)
-        anything_counts = anything_counts or bool(edited_files())
+        anything_counts = anything_counts or bool(edited_files()) or variant_in_use() is not None
         self._deliver_all = deliver_all = deliver_all or anything_counts
         self._now = 0.0
         self._generating = True

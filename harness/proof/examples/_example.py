@@ -10,6 +10,7 @@ from harness.checker import Result
 from harness.checker.judgement import Judgement
 from harness.checker.recurring_cycles import cycle_of
 from harness.errors import AgentFailedError
+from harness.play.variant import variant_in_use
 from harness.proof.bounds import Bounds
 from harness.run.simulate import ended_by, evidence_lines, simulate, write
 from harness.scenario.load import parse
@@ -32,7 +33,9 @@ class Example:
 
     @property
     def replay(self) -> str:
-        return f"ucp-harness run {self.path} --backend sim --seed {SEED}"
+        variant = variant_in_use()
+        option = "" if variant is None else f" --variant {variant.file}"
+        return f"ucp-harness run {self.path} --backend sim --seed {SEED}{option}"
 
     def to_json(self) -> dict[str, Any]:
         judged = {key: judgement.verdict for key, judgement in self.judged.items()}
