@@ -133,7 +133,7 @@ COMMANDS = {
 }
 """All commands in the order of the help. A command's module is imported when the command is called."""
 
-WITH_VARIANT = ("run", "check", "report", "watch", "diff", "replay", "coverage", "explore", "prove", "conformance")
+WITH_VARIANT = ("run", "check", "replay", "coverage", "explore", "prove", "conformance")
 """Commands with the option --variant: they play agents or judge them. `matrix` has one of its own."""
 
 OLD_NAMES = {
@@ -176,7 +176,7 @@ def loaded(name: str) -> Any:
     alone.command(name)(command)
     made = typer.main.get_command(alone)
     if name in WITH_VARIANT:
-        from harness.commands._shared_options import variant_option
+        from harness.commands.variant_option import variant_option
 
         made.params.append(variant_option())
     return made

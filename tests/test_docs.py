@@ -157,7 +157,9 @@ def test_the_picture_of_the_rooms_is_drawn_from_the_imports(site: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if page.stem != "run-a-matrix-every-night"], ids=lambda page: page.name
+    "page",
+    [page for page in PAGES if page.stem not in ("run-a-matrix-every-night", "try-a-protocol-change")],
+    ids=lambda page: page.name,
 )
 def test_a_scenario_that_a_page_shows_is_one(page: Path) -> None:
     for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
@@ -172,6 +174,10 @@ def test_every_command_of_the_tutorial_prints_what_it_shows(tmp_path: Path) -> N
 
 def test_commands_of_the_findings_print_their_results(tmp_path: Path) -> None:
     assert play(REPOSITORY / "docs" / "explanation" / "findings.md", tmp_path) > 7
+
+
+def test_commands_of_the_page_on_protocol_changes_print_their_results(tmp_path: Path) -> None:
+    assert play(REPOSITORY / "docs" / "how-to" / "try-a-protocol-change.md", tmp_path) == 6
 
 
 def test_the_public_names_are_on_their_page(site: Path) -> None:

@@ -4,7 +4,7 @@ import contextlib
 import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,34 +21,6 @@ BundleOption = Annotated[
     Path | None,
     typer.Option("--bundle", help="Key bundle of any vehicle, to read a secured mission."),
 ]
-
-
-def variant_option() -> Any:
-    """Return the option --variant. The variant is in force until the command ends."""
-
-    def put_in_force(ctx: typer.Context, file: Path | None) -> None:
-        if file is not None and not ctx.resilient_parsing:
-            from harness.run.variant_in_force import in_force
-
-            ctx.with_resource(in_force(file))
-
-    def command(
-        variant: Annotated[
-            Path | None,
-            typer.Option(
-                metavar="FILE",
-                callback=put_in_force,
-                rich_help_panel=RARE,
-                help="Protocol variant, a Python file: agents play it, and the reference judges by it.",
-            ),
-        ] = None,
-    ) -> None: ...
-
-    alone = typer.Typer(add_completion=False)
-    alone.command()(command)
-    (option,) = typer.main.get_command(alone).params
-    option.expose_value = False
-    return option
 
 
 def opener_of(bundle: Path | None) -> "Opener | None":

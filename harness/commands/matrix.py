@@ -1,19 +1,28 @@
 """`ucp-harness matrix`: a scenario over loss rates, numbers of agents, mission lengths, backends and seeds."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
 from harness.archive.directory import default_path
 from harness.backend_names import BackendName
-from harness.commands.terminal import complain, end_sweep, print_lines
+from harness.commands.terminal import complain, end_sweep, print_json, print_lines
+from harness.errors import INTERRUPTED
+from harness.play.variant import Variant, load_variant
 from harness.run.parallel import cores
+from harness.run.variant_in_force import in_force
 from harness.sweep import matrix
 from harness.sweep.matrix import matrix_outputs, matrix_summary, matrix_table
 from harness.sweep.matrix import nights as nights_of_matrix
+<<<<<<< HEAD
 from harness.sweep.matrix.matrix_run import compare_with, on_cluster, on_cores
+=======
+from harness.sweep.matrix.matrix_run import Spread, compared, on_cluster, on_cores
+>>>>>>> bcbc3e6d (Compare a protocol variant with the original in pairs of runs)
 from harness.sweep.matrix.nights import load_baseline
+from harness.sweep.matrix.variant_comparison import compare_runs
+from ucp.agent_files import write_atomically, write_json_atomically
 
 
 def matrix_command(
@@ -38,6 +47,12 @@ def matrix_command(
     secured: Annotated[
         bool, typer.Option("--secured", help="Secure the mission with fresh keys if it has none.")
     ] = False,
+    variant: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Protocol variant: also play each run with it, and write a page of paired differences."
+        ),
+    ] = None,
     nights: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Keep this night in DIR, and draw the trend of all nights in it."),
@@ -49,7 +64,7 @@ def matrix_command(
     three or more swarm sizes or mission lengths, it also has power laws of how figures grow.
 
     Exit status 0: no run is bad. 1: a run is bad or failed, or a figure is worse than in --against. 3: an agent does
-    not support a run. 4: no run is bad, but some needed more time.
+    not support a run. 4: no run is bad, but some needed more time. With --variant, the runs of the variant count.
     """
     request = matrix.load_matrix(file, backend)
     if secured:
@@ -57,10 +72,14 @@ def matrix_command(
     baseline = load_baseline(against, request) if against else None
     kept = nights_of_matrix.opened(nights) if nights else None
     directory = (out or default_path(request.name)).absolute()
+    if variant is not None and (against, nights, scheduler, coverage) != (None, None, None, False):
+        raise typer.BadParameter("--variant excludes --against, --nights, --scheduler and --coverage: leave them out")
     if scheduler is None:
         spread = on_cores(request, jobs or cores(), shown=True)
     else:
         spread = on_cluster(request, scheduler, shown=True)
+    if variant is not None:
+        _beside_the_original(request, load_variant(variant), directory, spread, as_json)
     finished = matrix.run_matrix(request, directory, spread, covers=coverage)
     if baseline is not None:
         finished = compare_with(finished, baseline, str(against))
@@ -76,3 +95,29 @@ def matrix_command(
     if finished.record.tried is not None and not as_json:
         print_lines(matrix_summary.describe_coverage(finished.record.tried))
     end_sweep(finished.record, None if as_json else matrix_table.render(finished.record), directory / "report.html")
+
+
+def _beside_the_original(
+    request: matrix.Matrix, variant: Variant, directory: Path, spread: Spread, as_json: bool
+) -> NoReturn:
+    """Play the matrix with the original and with the variant, in directories of their own, and compare."""
+    original = matrix.run_matrix(request, directory / "original", spread)
+    matrix_outputs.write(original, directory / "original")
+    if original.record.outcome == "interrupted":
+        complain(f"to continue, repeat the command with --out {directory}")
+        raise typer.Exit(INTERRUPTED)
+    beside = directory / f"{variant.name}-{variant.digest}"
+    with in_force(variant):
+        changed = matrix.run_matrix(request, beside, spread)
+    matrix_outputs.write(changed, beside)
+    comparison = compare_runs(variant, request, original, changed)
+    page = directory / "comparison.md"
+    write_atomically(page, comparison.to_markdown())
+    write_json_atomically(directory / "comparison.json", comparison.to_json())
+    if as_json:
+        print_json(comparison.to_json())
+    else:
+        print_lines([*comparison.to_markdown().splitlines(), "", str(page)])
+    if changed.record.outcome == "interrupted":
+        complain(f"to continue, repeat the command with --out {directory}")
+    raise typer.Exit(changed.record.exit_status)

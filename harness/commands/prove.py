@@ -97,7 +97,7 @@ def prove_command(
         str | None,
         typer.Option(
             metavar="ORIGINAL",
-            help="Commit or checkout of the original agent; exit status 1 only for findings that it does not have.",
+            help="Original agent: commit, checkout or `installed`; exit status 1 only for findings that it lacks.",
         ),
     ] = None,
     cores_: Annotated[

@@ -80,8 +80,8 @@ def of_core(
 ) -> Callable[[Callable[..., str]], CoreChange]:
     """Declare a function to be the handler of an algorithm in the agents.
 
-    The keyword arguments name what the new handler can do and the original cannot: branches that it returns, messages
-    that it sends, timers that it starts, and local events that it triggers.
+    The keyword arguments declare abilities that the original handler lacks: branches that it returns, messages that it
+    sends, timers that it starts, and local events that it triggers.
     """
     return lambda run: CoreChange(algorithm, run, branches, sends, starts, triggers)
 
@@ -109,7 +109,7 @@ class Variant:
 
     @property
     def in_words(self) -> str:
-        """What changes, such as "approve_ties (Algorithm 5)"."""
+        """Name and changed algorithms, such as "approve_ties (Algorithm 5)"."""
         numbers = [str(number) for number in sorted(self.core)]
         return f"{self.name} (Algorithm{'s' * (len(numbers) > 1)} {', '.join(numbers)})"
 

@@ -19,13 +19,15 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from harness.errors import INCOMPLETE, INTERRUPTED, VIOLATED, HarnessError
-from harness.play.core_version import edited_files
+from harness.play.core_version import CORE, edited_files
 from harness.proof._proof import Limits, Proof, prove
 from harness.proof._proof_text import in_words
 from harness.proof.bounds import Bounds
 from harness.run.code_state import ROOT, History, run_python
 
 MODULE = "harness.proof.original"
+INSTALLED = "installed"
+"""The name of the core of this installation, without a variant."""
 EXIT_S = 60.0
 """Seconds that the process may take beyond the limit of time, to start and to write its result."""
 
@@ -93,10 +95,16 @@ class Comparison:
 
 @contextmanager
 def code_of(original: str) -> Iterator[Path]:
-    """Yield the directory with the code of `original`: a directory with `ucp/` in it, or a commit of this clone.
+    """Yield the directory with the code of `original`.
+
+    It is "installed" (the core of this installation, for a proof with a variant), a directory with `ucp/` in it, or a
+    commit of this clone.
 
     Raises OriginalError, or RepositoryError for an unknown commit.
     """
+    if original == INSTALLED:
+        yield CORE.parent
+        return
     directory = Path(original)
     if directory.is_dir():
         if not (directory / "ucp" / "agent.py").is_file():

@@ -21,6 +21,7 @@ LOOSE_AT_MOST = 7
 DOORS = {
     "ucp.commit": "handlers, to read beside the thesis",
     "harness.cli": "a program",
+    "harness.play.variant_agent": "a program",
     "netem.init": "a program",
     "netem.tap": "a program",
     "ucp.contract.vectors.replay": "a program",

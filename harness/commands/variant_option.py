@@ -1,0 +1,36 @@
+"""The option --variant, which `harness.cli` adds to each command that plays or judges agents."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from harness.commands._shared_options import RARE
+
+
+def variant_option() -> Any:
+    """Return the option --variant. The variant is in force until the command ends."""
+
+    def put_in_force(ctx: typer.Context, file: Path | None) -> None:
+        if file is not None and not ctx.resilient_parsing:
+            from harness.run.variant_in_force import in_force
+
+            ctx.with_resource(in_force(file))
+
+    def command(
+        variant: Annotated[
+            Path | None,
+            typer.Option(
+                metavar="FILE",
+                callback=put_in_force,
+                rich_help_panel=RARE,
+                help="Protocol variant, a Python file: agents play it, and the reference judges by it.",
+            ),
+        ] = None,
+    ) -> None: ...
+
+    alone = typer.Typer(add_completion=False)
+    alone.command()(command)
+    (option,) = typer.main.get_command(alone).params
+    option.expose_value = False
+    return option

@@ -1,0 +1,169 @@
+"""A protocol variant beside the original: the same matrix with the same seeds, and one page of paired differences.
+
+A run of the variant and a run of the original with the same seed have the same blocks, losses and faults. The page
+therefore shows means of differences between pairs, whose intervals are narrower than those of two independent means.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from harness.play.variant import Variant
+from harness.present import text as words
+from harness.scenario.verdict_names import CHARACTERISTICS, kind_of
+from harness.sweep.matrix._cell import Run
+from harness.sweep.matrix._estimate import Estimate, estimate_mean
+from harness.sweep.matrix._matrix_file import Matrix, Point
+from harness.sweep.matrix.matrix_run import Finished
+from harness.sweep.matrix.matrix_table import name_of
+
+SEEDS_SHOWN = 5
+SIGNIFICANT_DIGITS = 4
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A value that is compared in each pair of runs. `of` returns None for a run that does not know it."""
+
+    label: str
+    of: Callable[[Run], float | None]
+    unit: Literal["share", "number"] = "number"
+
+
+def _figure(name: str) -> Callable[[Run], float | None]:
+    return lambda run: run.figures.get(name)
+
+
+def _missing_blocks(run: Run) -> float | None:
+    blocks, mutual = run.figures.get("blocks"), run.figures.get("mutual_chain")
+    return None if blocks is None or mutual is None else blocks - mutual
+
+
+def _forked(run: Run) -> float | None:
+    chains = run.figures.get("distinct_chains")
+    return None if chains is None else float(chains > 1)
+
+
+def _verdict(key: str, verdict: str) -> Callable[[Run], float | None]:
+    return lambda run: None if key not in run.verdicts else float(run.verdicts[key] == verdict)
+
+
+def _bad(*keys: str) -> Callable[[Run], float | None]:
+    return lambda run: float(any(kind_of(run.verdicts[key]) == "bad" for key in keys if key in run.verdicts))
+
+
+COMPARED = (
+    Compared("blocks that are not in every chain", _missing_blocks),
+    Compared("messages", _figure("messages")),
+    Compared("messages per block", _figure("messages_per_block")),
+    Compared("reconciles", _figure("reconciles")),
+    Compared("seconds to one chain", _figure("uniform_at_s")),
+    Compared("distinct chains at the end", _figure("distinct_chains")),
+    Compared("runs that end with a fork", _forked, "share"),
+    Compared("runs with a livelock", _verdict("liveness", "never finishes"), "share"),
+    Compared("runs that are not finished", _verdict("liveness", "not finished"), "share"),
+    Compared("runs that violate a characteristic", _bad(*CHARACTERISTICS), "share"),
+    Compared("runs with a step that deviates", _bad("steps"), "share"),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the page: means of original and variant over the pairs, and the mean difference of the pairs."""
+
+    compared: Compared
+    original: float | None
+    variant: float | None
+    difference: Estimate
+    differing: list[int]
+    """Seeds whose pair differs."""
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "label": self.compared.label,
+            "original": self.original,
+            "variant": self.variant,
+            "difference": self.difference.model_dump(),
+            "differing_seeds": self.differing,
+        }
+
+
+@dataclass(frozen=True)
+class VariantComparison:
+    """The rows of each cell of the matrix."""
+
+    variant: Variant
+    matrix: Matrix
+    rows: dict[Point, list[Row]]
+
+    def to_json(self) -> dict[str, Any]:
+        cells = [{**point._asdict(), "rows": [row.to_json() for row in rows]} for point, rows in self.rows.items()]
+        return {"schema": "ucp-variant-comparison/1", "variant": self.variant.version, "cells": cells}
+
+    def to_markdown(self) -> str:
+        return "\n".join(self._lines()) + "\n"
+
+    def _lines(self) -> Iterator[str]:
+        yield f"# {self.variant.in_words} beside the original"
+        yield ""
+        if self.variant.sentence:
+            yield f"{self.variant.sentence}"
+            yield ""
+        yield (
+            f"Matrix {self.matrix.name}, variant {self.variant.version}. Each seed was played with the original and "
+            "with the variant. A difference is variant minus original, as the mean over all pairs with its 95 % "
+            "interval."
+        )
+        for point, rows in self.rows.items():
+            yield ""
+            yield f"## {name_of(self.matrix, point)}"
+            yield ""
+            yield "| figure | pairs | original | variant | difference | 95 % interval | seeds that differ |"
+            yield "|---|--:|--:|--:|--:|--:|---|"
+            yield from map(_line, rows)
+
+
+def compare_runs(variant: Variant, matrix: Matrix, original: Finished, changed: Finished) -> VariantComparison:
+    """Compare all pairs of runs that have ended."""
+    before = {run.task: run for run in original.runs if run.judged}
+    pairs: dict[Point, list[tuple[Run, Run]]] = {}
+    for run in changed.runs:
+        if run.judged and run.task in before:
+            pairs.setdefault(run.point, []).append((before[run.task], run))
+    rows = {point: [_row(compared, its_pairs) for compared in COMPARED] for point, its_pairs in pairs.items()}
+    return VariantComparison(variant, matrix, rows)
+
+
+def _row(compared: Compared, pairs: Sequence[tuple[Run, Run]]) -> Row:
+    known = [
+        (run.seed, before, after)
+        for original, run in pairs
+        if (before := compared.of(original)) is not None and (after := compared.of(run)) is not None
+    ]
+    if not known:
+        return Row(compared, None, None, Estimate(n=0), [])
+    return Row(
+        compared,
+        sum(before for _, before, _ in known) / len(known),
+        sum(after for *_, after in known) / len(known),
+        estimate_mean([after - before for _, before, after in known]),
+        [seed for seed, before, after in known if before != after],
+    )
+
+
+def _line(row: Row) -> str:
+    difference = row.difference
+
+    def said(value: float | None, *, signed: bool = False) -> str:
+        if value is None:
+            return "-"
+        sign = "+" if signed and value > 0 else ""
+        return sign + (words.percent(value) if row.compared.unit == "share" else f"{value:.{SIGNIFICANT_DIGITS}g}")
+
+    interval = "-" if difference.low is None else f"{said(difference.low)} … {said(difference.high)}"
+    seeds = ", ".join(map(str, row.differing[:SEEDS_SHOWN]))
+    more = f" and {len(row.differing) - SEEDS_SHOWN} more" if len(row.differing) > SEEDS_SHOWN else ""
+    return (
+        f"| {row.compared.label} | {difference.n} | {said(row.original)} | {said(row.variant)} "
+        f"| {said(difference.mean, signed=True)} | {interval} | {seeds}{more} |"
+    )
