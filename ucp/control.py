@@ -69,7 +69,7 @@ class ControlServer:
     def answer(self, line: bytes) -> dict[str, Any]:
         """What is answered to one line."""
         try:
-            request = json.loads(line)
+            request = json.loads(line.decode())  # of bytes, json would also read UTF-16
             if not isinstance(request, dict):
                 return {"ok": False, "error": "not a JSON object"}
             check_request(request)

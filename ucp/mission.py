@@ -132,7 +132,7 @@ def parse_mission(document: Any) -> Mission:
             raise MissionError(f"`settings.max_block_bytes` is at most {most} where event data is sealed")
     return Mission(
         agent_id=agent_id,
-        roster=tuple(roster),
+        roster=tuple(dict.fromkeys(roster)),
         initial_data=initial_data,
         network=_network(_get(document, "network", dict)),
         events=_event_source(_get(document, "events", dict)),

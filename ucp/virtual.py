@@ -72,6 +72,11 @@ class VirtualAgent:
             self._mission = mission = parse_mission(given["mission"])
         except MissionError as error:
             raise InputError(str(error), unsupported=isinstance(error, UnsupportedMissionError)) from None
+        if mission.store is not None or mission.events.source != "none" or mission.speedup != 1:
+            raise InputError(
+                "a mission in virtual time must have `store` null, `events.source` none and `speedup` 1, because it "
+                "has no disk, no vehicle and no clock"
+            )
         if mission.epoch_us is None:
             raise InputError(
                 "`epoch_us` of the mission must be a whole number, because virtual time has no command `start`"
@@ -265,7 +270,7 @@ def _maker(mission: Mission, given: dict[str, Any]) -> Callable[..., Agent]:
 
 def _read(line: bytes) -> dict[str, Any]:
     try:
-        given = json.loads(line)
+        given = json.loads(line.decode())  # of bytes, json would also read UTF-16
     except (ValueError, RecursionError):
         raise InputError("not a line of JSON") from None
     if not isinstance(given, dict):

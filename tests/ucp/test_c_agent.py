@@ -21,6 +21,7 @@ from harness.run.simulate import simulate
 from tests.harness.command import harness, write_scenario
 from tests.harness.virtual import scenario
 from tests.machine import do_without
+from tests.ucp import refusals
 from ucp.contract.vectors import INDEX
 from ucp.contract.vectors.replay import Player, play
 
@@ -29,6 +30,15 @@ VECTORS = INDEX.parent.parent
 ABOUT: dict[str, dict[str, Any]] = json.loads(INDEX.read_text(encoding="ascii"))
 TRANSCRIPTS = {*ABOUT}
 SECURED = {name for name, about in ABOUT.items() if "secured" in about["features"]}
+FEATURES = (
+    "store",
+    "vote_names_chain",
+    "changed_before_tally",
+    "asks_after_commit",
+    "top_needs_majority",
+    "phase1_tie=pop",
+    "phase2_tie=block",
+)
 WARNINGS = ["-std=c11", "-Wall", "-Wextra", "-Werror"]
 HARD_RUN: dict[str, Any] = {
     "network": {"loss": 0.15},
@@ -110,6 +120,16 @@ def test_a_transcript_with_keys(name: str, player: Player, secured: Path) -> Non
     assert lacks is not None and lacks.startswith("not supported")
     with Player([str(secured)]) as playing:
         assert play(playing, INDEX.with_name(f"{name}.jsonl")) is None
+
+
+def test_missions_in_doubt_are_played_or_refused(agent: Path, secured: Path, tmp_path: Path) -> None:
+    for command, features in ((agent, FEATURES), (secured, (*FEATURES, "secured", "sealed"))):
+        assert not refusals.wrong_missions([str(command)], features)
+        assert not refusals.wrong_exits([str(command)], features, tmp_path)
+
+
+def test_requests_in_doubt_are_answered_as_in_the_vectors(checked: Path, tmp_path: Path) -> None:
+    assert not refusals.wrong_answers([str(checked)], tmp_path)
 
 
 def test_generated_vectors(agent: Path) -> None:

@@ -1,6 +1,7 @@
 """The program: how it starts and ends, which missions it refuses, and its control socket."""
 
 import asyncio
+import base64
 import json
 import os
 import signal
@@ -26,13 +27,18 @@ from harness.conformance.cases._bench import (
 )
 from harness.play.agent_control import AgentRefusedError
 from ucp.block import Block, next_chain_hash
+from ucp.contract.vectors import DIRECTORY
+from ucp.contract.vectors.refusal_vectors import UNKNOWN
 from ucp.features import UNSUPPORTED
 from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
 
 WRONG_MISSION = 2
+REFUSALS: dict[str, Any] = json.loads((DIRECTORY / "refusals.json").read_text(encoding="ascii"))
 NO_EXPIRY = {**VARIANTS["default"].settings.told(), "vote_timeout_s": 10_000.0}
 """Settings with which no vote ends during a case."""
 INPUTS = 50
+SECONDS_WITHOUT_EVENT = 20.0
+"""Mission seconds in which an agent would log an event with a probability of almost 1, if it drew one each second."""
 
 
 async def _refused(agent: Alone, command: str, why: str, **arguments: Any) -> None:
@@ -207,6 +213,20 @@ async def _quirk(bench: Bench) -> None:
         must((await agent.status())["chain"] == 0, "an empty chain, as `ignore_commit` 1 requests", "a block")
 
 
+@case("missions in doubt are played or refused as in the vectors", "contract, Features")
+async def _in_doubt(bench: Bench) -> None:
+    for vector in REFUSALS["missions"]:
+        needs, plays = vector["needs"], vector["plays"]
+        if "in virtual time" in vector["what"] or (needs and needs != [UNKNOWN]):
+            continue
+        keys = {key: vector["mission"][key] for key in ("features", "quirks", "settings", "initial_data")}
+        if plays and not needs:
+            async with bench.agent(keys) as agent:
+                await agent.status()
+        else:
+            await _ends_with(bench, UNSUPPORTED if needs else WRONG_MISSION, vector["what"], keys)
+
+
 @case("unknown keys of the mission file are ignored", "contract, The mission file")
 async def _unknown_keys(bench: Bench) -> None:
     async with bench.agent({"something": {"else": [1, 2, 3]}}) as agent:
@@ -258,6 +278,11 @@ async def _control(bench: Bench) -> None:
             refused = isinstance(answer, dict) and answer.get("ok") is False and bool(answer.get("error"))
             must(refused, f"`ok` false and an `error` to {request.decode()}", answer)
         must(isinstance(answers[-1], dict) and answers[-1].get("ok") is True, "a status after that", answers[-1])
+        for vector in REFUSALS["requests"]:
+            (answer,) = await _lines(agent, base64.b64decode(vector["line"]))
+            right = {"unsupported": None, **vector["answer"]}
+            came = {key: answer.get(key) for key in right} if isinstance(answer, dict) else answer
+            must(came == right, f"{vector['answer']} for a request that is {vector['what']}", came)
         await agent.answers_only(INCEPTION, "lines that are no commands")
 
 
@@ -271,6 +296,15 @@ async def _two_clients(bench: Bench) -> None:
 
 @case("after stop_events, no further events are logged", "contract, Control socket", 1)
 async def _stop_events(bench: Bench) -> None:
+    often = {"source": "random", "mean_s": 1.0}
+    async with bench.agent({"events": often, "settings": {**NO_EXPIRY, "max_event_bytes": 267}}) as agent:
+        await agent.hear_one(BlockAddRequest, "random events")
+        await agent.process.ask("stop_events")
+        before = await agent.process.export()
+        await asyncio.sleep(SECONDS_WITHOUT_EVENT / SPEEDUP)
+        after = await agent.process.export()
+        same = all(before[key] == after[key] for key in ("completed", "current_block"))
+        must(same, "no random event after stop_events", "another current block")
     async with bench.agent() as agent:
         await agent.process.ask("stop_events")
         with suppress(AgentRefusedError):

@@ -254,6 +254,18 @@ static int hex_digit(char c) {
          : -1;
 }
 
+static uint32_t four_hex(const char *s) {
+    return (uint32_t)(hex_digit(s[0]) << 12 | hex_digit(s[1]) << 8 | hex_digit(s[2]) << 4 | hex_digit(s[3]));
+}
+
+static uint32_t json_escape(const Json *j, size_t from) {   /* of \uXXXX there; if none, more than any has */
+    const char *s = j->text + j->at + from;
+    if (j->len - j->at < from + 6 || s[0] != '\\' || s[1] != 'u') return UINT32_MAX;
+    for (int i = 2; i < 6; i++)
+        if (hex_digit(s[i]) < 0) return UINT32_MAX;
+    return four_hex(s + 2);
+}
+
 static bool json_string(Json *j) {                      /* from behind the opening quote to behind the closing one */
     while (j->at < j->len) {
         uint8_t c = (uint8_t)j->text[j->at];
@@ -267,10 +279,9 @@ static bool json_string(Json *j) {                      /* from behind the openi
         }
         if (j->len - j->at < 2 || memchr("\"\\/bfnrtu", j->text[j->at + 1], 9) == NULL) return false;
         if (j->text[j->at + 1] == 'u') {
-            if (j->len - j->at < 6) return false;
-            for (int i = 2; i < 6; i++)
-                if (hex_digit(j->text[j->at + (size_t)i]) < 0) return false;
-            j->at += 4;
+            uint32_t high = json_escape(j, 0), low = high < 0xd800 || high > 0xdbff ? 0xdc00 : json_escape(j, 6);
+            if (high > 0xffff || (high >= 0xdc00 && high <= 0xdfff) || low < 0xdc00 || low > 0xdfff) return false;
+            j->at += high < 0xd800 || high > 0xdbff ? 4 : 10;
         }
         j->at += 2;
     }
@@ -351,10 +362,6 @@ static void put_utf8(Buf *b, uint32_t c) {
     put_byte(b, (uint8_t)((more > 0 ? 0xf00 >> (more + 1) : 0) | c >> 6 * more));
     while (more-- > 0)
         put_byte(b, (uint8_t)(0x80 | (c >> 6 * more & 63)));
-}
-
-static uint32_t four_hex(const char *s) {
-    return (uint32_t)(hex_digit(s[0]) << 12 | hex_digit(s[1]) << 8 | hex_digit(s[2]) << 4 | hex_digit(s[3]));
 }
 
 /* What a string says; good until the next call. Mostly there is no escape in it, and nothing is copied. */
@@ -499,8 +506,14 @@ __attribute__((format(printf, 3, 4))) static bool fail(Fault *fault, int status,
     return false;
 }
 
+static bool is_sealed(const Buf *data) {                /* a depot's key of 32 bytes ends it */
+    static const char tag[] = "UCP depot key";
+    size_t n = sizeof tag - 1 + 32;
+    return data->len >= n && memcmp(data->data + data->len - n, tag, sizeof tag - 1) == 0;
+}
+
 /* Features come before all values: one that is lacking may be the reason why a value is not known. */
-static bool mission_features(Json *j, uint32_t root, Fault *fault) {
+static bool mission_features(Json *j, uint32_t root, bool sealed, Fault *fault) {
     static const char *const has[] = {"store", "vote_names_chain", "changed_before_tally", "asks_after_commit",
                                       "top_needs_majority", "phase1_tie=pop", "phase2_tie=block",
 #ifdef SECURED
@@ -521,7 +534,11 @@ static bool mission_features(Json *j, uint32_t root, Fault *fault) {
                         name);
         }
     }
-#ifndef SECURED
+#ifdef SECURED
+    (void)sealed;
+#else
+    if (sealed)
+        return fail(fault, STATUS_LACKS, "This agent does not have the feature 'sealed'.");
     uint32_t security = member(j, root, "security");
     if (security != 0 && kind(j, security) != 'n')
         return fail(fault, STATUS_LACKS, "This agent does not have the feature 'secured'.");
@@ -531,9 +548,8 @@ static bool mission_features(Json *j, uint32_t root, Fault *fault) {
     if (quirks != 0 && kind(j, quirks) != '{') return fail(fault, STATUS_WRONG, "quirks is no object.");
     for (uint32_t i = quirks + 1; quirks != 0 && i < j->node[quirks].end; i = j->node[i + 1].end) {
         double value = 0;
-        if (kind(j, i + 1) != 't' && kind(j, i + 1) != 'f' && !json_double(j, i + 1, &value))
-            return fail(fault, STATUS_WRONG, "A quirk is neither a boolean nor a number.");
-        if (kind(j, i + 1) == 't' || value != 0)
+        bool none = kind(j, i + 1) == 'f' || (json_double(j, i + 1, &value) && value == 0);
+        if (!none)
             return fail(fault, STATUS_LACKS, "This agent does not have the feature 'quirks'.");
     }
     return true;
@@ -611,7 +627,8 @@ static bool mission_read(Mission *m, Json *j, uint32_t root, Fault *fault) {
     uint32_t at;
     if (kind(j, root) != '{' || !says(j, member(j, root, "schema"), "ucp-mission/1"))
         return fail(fault, STATUS_WRONG, "It is no mission of the schema ucp-mission/1.");
-    if (!mission_features(j, root, fault)) return false;
+    bool has_data = json_bytes(j, member(j, root, "initial_data"), &m->initial_data);
+    if (!mission_features(j, root, has_data && is_sealed(&m->initial_data), fault)) return false;
     if ((at = member(j, root, "contract")) != 0 && !json_uint(j, at, 1, UINT64_MAX, &value))
         return fail(fault, STATUS_WRONG, "contract is no version.");
     if (!json_uint(j, member(j, root, "agent_id"), 1, AGENT_IDS - 1, &value))
@@ -630,7 +647,7 @@ static bool mission_read(Mission *m, Json *j, uint32_t root, Fault *fault) {
         m->roster[m->roster_len++] = (uint16_t)value;
     }
     if (!named[m->agent_id]) return fail(fault, STATUS_WRONG, "roster is no list with this agent on it.");
-    if (!json_bytes(j, member(j, root, "initial_data"), &m->initial_data))
+    if (!has_data)
         return fail(fault, STATUS_WRONG, "initial_data is no base64.");
     uint32_t network = member(j, root, "network"), events = member(j, root, "events");
     if (kind(j, network) != '{' || !mission_address(j, network, "address", &m->address)
@@ -659,6 +676,8 @@ static bool mission_read(Mission *m, Json *j, uint32_t root, Fault *fault) {
     at = member(j, root, "security");
     if (at != 0 && kind(j, at) != 'n' && kind(j, member(j, at, "bundle")) != '"')
         return fail(fault, STATUS_WRONG, "security is neither null nor an object with a bundle.");
+    if (is_sealed(&m->initial_data) && (at == 0 || kind(j, at) == 'n'))
+        return fail(fault, STATUS_WRONG, "A depot's key ends initial_data, and there is no security.");
     return mission_path(j, member(j, root, "store"), "store", &m->store, fault)
         && mission_path(j, member(j, at, "bundle"), "bundle", &m->bundle, fault);
 }

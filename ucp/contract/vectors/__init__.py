@@ -1,7 +1,7 @@
 """Test vectors of the agent contract. `python -m ucp.contract.vectors` writes the files.
 
-They cover hashes, messages, dropped datagrams, full blocks, secured datagrams (which need the extra `secure`), and
-whole missions in virtual time.
+They cover hashes, messages, dropped datagrams, full blocks, refused missions and requests, secured datagrams (which
+need the extra `secure`), and whole missions in virtual time.
 """
 
 import base64
@@ -10,7 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ucp.contract.vectors import _block_vectors, _hash_vectors, _message_vectors, _mission_vectors, drop_vectors
+from ucp.contract.vectors import (
+    _block_vectors,
+    _hash_vectors,
+    _message_vectors,
+    _mission_vectors,
+    drop_vectors,
+    refusal_vectors,
+)
 
 DIRECTORY = Path(__file__).parent
 
@@ -26,6 +33,7 @@ DOCUMENTS: dict[str, Callable[[], Any]] = {
     "messages": _message_vectors.vectors,
     "drops": drop_vectors.vectors,
     "blocks": _block_vectors.vectors,
+    "refusals": refusal_vectors.vectors,
     "secured": _secured,
 }
 """Name of a file -> what it has."""
