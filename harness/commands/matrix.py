@@ -15,11 +15,7 @@ from harness.run.variant_in_force import in_force
 from harness.sweep import matrix
 from harness.sweep.matrix import matrix_outputs, matrix_summary, matrix_table
 from harness.sweep.matrix import nights as nights_of_matrix
-<<<<<<< HEAD
-from harness.sweep.matrix.matrix_run import compare_with, on_cluster, on_cores
-=======
-from harness.sweep.matrix.matrix_run import Spread, compared, on_cluster, on_cores
->>>>>>> bcbc3e6d (Compare a protocol variant with the original in pairs of runs)
+from harness.sweep.matrix.matrix_run import Spread, compare_with, on_cluster, on_cores
 from harness.sweep.matrix.nights import load_baseline
 from harness.sweep.matrix.variant_comparison import compare_runs
 from ucp.agent_files import write_atomically, write_json_atomically

@@ -23,24 +23,11 @@ class Containers(Processes):
     )
 
     def refuse(self, scenario: Scenario) -> None:
-        from harness.play.containers._container_preflight import (
-<<<<<<< HEAD
-            check_debuggers,
-            check_docker,
-        )
-        from harness.play.process.process_preflight import refuse_what_programs_cannot
-
-        check_debuggers(scenario)
-=======
-            refuse_debuggers_that_are_not_in_the_image,
-            refuse_variants,
-            refuse_what_docker_cannot,
-        )
+        from harness.play.containers._container_preflight import check_debuggers, check_docker, refuse_variants
         from harness.play.process.process_preflight import refuse_what_programs_cannot
 
         refuse_variants()
-        refuse_debuggers_that_are_not_in_the_image(scenario)
->>>>>>> bcbc3e6d (Compare a protocol variant with the original in pairs of runs)
+        check_debuggers(scenario)
         refuse_what_programs_cannot(scenario)
         check_docker(scenario)
         self.agent_commands(scenario)

@@ -21,22 +21,17 @@ def check_docker(scenario: Scenario) -> None:
         engine.close()
 
 
-<<<<<<< HEAD
-def check_debuggers(scenario: Scenario) -> None:
-    """Raise DockerError if a vehicle's debugger is missing in its image.
-
-    The project's image has no debuggers. An image from the host has those in the shared directories.
-    """
-=======
 def refuse_variants() -> None:
     """Raises DockerError if a protocol variant is in use. The image has no file of the user."""
     if (variant := variant_in_use()) is not None:
         raise DockerError(f"--backend docker cannot play the variant {variant.name}: choose --backend process or sim")
 
 
-def refuse_debuggers_that_are_not_in_the_image(scenario: Scenario) -> None:
-    """Raises DockerError. Vehicles are in the project's image, which has none, or share this machine's directories."""
->>>>>>> bcbc3e6d (Compare a protocol variant with the original in pairs of runs)
+def check_debuggers(scenario: Scenario) -> None:
+    """Raise DockerError if a vehicle's debugger is missing in its image.
+
+    The project's image has no debuggers. An image from the host has those in the shared directories.
+    """
     setups = (scenario.vehicles.setup_of(vehicle) for vehicle in scenario.roster)
     for debugger in sorted({setup.debugger for setup in setups if setup.debugger is not None}):
         if not scenario.docker.image_from_host:
