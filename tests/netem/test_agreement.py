@@ -159,7 +159,7 @@ def assert_same_share(what: str, one: Sequence[bool], other: Sequence[bool]) -> 
     assert_no_more(what, other, one)
 
 
-def test_lots_without_a_memory(netem: str, tmp_path: Path) -> None:
+def test_independent_draws_agree(netem: str, tmp_path: Path) -> None:
     """Loss and duplicates together, corruption, overtaking, and delays of every shape."""
     links = {
         WITNESS: CONSTANT,
@@ -184,7 +184,7 @@ def test_lots_without_a_memory(netem: str, tmp_path: Path) -> None:
     in_lab([1, *links], netem, tmp_path, story)
 
 
-def test_bursts_and_each_direction_of_a_pair(netem: str, tmp_path: Path) -> None:
+def test_bursts_and_directions_of_a_pair_agree(netem: str, tmp_path: Path) -> None:
     links = {
         WITNESS: CONSTANT,
         3: LinkConditions(GilbertElliott(0.05, 0.25)),
@@ -209,7 +209,7 @@ def test_bursts_and_each_direction_of_a_pair(netem: str, tmp_path: Path) -> None
     in_lab(range(1, 6), netem, tmp_path, story)
 
 
-def test_rates_and_limits(netem: str, tmp_path: Path) -> None:
+def test_rates_and_limits_agree(netem: str, tmp_path: Path) -> None:
     each_s = 2.0 / PACKETS  # so long takes a packet at the rate
     rate = (DATA_BYTES + HEADERS) * 8 / each_s
     limit = 40

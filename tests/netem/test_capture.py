@@ -49,7 +49,7 @@ def with_checksums_anew(data: bytes) -> Ether:
     return frame
 
 
-def test_at_10_000_packets_a_second_every_frame_is_in_every_file(tmp_path: Path) -> None:
+def test_capture_at_10_000_packets_a_second_has_every_frame(tmp_path: Path) -> None:
     count = 5 * PACKETS
     vehicles = [1, 2, 300, 65535]
 
@@ -66,7 +66,7 @@ def test_at_10_000_packets_a_second_every_frame_is_in_every_file(tmp_path: Path)
         assert statistics(tmp_path / f"{vehicle}.pcapng") == {"received": 2 * count, "dropped": 0}
 
 
-def test_what_is_lost_or_cut_off_on_its_way_is_in_its_senders_file_alone(engine: str, tmp_path: Path) -> None:
+def test_lost_and_cut_frames_are_only_in_the_file_of_their_sender(engine: str, tmp_path: Path) -> None:
     async def story(air: Air, capture: LiveCapture) -> None:
         conditions = NetworkConditions(receivers={2: LinkConditions(0.3)}).with_partition([[4]])
         await air.lab.apply(conditions)
@@ -87,7 +87,7 @@ def test_what_is_lost_or_cut_off_on_its_way_is_in_its_senders_file_alone(engine:
     capture([1, 2, 3, 4], tmp_path, story, engine)
 
 
-def test_a_frame_is_there_as_often_and_as_late_as_its_receiver_got_it(netem: str, tmp_path: Path) -> None:
+def test_file_of_the_receiver_has_duplicates_and_delays(netem: str, tmp_path: Path) -> None:
     delay_s, count = 0.3, 200
 
     async def story(air: Air, capture: LiveCapture) -> None:
@@ -106,7 +106,7 @@ def test_a_frame_is_there_as_often_and_as_late_as_its_receiver_got_it(netem: str
     assert numbers(tmp_path, 1, outbound=True) == list(range(count))
 
 
-def test_frames_are_whole_with_their_checksums_and_vlan_tags(tmp_path: Path) -> None:
+def test_frames_are_complete_with_checksums_and_vlan_tags(tmp_path: Path) -> None:
     tagged = "8100600588b5"
 
     async def story(air: Air, capture: LiveCapture) -> None:
@@ -130,7 +130,7 @@ def test_frames_are_whole_with_their_checksums_and_vlan_tags(tmp_path: Path) -> 
     assert about == {"ucp_harness": 1, "vehicle": 7, "speedup": 20.0}
 
 
-def test_a_capture_that_cannot_keep_up_says_how_much_it_lacks(tmp_path: Path) -> None:
+def test_slow_capture_reports_the_number_of_missing_frames(tmp_path: Path) -> None:
     count = 15_000  # of the largest datagrams: more than a ring has room for
 
     async def story(air: Air, capture: LiveCapture) -> None:
@@ -147,7 +147,7 @@ def test_a_capture_that_cannot_keep_up_says_how_much_it_lacks(tmp_path: Path) ->
     capture([1, 2], tmp_path, story)
 
 
-def test_a_capture_that_ends_by_itself_is_an_error_and_leaves_what_it_had(tmp_path: Path) -> None:
+def test_capture_that_ends_early_is_an_error_and_keeps_its_frames(tmp_path: Path) -> None:
     async def story(air: Air, capture: LiveCapture) -> None:
         await air.broadcast(1, 100)
         watched = asyncio.create_task(capture.watch())
@@ -168,7 +168,7 @@ def test_a_capture_that_ends_by_itself_is_an_error_and_leaves_what_it_had(tmp_pa
     capture([1, 2], tmp_path, story)
 
 
-def test_a_capture_that_sees_its_end_before_its_beginning_has_every_frame(tmp_path: Path) -> None:
+def test_capture_that_gets_sigterm_first_has_every_frame(tmp_path: Path) -> None:
     async def story() -> None:
         async with await Lab.open([1, 2], log=tmp_path / "lab.log") as lab:
             capture = await LiveCapture.start(lab, tmp_path)
@@ -190,7 +190,7 @@ def test_a_capture_of_a_mission_that_never_began_leaves_no_files(tmp_path: Path)
     assert not list(tmp_path.glob("*.pcapng"))
 
 
-def test_a_lab_whose_ports_cannot_be_tapped_says_why(tmp_path: Path) -> None:
+def test_failed_start_of_a_capture_gives_the_reason(tmp_path: Path) -> None:
     async def story() -> None:
         async with await Lab.open([1, 2], log=tmp_path / "lab.log") as lab:
             lab.vehicles = (1, 2, 3)

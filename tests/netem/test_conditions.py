@@ -18,7 +18,7 @@ from netem.errors import ConditionsError, EngineError, NetemError
 
 
 @pytest.mark.parametrize("loss", [-0.1, 1.5, math.nan, math.inf, "0.1", None, True])
-def test_a_loss_that_is_no_probability_is_refused_with_the_value_and_what_is_allowed(loss: object) -> None:
+def test_invalid_probability_is_refused_with_the_allowed_values(loss: object) -> None:
     with pytest.raises(ConditionsError, match=r"^loss: .*allowed is .*0\.\.1") as caught:
         LinkConditions(loss=loss)  # type: ignore[arg-type]
     assert repr(loss) in str(caught.value)
@@ -26,7 +26,7 @@ def test_a_loss_that_is_no_probability_is_refused_with_the_value_and_what_is_all
     assert isinstance(caught.value, ValueError)
 
 
-def test_a_loss_in_percent_is_told_how_to_write_it() -> None:
+def test_loss_in_percent_is_refused_with_the_right_spelling() -> None:
     with pytest.raises(ConditionsError, match=r"for 15 % write 0\.15"):
         LinkConditions(loss=15)
 
@@ -74,13 +74,13 @@ def test_a_loss_in_percent_is_told_how_to_write_it() -> None:
         (lambda: LinkConditions.from_json({"delay": {"jitter_s": 1}}), r"^delay\.mean_s: is missing"),
     ],
 )
-def test_what_means_nothing_is_refused_with_the_key_the_value_and_what_is_allowed(make: Any, sentence: str) -> None:
+def test_invalid_value_is_refused_with_key_value_and_allowed_values(make: Any, sentence: str) -> None:
     with pytest.raises(ConditionsError, match=sentence) as caught:
         make()
     assert "\n" not in str(caught.value)
 
 
-def test_a_delay_of_nothing_is_none() -> None:
+def test_delay_of_zero_is_none() -> None:
     assert LinkConditions(delay=Delay(0)) == LinkConditions()
 
 
@@ -91,7 +91,7 @@ def test_the_mean_of_bursts_is_the_loss_in_the_long_run() -> None:
     assert GilbertElliott(0.1, 0).mean == 1
 
 
-def test_lossless_means_that_nothing_is_ever_lost() -> None:
+def test_lossless_link_never_loses_a_packet() -> None:
     late = LinkConditions(delay=Delay(0.1), duplicate=0.5, reorder=0.5)
     assert late.lossless
     assert NetworkConditions(late).fully_connected
@@ -105,13 +105,13 @@ def test_lossless_means_that_nothing_is_ever_lost() -> None:
     assert not LinkConditions(corrupt=0.1).lossless
 
 
-def test_a_link_remembers_where_packets_before_count() -> None:
+def test_link_with_memory_depends_on_earlier_packets() -> None:
     bursts = LinkConditions(GilbertElliott(0.1, 0.1))
     assert all(it.remembers for it in (bursts, LinkConditions(rate=1e6), LinkConditions(delay=Delay(1), limit=5)))
     assert not LinkConditions(0.1, Delay(0.1, 0.1), 0.1, 0.1, 0.1).remembers
 
 
-def test_at_speed_delays_shrink_rates_grow_and_nothing_else_changes() -> None:
+def test_at_speed_changes_only_delays_and_rates() -> None:
     link = LinkConditions(0.1, Delay(2, 1, "pareto"), 0.1, 0.2, 0.3, 1e6, 50)
     fast = LinkConditions(0.1, Delay(0.1, 0.05, "pareto"), 0.1, 0.2, 0.3, 2e7, 50)
     slow = NetworkConditions(link, {1: link}, {(1, 2): link}, ({3},))
@@ -120,7 +120,7 @@ def test_at_speed_delays_shrink_rates_grow_and_nothing_else_changes() -> None:
     assert NetworkConditions(LinkConditions(0.1)).at_speed(20) == NetworkConditions(LinkConditions(0.1))
 
 
-def test_a_link_comes_before_its_receiver_and_that_before_the_default() -> None:
+def test_link_overrides_receiver_and_receiver_overrides_default() -> None:
     conditions = NetworkConditions(
         LinkConditions(0.1), {2: LinkConditions(0.2)}, {(1, 2): LinkConditions(), (1, 3): LinkConditions(0.4)}
     )
@@ -131,7 +131,7 @@ def test_a_link_comes_before_its_receiver_and_that_before_the_default() -> None:
     assert conditions.link(2, 2).loss == 0.2
 
 
-def test_needs_name_what_goes_beyond_loss_and_partition_once_and_where() -> None:
+def test_needs_name_each_further_condition_once_with_its_place() -> None:
     assert NetworkConditions(LinkConditions(0.1), {1: LinkConditions(0.2)}, partition=({1},)).needs() == ()
     late = LinkConditions(delay=Delay(0.1), reorder=0.1)
     both = LinkConditions(GilbertElliott(0.1, 0.1), Delay(0.1), 0.1)
@@ -153,7 +153,7 @@ def test_needs_name_what_goes_beyond_loss_and_partition_once_and_where() -> None
     assert NetworkConditions(slow).needs() == ("corrupt", "rate", "limit")
 
 
-def test_links_differ_where_they_are_not_as_their_receiver_is() -> None:
+def test_differing_links_are_those_unlike_their_receiver() -> None:
     lossy = {pair: LinkConditions(0.2) for pair in ((1, 2), (1, 3), (2, 3))}
     assert [*NetworkConditions(receivers={2: LinkConditions(0.2)}, links=lossy).differing_links()] == [
         (1, 3, LinkConditions(0.2)),
@@ -182,9 +182,7 @@ class _Untouchable(Engine):
         (NetworkConditions(links={(1, 2): LinkConditions(rate=1e6)}), "not links 1>2 rate;"),
     ],
 )
-def test_an_engine_refuses_what_it_cannot_do_before_it_changes_anything(
-    conditions: NetworkConditions, need: str
-) -> None:
+def test_engine_refuses_unsupported_conditions_before_any_change(conditions: NetworkConditions, need: str) -> None:
     engine = _Untouchable(SimpleNamespace(vehicles=(1, 2)))  # type: ignore[arg-type]
     with pytest.raises(EngineError, match=f"^Engine untouchable .* {need} .*--backend sim"):
         engine.apply(conditions)
@@ -210,7 +208,7 @@ class _Forgetful(Engine):
         return Applied(self.name, {1: ReceiverFigures.of(held, (), 0, 0, 0)})
 
 
-def test_a_change_that_the_kernel_refuses_is_taken_back_and_the_error_says_so() -> None:
+def test_refused_change_is_undone_and_reported() -> None:
     engine = _Forgetful(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
     engine.apply(NetworkConditions(LinkConditions(0.1)))
     with pytest.raises(EngineError, match=r"^The kernel said no\. Asked: .*0\.9.*; in force again: .*0\.1"):
@@ -218,7 +216,7 @@ def test_a_change_that_the_kernel_refuses_is_taken_back_and_the_error_says_so() 
     assert engine.read().receivers[1].loss == 0.1
 
 
-def test_a_change_that_cannot_be_taken_back_is_told_with_what_is_in_force() -> None:
+def test_failed_undo_is_reported_with_the_conditions_in_force() -> None:
     engine = _Forgetful(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
     engine.apply(NetworkConditions(LinkConditions(0.1)))
     engine.stuck = True
@@ -241,7 +239,7 @@ def test_a_change_that_cannot_be_taken_back_is_told_with_what_is_in_force() -> N
         (LinkConditions(rate=1e6), LinkConditions(rate=1e6, limit=100), "limit"),
     ],
 )
-def test_what_is_held_is_what_was_asked_within_the_resolution(
+def test_state_of_the_kernel_is_compared_within_the_resolution(
     asked: LinkConditions, held: LinkConditions, differing: str | None
 ) -> None:
     engine = _Forgetful(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
@@ -293,7 +291,7 @@ def test_a_group_must_be_vehicle_ids(group: list[object]) -> None:
         NetworkConditions().with_partition([group])  # type: ignore[list-item]
 
 
-def test_unknown_vehicles_are_refused_with_the_key_and_who_exists() -> None:
+def test_unknown_vehicles_are_refused_with_key_and_known_vehicles() -> None:
     with pytest.raises(ConditionsError, match=r"partition\[0\]: unknown vehicle 9; .* 1, 2"):
         NetworkConditions().with_partition([[1, 9]]).validate([1, 2])
     with pytest.raises(ConditionsError, match="receivers: unknown vehicles 7, 8"):
@@ -302,7 +300,7 @@ def test_unknown_vehicles_are_refused_with_the_key_and_who_exists() -> None:
         NetworkConditions(links={(1, 7): LinkConditions(), (8, 1): LinkConditions()}).validate([1, 2])
 
 
-def test_what_a_caller_changes_later_does_not_change_the_value() -> None:
+def test_later_changes_by_the_caller_do_not_change_the_value() -> None:
     receivers = {1: LinkConditions(0.5)}
     conditions = NetworkConditions(receivers=receivers)
     receivers[1] = LinkConditions(0.9)
@@ -314,7 +312,7 @@ def test_an_unknown_key_is_refused() -> None:
         NetworkConditions.from_json({"default": {"los": 0.1}})
 
 
-def test_the_json_of_a_plain_loss_is_as_it_always_was() -> None:
+def test_json_of_a_plain_loss_has_one_key() -> None:
     assert LinkConditions(0.1).to_json() == {"loss": 0.1}
     old = {"default": {"loss": 0.1}, "receivers": {"2": {"loss": 0.5}}, "partition": [[1]]}
     assert NetworkConditions.from_json(old) == NetworkConditions(
@@ -342,7 +340,7 @@ _pairs = st.tuples(_vehicles, _vehicles).filter(lambda pair: pair[0] != pair[1])
     st.dictionaries(_pairs, _links, max_size=4),
     st.lists(st.integers(1, 9), unique=True).map(lambda ids: tuple(frozenset([i]) for i in ids)),
 )
-def test_json_brings_the_same_conditions_back(
+def test_json_round_trip_keeps_the_conditions(
     default: LinkConditions,
     receivers: dict[int, LinkConditions],
     links: dict[tuple[int, int], LinkConditions],

@@ -51,7 +51,7 @@ async def deliveries(air: Air, sender: int, receivers: Sequence[int], count: int
     return {vehicle: set(result["numbers"]) for vehicle, result in heard.items()}
 
 
-def test_without_conditions_every_broadcast_reaches_everybody(engine: str, tmp_path: Path) -> None:
+def test_broadcasts_without_conditions_reach_all_vehicles(engine: str, tmp_path: Path) -> None:
     async def story(air: Air) -> None:
         got = await deliveries(air, 1, [2, 300, 65535], 200)
         assert got == {vehicle: set(range(200)) for vehicle in (2, 300, 65535)}
@@ -59,7 +59,7 @@ def test_without_conditions_every_broadcast_reaches_everybody(engine: str, tmp_p
     in_lab([1, 2, 300, 65535], engine, tmp_path, story)
 
 
-def test_loss_is_what_was_asked_per_receiver_and_drawn_independently(engine: str, tmp_path: Path) -> None:
+def test_loss_per_receiver_is_as_requested_and_independent(engine: str, tmp_path: Path) -> None:
     asked = {2: 0.15, 3: 0.15, 4: 0.5, 5: 0.0, 6: 1.0}
 
     async def story(air: Air) -> None:
@@ -272,7 +272,7 @@ def test_an_unknown_vehicle_is_refused_and_the_old_conditions_stay(engine: str, 
 
 
 @pytest.mark.parametrize("tiny", [1e-12, 1 - 1e-12])
-def test_a_loss_that_is_neither_none_nor_all_never_becomes_it(engine: str, tmp_path: Path, tiny: float) -> None:
+def test_loss_between_0_and_1_is_not_rounded_to_0_or_1(engine: str, tmp_path: Path, tiny: float) -> None:
     async def story(air: Air) -> None:
         applied = await air.lab.apply(loss(tiny))
         assert applied.receivers[1].loss == pytest.approx(tiny, abs=1e-9)

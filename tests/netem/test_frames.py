@@ -10,7 +10,7 @@ from netem.frames import udp_broadcast
 
 
 @given(vehicle=st.integers(addresses.MIN_ID, addresses.MAX_ID), data=st.binary(max_size=1472))
-def test_a_broadcast_is_what_its_headers_say_and_its_checksums_are_right(vehicle: int, data: bytes) -> None:
+def test_broadcast_frame_has_correct_headers_and_checksums(vehicle: int, data: bytes) -> None:
     own, everyone = addresses.address(vehicle), addresses.BROADCAST
     wanted = (
         Ether(dst="ff:ff:ff:ff:ff:ff", src=addresses.mac(vehicle))
@@ -21,7 +21,7 @@ def test_a_broadcast_is_what_its_headers_say_and_its_checksums_are_right(vehicle
     assert udp_broadcast(vehicle, 14600, data) == bytes(wanted)
 
 
-def test_a_checksum_that_is_0_is_written_as_all_ones_in_udp_alone() -> None:
+def test_checksum_0_becomes_all_ones_only_in_udp() -> None:
     """There 0 means that there is none (RFC 768)."""
     udp = {udp_broadcast(1, 14600, word.to_bytes(2, "big"))[40:42] for word in range(0x10000)}
     ip = {udp_broadcast(vehicle, 14600, b"")[24:26] for vehicle in range(1, 0x10000)}

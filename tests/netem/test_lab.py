@@ -53,7 +53,7 @@ def test_a_vehicle_has_its_address_a_broadcast_address_and_a_default_route(tmp_p
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may enter a network that somebody else made")
-def test_a_cable_can_end_in_a_network_that_is_there_already(tmp_path: Path) -> None:
+def test_cable_can_end_in_an_existing_network(tmp_path: Path) -> None:
     """Whoever lives there is on the air, under its conditions; when the lab is gone they have what they had."""
     neighbour = subprocess.Popen(["unshare", "--net", "sleep", "60"])
     network = Path(f"/proc/{neighbour.pid}/ns/net")
@@ -148,7 +148,7 @@ def test_output_is_appended_to_what_was_there(tmp_path: Path) -> None:
     in_lab(tmp_path, story)
 
 
-def test_the_end_of_a_program_is_told_as_it_was(tmp_path: Path) -> None:
+def test_end_of_a_program_is_reported_correctly(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         failing = await start(lab, tmp_path, 1, "/bin/sh", "-c", "exit 7")
         endless = await start(lab, tmp_path, 2, "/bin/sleep", "1000")
@@ -162,7 +162,7 @@ def test_the_end_of_a_program_is_told_as_it_was(tmp_path: Path) -> None:
     in_lab(tmp_path, story)
 
 
-def test_many_programs_that_end_at_once_are_all_told(tmp_path: Path) -> None:
+def test_simultaneous_ends_of_programs_are_all_reported(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         processes = [await start(lab, tmp_path, 1, "/bin/true") for _ in range(50)]
         assert await asyncio.gather(*(process.wait() for process in processes)) == [0] * 50
@@ -170,7 +170,7 @@ def test_many_programs_that_end_at_once_are_all_told(tmp_path: Path) -> None:
     in_lab(tmp_path, story)
 
 
-def test_terminate_kills_what_does_not_obey_even_if_it_is_stopped(tmp_path: Path) -> None:
+def test_terminate_kills_a_program_that_ignores_sigterm_or_is_stopped(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         stubborn = await start(lab, tmp_path, 1, "/bin/sh", "-c", "trap '' TERM; echo on; while :; do sleep 1; done")
         await until(lambda: "on" in (tmp_path / "out").read_text(), "the trap is set")
@@ -182,7 +182,7 @@ def test_terminate_kills_what_does_not_obey_even_if_it_is_stopped(tmp_path: Path
     in_lab(tmp_path, story)
 
 
-def test_a_signal_reaches_the_whole_family_of_a_program(tmp_path: Path) -> None:
+def test_signal_reaches_the_process_group_of_a_program(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         family = await start(lab, tmp_path, 1, "/bin/sh", "-c", "sleep 1000 & echo $!; wait")
         await until(lambda: (tmp_path / "out").exists() and (tmp_path / "out").read_text(), "the child runs")
@@ -228,7 +228,7 @@ def test_a_connection_is_made_inside_the_vehicle(tmp_path: Path) -> None:
     in_lab(tmp_path, story)
 
 
-def test_a_connection_to_nobody_times_out_and_stalls_nobody(tmp_path: Path) -> None:
+def test_connection_without_listener_times_out_and_delays_no_other(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         # Loss of everything: not even the ARP answer comes, so connecting hangs.
         await lab.apply(NetworkConditions().with_partition([[1]]))
@@ -241,7 +241,7 @@ def test_a_connection_to_nobody_times_out_and_stalls_nobody(tmp_path: Path) -> N
     in_lab(tmp_path, story)
 
 
-def test_who_is_not_in_the_lab_is_refused_by_name(tmp_path: Path) -> None:
+def test_unknown_vehicle_is_refused_by_name(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         with pytest.raises(LabError, match="vehicle: the lab has no vehicle 9; use one of 1, 2"):
             await start(lab, tmp_path, 9, "/bin/true")
@@ -285,7 +285,7 @@ def test_closing_ends_every_program_and_may_be_repeated(tmp_path: Path) -> None:
     in_lab(tmp_path, story)
 
 
-def test_several_labs_run_at_once_and_do_not_hear_each_other(tmp_path: Path) -> None:
+def test_simultaneous_labs_do_not_receive_each_other(tmp_path: Path) -> None:
     async def run() -> None:
         folders = [tmp_path / name for name in "ab"]
         for folder in folders:
@@ -338,7 +338,7 @@ async def _until_dead(lab: Lab) -> None:
         ("open", {"vehicles": [1], "engine": None}),
     ],
 )
-def test_a_request_that_makes_no_sense_is_answered_and_survived(
+def test_invalid_request_gets_an_error_and_the_lab_survives(
     tmp_path: Path, request_: str, arguments: dict[str, object]
 ) -> None:
     async def story(lab: Lab) -> None:
@@ -353,5 +353,5 @@ def test_a_request_that_makes_no_sense_is_answered_and_survived(
     in_lab(tmp_path, story)
 
 
-def test_an_end_in_words() -> None:
+def test_in_words_names_signal_or_status() -> None:
     assert [in_words(returncode) for returncode in (0, 3, -9, -40)] == ["status 0", "status 3", "SIGKILL", "signal 40"]

@@ -103,9 +103,7 @@ def namespaces_of(pids: set[int]) -> set[str]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_a_full_lab_is_gone_after_its_orchestrator_even_if_it_is_stopped_itself(
-    tmp_path: Path, number: signal.Signals
-) -> None:
+def test_stopped_lab_with_programs_is_removed_after_its_orchestrator(tmp_path: Path, number: signal.Signals) -> None:
     with orchestrator_in(tmp_path) as orchestrator:
         assert orchestrator.stdout is not None
         while orchestrator.stdout.readline() != b"full\n":
@@ -136,7 +134,7 @@ def test_a_closed_lab_leaves_nothing(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"lab.log", "o"}
 
 
-def test_a_lab_that_is_given_up_while_it_opens_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cancelled_opening_of_a_lab_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UCP_TEST_MARK", str(tmp_path))
 
     async def run() -> None:

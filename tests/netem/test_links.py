@@ -55,7 +55,7 @@ def to_each(links: dict[int, LinkConditions]) -> NetworkConditions:
     return NetworkConditions(receivers=links)
 
 
-def test_delays_have_the_mean_the_deviation_and_the_shape_that_were_asked(netem: str, tmp_path: Path) -> None:
+def test_delays_have_the_requested_mean_deviation_and_shape(netem: str, tmp_path: Path) -> None:
     shapes: dict[int, Delay] = {2: Delay(0.05)}
     shapes |= {3 + i: Delay(0.1, 0.02, shape) for i, shape in enumerate(get_args(Distribution))}
 
@@ -93,7 +93,7 @@ def skewness(values: list[float]) -> float:
     return statistics.fmean(((value - mean) / deviation) ** 3 for value in values)
 
 
-def test_bursts_come_and_go_as_asked_and_each_link_has_its_own(netem: str, tmp_path: Path) -> None:
+def test_bursts_are_as_requested_and_independent_between_links(netem: str, tmp_path: Path) -> None:
     bursts = GilbertElliott(0.05, 0.25)
     soft = GilbertElliott(0.2, 0.2, loss_bad=0.9, loss_good=0.1)
 
@@ -114,7 +114,7 @@ def test_bursts_come_and_go_as_asked_and_each_link_has_its_own(netem: str, tmp_p
     in_lab(range(1, 5), netem, tmp_path, story)
 
 
-def test_packets_come_twice_overtake_and_break_as_often_as_asked(netem: str, tmp_path: Path) -> None:
+def test_shares_of_duplicates_reorders_and_corruptions_are_as_requested(netem: str, tmp_path: Path) -> None:
     size = 1000
 
     async def story(air: Air) -> None:
@@ -141,7 +141,7 @@ def test_packets_come_twice_overtake_and_break_as_often_as_asked(netem: str, tmp
     in_lab(range(1, 5), netem, tmp_path, story)
 
 
-def test_a_rate_holds_each_sender_for_itself_and_a_limit_loses_what_does_not_fit(netem: str, tmp_path: Path) -> None:
+def test_rate_applies_per_sender_and_limit_loses_excess_packets(netem: str, tmp_path: Path) -> None:
     size, count, rate, limit = 1000, 250, 2e6, 40
     each_s = (size + HEADERS) * 8 / rate
 
@@ -166,7 +166,7 @@ def test_a_rate_holds_each_sender_for_itself_and_a_limit_loses_what_does_not_fit
     in_lab(range(1, 5), netem, tmp_path, story)
 
 
-def test_a_change_loses_nothing_that_is_under_way(netem: str, tmp_path: Path) -> None:
+def test_change_loses_no_packet_on_its_way(netem: str, tmp_path: Path) -> None:
     slow = LinkConditions(delay=Delay(2.0))
 
     async def story(air: Air) -> None:
@@ -193,7 +193,7 @@ def test_a_change_loses_nothing_that_is_under_way(netem: str, tmp_path: Path) ->
     in_lab(range(1, 4), netem, tmp_path, story)
 
 
-def test_the_kernel_holds_whatever_is_asked_of_any_pair(netem: str, tmp_path: Path) -> None:
+def test_kernel_applies_any_conditions_of_any_pair(netem: str, tmp_path: Path) -> None:
     random = Random(7)
 
     def anything() -> LinkConditions:
@@ -226,7 +226,7 @@ def test_the_kernel_holds_whatever_is_asked_of_any_pair(netem: str, tmp_path: Pa
     in_lab(range(1, 6), netem, tmp_path, story)
 
 
-def test_what_the_kernel_does_not_take_leaves_the_conditions_before_in_force(netem: str, tmp_path: Path) -> None:
+def test_refused_change_leaves_the_previous_conditions_in_force(netem: str, tmp_path: Path) -> None:
     good = NetworkConditions(LinkConditions(0.1), links={(1, 2): LinkConditions(0.2, Delay(0.1))}).with_partition([[3]])
     # A jitter has 31 bits of nanoseconds in the kernel, which takes more and holds less.
     far = NetworkConditions(LinkConditions(0.5), {2: LinkConditions(delay=Delay(10, 5))})
@@ -243,7 +243,7 @@ def test_what_the_kernel_does_not_take_leaves_the_conditions_before_in_force(net
     in_lab([1, 2, 3], netem, tmp_path, story)
 
 
-def test_a_kernel_that_wants_duplicates_alone_says_so_and_changes_nothing(netem: str, tmp_path: Path) -> None:
+def test_kernel_without_mixed_duplicates_refuses_and_changes_nothing(netem: str, tmp_path: Path) -> None:
     twice = LinkConditions(duplicate=0.5)
 
     async def story(air: Air) -> None:
@@ -264,7 +264,7 @@ def test_a_kernel_that_wants_duplicates_alone_says_so_and_changes_nothing(netem:
     in_lab([1, 2, 3], netem, tmp_path, story)
 
 
-def test_what_some_kernels_with_netem_refuse_is_found_before_anything_starts(netem: str) -> None:
+def test_preflight_finds_conditions_that_some_kernels_refuse(netem: str) -> None:
     def scenario(jitter_s: float) -> Scenario:
         ramp = {"at_s": 60, "loss": 0.1}
         delay = {"mean_s": 6, "jitter_s": jitter_s, "distribution": "normal"}
@@ -280,7 +280,7 @@ def test_what_some_kernels_with_netem_refuse_is_found_before_anything_starts(net
         refuse_what_this_machine_cannot(scenario(5.0))
 
 
-def test_flight_makes_links_differ_which_is_rehearsed_too(netem: str, tmp_path: Path) -> None:
+def test_preflight_tests_links_that_differ_because_of_flight(netem: str, tmp_path: Path) -> None:
     twice = LinkConditions(duplicate=0.5)
     refused: list[EngineError] = []
 
@@ -296,7 +296,7 @@ def test_flight_makes_links_differ_which_is_rehearsed_too(netem: str, tmp_path: 
         refuse_what_this_machine_cannot(Scenario.model_validate(flying))
 
 
-def test_what_an_engine_cannot_do_is_refused_before_anything_starts_with_the_way_out(tmp_path: Path) -> None:
+def test_preflight_refuses_unsupported_conditions_with_the_remedy(tmp_path: Path) -> None:
     needs = NetworkConditions(LinkConditions(delay=Delay(1)), {2: LinkConditions(corrupt=0.1)}).needs()
 
     async def story() -> None:

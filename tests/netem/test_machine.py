@@ -73,7 +73,7 @@ _STORY = """
 
 
 @pytest.mark.lab
-def test_an_ordinary_user_gets_a_lab_without_any_right() -> None:
+def test_ordinary_user_can_open_a_lab() -> None:
     done = run_script(_STORY)
     user = os.geteuid() or pwd.getpwnam("nobody").pw_uid
     assert done.stdout.splitlines() == [f"{user} 0.25 (2,)", f"0 {user}"], done.stderr
@@ -97,7 +97,7 @@ _EXPECT_REFUSAL = """
 
 
 @pytest.mark.lab
-def test_where_user_namespaces_are_forbidden_the_refusal_says_so_and_what_to_do() -> None:
+def test_forbidden_user_namespaces_are_reported_with_the_remedy() -> None:
     # A user namespace may forbid further ones inside it, as an administrator does for a machine. Root's
     # rights are taken away too, for root needs no user namespace.
     done = run_script(
@@ -130,7 +130,7 @@ _INTERPRETER_OUT_OF_REACH = """
 
 
 @pytest.mark.lab
-def test_an_interpreter_that_a_user_cannot_reach_is_named_and_nothing_else_is_blamed() -> None:
+def test_unreachable_interpreter_is_named_as_the_only_cause() -> None:
     done = run_script(_INTERPRETER_OUT_OF_REACH)
     said, findings = done.stdout.splitlines()
     user = pwd.getpwuid(os.geteuid() or pwd.getpwnam("nobody").pw_uid).pw_name
@@ -155,7 +155,7 @@ def test_a_program_that_a_user_cannot_execute_is_named_with_the_user() -> None:
         ("kernel/apparmor_restrict_unprivileged_userns", 1, "kernel.apparmor_restrict_unprivileged_userns=0"),
     ],
 )
-def test_each_way_to_forbid_namespaces_has_its_own_way_out(
+def test_each_restriction_of_namespaces_has_its_own_remedy(
     monkeypatch: pytest.MonkeyPatch, name: str, value: int, expected: str
 ) -> None:
     monkeypatch.setattr(_namespaces, "_sysctl", lambda asked: value if asked == name else None)
@@ -170,7 +170,7 @@ def test_a_missing_tool_is_named_with_its_package(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.lab
-def test_an_engine_that_the_kernel_lacks_is_refused_with_the_way_out() -> None:
+def test_missing_engine_is_refused_with_the_remedy() -> None:
     for engine in ("netem", "nftables"):
         if (error := unavailable(engine)) is not None:
             assert error.stage == "engine"

@@ -57,7 +57,7 @@ def test_a_mean_and_a_deviation_have_normal_intervals() -> None:
     assert normal.high - normal.low == pytest.approx(2 * Z * 2 / math.sqrt(2 * 20_000), rel=0.05)
 
 
-def test_the_interval_of_losses_in_bursts_knows_that_they_come_together() -> None:
+def test_interval_of_burst_losses_accounts_for_correlation() -> None:
     bursts, count = GilbertElliott(0.05, 0.25), 2000
     random = Random(2)
     outside = {"chain": 0, "independent": 0, "length": 0}
@@ -80,13 +80,13 @@ def test_the_interval_of_losses_in_bursts_knows_that_they_come_together() -> Non
     assert outside["independent"] > 20
 
 
-def test_bursts_are_counted_whole() -> None:
+def test_unfinished_burst_is_not_counted() -> None:
     gone = {2, 3, 4, 7, 9, 10, 17, 18, 19}
     one = received([(number, 0.0) for number in range(20) if number not in gone], [0.0] * 20)
     assert estimates.burst_length(one).measured == 2.0  # 3, 1 and 2: the last one goes on
 
 
-def test_delays_are_measured_without_what_the_machine_takes_itself() -> None:
+def test_delay_excludes_the_lateness_of_the_machine() -> None:
     way_s = [0.001, 0.004] * 50
     sent_s = [float(number) for number in range(100)]
     arrivals = [(number, sent_s[number] + 0.1 + way_s[number]) for number in range(100)]
@@ -101,7 +101,7 @@ def test_delays_are_measured_without_what_the_machine_takes_itself() -> None:
     assert deviation.low == pytest.approx(math.sqrt(0.01**2 - 0.002**2))  # timers may have added theirs
 
 
-def test_a_rate_is_measured_while_packets_wait_for_each_other() -> None:
+def test_rate_is_measured_in_the_longest_queue() -> None:
     # Five that queue for 10 ms each; a pause; and two more.
     sent_s = [0.0, 0.001, 0.002, 0.003, 0.004, 1.0, 1.001]
     at_s = [0.01, 0.02, 0.03, 0.04, 0.05, 1.01, 1.02]
@@ -112,7 +112,7 @@ def test_a_rate_is_measured_while_packets_wait_for_each_other() -> None:
     assert (found.low, found.high) == pytest.approx((4000 / 0.044, 4000 / 0.036))
 
 
-def test_a_limit_is_what_waits_when_a_packet_is_lost() -> None:
+def test_limit_is_the_number_waiting_at_a_loss() -> None:
     sent_s = [number * 0.01 for number in range(100)]
     received_packets: list[tuple[int, float]] = []
     for number, now in enumerate(sent_s):  # each waits 95 ms; three may
@@ -152,7 +152,7 @@ def losing(*shares: float) -> tuple[list[tuple[Study, int]], EngineMeasurement]:
     return asked, measure("test", [study], observe, 1000)
 
 
-def test_what_lies_outside_is_asked_once_more_and_both_answers_are_kept() -> None:
+def test_answer_outside_is_measured_again_and_both_are_kept() -> None:
     asked, measured = losing(0.3, 0.15)
     assert [[question.receiver for question in study.questions] for study, _ in asked] == [[4, 5], [4]]
     assert asked[1][0].conditions == asked[0][0].conditions
@@ -165,14 +165,14 @@ def test_what_lies_outside_is_asked_once_more_and_both_answers_are_kept() -> Non
     assert (as_json["ok"], as_json["measured"], as_json["before"]["measured"]) == (True, 0.15, 0.3)
 
 
-def test_what_lies_outside_twice_is_not_ok() -> None:
+def test_answer_outside_twice_is_not_ok() -> None:
     asked, measured = losing(0.3, 0.3)
     assert len(asked) == 2
     assert [row.ok for row in measured.rows] == [False, True]
     assert not measured.ok
 
 
-def test_in_virtual_time_everything_is_as_asked() -> None:
+def test_all_answers_in_virtual_time_are_ok() -> None:
     measured = measure("medium", studies("medium"), in_medium(seed=5))
     assert [row for row in measured.rows if not row.ok] == []
     quantities = {row.question.condition.split()[0] for row in measured.rows}
@@ -197,7 +197,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("condition", WRONG)
-def test_whatever_is_wrong_is_found(condition: str) -> None:
+def test_wrong_conditions_are_found(condition: str) -> None:
     everything = [question for study in studies("medium") for question in study.questions]
     questions = tuple(replace(question, receiver=4) for question in everything if question.condition == condition)
     wrong = NetworkConditions(receivers={4: WRONG[condition]})
@@ -208,7 +208,7 @@ def test_whatever_is_wrong_is_found(condition: str) -> None:
 
 
 @pytest.mark.lab
-def test_real_packets_fare_as_asked(engine: EngineName) -> None:
+def test_answers_with_real_packets_are_ok(engine: EngineName) -> None:
     for _ in range(2):  # a machine that was busy for a while is not an engine that is wrong
         measured = measure(engine, studies(engine), in_lab(engine))
         if measured.ok:
@@ -219,7 +219,7 @@ def test_real_packets_fare_as_asked(engine: EngineName) -> None:
 
 
 @pytest.mark.lab
-def test_a_network_that_loses_more_than_asked_is_found(engine: EngineName) -> None:
+def test_network_with_excessive_loss_is_found(engine: EngineName) -> None:
     study = replace(one_question(0.15), conditions=NetworkConditions(LinkConditions(0.2), {3: LinkConditions()}))
     (row,) = measure(engine, [study], in_lab(engine), SOME).rows
     assert not row.ok
@@ -227,7 +227,7 @@ def test_a_network_that_loses_more_than_asked_is_found(engine: EngineName) -> No
 
 
 @pytest.mark.lab
-def test_a_network_that_delays_longer_than_asked_is_found(netem: EngineName) -> None:
+def test_network_with_excessive_delay_is_found(netem: EngineName) -> None:
     question = Question(1, 4, "delay 100 ms", "mean", 0.1, estimates.delay_mean)
     study = Study(NetworkConditions(receivers={4: LinkConditions(delay=Delay(0.11))}), (question,))
     (row,) = measure(netem, [study], in_lab(netem), SOME).rows
@@ -236,7 +236,7 @@ def test_a_network_that_delays_longer_than_asked_is_found(netem: EngineName) -> 
 
 
 @pytest.mark.lab
-def test_a_receiver_says_how_many_packets_it_had_no_room_for(tmp_path: Path) -> None:
+def test_receiver_reports_overflows_of_its_buffer(tmp_path: Path) -> None:
     require(None)
     count = 15_000
 
@@ -254,7 +254,7 @@ def test_a_receiver_says_how_many_packets_it_had_no_room_for(tmp_path: Path) -> 
     play(story())
 
 
-def test_packets_that_the_machine_lost_are_an_error_unless_corruption_hides_them() -> None:
+def test_loss_by_the_machine_is_an_error_unless_corruption_hides_it() -> None:
     study = one_question(0.15)
     one, two = (Applied("test", {4: ReceiverFigures.of({}, (), passed, 0, 0)}) for passed in (1, 2))
     received_packets = {(1, 4): [Arrival(0, 0.0, 0.1)]}

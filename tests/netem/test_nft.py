@@ -37,14 +37,14 @@ def every_link() -> NetworkConditions:
     return NetworkConditions(links={pair: LinkConditions(loss=(n + 1) / 1000) for n, pair in enumerate(pairs)})
 
 
-def test_what_is_too_long_for_one_transaction_goes_in_several() -> None:
+def test_long_change_is_split_into_several_transactions() -> None:
     engine = Narrow()
     engine.change(every_link())
     assert len(engine.sent) > 3
     assert sum(engine.sent) > 3000
 
 
-def test_after_half_a_change_undoing_it_sets_every_loss_again() -> None:
+def test_undo_of_a_partial_change_sets_all_losses_again() -> None:
     engine = Narrow()
     engine.lasts = 2
     with pytest.raises(EngineError, match="no more memory"):

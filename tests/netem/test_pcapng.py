@@ -29,7 +29,7 @@ def written(folder: Path) -> Path:
     return path
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_written_packets_are_read_again(tmp_path: Path) -> None:
     path = written(tmp_path)
     assert frames(path) == FRAMES
     assert comment(path) == {"ucp_harness": 1, "vehicle": 7, "epoch_us": EPOCH_US, "speedup": 20.0}
@@ -37,7 +37,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert [bytes(packet) for packet in rdpcap(str(path))] == [frame.data for frame in FRAMES]
 
 
-def test_of_a_file_that_was_cut_off_every_whole_packet_is_read(tmp_path: Path) -> None:
+def test_truncated_file_has_every_complete_packet(tmp_path: Path) -> None:
     path = written(tmp_path)
     whole = path.read_bytes()
     lengths = []
@@ -61,7 +61,7 @@ def full_after(limit: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_where_there_is_no_more_room_a_file_ends_with_a_whole_packet(tmp_path: Path) -> None:
+def test_full_disk_leaves_a_file_with_complete_packets(tmp_path: Path) -> None:
     path = begin_file(tmp_path, 7, EPOCH_US, 20)
     file = PcapngFile(path)
     file.packet(FRAMES[0].at_ns, FRAMES[0].data, outbound=FRAMES[0].outbound)
@@ -76,7 +76,7 @@ def test_where_there_is_no_more_room_a_file_ends_with_a_whole_packet(tmp_path: P
     assert frames(path) == FRAMES[:1]
 
 
-def test_wireshark_reads_it(tmp_path: Path) -> None:
+def test_wireshark_reads_the_file(tmp_path: Path) -> None:
     fields = ["frame.time_epoch", "frame.packet_flags_direction", "frame.interface_name", "frame.len"]
     shown = [part for field in fields for part in ("-e", field)]
     argv = [require_tshark(), "-r", str(written(tmp_path)), "-T", "fields", *shown]

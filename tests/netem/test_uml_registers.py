@@ -56,7 +56,7 @@ def test_threads_children_and_signals_leave_registers_alone(
 
 @pytest.mark.uml
 @pytest.mark.any_user
-def test_hashes_copies_and_floats_come_out_as_on_the_host(guest: None, capfd: pytest.CaptureFixture[str]) -> None:
+def test_hashes_copies_and_floats_equal_those_of_the_host(guest: None, capfd: pytest.CaptureFixture[str]) -> None:
     argv = [sys.executable, str(PROGRAMS / "work.py")]
     here = subprocess.run(argv, capture_output=True, text=True, check=True).stdout
     assert run("timeout", "60", *argv) == 0
@@ -65,7 +65,7 @@ def test_hashes_copies_and_floats_come_out_as_on_the_host(guest: None, capfd: py
 
 @pytest.mark.uml
 @pytest.mark.any_user
-def test_registers_that_are_lost_are_noticed(
+def test_lost_registers_are_detected(
     check: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv(_uml_registers.FORCE, "1")
@@ -106,7 +106,7 @@ def test_a_missing_compiler_is_named_where_it_is_needed(tmp_path: Path, monkeypa
         uml.find()
 
 
-def test_a_compiler_that_fails_is_an_error_with_its_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_compiler_is_an_error_with_its_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiler = tmp_path / "cc"
     compiler.write_text("#!/bin/sh\necho 'as: not found' >&2\nexit 1\n")
     compiler.chmod(0o755)

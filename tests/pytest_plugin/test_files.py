@@ -138,7 +138,7 @@ def test_other_yaml_files_in_the_tree_are_left_alone(pytester: pytest.Pytester) 
     assert "warning" not in result.stdout.str()
 
 
-def test_a_scenario_that_is_no_yaml_is_one_sentence(pytester: pytest.Pytester) -> None:
+def test_invalid_yaml_is_reported_in_one_sentence(pytester: pytest.Pytester) -> None:
     (pytester.path / "s.yaml").write_text("name: x\nexpect: {seeds: [1}\n")
     result = run(pytester, "s.yaml")
     result.assert_outcomes(errors=1)
@@ -146,7 +146,7 @@ def test_a_scenario_that_is_no_yaml_is_one_sentence(pytester: pytest.Pytester) -
     no_internals(result)
 
 
-def test_run_directories_are_kept_where_asked_for_and_never_overwritten(pytester: pytest.Pytester) -> None:
+def test_run_directories_are_kept_in_the_given_place_and_not_overwritten(pytester: pytest.Pytester) -> None:
     write_scenario(pytester, "s.yaml", expect={})
     for _ in range(2):
         run(pytester, "s.yaml", "--ucp-keep", "kept", "--ucp-speedup", 7).assert_outcomes(passed=1)
@@ -164,7 +164,7 @@ def test_run_directories_are_kept_where_asked_for_and_never_overwritten(pytester
         ("--ucp-seed", -1, "--ucp-seed is -1: use a number from 0 on"),
     ],
 )
-def test_an_option_that_means_nothing_is_one_sentence(
+def test_invalid_option_is_reported_in_one_sentence(
     pytester: pytest.Pytester, option: str, value: int, sentence: str
 ) -> None:
     write_scenario(pytester, "s.yaml", expect={})
@@ -174,7 +174,7 @@ def test_an_option_that_means_nothing_is_one_sentence(
     no_internals(result)
 
 
-def test_a_failed_test_says_who_ran_what_where_not_all_ran_ours(pytester: pytest.Pytester) -> None:
+def test_failed_test_names_the_programs_of_foreign_agents(pytester: pytest.Pytester) -> None:
     write_scenario(pytester, "mixed.yaml", expect={"figures": {"blocks": 999}})
     agent = f"2={shlex.quote(sys.executable)} -P -m ucp.node"
     result = run(pytester, "mixed.yaml", "--ucp-agent", agent)

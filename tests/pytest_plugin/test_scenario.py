@@ -7,7 +7,7 @@ from tests.pytest_plugin.inner import no_internals, report, run, run_directories
 pytest_plugins = "pytester"
 
 
-def test_a_test_sees_what_came_of_the_scenario_that_its_marker_names(pytester: pytest.Pytester) -> None:
+def test_fixture_provides_the_findings_of_the_marked_scenario(pytester: pytest.Pytester) -> None:
     pytester.mkpydir("deep")
     write_scenario(pytester, "deep/lossy.yaml", network={"loss": 0.1}, duration_s=300, final_reconcile=True)
     (pytester.path / "deep" / "test_deep.py").write_text(
@@ -22,7 +22,7 @@ def test_a_test_sees_what_came_of_the_scenario_that_its_marker_names(pytester: p
     assert not run_directories(pytester)
 
 
-def test_what_the_scenario_expects_is_judged_with_the_test(pytester: pytest.Pytester) -> None:
+def test_expectations_of_the_scenario_are_judged_with_the_test(pytester: pytest.Pytester) -> None:
     write_scenario(pytester, "s.yaml", expect={"figures": {"blocks": {"min": 1000}, "distinct_chains": 2, "agents": 3}})
     pytester.makepyfile('import pytest\n@pytest.mark.scenario("s.yaml")\ndef test_s(scenario): pass')
     result = run(pytester)
@@ -50,9 +50,7 @@ def test_what_the_scenario_expects_is_judged_with_the_test(pytester: pytest.Pyte
         ('@pytest.mark.scenario("fates.yaml", backend="process")', "`fates` needs virtual time: use --backend sim"),
     ],
 )
-def test_a_scenario_that_cannot_be_played_is_one_sentence(
-    pytester: pytest.Pytester, marker: str, sentence: str
-) -> None:
+def test_unplayable_scenario_is_reported_in_one_sentence(pytester: pytest.Pytester, marker: str, sentence: str) -> None:
     write_scenario(pytester, "s.yaml")
     write_scenario(pytester, "fates.yaml", fates=[{"sender": 1, "count": 1, "drop": True}])
     pytester.makepyfile(f"import pytest\n{marker}\ndef test_mistake(scenario): pass")
@@ -70,7 +68,7 @@ def test_a_fate_that_never_matched_fails_the_test(pytester: pytest.Pytester) -> 
     result.stdout.fnmatch_lines(["*block 1.900*, so this run differs from its script"])
 
 
-def test_a_backend_that_this_machine_cannot_is_skipped_with_the_way_out(
+def test_unavailable_backend_is_skipped_with_the_remedy(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(pytester.path))  # where there is neither unshare nor nft

@@ -42,9 +42,7 @@ PROJECT = """
 
 
 @pytest.mark.parametrize("workers", [("-n", "1"), ("-n", "4"), ("-n", "2", "--dist=loadgroup")])
-def test_the_same_tests_end_the_same_with_any_number_of_workers(
-    pytester: pytest.Pytester, workers: tuple[str, ...]
-) -> None:
+def test_results_do_not_depend_on_the_number_of_workers(pytester: pytest.Pytester, workers: tuple[str, ...]) -> None:
     pytester.makepyfile(PROJECT)
     write_scenario(pytester, "s.yaml", expect={"seeds": [1, 2, 3]})
     result = pytester.runpytest_subprocess(*workers, "--ucp-keep", "kept", "s.yaml", ".")
@@ -55,7 +53,7 @@ def test_the_same_tests_end_the_same_with_any_number_of_workers(
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_eight_labs_at_once_do_not_meet(pytester: pytest.Pytester) -> None:
+def test_eight_simultaneous_labs_do_not_interfere(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
     import json, pathlib, pytest, time
 
@@ -79,9 +77,7 @@ def test_eight_labs_at_once_do_not_meet(pytester: pytest.Pytester) -> None:
 
 @pytest.mark.parametrize("backend", [pytest.param("process", marks=pytest.mark.lab), "sim"])
 @pytest.mark.parametrize("what", ["swarm", "s.yaml"])
-def test_ctrl_c_ends_the_session_and_leaves_a_whole_run_and_no_process(
-    pytester: pytest.Pytester, backend: str, what: str
-) -> None:
+def test_ctrl_c_leaves_a_complete_run_and_no_process(pytester: pytest.Pytester, backend: str, what: str) -> None:
     write_scenario(pytester, "s.yaml", duration_s=MAX_DURATION_S, settings={"vote_timeout_s": 1}, expect={})
     pytester.makepyfile("""
     def test_swarm(swarm):
@@ -121,7 +117,7 @@ def test_ctrl_c_ends_the_session_and_leaves_a_whole_run_and_no_process(
     assert (left / "report.html").exists()
 
 
-def test_a_project_that_does_not_use_it_pays_for_no_import(pytester: pytest.Pytester) -> None:
+def test_project_without_the_plugin_imports_nothing(pytester: pytest.Pytester) -> None:
     for number in range(3):
         (pytester.path / f"{number}.yaml").write_text("name: x\njobs: []\n")
     pytester.makepyfile("""
@@ -137,7 +133,7 @@ def test_a_project_that_does_not_use_it_pays_for_no_import(pytester: pytest.Pyte
     pytester.runpytest_subprocess().assert_outcomes(passed=1)
 
 
-def test_nothing_needs_to_be_imported_and_markers_are_known(pytester: pytest.Pytester) -> None:
+def test_fixtures_and_markers_need_no_import(pytester: pytest.Pytester) -> None:
     (found,) = entry_points(group="pytest11", name="ucp-harness")
     assert found.value == "ucp_harness_pytest"
     result = run(pytester, "--markers")

@@ -42,7 +42,7 @@ def written(pytester: pytest.Pytester, text: str = TOLD) -> Path:
     return path
 
 
-def test_what_agents_do_is_written_below_what_happens(pytester: pytest.Pytester) -> None:
+def test_reactions_are_written_below_sentences(pytester: pytest.Pytester) -> None:
     text = written(pytester).read_text()
     assert [line for line in text.splitlines() if line and not line.startswith(" ")] == [
         line for line in TOLD.splitlines() if line
@@ -61,12 +61,12 @@ def test_what_agents_do_is_written_below_what_happens(pytester: pytest.Pytester)
     assert not run_directories(pytester)
 
 
-def test_written_again_it_is_the_same(pytester: pytest.Pytester) -> None:
+def test_rewriting_a_correct_story_changes_nothing(pytester: pytest.Pytester) -> None:
     text = written(pytester).read_text()
     assert written(pytester, text).read_text() == text
 
 
-def test_an_agent_that_does_otherwise_fails_with_the_lines_that_differ(pytester: pytest.Pytester) -> None:
+def test_deviating_agent_fails_with_the_differing_lines(pytester: pytest.Pytester) -> None:
     path = written(pytester)
     wrong = path.read_text().replace("agents: 3\n", "agents: 3\nquirks: {ignore_commit: {agents: [2], value: 1.0}}\n")
     path.write_text(wrong)
@@ -86,7 +86,7 @@ def test_an_agent_that_does_otherwise_fails_with_the_lines_that_differ(pytester:
     assert path.read_text() == wrong
 
 
-def test_what_needs_virtual_time_is_skipped_elsewhere(pytester: pytest.Pytester) -> None:
+def test_story_that_needs_virtual_time_is_skipped_on_processes(pytester: pytest.Pytester) -> None:
     fates = 'fates: [{message: Commit Block, block: "1.1", receiver: 3, drop: true}]\n'
     path = written(pytester, TOLD.replace("agents: 3\n", "agents: 3\n" + fates))
     result = run(pytester, path, "--ucp-backend", "process", "-rs")
@@ -95,7 +95,7 @@ def test_what_needs_virtual_time_is_skipped_elsewhere(pytester: pytest.Pytester)
 
 
 @pytest.mark.lab
-def test_processes_do_as_the_story_tells(pytester: pytest.Pytester) -> None:
+def test_processes_follow_the_story(pytester: pytest.Pytester) -> None:
     path = written(pytester)
     agent = f"{shlex.quote(sys.executable)} -P -m ucp.node"
     run(pytester, path, "--ucp-backend", "process", "--ucp-agent", agent).assert_outcomes(passed=1)
@@ -107,13 +107,13 @@ def test_processes_do_as_the_story_tells(pytester: pytest.Pytester) -> None:
     assert commands["2"] == [sys.executable, "-P", "-m", "ucp.node"]
 
 
-def test_files_of_others_are_left_alone(pytester: pytest.Pytester) -> None:
+def test_story_files_of_other_tools_are_not_collected(pytester: pytest.Pytester) -> None:
     write(pytester, "Scenario: trader is alerted\nGiven a stock\n", "trader.story")
     (pytester.path / "binary.story").write_bytes(b"\xff\xfe1 s: x\n")
     run(pytester).assert_outcomes()
 
 
-def test_what_an_agent_tells_in_words_that_nobody_knows_is_not_compared(pytester: pytest.Pytester) -> None:
+def test_trace_with_unknown_words_is_not_compared(pytester: pytest.Pytester) -> None:
     agent = pytester.makepyfile(
         agent="""
         import sys
@@ -134,7 +134,7 @@ def test_what_an_agent_tells_in_words_that_nobody_knows_is_not_compared(pytester
 
 
 @pytest.mark.lab
-def test_what_an_agent_does_not_support_is_skipped(pytester: pytest.Pytester) -> None:
+def test_unsupported_feature_skips_the_test(pytester: pytest.Pytester) -> None:
     agent = refusing_to_start(pytester.path / "agent")
     pytester.makepyfile("def test_waits(swarm):\n    swarm.run_for(60)\n")
     command = f"2={shlex.quote(str(agent))}"
@@ -151,7 +151,7 @@ def test_what_an_agent_does_not_support_is_skipped(pytester: pytest.Pytester) ->
         (["2="], "--ucp-agent is empty: name a program"),
     ],
 )
-def test_an_agent_of_the_command_line_that_cannot_be_is_one_sentence(
+def test_impossible_agent_option_is_reported_in_one_sentence(
     pytester: pytest.Pytester, asked: list[str], sentence: str
 ) -> None:
     options = [word for agent in asked for word in ("--ucp-agent", agent)]
@@ -160,7 +160,7 @@ def test_an_agent_of_the_command_line_that_cannot_be_is_one_sentence(
     no_internals(result)
 
 
-def test_in_virtual_time_any_agent_does_as_the_story_tells(pytester: pytest.Pytester) -> None:
+def test_foreign_agents_follow_the_story_in_virtual_time(pytester: pytest.Pytester) -> None:
     path = written(pytester)
     run(pytester, path, "--ucp-agent", f"2={shlex.quote(sys.executable)} -P -m ucp.node").assert_outcomes(passed=1)
     result = run(pytester, path, "--ucp-agent", "./my_agent --quick")
@@ -198,7 +198,7 @@ def test_in_virtual_time_any_agent_does_as_the_story_tells(pytester: pytest.Pyte
         ("1 s: {at_s: 3}\n2 s: end\n", "is not an entry of a timeline without `at_s`"),
     ],
 )
-def test_a_mistake_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+def test_mistake_in_a_story_is_reported_in_one_sentence(tmp_path: Path, text: str, sentence: str) -> None:
     path = tmp_path / "wrong.story"
     path.write_text(text)
     with pytest.raises(ScenarioError) as told:

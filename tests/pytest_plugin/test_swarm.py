@@ -69,7 +69,7 @@ def test_a_partition_heals_at_the_end_of_its_block(pytester: pytest.Pytester) ->
 
 
 @pytest.mark.lab
-def test_the_same_story_is_told_to_processes(pytester: pytest.Pytester) -> None:
+def test_processes_pass_the_same_test(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(STORY)
     run(pytester, "--ucp-backend", "process", "--ucp-speedup", "50").assert_outcomes(passed=1)
     assert not run_directories(pytester)
@@ -133,7 +133,7 @@ def test_agents_are_killed_paused_rebooted_and_come_back(pytester: pytest.Pytest
     assert [(one["restarts"], one["reboots"]) for one in record["agents"].values()] == [(1, 0), (0, 0), (0, 1), (1, 0)]
 
 
-def test_whoever_has_landed_or_is_switched_off_is_not_waited_for(pytester: pytest.Pytester) -> None:
+def test_wait_idle_ignores_landed_and_stopped_agents(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
     def test_landing(swarm):
         swarm.run_for(200)
@@ -157,9 +157,7 @@ def test_processes_are_killed_paused_rebooted_and_come_back(pytester: pytest.Pyt
     assert not record["errors"]
 
 
-def test_looking_changes_nothing_and_what_was_told_can_be_played_again(
-    pytester: pytest.Pytester, tmp_path: Path
-) -> None:
+def test_queries_change_nothing_and_the_run_can_be_played_again(pytester: pytest.Pytester, tmp_path: Path) -> None:
     look = "swarm.characteristic(1), swarm.chain(2), swarm.figures"
     pytester.makepyfile(f"""
     import pytest
@@ -210,7 +208,7 @@ def test_a_violation_fails_the_test_with_its_evidence_and_its_report(pytester: p
     assert json.loads((report(result).parent / "run.json").read_text())["characteristics"]["1"]["verdict"] == "violated"
 
 
-def test_a_violation_that_is_expected_passes_and_one_that_does_not_come_fails(pytester: pytest.Pytester) -> None:
+def test_expected_violation_passes_and_a_missing_one_fails(pytester: pytest.Pytester) -> None:
     expect = {
         "characteristics": {1: "violated", 5: "violated", 6: "violated"},
         "steps": "deviates",
@@ -235,7 +233,7 @@ def test_a_violation_that_is_expected_passes_and_one_that_does_not_come_fails(py
     result.stdout.fnmatch_lines(["characteristic 1, distributed: holds: *", "    expected: violated"])
 
 
-def test_a_failing_assert_shows_the_verdict_and_where_the_report_is(pytester: pytest.Pytester) -> None:
+def test_failing_assert_shows_the_verdict_and_the_report_path(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
     def test_apart(swarm):
         swarm.partition([1], [2, 3, 4, 5])
@@ -254,7 +252,7 @@ def test_a_failing_assert_shows_the_verdict_and_where_the_report_is(pytester: py
     report(result)
 
 
-def test_the_network_changes_for_a_while_and_a_test_that_ends_waits_for_that(pytester: pytest.Pytester) -> None:
+def test_end_of_a_test_waits_for_temporary_changes(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
     def test_network(swarm):
         swarm.run_until(100)
@@ -295,7 +293,7 @@ def test_the_network_changes_for_a_while_and_a_test_that_ends_waits_for_that(pyt
         ("swarm.pause(1); swarm.wait_idle(20)", "within 20 mission seconds not every agent has voted and become idle"),
     ],
 )
-def test_what_cannot_be_is_one_sentence_at_the_test_s_own_line(
+def test_impossible_action_is_reported_at_the_line_of_the_test(
     pytester: pytest.Pytester, told: str, sentence: str
 ) -> None:
     pytester.makepyfile(f"def test_mistake(swarm):\n    {told}")
@@ -315,7 +313,7 @@ def test_what_cannot_be_is_one_sentence_at_the_test_s_own_line(
         ("agent_command=['./x']", "`agent_command`: ./x is not a program: *"),
     ],
 )
-def test_a_swarm_that_cannot_be_is_one_sentence(pytester: pytest.Pytester, marker: str, sentence: str) -> None:
+def test_impossible_swarm_is_reported_in_one_sentence(pytester: pytest.Pytester, marker: str, sentence: str) -> None:
     pytester.makepyfile(f"import pytest\n@pytest.mark.swarm({marker})\ndef test_mistake(swarm): pass")
     result = run(pytester)
     result.assert_outcomes(errors=1)
@@ -324,7 +322,7 @@ def test_a_swarm_that_cannot_be_is_one_sentence(pytester: pytest.Pytester, marke
 
 
 @pytest.mark.lab
-def test_an_agent_that_dies_fails_the_sentence_that_it_dies_in(pytester: pytest.Pytester) -> None:
+def test_dying_agent_fails_the_current_action(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
     import os, pytest, signal
     from tests.harness.command import processes
@@ -345,7 +343,7 @@ def test_an_agent_that_dies_fails_the_sentence_that_it_dies_in(pytester: pytest.
     assert json.loads((report(result).parent / "run.json").read_text())["outcome"] == "failed"
 
 
-def test_steps_and_records_are_judged_in_the_middle_of_a_story(pytester: pytest.Pytester) -> None:
+def test_steps_and_records_are_judged_during_a_run(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
     import pytest
 

@@ -53,7 +53,7 @@ WAITING = """
 """
 
 
-def test_a_story_goes_on_until_an_agent_runs_a_handler(pytester: pytest.Pytester, tmp_path: Path) -> None:
+def test_wait_for_continues_until_an_agent_runs_a_handler(pytester: pytest.Pytester, tmp_path: Path) -> None:
     pytester.makepyfile(WAITING)
     run(pytester, "--ucp-keep", "kept").assert_outcomes(passed=1)
     assert [entry["reconcile"] for entry in record(pytester)["scenario"]["timeline"]] == [[2]]
@@ -61,12 +61,12 @@ def test_a_story_goes_on_until_an_agent_runs_a_handler(pytester: pytest.Pytester
 
 
 @pytest.mark.lab
-def test_processes_are_waited_for_too(pytester: pytest.Pytester) -> None:
+def test_wait_for_works_with_processes(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(WAITING)
     run(pytester, "--ucp-backend", "process").assert_outcomes(passed=1)
 
 
-def test_a_story_stops_at_the_very_moment(pytester: pytest.Pytester) -> None:
+def test_wait_for_stops_at_the_moment_of_the_handler_run(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
     import json
 
@@ -81,7 +81,7 @@ def test_a_story_stops_at_the_very_moment(pytester: pytest.Pytester) -> None:
     run(pytester).assert_outcomes(passed=1)
 
 
-def test_messages_that_do_nothing_are_waited_for_as_well(pytester: pytest.Pytester) -> None:
+def test_wait_for_finds_messages_without_effect(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
     def test_votes_of_others(swarm):
         swarm.wait_for("receive_vote_add_block", "no vote running", agent=3, limit_s=600)
@@ -129,7 +129,7 @@ def test_messages_are_held_back_and_released(pytester: pytest.Pytester, tmp_path
     is_played_again_alike(pytester, tmp_path / "again")
 
 
-def test_a_hold_that_holds_nothing_fails_the_test(pytester: pytest.Pytester) -> None:
+def test_hold_without_messages_fails_the_test(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("def test_nothing(swarm):\n    swarm.hold('Block Response')\n    swarm.run_for(9)")
     result = run(pytester)
     result.assert_outcomes(failed=1)
@@ -179,7 +179,7 @@ INJECTIONS = """
 """
 
 
-def test_a_rogue_node_comes_late_and_has_heard_everything(pytester: pytest.Pytester, tmp_path: Path) -> None:
+def test_late_rogue_node_knows_earlier_messages(pytester: pytest.Pytester, tmp_path: Path) -> None:
     pytester.makepyfile(INJECTIONS)
     run(pytester, "--ucp-keep", "kept").assert_outcomes(passed=1)
     told = record(pytester)
@@ -192,7 +192,7 @@ def test_a_rogue_node_comes_late_and_has_heard_everything(pytester: pytest.Pytes
 
 @pytest.mark.lab
 @pytest.mark.parametrize("told", ["hold('Commit Block')", "replay('Commit Block')"])
-def test_what_needs_virtual_time_is_said_and_the_story_goes_on(pytester: pytest.Pytester, told: str) -> None:
+def test_action_that_needs_virtual_time_is_refused_and_the_run_continues(pytester: pytest.Pytester, told: str) -> None:
     pytester.makepyfile(f"""
     import pytest
 
@@ -249,7 +249,7 @@ def test_what_needs_virtual_time_is_said_and_the_story_goes_on(pytester: pytest.
         ("swarm.flood(for_s=5)", "ScenarioError: `flood.per_s` is missing*"),
     ],
 )
-def test_what_cannot_be_is_one_sentence_at_the_test_s_own_line(
+def test_impossible_action_is_reported_at_the_line_of_the_test(
     pytester: pytest.Pytester, told: str, sentence: str
 ) -> None:
     pytester.makepyfile(f"def test_mistake(swarm):\n    {told}")

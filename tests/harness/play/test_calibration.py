@@ -50,7 +50,7 @@ def doctor(*options: str) -> Result:
     return CliRunner().invoke(cli.app, ["doctor", "--measure", *options])
 
 
-def test_a_table_says_what_was_asked_and_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table_shows_requested_and_measured_values(monkeypatch: pytest.MonkeyPatch) -> None:
     fake(monkeypatch, losing(0.15))
     done = doctor()
     assert done.exit_code == 0
@@ -60,7 +60,7 @@ def test_a_table_says_what_was_asked_and_what_was_measured(monkeypatch: pytest.M
     assert "nftables: 10000 packets for 1 question" in done.stderr
 
 
-def test_what_lies_outside_once_is_shown_and_forgiven(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answer_outside_once_is_shown_and_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
     fake(monkeypatch, losing(0.2, 0.15))
     done = doctor()
     assert done.exit_code == 0
@@ -68,7 +68,7 @@ def test_what_lies_outside_once_is_shown_and_forgiven(monkeypatch: pytest.Monkey
     assert first == ["at", "first", "20", "18.72", "to", "21.35", "10000"]
 
 
-def test_what_lies_outside_twice_is_status_1(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answer_outside_twice_gives_status_1(monkeypatch: pytest.MonkeyPatch) -> None:
     fake(monkeypatch, losing(0.2, 0.2))
     done = doctor()
     assert done.exit_code == 1
@@ -100,7 +100,7 @@ def test_json_has_findings_lateness_and_a_row_for_each_question(monkeypatch: pyt
     } == row.keys()
 
 
-def test_without_an_engine_there_is_nothing_to_measure_and_status_3(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_engine_gives_status_3(monkeypatch: pytest.MonkeyPatch) -> None:
     fake(monkeypatch, losing(), NOTHING_WORKS)
     done = doctor()
     assert done.exit_code == 3

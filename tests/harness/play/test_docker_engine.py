@@ -36,7 +36,7 @@ def listening(path: Path) -> socket.socket:
     return server
 
 
-def test_there_is_no_engine(tmp_path: Path) -> None:
+def test_missing_engine_is_one_sentence(tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path)
     for host, word in (
         (f"unix://{tmp_path}/nowhere.sock", "there is no Docker engine: .* install it"),
@@ -53,7 +53,7 @@ def test_there_is_no_engine(tmp_path: Path) -> None:
         assert not (tmp_path / "run").exists()
 
 
-def test_an_engine_that_is_not_running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stopped_engine_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "docker.sock"
     listening(path).close()
     monkeypatch.setenv("DOCKER_HOST", f"unix://{path}")
@@ -62,7 +62,7 @@ def test_an_engine_that_is_not_running(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody who may not")
-def test_an_engine_that_this_user_may_not_use(tmp_path: Path) -> None:
+def test_inaccessible_engine_is_one_sentence(tmp_path: Path) -> None:
     path = Path("/tmp", f"ucp-test-{os.getpid()}.sock")  # noqa: S108  (where nobody can look)
     server = listening(path)
     path.chmod(0o600)
@@ -78,7 +78,7 @@ except docker_engine.DockerError as error: print(error)
     assert done.stdout == f"{path} is not accessible to this user: use sudo\n", done.stderr
 
 
-def test_an_engine_that_never_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_engine_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "docker.sock"
     server = listening(path)
     monkeypatch.setenv("DOCKER_HOST", f"unix://{path}")
@@ -88,7 +88,7 @@ def test_an_engine_that_never_answers(tmp_path: Path, monkeypatch: pytest.Monkey
     server.close()
 
 
-def test_an_engine_that_fell_silent_is_not_asked_again() -> None:
+def test_silent_engine_gets_no_further_calls() -> None:
     asked = []
 
     def late() -> None:
@@ -103,7 +103,7 @@ def test_an_engine_that_fell_silent_is_not_asked_again() -> None:
     one.close()
 
 
-def test_a_disk_that_is_full_is_not_an_engine_that_is_gone() -> None:
+def test_full_disk_does_not_count_as_a_stopped_engine() -> None:
     def refuse() -> None:
         answer = requests.Response()
         answer.status_code = 500
@@ -133,13 +133,13 @@ def test_an_image_that_cannot_be_built_is_one_sentence() -> None:
     one.close()
 
 
-def test_only_root_can_lay_cables(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_docker_backend_requires_root(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     with pytest.raises(docker_engine.DockerError, match="use sudo"):
         _container_preflight.require_root()
 
 
-def test_a_debugger_has_to_be_in_the_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_debugger_must_be_in_the_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     document = {"name": "gdb", "vehicles": {"each": {2: {"debugger": "gdb"}}}}
     with pytest.raises(docker_engine.DockerError, match=r"the project's image has no gdb: use .*--image-from-host"):
         _container_preflight.check_debuggers(Scenario.model_validate(document))
@@ -160,7 +160,7 @@ def test_user_mode_linux_has_no_engine(tmp_path: Path) -> None:
     assert (done.returncode, len(sentences(done.stderr))) == (2, 1)
 
 
-def test_a_run_is_its_orchestrators_as_long_as_that_lives() -> None:
+def test_run_belongs_to_its_orchestrator_while_that_exists() -> None:
     assert ownership.is_alive(ownership.this_process())
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     boot, _, _ = ownership.this_process().split()
@@ -177,13 +177,13 @@ def test_a_run_is_its_orchestrators_as_long_as_that_lives() -> None:
 
 
 @pytest.mark.parametrize("name", ["loss 15 %", "..", "é", "-x-", "a" * 300])
-def test_the_names_of_runs_are_names_that_containers_may_have(name: str, tmp_path: Path) -> None:
+def test_run_names_are_valid_container_names(name: str, tmp_path: Path) -> None:
     found = ownership.run_name(tmp_path / name)
     assert re.fullmatch(r"[a-zA-Z0-9][a-zA-Z0-9_.-]{1,60}", found)
     assert found != ownership.run_name(tmp_path / "other" / name)
 
 
-def test_what_a_container_says_goes_to_the_right_file_however_it_is_cut(tmp_path: Path) -> None:
+def test_output_of_a_container_goes_to_the_right_file(tmp_path: Path) -> None:
     def frame(output: int, said: bytes) -> bytes:
         return struct.pack(">B3xI", output, len(said)) + said
 
@@ -243,7 +243,7 @@ def emitted(tmp_path: Path, *options: object, **keys: Any) -> dict[str, Any]:
     return document
 
 
-def test_a_compose_file_has_everybody_at_their_addresses(tmp_path: Path) -> None:
+def test_compose_file_has_all_vehicles_at_their_addresses(tmp_path: Path) -> None:
     services = emitted(tmp_path, agents=[1, 300], vehicles={"kind": "embedded"}, docker={"memory_mib": 64})["services"]
     assert list(services) == ["vehicle-1", "agent-1", "vehicle-300", "agent-300", "start"]
     assert services["vehicle-300"]["networks"]["air"]["ipv4_address"] == "10.77.1.44"
@@ -283,7 +283,7 @@ def test_a_compose_file_shows_each_agent_its_own_bundle_and_holds_no_secret(tmp_
         assert not (tmp_path / "other.yaml").exists()
 
 
-def test_in_a_compose_file_an_image_of_ones_own_runs_ones_own_command(tmp_path: Path) -> None:
+def test_compose_file_runs_own_command_in_own_image(tmp_path: Path) -> None:
     own = {"docker": {"image": "mine:3"}, "agent_command": ["/app/agent", "--fast"], "vehicles": {"kind": "none"}}
     services = emitted(tmp_path, agents=[7], **own)["services"]
     agent = services["agent-7"]
@@ -297,7 +297,7 @@ def test_in_a_compose_file_an_image_of_ones_own_runs_ones_own_command(tmp_path: 
     assert services["start"]["depends_on"] == ["agent-7"]
 
 
-def test_in_a_compose_file_only_those_who_are_named_run_in_the_image_of_ones_own(tmp_path: Path) -> None:
+def test_compose_file_runs_only_named_agents_in_own_image(tmp_path: Path) -> None:
     own = {"docker": {"image": "mine:3"}, "agent_command": {"7": ["/app/agent"]}, "vehicles": {"kind": "none"}}
     services = emitted(tmp_path, agents=[7, 8], **own)["services"]
     assert (services["agent-7"]["image"], services["agent-7"]["entrypoint"]) == ("mine:3", ["/app/agent"])
@@ -306,7 +306,7 @@ def test_in_a_compose_file_only_those_who_are_named_run_in_the_image_of_ones_own
     assert "build" in services["agent-8"]
 
 
-def test_the_start_of_a_compose_file_is_one_for_all(tmp_path: Path) -> None:
+def test_compose_file_starts_all_agents_at_once(tmp_path: Path) -> None:
     from harness.play.containers import start
 
     heard: list[Any] = []

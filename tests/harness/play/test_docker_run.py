@@ -80,7 +80,7 @@ def test_faults_of_agents_and_vehicles(tmp_path: Path) -> None:
     assert containers(run) == []
 
 
-def test_captured_keys_do_in_containers_what_they_do_elsewhere_and_no_secret_is_left(tmp_path: Path) -> None:
+def test_captured_keys_work_in_containers_and_leave_no_secret(tmp_path: Path) -> None:
     """Sealed, forged in two names, replayed, revoked: what agents dropped, and in whose name they heard what."""
     home = Home.new(tmp_path / "home", [1, 2, 3], seals=True, epoch_s=30.0)
     timeline = [
@@ -109,7 +109,7 @@ def test_captured_keys_do_in_containers_what_they_do_elsewhere_and_no_secret_is_
     assert containers(tmp_path / "run") == []
 
 
-def test_after_sigkill_clean_removes_what_is_ours_and_no_more(tmp_path: Path) -> None:
+def test_clean_after_sigkill_removes_only_own_containers(tmp_path: Path) -> None:
     run = long_run(tmp_path)
     held = [f"{ownership.run_name(run.out)}-{role}-{number}" for role in ("agent", "network") for number in (1, 2, 3)]
     assert containers(run.out) == held
@@ -151,7 +151,7 @@ def test_ctrl_c_while_containers_start_leaves_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("hurt", "sentence"), [(Way.silent, "stopped answering"), (Way.cut, "the Docker engine has stopped")]
 )
-def test_an_engine_that_is_gone_ends_the_run(hurt: Any, sentence: str, tmp_path: Path) -> None:
+def test_stopped_engine_ends_the_run(hurt: Any, sentence: str, tmp_path: Path) -> None:
     way = Way(tmp_path / "way.sock")
     scenario = write_scenario(tmp_path, duration_s=100_000, **NO_VEHICLES)
     out = tmp_path / "run"
@@ -171,7 +171,7 @@ def test_an_engine_that_is_gone_ends_the_run(hurt: Any, sentence: str, tmp_path:
     assert containers(out) == []
 
 
-def test_a_name_that_is_taken(tmp_path: Path) -> None:
+def test_used_container_name_is_one_sentence(tmp_path: Path) -> None:
     name = f"{ownership.run_name(tmp_path / 'run')}-network-2"
     with stranger(name):
         done = on_docker(tmp_path, **NO_VEHICLES)
@@ -201,14 +201,14 @@ def test_a_name_that_is_taken(tmp_path: Path) -> None:
         ),
     ],
 )  # fmt: skip
-def test_an_agent_that_cannot_run(keys: Any, status: int, sentence: str, tmp_path: Path) -> None:
+def test_agent_that_cannot_run_fails_the_run(keys: Any, status: int, sentence: str, tmp_path: Path) -> None:
     done = on_docker(tmp_path, agents=[1], **NO_VEHICLES, **keys)
     assert done.returncode == status, done.stderr
     assert sentences(done.stderr)[0].startswith(sentence)
     assert containers(tmp_path / "run") == []
 
 
-def test_captures_see_what_containers_send(tmp_path: Path) -> None:
+def test_captures_contain_datagrams_of_containers(tmp_path: Path) -> None:
     done = on_docker(tmp_path, "--capture", events={"source": "random", "mean_s": 5}, **NO_VEHICLES)
     assert done.returncode == 0, done.stderr
     captured = json.loads((tmp_path / "run/run.json").read_text())["capture"]
@@ -218,7 +218,7 @@ def test_captures_see_what_containers_send(tmp_path: Path) -> None:
         assert (tmp_path / f"run/capture/{vehicle}.pcapng").stat().st_size > 1000
 
 
-def test_what_a_program_says_is_in_its_log(tmp_path: Path) -> None:
+def test_output_of_a_program_is_in_its_log(tmp_path: Path) -> None:
     agent = tmp_path / "agent.sh"
     agent.write_text("#!/bin/sh\necho to $1\necho at home: $(ls /proc/self/fd | wc -l) >&2\nexit 4\n")
     agent.chmod(0o755)
@@ -229,7 +229,7 @@ def test_what_a_program_says_is_in_its_log(tmp_path: Path) -> None:
     assert "at home:" in said
 
 
-def test_a_container_can_do_nothing_to_its_network(tmp_path: Path) -> None:
+def test_container_cannot_change_its_network(tmp_path: Path) -> None:
     """It has no capability, and a root that it cannot write to."""
     agent = tmp_path / "agent.sh"
     agent.write_text("#!/bin/sh\ngrep Cap /proc/self/status\ngrep NoNewPrivs /proc/self/status\ntouch /x\nexit 4\n")

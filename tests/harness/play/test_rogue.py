@@ -60,7 +60,7 @@ def said(injected: RogueDatagram) -> Message:
     return decode(injected.datagram)[2]
 
 
-def test_it_replays_the_last_that_match_byte_for_byte_in_their_order() -> None:
+def test_replay_sends_the_last_matching_datagrams_in_order() -> None:
     one = rogue()
     commits = [
         encode(sender, sequence, CommitBlock(BLOCK, TOP)) for sender, sequence in ((1, 1), (2, 1), (1, 2), (1, 3))
@@ -73,7 +73,7 @@ def test_it_replays_the_last_that_match_byte_for_byte_in_their_order() -> None:
     assert one.next_timer() is None
 
 
-def test_what_it_has_not_heard_it_cannot_send() -> None:
+def test_replay_without_received_datagrams_sends_nothing() -> None:
     one = rogue()
     receive(one, b"no message", 1.0)
     assert begin(one, "replay", number=1) == []
@@ -81,7 +81,7 @@ def test_what_it_has_not_heard_it_cannot_send() -> None:
     assert one.sent == {1: 0, 2: 0}
 
 
-def test_it_duplicates_what_matches_as_long_as_it_is_asked_to() -> None:
+def test_duplicate_sends_copies_until_its_end() -> None:
     one = rogue()
     begin(one, "duplicate", for_s=10, copies=2, message="Commit Block")
     assert [it.datagram for it in receive(one, COMMIT, 109.9)] == [COMMIT, COMMIT]
@@ -89,7 +89,7 @@ def test_it_duplicates_what_matches_as_long_as_it_is_asked_to() -> None:
     assert receive(one, COMMIT, 110.0) == []
 
 
-def test_it_sends_again_later_what_it_has_heard_in_time() -> None:
+def test_delayed_copy_is_sent_after_its_delay() -> None:
     one = rogue()
     begin(one, "delay", for_s=10, by_s=30, sender=3)
     assert receive(one, REQUEST, 101.0) == receive(one, REQUEST, 109.0) == receive(one, COMMIT, 109.0) == []
@@ -97,7 +97,7 @@ def test_it_sends_again_later_what_it_has_heard_in_time() -> None:
     assert [(at, it.datagram) for at, it in wait(one, 1000)] == [(131.0, REQUEST), (139.0, REQUEST)]
 
 
-def test_it_flips_as_many_bits_as_asked() -> None:
+def test_corrupt_flips_the_requested_number_of_bits() -> None:
     one = rogue()
     begin(one, "corrupt", for_s=10, bits=3)
     (changed,) = receive(one, COMMIT, 101.0)
@@ -106,7 +106,7 @@ def test_it_flips_as_many_bits_as_asked() -> None:
     assert corrupted(b"\x0f", 1000, Random(1)) == b"\xf0"
 
 
-def test_a_forged_commit_goes_on_top_of_what_was_heard_last() -> None:
+def test_forged_commit_extends_the_last_received_chain() -> None:
     one = rogue()
     receive(one, COMMIT, 1.0)
     other = bytes(32)
@@ -132,7 +132,7 @@ def test_a_forged_commit_goes_on_top_of_what_was_heard_last() -> None:
         ({}, ChainHashSuccessorQuery(TOP), NextInSequenceResponse(TOP, None, 0)),
     ],
 )
-def test_it_answers_every_question_in_an_agent_s_name(keys: dict[str, Any], question: Message, answer: Message) -> None:
+def test_forge_answers_each_query_in_an_agents_name(keys: dict[str, Any], question: Message, answer: Message) -> None:
     one = rogue()
     begin(one, "forge", message=answer.NAME, sender=2, for_s=10, **keys)
     assert [(it.source, said(it)) for it in receive(one, encode(1, 1, question), 101.0)] == [(2, answer)]
@@ -141,7 +141,7 @@ def test_it_answers_every_question_in_an_agent_s_name(keys: dict[str, Any], ques
     assert receive(one, encode(1, 3, question), 110.0) == []
 
 
-def test_a_forged_vote_names_the_chain_where_votes_do() -> None:
+def test_forged_vote_names_the_chain_if_votes_do() -> None:
     one = rogue()
     begin(one, "forge", message="Block Add Response", sender=2, for_s=10)
     receive(one, encode(1, 1, BlockAddResponse(TOP, True, TOP)), 101.0)
@@ -149,7 +149,7 @@ def test_a_forged_vote_names_the_chain_where_votes_do() -> None:
     assert said(vote) == BlockAddResponse(BLOCK.block_hash, False, TOP)
 
 
-def test_a_flood_is_well_formed_evenly_spaced_and_the_same_for_the_same_seed() -> None:
+def test_flood_is_well_formed_evenly_spaced_and_reproducible() -> None:
     sent = []
     for _ in range(2):
         one = rogue()
@@ -164,7 +164,7 @@ def test_a_flood_is_well_formed_evenly_spaced_and_the_same_for_the_same_seed() -
     assert len({sequence for _, sequence, _ in decoded}) == 200
 
 
-def test_a_machine_that_is_too_slow_floods_less_not_longer() -> None:
+def test_slow_machine_shortens_the_flood_in_number_not_in_time() -> None:
     one = rogue()
     begin(one, "flood", for_s=10, per_s=1000)
     one.handle_timer(109.0)
@@ -180,7 +180,7 @@ def test_random_messages_of_every_type_are_well_formed(message: type[Message]) -
         assert type(decode(bytes(encode(1, 1, message.from_body(bytes(layer)))))[2]) is message
 
 
-def test_sequence_numbers_tell_the_injection_and_are_no_agent_s() -> None:
+def test_sequence_numbers_identify_the_injection() -> None:
     assert injection_of(2**31 - 1) is None
     for number in (1, 2, 10_000):
         for count in (0, 1, MAX_FLOOD - 1):

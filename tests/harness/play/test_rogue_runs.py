@@ -73,7 +73,7 @@ def test_duplicates_change_nothing(tmp_path: Path) -> None:
     assert not violated(finished)
 
 
-def test_delayed_commits_find_that_the_chain_has_gone_on(tmp_path: Path) -> None:
+def test_delayed_commits_do_not_fit_the_grown_chain(tmp_path: Path) -> None:
     finished = played(tmp_path, {"at_s": 100, "delay": {"for_s": 100, "by_s": 40, "message": "Commit Block"}})
     late = only(finished)
     assert late.handled == {"does not succeed": 4 * late.sent}
@@ -96,7 +96,7 @@ def test_corrupt_messages_are_refused_or_change_no_chain(tmp_path: Path) -> None
     assert violated(finished) <= {"1"}
 
 
-def test_a_flood_is_noticed_by_1_alone(tmp_path: Path) -> None:
+def test_flood_is_noticed_by_characteristic_1_only(tmp_path: Path) -> None:
     finished = played(tmp_path, {"at_s": 100, "flood": {"for_s": 20, "per_s": 30, "message": "Chain Contain Query"}})
     flood = only(finished)
     assert (flood.sent, flood.changed, flood.unhandled) == (600, 0, 0)
@@ -104,7 +104,7 @@ def test_a_flood_is_noticed_by_1_alone(tmp_path: Path) -> None:
     assert violated(finished) == {"1"}
 
 
-def test_forged_votes_keep_a_block_from_being_committed_at_once(tmp_path: Path) -> None:
+def test_forged_votes_delay_the_commit_of_a_block(tmp_path: Path) -> None:
     no = {"message": "Block Add Response", "approve": False, "for_s": 60}
     votes = [{"at_s": 100 + agent, "forge": {**no, "sender": agent}} for agent in (1, 2, 3, 4, 5)]
     finished = played(tmp_path, *votes)
@@ -124,7 +124,7 @@ def check_forgery(finished: Run) -> None:
         assert f"holds block {finding.block}, which agent 2 never completed; the block arrived at t=2" in finding.detail
 
 
-def test_a_forged_commit_is_noticed_and_the_report_says_what_became_of_it(tmp_path: Path) -> None:
+def test_forged_commit_is_found_and_reported(tmp_path: Path) -> None:
     finished = played(tmp_path, FORGE)
     check_forgery(finished)
     page = finished.report.read_text()
@@ -138,7 +138,7 @@ def test_a_forged_commit_is_noticed_and_the_report_says_what_became_of_it(tmp_pa
     assert (injection["at_s"], injection["detail"], injection["sent"]) == (200, "Commit Block from 2", 1)
 
 
-def test_an_account_that_is_none_is_left_out_of_the_report() -> None:
+def test_invalid_rogue_record_is_left_out_of_the_report() -> None:
     hostile = {"at_s": 1, "what": "<script>", "detail": "x", "refused": {"<b>": 2}}
     record, _ = fit(RunRecord, {"rogue": [hostile, {"at_s": "soon"}]})
     told = section(record.rogue)
@@ -148,7 +148,7 @@ def test_an_account_that_is_none_is_left_out_of_the_report() -> None:
 
 
 @pytest.mark.lab
-def test_it_is_on_the_air_as_well_across_a_partition_and_is_nobody_there(tmp_path: Path) -> None:
+def test_rogue_node_reaches_all_groups_and_is_no_vehicle(tmp_path: Path) -> None:
     apart = {"at_s": 190, "partition": [[1, 2], [3, 4, 5]]}
     chatty = {"duration_s": 260, "speedup": 20, "events": {"source": "random", "mean_s": 20}}
     replay = {"at_s": 180, "replay": {"message": "Commit Block"}}
@@ -202,7 +202,7 @@ def test_a_rogue_node_that_dies_ends_the_run_as_a_failure_of_the_harness(tmp_pat
     assert not processes(tmp_path / "run")
 
 
-def test_captures_have_what_the_rogue_sent_at_its_receivers(tmp_path: Path) -> None:
+def test_captures_of_receivers_contain_rogue_datagrams(tmp_path: Path) -> None:
     played(tmp_path, FORGE, capture=True)
     folder = tmp_path / "run" / "capture"
     assert sorted(path.name for path in folder.iterdir()) == [f"{agent}.pcapng" for agent in (1, 2, 3, 4, 5)]
@@ -213,21 +213,21 @@ def forged(packet: Packet) -> bool:
     return UCP in packet and injection_of(packet[UCP].sequence) is not None
 
 
-def test_an_injection_that_comes_to_nothing_is_told(tmp_path: Path) -> None:
+def test_injection_without_effect_is_reported(tmp_path: Path) -> None:
     finished = played(tmp_path, {"at_s": 0.5, "replay": {"message": "Block Response", "sender": 4}})
     (sentence,) = finished.played.unmatched_fates
     assert sentence.startswith("replay at 0.5 s (the last 1 of Block Response from 4) sent nothing")
     assert finished.exit_status == 2
 
 
-def test_the_same_seed_gives_the_same_run_and_a_harmless_injection_leaves_all_else_as_it_was() -> None:
+def test_harmless_injection_leaves_the_run_of_a_seed_unchanged() -> None:
     one = injecting({"at_s": 100, "flood": {"for_s": 20, "per_s": 10}}, FORGE)
     again = [simulate(one, 1, tracing=True).evidence for _ in range(2)]
     assert again[0].exports == again[1].exports
     assert again[0].traces == again[1].traces
 
 
-def test_dead_and_paused_agents_hear_the_rogue_as_they_hear_anybody(tmp_path: Path) -> None:
+def test_dead_and_paused_agents_receive_rogue_datagrams_as_usual(tmp_path: Path) -> None:
     gone = [{"at_s": 190, "kill": [3]}, {"at_s": 191, "pause": [4]}, {"at_s": 220, "resume": [4]}]
     finished = played(tmp_path, *gone, FORGE)
     assert sum(only(finished).handled.values()) == 3
@@ -269,14 +269,14 @@ def test_dead_and_paused_agents_hear_the_rogue_as_they_hear_anybody(tmp_path: Pa
         ),
     ],
 )
-def test_a_mistake_is_told_in_one_sentence(entry: dict[str, Any], sentence: str) -> None:
+def test_mistake_in_an_injection_is_one_sentence(entry: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ScenarioError) as error:
         parse({"name": "x", "agents": 5, "duration_s": 300, "timeline": [{"at_s": 100, **entry}]})
     assert sentence in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_around_a_rogue_the_air_is_open_and_between_the_others_as_it_was() -> None:
+def test_rogue_links_are_perfect_and_other_links_unchanged() -> None:
     asked = NetworkConditions(LinkConditions(loss=0.2), receivers={3: LinkConditions(loss=0.5)})
     asked = asked.with_partition([[1, 2], [3]])
     held = on_the_air(asked, injecting(FORGE, agents=3))

@@ -31,7 +31,7 @@ def secrets(home: Path) -> list[str]:
     return [*keys, private["group_secret"], *private["vehicles"].values()]
 
 
-def test_nobody_else_can_read_what_is_secret(made: Path) -> None:
+def test_other_users_cannot_read_secret_files(made: Path) -> None:
     assert made.stat().st_mode & 0o777 == 0o700
     modes = {path.name: path.stat().st_mode & 0o777 for path in (*made.iterdir(), *(made.parent / "bundles").iterdir())}
     assert modes.pop("public.json") == 0o644
@@ -50,19 +50,19 @@ def test_a_bundle_has_the_secrets_of_one_vehicle(made: Path) -> None:
 
 
 @pytest.mark.parametrize("how", [(), ("--json",)])
-def test_inspect_tells_no_secret(made: Path, how: tuple[str, ...]) -> None:
+def test_inspect_reveals_no_secret(made: Path, how: tuple[str, ...]) -> None:
     done = harness("keys", "inspect", made, made.parent / "bundles", *how)
     assert done.returncode == 0
     assert "the bundle of vehicle 28" in done.stdout
     assert not any(secret in done.stdout + done.stderr for secret in secrets(made))
 
 
-def test_keys_of_two_missions_are_told_apart(made: Path, home: Path) -> None:
+def test_keys_of_another_mission_are_refused(made: Path, home: Path) -> None:
     done = harness("keys", "inspect", made / "public.json", home / "public.json")
     assert (done.returncode, "belong to 2 missions" in done.stderr) == (1, True)
 
 
-def test_revocations_say_all_that_was_revoked_so_far(home: Path) -> None:
+def test_revocation_lists_all_vehicles_revoked_so_far(home: Path) -> None:
     assert harness("keys", "revoke", home, "7").returncode == 0
     done = harness("keys", "revoke", home, "1", "--out", home.parent / "message.json")
     assert done.stdout.rstrip().endswith("number 2, revoked 1, 7")
@@ -75,7 +75,7 @@ def test_revocations_say_all_that_was_revoked_so_far(home: Path) -> None:
         Home(home).bundle(7)
 
 
-def test_what_is_there_is_not_replaced(home: Path) -> None:
+def test_existing_key_files_are_not_replaced(home: Path) -> None:
     done = harness("keys", "new", home, "--agents", "3")
     assert (done.returncode, "is not an empty directory" in done.stderr) == (2, True)
     for _ in range(2):
@@ -102,7 +102,7 @@ def test_keys_that_do_not_belong_together_are_refused(home: Path, made: Path) ->
         load_depot_key(home)
 
 
-def test_a_revocation_that_was_edited_revokes_nobody(home: Path) -> None:
+def test_edited_revocation_revokes_no_vehicle(home: Path) -> None:
     Home(home).revoke([7])
     for message in ("AAAA", "no base64", 7, None):
         edited(home / "revocation.json", message=message)
