@@ -16,6 +16,7 @@ opened it. In another thread the signal is left out. Then only the end of the co
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
 import socket
@@ -291,7 +292,8 @@ class Lab:
         try:
             await asyncio.wait_for(self._process.wait(), _CLOSE_DEADLINE_S)
         except TimeoutError:
-            self._process.kill()
+            with contextlib.suppress(ProcessLookupError):  # it may end at this moment
+                self._process.kill()
             await self._process.wait()
 
     async def __aenter__(self) -> Self:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from netem import lab as lab_module
 from netem._lab_channel import Channel
 from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError, LabError, SpawnError
@@ -355,3 +356,24 @@ def test_invalid_request_gets_an_error_and_the_lab_survives(
 
 def test_in_words_names_signal_or_status() -> None:
     assert [in_words(returncode) for returncode in (0, 3, -9, -40)] == ["status 0", "status 3", "SIGKILL", "signal 40"]
+
+
+def test_close_succeeds_if_the_lab_ends_at_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Process:
+        ended = False
+
+        async def wait(self) -> int:
+            if not self.ended:
+                await asyncio.sleep(DEADLINE_S)
+            return 0
+
+        def kill(self) -> None:
+            self.ended = True
+            raise ProcessLookupError
+
+    class ClosedChannel:
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(lab_module, "_CLOSE_DEADLINE_S", 0.001)
+    asyncio.run(Lab((1,), Process(), ClosedChannel()).close())  # type: ignore[arg-type]
