@@ -27,11 +27,11 @@ from harness.archive.exports import (
     export_paths,
     read_exports,
 )
-from harness.archive.history import in_time
+from harness.archive.history import has_possible_time
 from harness.archive.lag import LAG_FILE, LagLine, MeasuredLag
 from harness.archive.record_file import RecordFile, read_record
 from harness.archive.run_record import JudgedRecord, RunRecord
-from harness.archive.traces import SUFFIX, Line, Trace, read_lines, read_trace, why_none
+from harness.archive.traces import SUFFIX, Trace, TraceLine, read_trace, read_trace_lines, why_not_a_trace
 from harness.archive.tracks import TRACKS_FILE, Tracks, read_tracks
 from harness.errors import RunDirectoryError
 from ucp.trace import HandlerRun
@@ -165,10 +165,10 @@ class RunArchive:
         """The trace of each agent, in order of IDs. All traces are then in memory."""
         return self._read_traces[0]
 
-    def trace_lines(self, agent_id: int) -> Iterator[Line]:
+    def trace_lines(self, agent_id: int) -> Iterator[TraceLine]:
         """Yield the lines of an agent's handler runs. Raises RunDirectoryError at a damaged line."""
         assert self.directory is not None
-        return read_lines(agents_directory(self.directory) / f"{agent_id}{SUFFIX}")
+        return read_trace_lines(agents_directory(self.directory) / f"{agent_id}{SUFFIX}")
 
     def handler_runs(self) -> Iterator[RecordedRun]:
         """Yield every handler run, trace by trace, agents in order of their IDs.
@@ -177,8 +177,8 @@ class RunArchive:
         length. Raises RunDirectoryError at the first damaged line. `traces` has the lines before it.
         """
         for path in self._trace_files:
-            for line in read_lines(path):
-                yield RecordedRun(line.agent_id, line.life, line.number, line.parsed())
+            for line in read_trace_lines(path):
+                yield RecordedRun(line.agent_id, line.incarnation, line.number, line.parse())
 
     def blocks(self) -> Iterator[HeldBlock]:
         """Yield every block that an agent holds in its export, agents in order of their IDs.
@@ -223,7 +223,7 @@ class RunArchive:
             if trace is None and self._never_began and not path.stat().st_size:
                 continue  # an agent that was ready, but whose mission did not start
             if trace is None:
-                problems.append(f"{path}: {why_none(path)}; it is left out")
+                problems.append(f"{path}: {why_not_a_trace(path)}; it is left out")
                 continue
             agent_id = trace.header.agent_id
             if agent_id in traces or (of_the_run and agent_id not in of_the_run):
@@ -236,7 +236,7 @@ class RunArchive:
                 problems.append(f"{path}: {trace.problem}; the part before is read")
             elif trace.cut_off:
                 gaps.append(f"{path}: truncated in the middle of a line; the part before is read")
-            if not all(map(in_time, trace.runs)):
+            if not all(map(has_possible_time, trace.runs)):
                 gaps.append(f"{path}: handler runs without a possible time are left out of the timeline")
             traces[agent_id] = trace
         return dict(sorted(traces.items())), problems, gaps

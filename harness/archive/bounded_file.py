@@ -17,8 +17,8 @@ MAX_BYTES = 1024 * 1024 * 1024
 _CHUNK_BYTES = 256 * 1024
 
 
-class Opened(io.BufferedReader):
-    """The content, from its beginning. `trouble` says, once it was read to its end, why there is no more."""
+class BoundedFile(io.BufferedReader):
+    """The content, from its beginning. `problem` says, once it was read to its end, why there is no more."""
 
     def __init__(self, path: Path, most_bytes: int = MAX_BYTES) -> None:
         """Raises OSError if there is no such file, it may not be read, or is a fifo, a device or a socket."""
@@ -31,13 +31,13 @@ class Opened(io.BufferedReader):
         return self._content.packed
 
     @property
-    def trouble(self) -> str:
-        return self._content.trouble
+    def problem(self) -> str:
+        return self._content.problem
 
 
 class _Content(io.RawIOBase):
     def __init__(self, path: Path, most_bytes: int) -> None:
-        self.trouble = ""
+        self.problem = ""
         self._left = self._most = most_bytes
         self._file = open(open_plain_file(path), "rb", buffering=0)  # noqa: SIM115
         self.packed = self._file.read(2) == GZIP_MAGIC
@@ -52,7 +52,7 @@ class _Content(io.RawIOBase):
         most = min(len(buffer), self._left)
         if not most:
             if self._next(1):
-                self.trouble = f"only the first {self._most // 1024 // 1024} MiB are read"
+                self.problem = f"only the first {self._most // 1024 // 1024} MiB are read"
                 self.packed, self._input = False, b""
                 self._file.seek(0, os.SEEK_END)
             return 0
@@ -71,7 +71,7 @@ class _Content(io.RawIOBase):
         return self._unpacked(most) if self.packed else self._file.read(most)
 
     def _unpacked(self, most: int) -> bytes:
-        while not self.trouble:
+        while not self.problem:
             if self._unpacker.eof:
                 self._input = self._unpacker.unused_data.lstrip(b"\0") or self._file.read(_CHUNK_BYTES).lstrip(b"\0")
                 if not self._input:
@@ -79,12 +79,12 @@ class _Content(io.RawIOBase):
                 self._unpacker = _unpacker()
             self._input = self._input or self._file.read(_CHUNK_BYTES)
             if not self._input:
-                self.trouble = "the gzip data ends early"
+                self.problem = "the gzip data ends early"
                 break
             try:
                 data: bytes = self._unpacker.decompress(self._input, most)
             except zlib.error:
-                self.trouble = "the gzip data is damaged"
+                self.problem = "the gzip data is damaged"
                 break
             self._input = self._unpacker.unconsumed_tail
             if data:
@@ -120,7 +120,7 @@ class JsonLines(Generic[Record]):
     def __init__(self, path: Path | None, model: type[Record]) -> None:
         self._path, self._model = path, model
         self._left_out = 0
-        self._trouble = ""
+        self._problem = ""
 
     def __iter__(self) -> Iterator[Record]:
         if self._path is None or not self._path.is_file():
@@ -131,12 +131,12 @@ class JsonLines(Generic[Record]):
                     if not (line := file.readline(MAX_LINE_BYTES)):
                         return
                     if number > MAX_LINES or file.tell() > MAX_LINES_BYTES:
-                        self._trouble = (
+                        self._problem = (
                             f"only the first {MAX_LINES} lines or {MAX_LINES_BYTES // 1024 // 1024} MiB are read"
                         )
                         return
                     if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
-                        self._trouble = (
+                        self._problem = (
                             f"the part after {MAX_LINE_BYTES // 1024 // 1024} MiB without a line end is left out"
                         )
                         return
@@ -147,7 +147,7 @@ class JsonLines(Generic[Record]):
                     else:
                         yield read
         except OSError as error:
-            self._trouble = f"cannot be read: {error.strerror}"
+            self._problem = f"cannot be read: {error.strerror}"
 
     def leave_out(self) -> None:
         """The last line means nothing after all."""
@@ -155,10 +155,10 @@ class JsonLines(Generic[Record]):
 
     def problems(self) -> list[str]:
         """A sentence, for people, on each thing that was wrong with what was read."""
-        troubles = []
+        problems = []
         if self._left_out:
             lines = "1 damaged or unknown line is" if self._left_out == 1 else ""
-            troubles.append(f"{lines or f'{self._left_out} damaged or unknown lines are'} left out")
-        if self._trouble:
-            troubles.append(self._trouble)
-        return [f"{self._path.name if self._path else ''}: {trouble}" for trouble in troubles]
+            problems.append(f"{lines or f'{self._left_out} damaged or unknown lines are'} left out")
+        if self._problem:
+            problems.append(self._problem)
+        return [f"{self._path.name if self._path else ''}: {problem}" for problem in problems]

@@ -65,7 +65,7 @@ def quality(loss: float) -> int:
     return bisect_right(QUALITY_LIMITS, loss)
 
 
-def _is_another(loss: float, before: float) -> bool:
+def _differs(loss: float, before: float) -> bool:
     return abs(loss - before) >= SAME_LOSS or quality(loss) != quality(before)
 
 
@@ -90,8 +90,8 @@ class Connectivity:
 
     def links(self, at_s: float) -> list[Pair]:
         """The links between living vehicles."""
-        living = [vehicle for vehicle in self.vehicles if not _switched(self._lost.get(vehicle, ()), at_s)]
-        return [pair for pair in combinations(living, 2) if not _switched(self._cut.get(pair, ()), at_s)]
+        living = [vehicle for vehicle in self.vehicles if not _is_on(self._lost.get(vehicle, ()), at_s)]
+        return [pair for pair in combinations(living, 2) if not _is_on(self._cut.get(pair, ()), at_s)]
 
     def loss(self, pair: Pair, at_s: float) -> float:
         """What a pair loses then, to a twentieth."""
@@ -99,7 +99,7 @@ class Connectivity:
         at = bisect_right(losses, at_s, key=itemgetter(0))
         return losses[at - 1][1] if at else 1.0
 
-    def lives(self, vehicle: int, end_s: float) -> list[tuple[float, float, bool]]:
+    def airborne_intervals(self, vehicle: int, end_s: float) -> list[tuple[float, float, bool]]:
         """From when to when the vehicle was in the air, and whether it was then lost; nothing goes beyond `end_s`."""
         times = [at_s for at_s in self._lost.get(vehicle, ()) if at_s <= end_s]
         ends = [0.0, *times, *([end_s] if len(times) % 2 == 0 else [])]
@@ -118,7 +118,7 @@ class NetworkLine(BaseModel):
     agents: list[int] = []
 
 
-class Network:
+class NetworkReplay:
     """The network while its record is read, line by line."""
 
     def __init__(self, vehicles: Collection[int]) -> None:
@@ -127,25 +127,25 @@ class Network:
         self._pairs = {f"{low}-{high}": (low, high) for low, high in combinations(self.vehicles, 2)}
         self._out_of_range: set[Pair] = set()
         self._cut_off: set[Pair] = set()
-        self._asked: dict[Pair, tuple[float, float]] = {}
+        self._scripted: dict[Pair, tuple[float, float]] = {}
         """What each pair loses in either direction, over which the radio loses more."""
-        self._over_the_radio: dict[Pair, float] = {}
+        self._radio_losses: dict[Pair, float] = {}
 
     @property
     def cut(self) -> set[Pair]:
         return self._out_of_range | self._cut_off
 
-    def play(self, line: NetworkLine) -> None:
+    def apply(self, line: NetworkLine) -> None:
         """Raises ValueError, TypeError, AttributeError or KeyError if the line means nothing."""
         losses = {self._pairs[name]: loss for name, loss in line.losses.items()}
         if line.asked is not None:
             conditions = NetworkConditions.from_json(line.asked)
             self._cut_off = {pair for pair in self._pairs.values() if len(components(conditions, pair)) > 1}
-            self._asked = {
+            self._scripted = {
                 (low, high): (_asked_loss(conditions, low, high), _asked_loss(conditions, high, low))
                 for low, high in self._pairs.values()
             }
-        self._over_the_radio |= losses
+        self._radio_losses |= losses
         self._out_of_range -= losses.keys()
         self._out_of_range |= {pair for pair, loss in losses.items() if loss == 1.0}
         if (fault := named(line.what)).takes_the_vehicle:
@@ -155,14 +155,14 @@ class Network:
 
     def losses(self, at_s: float) -> Losses:
         """What the links lose now."""
-        lost = [loss for pair in self._asked if self._is_up(pair) for loss in self._directions(pair)]
+        lost = [loss for pair in self._scripted if self._is_up(pair) for loss in self._directions(pair)]
         mean = sum(lost) / len(lost) if lost else 0.0
         return Losses(at_s, round(mean, 3), round(max(lost, default=0.0), 3))
 
     def by_link(self) -> dict[Link, float]:
         """What each link loses now, in either direction: everything where there is none."""
         losses: dict[Link, float] = {}
-        for low, high in self._asked:
+        for low, high in self._scripted:
             there, back = (1.0, 1.0) if self.lost & {low, high} else self._directions((low, high))
             losses |= {(low, high): there, (high, low): back}
         return losses
@@ -173,32 +173,32 @@ class Network:
 
     def by_pair(self) -> dict[Pair, float]:
         """What each pair loses now, both ways together."""
-        return {pair: sum(self._directions(pair)) / 2 if self._is_up(pair) else 1.0 for pair in self._asked}
+        return {pair: sum(self._directions(pair)) / 2 if self._is_up(pair) else 1.0 for pair in self._scripted}
 
     def _is_up(self, pair: Pair) -> bool:
         return pair not in self._out_of_range and pair not in self._cut_off and not self.lost & {*pair}
 
     def _directions(self, pair: Pair) -> tuple[float, float]:
-        over_the_radio = self._over_the_radio.get(pair, 0.0)
-        there, back = self._asked[pair]
-        return 1 - (1 - there) * (1 - over_the_radio), 1 - (1 - back) * (1 - over_the_radio)
+        radio_loss = self._radio_losses.get(pair, 0.0)
+        there, back = self._scripted[pair]
+        return 1 - (1 - there) * (1 - radio_loss), 1 - (1 - back) * (1 - radio_loss)
 
     def components(self) -> Components:
-        left = set(self.vehicles) - self.lost
-        reaches = {vehicle: left - {vehicle} for vehicle in left}
+        remaining = set(self.vehicles) - self.lost
+        reaches = {vehicle: remaining - {vehicle} for vehicle in remaining}
         for low, high in self.cut:
-            if low in left and high in left:
+            if low in remaining and high in remaining:
                 reaches[low].discard(high)
                 reaches[high].discard(low)
         groups = []
-        while left:
+        while remaining:
             reached: set[int] = set()
-            ahead = {min(left)}
-            while ahead:
-                reached |= ahead
-                ahead = set().union(*(reaches[vehicle] for vehicle in ahead)) - reached
+            frontier = {min(remaining)}
+            while frontier:
+                reached |= frontier
+                frontier = set().union(*(reaches[vehicle] for vehicle in frontier)) - reached
             groups.append(frozenset(reached))
-            left -= reached
+            remaining -= reached
         return tuple(sorted(groups, key=lambda group: (-len(group), min(group))))
 
 
@@ -214,7 +214,7 @@ def _loss(link: LinkConditions) -> float:
 def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectivity:
     """The network among `vehicles`. A line that means nothing, or comes before the first conditions, is left out."""
     lines = JsonLines(path, NetworkLine)
-    network = Network(vehicles)
+    network = NetworkReplay(vehicles)
     states: list[Topology] = []
     losses: list[Losses] = []
     reboots: list[tuple[float, int]] = []
@@ -227,14 +227,14 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
         try:
             if not states and line.asked is None:
                 raise ValueError("the record begins with conditions")
-            network.play(line)
+            network.apply(line)
         except (ValueError, TypeError, AttributeError, KeyError):
             lines.leave_out()
             continue
         now_s = max(now_s, line.at_s)
-        switched, fallen = cut_before ^ network.cut, lost_before ^ network.lost
-        _switch(cut, switched, now_s)
-        _switch(lost, fallen, now_s)
+        toggled_pairs, toggled_vehicles = cut_before ^ network.cut, lost_before ^ network.lost
+        _toggle(cut, toggled_pairs, now_s)
+        _toggle(lost, toggled_vehicles, now_s)
         if (fault := named(line.what)).ends_a_life and not fault.takes_the_vehicle:
             reboots += [(now_s, vehicle) for vehicle in line.agents if vehicle in network.vehicles]
         lost_now = network.losses(now_s)
@@ -242,10 +242,10 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
             losses.append(lost_now)
         for pair, loss in network.by_pair().items():
             history = pair_losses.setdefault(pair, [])
-            if not history or _is_another(loss, history[-1][1]):
+            if not history or _differs(loss, history[-1][1]):
                 history.append((now_s, round(loss, 3)))
-        if switched or fallen or not states:
-            _enter(states, Topology(now_s, line.what, network.components()))
+        if toggled_pairs or toggled_vehicles or not states:
+            _append_state(states, Topology(now_s, line.what, network.components()))
     return Connectivity(network.vehicles, states, losses, reboots, lines.problems(), pair_losses, cut, lost)
 
 
@@ -254,14 +254,14 @@ def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[t
 
     A link that is cut, out of range, or of a vehicle that is lost, loses everything.
     """
-    network = Network(vehicles)
+    network = NetworkReplay(vehicles)
     before: dict[Link, float] = {}
     now_s = 0.0
     for line in JsonLines(path, NetworkLine):
         if not before and line.asked is None:
             continue
         try:
-            network.play(line)
+            network.apply(line)
         except (ValueError, TypeError, AttributeError, KeyError):
             continue
         now_s = max(now_s, line.at_s)
@@ -271,7 +271,7 @@ def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[t
         before = losses
 
 
-def _enter(states: list[Topology], state: Topology) -> None:
+def _append_state(states: list[Topology], state: Topology) -> None:
     """Add the state if it is another than the last; one that lasted no time was none."""
     if states and states[-1].at_s == state.at_s:
         states.pop()
@@ -282,11 +282,11 @@ def _enter(states: list[Topology], state: Topology) -> None:
 Key = TypeVar("Key", Pair, int)
 
 
-def _switch(times: dict[Key, list[float]], keys: Iterable[Key], at_s: float) -> None:
+def _toggle(times: dict[Key, list[float]], keys: Iterable[Key], at_s: float) -> None:
     for key in keys:
         times.setdefault(key, []).append(at_s)
 
 
-def _switched(times: Sequence[float], at_s: float) -> bool:
+def _is_on(times: Sequence[float], at_s: float) -> bool:
     """Whether what is switched at these times is on."""
     return bisect_right(times, at_s) % 2 == 1

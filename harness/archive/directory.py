@@ -58,15 +58,15 @@ class RunDirectory:
         """Where each vehicle has its keys while it is played: elsewhere, for nothing secret is kept here."""
         claim(path, self.agents, self.vehicles)
 
-    def vehicle(self, vehicle_id: int, life: int = 1) -> Path:
+    def vehicle(self, vehicle_id: int, incarnation: int = 1) -> Path:
         """The directory in which a vehicle works; each that takes the place of a lost one has its own."""
-        path = self.vehicles / (str(vehicle_id) if life == 1 else f"{vehicle_id}-{life}")
+        path = self.vehicles / (str(vehicle_id) if incarnation == 1 else f"{vehicle_id}-{incarnation}")
         path.mkdir(exist_ok=True)
         return path
 
-    def agent(self, agent_id: int, life: int = 1) -> Path:
+    def agent(self, agent_id: int, incarnation: int = 1) -> Path:
         """The directory in which an agent works; each life of it has its own."""
-        path = self.agents if life == 1 else self.agents / f"{agent_id}-{life}"
+        path = self.agents if incarnation == 1 else self.agents / f"{agent_id}-{incarnation}"
         path.mkdir(exist_ok=True)
         return path
 
@@ -82,13 +82,13 @@ class RunDirectory:
         write_json_atomically(path, dict(mission))
         return path
 
-    def bring_export(self, agent_id: int, directory: Path) -> None:
+    def copy_export(self, agent_id: int, directory: Path) -> None:
         """Copy the export of a later life, if there is one, to where the checker looks for it."""
         export = directory / f"{agent_id}{SUFFIX}"
         if directory != self.agents and export.exists():
             shutil.copyfile(export, self.agents / export.name)
 
-    def bring_trace(self, agent_id: int, directory: Path, brought: int = 0) -> int:
+    def append_trace(self, agent_id: int, directory: Path, copied_bytes: int = 0) -> int:
         """Append what is new in the trace of a later life, after `brought` bytes, to the agent's; how many bytes it is.
 
         Half a last line, which the agent was killed over or still writes, is left out.
@@ -97,14 +97,14 @@ class RunDirectory:
         if not later.exists():
             return 0
         with later.open("rb") as file:
-            file.seek(brought)
-            new = file.read()
-        new = new[: new.rfind(b"\n") + 1]
+            file.seek(copied_bytes)
+            added = file.read()
+        added = added[: added.rfind(b"\n") + 1]
         with (self.agents / later.name).open("a+b") as trace:
             trace.seek(0)
             trace.truncate(trace.read().rfind(b"\n") + 1)
-            trace.write(new)
-        return len(new)
+            trace.write(added)
+        return len(added)
 
     def keep_exports_before_final_reconcile(self) -> None:
         """Copy the exports as they stand: how the mission left the chains, before anybody put them in order."""

@@ -45,7 +45,7 @@ def _decodable(text: str) -> str:
 
 
 Base64 = Annotated[str, AfterValidator(_decodable)]
-EventData = Annotated[Base64, Field(max_length=4 * (MAX_EVENT_DATA_BYTES // 3 + 1))]
+EncodedEventData = Annotated[Base64, Field(max_length=4 * (MAX_EVENT_DATA_BYTES // 3 + 1))]
 
 
 class ExportedBlock(BaseModel):
@@ -56,7 +56,7 @@ class ExportedBlock(BaseModel):
 
     agent_id: AgentId
     timestamp_us: Annotated[int, Field(ge=0, lt=2**64, strict=True)]
-    event_data: EventData
+    event_data: EncodedEventData
     block_hash: Hash
     chain_hash: Hash | None
     signature: Annotated[
@@ -89,7 +89,7 @@ class CurrentBlock(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    event_data: EventData
+    event_data: EncodedEventData
 
 
 class Export(BaseModel):
@@ -197,11 +197,11 @@ def read_export(path: Path) -> Export:
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise not_json(path, error) from None
-    return export_of(path, document)
+        raise json_error(path, error) from None
+    return parse_export(path, document)
 
 
-def not_json(path: Path, error: ValueError | RecursionError) -> ExportError:
+def json_error(path: Path, error: ValueError | RecursionError) -> ExportError:
     """What json found wrong with an export."""
     where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else "its nesting"
     if isinstance(error, ValueError) and not isinstance(error, json.JSONDecodeError):
@@ -209,7 +209,7 @@ def not_json(path: Path, error: ValueError | RecursionError) -> ExportError:
     return ExportError(f"{path}: truncated or damaged: not JSON at {where}; export it again")
 
 
-def export_of(path: Path, document: Any) -> Export:
+def parse_export(path: Path, document: Any) -> Export:
     """The export that a JSON document is. Raises ExportError, as `read_export` of the file that it is in."""
     if not isinstance(document, dict) or "schema" not in document:
         raise ExportError(f"{path}: not a chain export (it has no `schema`)")
@@ -314,14 +314,14 @@ def name_blocks(exports: Mapping[int, Export]) -> dict[str, str]:
     completed: dict[int, dict[str, int]] = {
         agent_id: dict.fromkeys(export.completed, 0) for agent_id, export in exports.items()
     }
-    strays: dict[int, dict[str, int]] = {}
+    unexported: dict[int, dict[str, int]] = {}
     for export in exports.values():
         for block in export.blocks():
             if block.block_hash not in completed.get(block.agent_id, {}):
-                strays.setdefault(block.agent_id, {})[block.block_hash] = block.timestamp_us
-    for agent_id, blocks in strays.items():
-        in_time = sorted(blocks, key=lambda block_hash: (blocks[block_hash], block_hash))
-        completed.setdefault(agent_id, {}).update(dict.fromkeys(in_time, 0))
+                unexported.setdefault(block.agent_id, {})[block.block_hash] = block.timestamp_us
+    for agent_id, blocks in unexported.items():
+        by_time = sorted(blocks, key=lambda block_hash: (blocks[block_hash], block_hash))
+        completed.setdefault(agent_id, {}).update(dict.fromkeys(by_time, 0))
     return {
         block_hash: f"{agent_id}.{ordinal}"
         for agent_id, blocks in sorted(completed.items())

@@ -96,7 +96,7 @@ class Tie:
     branch: str
 
 
-class Begun(NamedTuple):
+class ActivityStart(NamedTuple):
     """An agent began a vote, a reconcile or a phase of one.
 
     `detail` is the hash of the block, the reason of the reconcile, or the name of the phase.
@@ -107,7 +107,7 @@ class Begun(NamedTuple):
     detail: str
 
 
-Step = Begun | Vote | Reconcile | Tie | Commit
+HistoryEvent = ActivityStart | Vote | Reconcile | Tie | Commit
 """What a handler run began, ended or did."""
 
 
@@ -134,38 +134,38 @@ class History:
     messages: list[Message] | None
 
 
-def in_time(run: HandlerRun) -> bool:
+def has_possible_time(run: HandlerRun) -> bool:
     """Whether the handler ran when it can have run."""
     return 0 <= run.t <= LATEST_S
 
 
-def lives(trace: Trace) -> list[list[HandlerRun]]:
+def incarnations(trace: Trace) -> list[list[HandlerRun]]:
     """The handler runs of each life of an agent that have a possible time."""
-    return [[run for _, run in life if in_time(run)] for life in trace.lives()]
+    return [[run for _, run in runs if has_possible_time(run)] for runs in trace.incarnations()]
 
 
 def history_of(
     traces: Mapping[int, Trace], faults: Iterable[FaultRecord], end_s: float, *, whole: bool = True
 ) -> History:
     """`end_s` is when the run ended, in mission seconds; without `whole` traces there are no messages."""
-    falls: dict[int, list[float]] = defaultdict(list)
+    ends: dict[int, list[float]] = defaultdict(list)
     for fault in faults:
         if fault.kind.ends_a_life:
             for agent in fault.agents or ():
-                falls[agent].append(fault.at_s)
+                ends[agent].append(fault.at_s)
     history = History([], [], [], [], [] if whole else None)
     for agent, trace in sorted(traces.items()):
-        every = [runs for runs in lives(trace) if runs]
+        every = [runs for runs in incarnations(trace) if runs]
         for runs, later in zip_longest(every, every[1:]):
-            known = [at_s for at_s in falls[agent] if at_s >= runs[-1].t]
-            incarnation = Incarnation(agent)
+            known = [at_s for at_s in ends[agent] if at_s >= runs[-1].t]
+            incarnation = HistoryReader(agent)
             for run in runs:
-                _keep(history, incarnation.take(run))
-            _keep(history, incarnation.end(min([*known, later[0].t if later else end_s])))
+                _append(history, incarnation.feed(run))
+            _append(history, incarnation.end(min([*known, later[0].t if later else end_s])))
     return replace(history, messages=_messages(traces)) if whole else history
 
 
-def _keep(history: History, steps: Iterable[Step]) -> None:
+def _append(history: History, steps: Iterable[HistoryEvent]) -> None:
     for step in steps:
         match step:
             case Vote():
@@ -178,7 +178,7 @@ def _keep(history: History, steps: Iterable[Step]) -> None:
                 history.commits.append(step)
 
 
-class Incarnation:
+class HistoryReader:
     """The course of an agent between its start and its end, read one handler run after another.
 
     The report and the live page both use this class, so a vote or a reconcile begins and ends in both at the same
@@ -193,24 +193,24 @@ class Incarnation:
         self._phase: tuple[PhaseName, float, int] | None = None
         self._phases: list[Phase] = []
 
-    def take(self, run: HandlerRun) -> Iterator[Step]:
+    def feed(self, run: HandlerRun) -> Iterator[HistoryEvent]:
         """Yield the steps of the next handler run."""
         self._now_s = run.t
         if run.handler == "process_next_deque_block" and run.branch == "proposed":
             self._vote = next((sent.block or "" for sent in run.sent), ""), run.t
-            yield Begun("vote", run.t, self._vote[0])
+            yield ActivityStart("vote", run.t, self._vote[0])
         elif run.handler == "vote_timer_expiration":
             yield from self._end_vote(run.t, run.branch)
         elif run.handler == "reconcile_begin" and run.branch == "begun":
             self._reconcile = REASONS.get(str(run.trigger.subject), "asked by the operator"), run.t
-            yield Begun("reconcile", run.t, self._reconcile[0])
+            yield ActivityStart("reconcile", run.t, self._reconcile[0])
         elif self._reconcile is not None:
-            yield from self._go_on(run)
+            yield from self._continue_reconcile(run)
         for operation, block in run.changes:
             if operation == "chain+":
                 yield Commit(self._agent, run.t, block, COMMITTED_BY.get(run.handler, "otherwise"))
 
-    def end(self, at_s: float) -> Iterator[Step]:
+    def end(self, at_s: float) -> Iterator[HistoryEvent]:
         """Yield the vote and the reconcile that the end of the incarnation cuts short."""
         at_s = max(at_s, self._now_s)
         yield from self._end_vote(at_s, CUT_SHORT)
@@ -222,7 +222,7 @@ class Incarnation:
             self._vote = None
             yield Vote(self._agent, block, since_s, max(at_s, since_s), outcome)
 
-    def _go_on(self, run: HandlerRun) -> Iterator[Step]:
+    def _continue_reconcile(self, run: HandlerRun) -> Iterator[HistoryEvent]:
         """Yield the steps of the reconcile that is under way."""
         if run.branch.startswith("tie:"):
             yield Tie(self._agent, run.t, run.branch)
@@ -234,7 +234,7 @@ class Incarnation:
             else:
                 self._end_phase(run.t)
                 self._phase = name, run.t, 1
-                yield Begun("phase", run.t, name)
+                yield ActivityStart("phase", run.t, name)
 
     def _end_phase(self, at_s: float) -> None:
         if self._phase is not None:
@@ -256,7 +256,7 @@ def _messages(traces: Mapping[int, Trace]) -> list[Message]:
     sent: dict[tuple[object, object], list[Message]] = defaultdict(list)
     for agent, trace in sorted(traces.items()):
         for run in trace.runs:
-            if in_time(run):
+            if has_possible_time(run):
                 for broadcast in run.sent:
                     message = Message(agent, run.t, broadcast.message, broadcast.block, seq=broadcast.seq)
                     sent[agent, broadcast.seq].append(message)
@@ -265,7 +265,7 @@ def _messages(traces: Mapping[int, Trace]) -> list[Message]:
             if not isinstance(run.trigger, MessageTrigger):
                 continue
             of_this_number = sent.get((run.trigger.sender, run.trigger.sequence))
-            if of_this_number and in_time(run):
+            if of_this_number and has_possible_time(run):
                 by_then = bisect_right([message.at_s for message in of_this_number], run.t)
                 of_this_number[max(by_then - 1, 0)].receipts.append((agent, run.t))
     return sorted(
@@ -274,12 +274,12 @@ def _messages(traces: Mapping[int, Trace]) -> list[Message]:
     )
 
 
-def ends_at(traces: Mapping[int, Trace]) -> float:
+def end_of_traces(traces: Mapping[int, Trace]) -> float:
     """When the last handler ran, in mission seconds; 0 if none did."""
-    return max((run.t for trace in traces.values() for run in trace.runs if in_time(run)), default=0.0)
+    return max((run.t for trace in traces.values() for run in trace.runs if has_possible_time(run)), default=0.0)
 
 
-def possible(faults: Iterable[FaultRecord]) -> list[FaultRecord]:
+def possible_faults(faults: Iterable[FaultRecord]) -> list[FaultRecord]:
     """Those with a possible time, in order."""
     return sorted(
         (fault for fault in faults if math.isfinite(fault.at_s) and 0 <= fault.at_s <= LATEST_S),

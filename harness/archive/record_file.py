@@ -22,18 +22,18 @@ Place = tuple[dict[Any, Any] | list[Any], Any]
 
 MAX_ROUNDS = 100
 """Each round takes a part out of whatever is wrong: more than parts are within each other are not needed."""
-MAX_MISFITS = 20_000
+MAX_ERRORS = 20_000
 MAX_NAME = 80
-UNKNOWN = "extra_forbidden"
-HALF_A_CHARACTER = "string_unicode"
+UNKNOWN_KEY = "extra_forbidden"
+LONE_SURROGATE = "string_unicode"
 MISSING = "missing"
-OF_A_MODEL = "model_type"
+MODEL_TYPE = "model_type"
 """Error types of pydantic."""
 NOT_AN_OBJECT = "input should be an object"
 
 
 @dataclass(frozen=True)
-class Misfit:
+class InvalidPart:
     """`key` of the document has something that is wrong: the first is `where`, and `more` follow."""
 
     key: str
@@ -46,39 +46,39 @@ class Misfit:
         return f"`{self.where}` is wrong: {self.what}{more}"
 
 
-def fit(model: type[Model], document: dict[str, Any]) -> tuple[Model, list[Misfit]]:
+def validate_leniently(model: type[Model], document: dict[str, Any]) -> tuple[Model, list[InvalidPart]]:
     """What fits `model`, all of whose keys have defaults, and what was taken out of `document` because it does not.
 
     Keys that the model does not know are passed over, and half a character in a text becomes a question mark. Raises
     ValueError if more than `MAX_MISFITS` things are wrong.
     """
-    misfits: dict[str, Misfit] = {}
+    invalid_parts: dict[str, InvalidPart] = {}
     for _ in range(MAX_ROUNDS):
         try:
-            return model.model_validate(document), list(misfits.values())
+            return model.model_validate(document), list(invalid_parts.values())
         except ValidationError as error:
-            if error.error_count() > MAX_MISFITS:
+            if error.error_count() > MAX_ERRORS:
                 raise ValueError(f"{error.error_count()} errors in it") from None
             errors = error.errors(include_url=False, include_context=False, include_input=False)
-        for misfit in _by_key(document, errors):
-            misfits.setdefault(misfit.key, misfit)
+        for part in _by_key(document, errors):
+            invalid_parts.setdefault(part.key, part)
         places = [(problem, _place(document, problem["loc"])[0]) for problem in errors]
-        _take_out([place for problem, place in places if not _mended(place, problem)])
-    return model(), list(misfits.values())
+        _remove([place for problem, place in places if not _repair(place, problem)])
+    return model(), list(invalid_parts.values())
 
 
-def _by_key(document: dict[str, Any], errors: Sequence[ErrorDetails]) -> Iterator[Misfit]:
+def _by_key(document: dict[str, Any], errors: Sequence[ErrorDetails]) -> Iterator[InvalidPart]:
     by_key: dict[str, dict[str, str]] = {}
     for problem in errors:
-        if problem["type"] not in (UNKNOWN, HALF_A_CHARACTER):
-            _, steps = _place(document, problem["loc"])
-            steps += problem["loc"][-1:] if problem["type"] == MISSING else ()
-            where = ".".join(str(step)[:MAX_NAME] for step in steps)
-            what = NOT_AN_OBJECT if problem["type"] == OF_A_MODEL else problem["msg"].lower()
+        if problem["type"] not in (UNKNOWN_KEY, LONE_SURROGATE):
+            _, path = _place(document, problem["loc"])
+            path += problem["loc"][-1:] if problem["type"] == MISSING else ()
+            where = ".".join(str(step)[:MAX_NAME] for step in path)
+            what = NOT_AN_OBJECT if problem["type"] == MODEL_TYPE else problem["msg"].lower()
             by_key.setdefault(str(problem["loc"][0]), {}).setdefault(where, what)
     for key, wrong in by_key.items():
         where, what = next(iter(wrong.items()))
-        yield Misfit(key, where, what, len(wrong) - 1)
+        yield InvalidPart(key, where, what, len(wrong) - 1)
 
 
 def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, list[int | str]]:
@@ -87,26 +87,26 @@ def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, l
     Steps that the document does not have say which type was tried.
     """
     place: Place = document, loc[0]
-    here: Any = document
-    way = []
+    value: Any = document
+    path = []
     for step in loc:
-        in_list = isinstance(here, list) and isinstance(step, int) and step < len(here)
-        if in_list or (isinstance(here, dict) and step in here):
-            place, here = (here, step), here[step]
-            way.append(step)
-    return place, way
+        in_list = isinstance(value, list) and isinstance(step, int) and step < len(value)
+        if in_list or (isinstance(value, dict) and step in value):
+            place, value = (value, step), value[step]
+            path.append(step)
+    return place, path
 
 
-def _mended(place: Place, problem: ErrorDetails) -> bool:
+def _repair(place: Place, problem: ErrorDetails) -> bool:
     """Text with half a character in it is as good with a question mark there."""
     holder, key = place
-    if problem["type"] == HALF_A_CHARACTER and isinstance(text := holder[key], str):
+    if problem["type"] == LONE_SURROGATE and isinstance(text := holder[key], str):
         holder[key] = text.encode(errors="replace").decode()
         return bool(holder[key] != text)
     return False
 
 
-def _take_out(places: Sequence[Place]) -> None:
+def _remove(places: Sequence[Place]) -> None:
     """A part of a list does not move the others before they are taken out."""
     lists: dict[int, tuple[list[Any], set[int]]] = {}
     for holder, key in places:
@@ -153,10 +153,10 @@ def read_record(path: Path) -> RecordFile:
 def _read(path: Path) -> RecordFile:
     document = _document(path)
     try:
-        record, misfits = fit(RunRecord, document)
+        record, invalid_parts = validate_leniently(RunRecord, document)
     except ValueError as error:
         raise DamagedRecordError(f"{path}: {error}; it was edited or damaged") from None
-    problems = {misfit.key: str(misfit) for misfit in misfits}
+    problems = {part.key: str(part) for part in invalid_parts}
     if "roster" not in record.model_fields_set:
         problems.setdefault("roster", "`roster` is missing")
     needed = problems.keys() & JudgedRecord.model_fields.keys()

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from harness.archive.history import lives
+from harness.archive.history import incarnations
 from harness.archive.run_record import FaultRecord
 from harness.archive.traces import Trace
 from ucp.trace import HandlerRun
@@ -35,16 +35,16 @@ def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -
     for fault in faults:
         steps += [(fault.at_s, 0, agent, fault) for agent in fault.agents or () if agent in traces]
     for agent, trace in traces.items():
-        for life, runs in enumerate(lives(trace), 1):
-            steps += [(run.t, life, agent, run) for run in runs if run.changes]
+        for incarnation, runs in enumerate(incarnations(trace), 1):
+            steps += [(run.t, incarnation, agent, run) for run in runs if run.changes]
     steps.sort(key=lambda step: step[:3])
     chains = _Chains(traces)
     states = [chains.replication(0.0)]
-    for number, (at_s, life, agent, step) in enumerate(steps):
+    for number, (at_s, incarnation, agent, step) in enumerate(steps):
         if isinstance(step, FaultRecord):
-            chains.suffer(agent, step)
+            chains.apply_fault(agent, step)
         else:
-            chains.play(agent, life, step)
+            chains.apply_run(agent, incarnation, step)
         if number + 1 == len(steps) or steps[number + 1][0] > at_s:
             now = chains.replication(at_s)
             if states[-1].at_s == at_s:
@@ -59,7 +59,7 @@ class _Chains:
 
     def __init__(self, agents: Iterable[int]) -> None:
         self._paths: dict[int, list[tuple[int, str]]] = {agent: [] for agent in agents}
-        self._life = dict.fromkeys(self._paths, 1)
+        self._incarnation = dict.fromkeys(self._paths, 1)
         self._prefixes: dict[tuple[int, str], int] = {}
         self._sharing: Counter[int] = Counter()
         self._mutual = 0  # at most as long as the mutual chain
@@ -68,7 +68,7 @@ class _Chains:
         self._blocks_with: Counter[int] = Counter()  # so many copies
         self._copies_of_completed = 0
 
-    def suffer(self, agent: int, fault: FaultRecord) -> None:
+    def apply_fault(self, agent: int, fault: FaultRecord) -> None:
         if fault.loses_data:
             self._empty(agent)
             self._paths.pop(agent, None)
@@ -76,10 +76,10 @@ class _Chains:
             self._mutual = 0 if agent not in self._paths else self._mutual
             self._paths.setdefault(agent, [])
 
-    def play(self, agent: int, life: int, run: HandlerRun) -> None:
+    def apply_run(self, agent: int, incarnation: int, run: HandlerRun) -> None:
         """A run of a life that was taken already changes nothing any more."""
-        if life > self._life[agent]:
-            self._life[agent] = life
+        if incarnation > self._incarnation[agent]:
+            self._incarnation[agent] = incarnation
             self._empty(agent)
             self._paths[agent] = []
             self._mutual = 0
@@ -115,17 +115,17 @@ class _Chains:
             self._sharing[prefix] -= 1
             self._count(block, -1)
 
-    def _count(self, block: str, more: int) -> None:
+    def _count(self, block: str, difference: int) -> None:
         if block in self._completed:
             self._blocks_with[self._copies[block]] -= 1
-            self._blocks_with[self._copies[block] + more] += 1
-            self._copies_of_completed += more
-        self._copies[block] += more
+            self._blocks_with[self._copies[block] + difference] += 1
+            self._copies_of_completed += difference
+        self._copies[block] += difference
 
     def replication(self, at_s: float) -> Replication:
         paths = list(self._paths.values())
-        first: list[tuple[int, str]] = paths[0] if paths else []
-        while self._mutual < len(first) and self._sharing[first[self._mutual][0]] == len(paths):
+        first_path: list[tuple[int, str]] = paths[0] if paths else []
+        while self._mutual < len(first_path) and self._sharing[first_path[self._mutual][0]] == len(paths):
             self._mutual += 1
         completed = len(self._completed)
         return Replication(

@@ -58,8 +58,8 @@ class Header(BaseModel):
 
     def to_line(self) -> str:
         """The line that it is in a trace."""
-        said = self.model_dump(by_alias=True)
-        in_order = {name: said[name] for name in _HEADER_KEYS if said[name] is not None}
+        fields = self.model_dump(by_alias=True)
+        in_order = {name: fields[name] for name in _HEADER_KEYS if fields[name] is not None}
         return json.dumps(in_order, separators=(",", ":")) + "\n"
 
     @property
@@ -72,7 +72,7 @@ class _VersionedHeader(Header):
     schema_: Version = Field(alias="schema")
 
 
-_ONLY_TAKES_IN = re.compile(
+_ONLY_RECEIVES = re.compile(
     rb"""
     \{"t":(?!0\d)\d{1,6}(?:\.\d+)?,"handler":"receive_\w+","algorithm":(?!0)\d{1,2},
     "trigger":\{"message":"[\w ]+","from":(?!0)\d{1,5},"seq":(?!0\d)\d{1,9}\},(?:"input":"[\w+/=]*",)?
@@ -125,20 +125,20 @@ class Trace:
     lines: tuple[Sequence[int], Sequence[int]] | None = None
     """In which line of its file each of `runs`, and of `asides`, stands; None where they stand one after another."""
 
-    def lives(self) -> Iterator[Iterator[tuple[int, HandlerRun]]]:
+    def incarnations(self) -> Iterator[Iterator[tuple[int, HandlerRun]]]:
         """Each life of the agent: its runs, with their lines, which count from 1. A life begins with a header line."""
         bounds = [0, *self.starts, len(self.runs)]
-        for life, (start, end) in enumerate(pairwise(bounds), 1):
-            yield self._numbered(start, end, life)
+        for incarnation, (start, end) in enumerate(pairwise(bounds), 1):
+            yield self._numbered(start, end, incarnation)
 
-    def _numbered(self, start: int, end: int, life: int) -> Iterator[tuple[int, HandlerRun]]:
+    def _numbered(self, start: int, end: int, incarnation: int) -> Iterator[tuple[int, HandlerRun]]:
         if self.lines is not None:
             return zip(islice(self.lines[0], start, end), islice(self.runs, start, end), strict=True)
         if not self.asides:
-            return enumerate(islice(self.runs, start, end), start + life + 1)
+            return enumerate(islice(self.runs, start, end), start + incarnation + 1)
         before = [position for position, _ in self.asides]
         return (
-            (number + life + 1 + bisect_right(before, number), run)
+            (number + incarnation + 1 + bisect_right(before, number), run)
             for number, run in enumerate(islice(self.runs, start, end), start)
         )
 
@@ -176,7 +176,7 @@ class Trace:
 
     def skimmed(self) -> "Trace":
         """The trace without the handler runs that only took a message in; lines are then not counted by `lives`."""
-        kept = [not only_takes_in(run) for run in self.runs]
+        kept = [not only_receives(run) for run in self.runs]
         before = [0, *accumulate(kept)]
         return replace(
             self,
@@ -198,16 +198,8 @@ class Trace:
             (run.t for run in self.runs if any("chain" in operation for operation, _ in run.changes)), default=0.0
         )
 
-    def steps(self) -> Iterator[tuple[int, HandlerRun, "Held"]]:
-        """Line, run, and what the agent held after it. The same `Held` is updated from step to step of a life."""
-        for life in self.lives():
-            held = Held()
-            for line, run in life:
-                held.replay(run)
-                yield line, run, held
 
-
-class Held:
+class HeldBlocks:
     """Where an agent holds which block, how often, and which blocks it has completed."""
 
     def __init__(self) -> None:
@@ -249,7 +241,7 @@ class Held:
                     self.not_in_chain.add(block)
 
 
-def parsed(line: bytes) -> Header | Entry:
+def parse_line(line: bytes) -> Header | Entry:
     """What a line of a trace says. Raises ValueError if it says nothing."""
     if b'"handler"' in line:
         return HANDLER_RUN.validate_json(line)
@@ -261,18 +253,18 @@ def gap_line(gap: Gap) -> str:
     return f'{{"lost_lines":{gap.lines},"lost_bytes":{gap.lost_bytes}}}\n'
 
 
-def gap_in(line: bytes) -> tuple[int, int] | None:
+def parse_gap(line: bytes) -> tuple[int, int] | None:
     """How many lines, and bytes, are lost where this line stands; None if it does not say so."""
-    told = _LOST.fullmatch(line.strip())
-    return None if told is None else (int(told[1]), int(told[2]))
+    match = _LOST.fullmatch(line.strip())
+    return None if match is None else (int(match[1]), int(match[2]))
 
 
-def only_takes_in(run: HandlerRun) -> bool:
+def only_receives(run: HandlerRun) -> bool:
     """Whether the handler took a message in, and nothing changed."""
     return not run.changes and run.handler.startswith("receive_")
 
 
-def why_none(path: Path) -> str:
+def why_not_a_trace(path: Path) -> str:
     """What is wrong with a file that does not even begin as a trace."""
     try:
         with path.open("rb") as file:
@@ -304,10 +296,10 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
                     elif trace is not None:
                         trace.cut_off = True
                     break
-                if skim and trace is not None and _ONLY_TAKES_IN.fullmatch(line):
+                if skim and trace is not None and _ONLY_RECEIVES.fullmatch(line):
                     continue
                 try:
-                    entry = parsed(line) if trace else HEADER.validate_json(line)
+                    entry = parse_line(line) if trace else HEADER.validate_json(line)
                     if trace is None:
                         assert isinstance(entry, Header)
                         trace = Trace(entry)
@@ -320,7 +312,7 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
                         break
                 except ValueError:
                     if trace is not None:
-                        lost = gap_in(line)
+                        lost = parse_gap(line)
                         trace.problem = f"line {number} is damaged" if lost is None else f"lines are lost at {number}"
                     break
     except OSError:
@@ -331,44 +323,44 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
 Record = TypeVar("Record")
 
 
-class Line(NamedTuple):
+class TraceLine(NamedTuple):
     """A handler run as it stands in a trace; lines and lives count from 1."""
 
     path: Path
     number: int
     agent_id: int
-    life: int
+    incarnation: int
     text: bytes
 
-    def parsed(self) -> HandlerRun:
+    def parse(self) -> HandlerRun:
         """Raises RunDirectoryError if it is none."""
         return _validated(HANDLER_RUN, self.path, self.number, self.text)
 
 
-def read_lines(path: Path) -> Iterator[Line]:
+def read_trace_lines(path: Path) -> Iterator[TraceLine]:
     """The handler runs of a trace; half a last line, over which an agent was killed, is none.
 
     Raises RunDirectoryError, when it comes there, if the file cannot be read or a line is not what it should be.
     """
-    life = number = agent_id = 0
+    incarnation = number = agent_id = 0
     try:
         with path.open("rb") as file:
             while text := file.readline(MAX_LINE_BYTES):
                 number += 1
                 if not text.endswith(b"\n") and len(text) < MAX_LINE_BYTES:
                     break
-                if life and b'"handler"' in text:
-                    yield Line(path, number, agent_id, life, text)
-                elif life and b'"schema"' not in text:
+                if incarnation and b'"handler"' in text:
+                    yield TraceLine(path, number, agent_id, incarnation, text)
+                elif incarnation and b'"schema"' not in text:
                     _validated(ASIDE, path, number, text)
                 else:
                     agent_id = _validated(HEADER, path, number, text).agent_id
-                    life += 1
+                    incarnation += 1
     except OSError as error:
         raise RunDirectoryError(
             f"{path}: cannot be read ({error.strerror}), and a comparison needs it: play the run again"
         ) from None
-    if not life:
+    if not incarnation:
         raise RunDirectoryError(f"{path}: it is empty, and a comparison needs it: play the run again")
 
 

@@ -14,7 +14,7 @@ from ucp.trigger import KINDS, LocalTrigger, MessageTrigger, TimerTrigger, Unkno
 
 Kind = Literal["trigger", "handler", "timer", "branch", "message", "operation", "tally"]
 
-Unknown = dict[Kind, str]
+UnknownNames = dict[Kind, str]
 """Kind -> the first unknown word of that kind, in words: "unknown timer name 'x'"."""
 
 TIMERS = frozenset(ON_TIMER)
@@ -43,7 +43,7 @@ TALLIES = {
 }
 """Handler -> the keys of its tally; None if they are block hashes."""
 
-COMPARED_WITHOUT: frozenset[Kind] = frozenset(("branch", "tally", "timer"))
+IGNORED_KINDS: frozenset[Kind] = frozenset(("branch", "tally", "timer"))
 """Of a step with unknown words of these kinds all the rest can be judged; with others it is not known what it was.
 
 Which timer ended, its handler tells.
@@ -51,13 +51,13 @@ Which timer ended, its handler tells.
 
 _TIMER_OF = {handler.name: timer for timer, handler in ON_TIMER.items()}
 
-SHOWN = 40
+MAX_SHOWN = 40
 """More of an unknown word is not shown."""
 
 
-def unknown_words(runs: Iterable[HandlerRun]) -> Unknown:
+def unknown_names(runs: Iterable[HandlerRun]) -> UnknownNames:
     """The first unknown word of each kind; a branch is one of the handler that takes it."""
-    unknown: Unknown = {}
+    unknown: UnknownNames = {}
     for handler, branch in dict.fromkeys((run.handler, run.branch) for run in runs):
         if handler not in HANDLERS:
             unknown.setdefault("handler", f"unknown handler name {_shown(handler)}")
@@ -75,7 +75,7 @@ def unknown_words(runs: Iterable[HandlerRun]) -> Unknown:
         elif isinstance(trigger, LocalTrigger):
             if trigger.handler not in HANDLERS:
                 unknown.setdefault("handler", f"unknown handler name {_shown(trigger.handler)}")
-        elif isinstance(trigger, UnknownTrigger) and names_another_kind(trigger):
+        elif isinstance(trigger, UnknownTrigger) and has_unknown_kind(trigger):
             unknown.setdefault("trigger", f"unknown trigger {_shown(next(iter(trigger.fields)))}")
         for operation, _ in run.changes:
             if operation not in OPERATIONS:
@@ -87,8 +87,8 @@ def unknown_words(runs: Iterable[HandlerRun]) -> Unknown:
             if timer not in TIMERS:
                 unknown.setdefault("timer", f"unknown timer name {_shown(timer)}")
         if run.tally and not tally_is_known(run):
-            word = next((key for key in run.tally if key not in VOTES), "")
-            unknown.setdefault("tally", f"unknown key {_shown(word)} of the tally of {run.handler}")
+            name = next((key for key in run.tally if key not in VOTES), "")
+            unknown.setdefault("tally", f"unknown key {_shown(name)} of the tally of {run.handler}")
     return unknown
 
 
@@ -98,7 +98,7 @@ def tally_is_known(run: HandlerRun) -> bool:
     return not run.tally or keys is None or keys.issuperset(run.tally)
 
 
-def names_another_kind(trigger: UnknownTrigger) -> bool:
+def has_unknown_kind(trigger: UnknownTrigger) -> bool:
     """Whether the trigger names a kind that the contract does not have, rather than none or a malformed one."""
     return bool(trigger.fields) and KINDS.isdisjoint(trigger.fields)
 
@@ -119,10 +119,10 @@ def branch_is_known(run: HandlerRun) -> bool:
     return run.branch in BRANCHES.get(run.handler, ())
 
 
-def first_of(unknown: Unknown, kinds: Collection[Kind] | None = None) -> str | None:
+def first_unknown(unknown: UnknownNames, kinds: Collection[Kind] | None = None) -> str | None:
     """The first unknown word, of these kinds if they are given; None if there is none."""
-    return next((words for kind, words in unknown.items() if kinds is None or kind in kinds), None)
+    return next((description for kind, description in unknown.items() if kinds is None or kind in kinds), None)
 
 
-def _shown(word: object) -> str:
-    return repr(str(word)[:SHOWN])
+def _shown(name: object) -> str:
+    return repr(str(name)[:MAX_SHOWN])

@@ -115,7 +115,7 @@ def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
     last_change = {agent_id: trace.chain_changed_at() for agent_id, trace in evidence.traces.items()}
     for agent_id in differing & set(evidence.traces):
         others_changed_at = max((t for peer, t in last_change.items() if peer != agent_id), default=0.0)
-        for life in evidence.traces[agent_id].lives():
+        for life in evidence.traces[agent_id].incarnations():
             began_s: float | None = None
             for _, run in life:
                 if run.handler == "reconcile_begin" and run.branch == "begun":

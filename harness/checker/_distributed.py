@@ -6,7 +6,7 @@ when its own timer does. Only traces can tell, and only in words that are known.
 
 from typing import Any
 
-from harness.archive.vocabulary import MESSAGES, TIMERS, names_another_kind
+from harness.archive.vocabulary import MESSAGES, TIMERS, has_unknown_kind
 from harness.checker._waiting import waited_too_long
 from harness.checker.evidence import Evidence, Sendings
 from harness.checker.judgement import Finding, Judgement, agents, violated
@@ -43,7 +43,7 @@ def check(evidence: Evidence) -> Judgement:
     runs = 0
     for agent_id, trace in evidence.traces.items():
         runs += len(trace.runs)
-        for life in trace.lives():
+        for life in trace.incarnations():
             ran: set[str] = set()
             for line, run in life:
                 ran.add(run.handler)
@@ -104,7 +104,7 @@ def _is_in_known_words(run: HandlerRun) -> bool:
         case LocalTrigger(handler):
             return handler in HANDLERS
         case UnknownTrigger() as unknown:
-            return not names_another_kind(unknown)
+            return not has_unknown_kind(unknown)
     return True
 
 

@@ -68,7 +68,7 @@ class Life:
 
     def numbered(self) -> Iterator[tuple[int, HandlerRun]]:
         """Its runs with their lines."""
-        return next(islice(self.trace.lives(), self.number, None))
+        return next(islice(self.trace.incarnations(), self.number, None))
 
 
 def replay(trace: Trace, inception: str | None) -> list[Life]:

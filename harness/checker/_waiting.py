@@ -65,7 +65,7 @@ def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
         if evidence.unknown_word("handler", "branch", agent_id=agent_id):
             continue  # what goes on, and what waits, is told by these
         vote_s, reconcile_s = longest(trace, VOTE_TIMERS), longest(trace, RECONCILE_TIMERS)
-        for life in trace.lives():
+        for life in trace.incarnations():
             vote = _Wait("a vote began and did not end", vote_s)
             reconcile = _Wait("a reconcile did not continue", reconcile_s)
             yield from _in_life(evidence, agent_id, life, vote, reconcile)

@@ -18,7 +18,7 @@ from harness.archive.lag import MeasuredLag
 from harness.archive.packets.capture_files import DIRECTORY, Captures, capture_files, read_captures
 from harness.archive.run_record import AgentRecord, Counters, JudgedRecord
 from harness.archive.traces import Trace
-from harness.archive.vocabulary import Kind, Unknown, first_of, unknown_words
+from harness.archive.vocabulary import Kind, UnknownNames, first_unknown, unknown_names
 from harness.checker._trace_replay import Life, replay
 from harness.checker.reference.state import State
 from harness.errors import RunDirectoryError
@@ -150,15 +150,15 @@ class Evidence:
         return self.names.get(block_hash, block_hash[:12])
 
     @cached_property
-    def unknown(self) -> dict[int, Unknown]:
+    def unknown(self) -> dict[int, UnknownNames]:
         """Words in traces that the harness does not know, of each agent whose trace has any."""
-        words = {agent_id: unknown_words(trace.runs) for agent_id, trace in self.traces.items()}
+        words = {agent_id: unknown_names(trace.runs) for agent_id, trace in self.traces.items()}
         return {agent_id: unknown for agent_id, unknown in words.items() if unknown}
 
     def unknown_word(self, *kinds: Kind, agent_id: int | None = None) -> str | None:
         """The first unknown word of these kinds, in words, in this agent's trace or in any; None if there is none."""
         for named, unknown in self.unknown.items():
-            if agent_id in (None, named) and (words := first_of(unknown, kinds)):
+            if agent_id in (None, named) and (words := first_unknown(unknown, kinds)):
                 return f"{words} in the trace of agent {named}"
         return None
 

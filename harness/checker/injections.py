@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from harness.archive.archive import RunArchive
 from harness.archive.run_record import InjectedMessages, RogueInjection
 from harness.archive.traces import Trace
-from harness.archive.vocabulary import unknown_words
+from harness.archive.vocabulary import unknown_names
 from harness.play.rogue.rogue_line import injection_of
 from harness.scenario import Scenario
 from harness.scenario.changes import injections_of
@@ -72,7 +72,7 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
         return []
     tallies = {injection.number: _Tally() for injection in injections}
     named_otherwise = any(
-        {"message", "trigger"} & unknown_words(trace.runs).keys() for trace in archive.traces.values()
+        {"message", "trigger"} & unknown_names(trace.runs).keys() for trace in archive.traces.values()
     )
     copies: dict[_Key, list[tuple[float, int]]] = defaultdict(list)
     for line in archive.injected(_Line):

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 
 from harness.archive.exports import Export
 from harness.archive.run_record import BlockHolders, FaultRecord, LeastHeld, Loss, Survival
-from harness.archive.traces import Held, Trace
+from harness.archive.traces import HeldBlocks, Trace
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import agents
 
@@ -111,15 +111,15 @@ def _losses(evidence: Evidence, lost: list[FaultRecord], at_end: Mapping[str, li
 def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) -> list[set[str]]:
     """The blocks that an agent held at each of the instants, the moment before it was lost itself."""
     waiting, blocks_held = deque(instants), []
-    held, at_s = Held(), -math.inf
+    held, at_s = HeldBlocks(), -math.inf
 
     def take_down() -> None:
         instant = waiting.popleft()
         gone = any(at_s <= loss < instant for loss in lost_at)
         blocks_held.append(set() if gone else {block for block, copies in held.copies.items() if copies})
 
-    for life in trace.lives():
-        new = Held()
+    for life in trace.incarnations():
+        new = HeldBlocks()
         for _, run in life:
             while waiting and waiting[0] < run.t:
                 take_down()

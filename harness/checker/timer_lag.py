@@ -49,7 +49,7 @@ def _of_machine(trace: Trace, ended_s: float, late_s: float, lag: MeasuredLag | 
 
 def _votes(trace: Trace) -> Iterator[tuple[float, float]]:
     """Yield the end and the duration of each vote. A reconcile pauses the timer, and leaves its vote out."""
-    for life in trace.lives():
+    for life in trace.incarnations():
         began: float | None = None
         for _, run in life:
             if run.handler == "vote_timer_expiration" and began is not None:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from harness.archive.playable import scenario_of
+from harness.archive.recorded_scenario import load_recorded_scenario
 from harness.archive.run_listing import RUNS
 from harness.commands.terminal import complain, print_json
 from harness.run.parallel import cores
@@ -97,7 +97,7 @@ def explore_command(
 
 def _asked(scenario: Path, secured: bool) -> tuple[Scenario, int | None]:
     """The scenario, and the seed of the run that it was."""
-    request, own_seed = scenario_of(scenario)
+    request, own_seed = load_recorded_scenario(scenario)
     return request.secured() if secured else request, own_seed
 
 

@@ -9,12 +9,12 @@ import typer
 from rich.console import Console
 
 from harness.archive.packets import packets_text
-from harness.archive.packets.air_names import Names, runs_of
+from harness.archive.packets.block_names import BlockNames, run_directories
 from harness.archive.packets.capture_files import Captures, capture_files, read_captures
-from harness.archive.packets.exchanges import Exchanges, count_losses, matrix
+from harness.archive.packets.exchanges import Exchanges, count_losses, loss_matrix
 from harness.archive.packets.packets_document import document
-from harness.archive.packets.packets_text import Paint, Wording
-from harness.archive.packets.selection import Selection, in_order, story
+from harness.archive.packets.packets_text import Paint, TransmissionText
+from harness.archive.packets.selection import Selection, exchanges_about, in_order
 from harness.archive.packets.transmissions import join
 from harness.commands._shared_options import BundleOption, opener_of
 from harness.commands.terminal import complain, print_lines
@@ -50,35 +50,35 @@ def packets_command(
     selection = Selection(sender, receiver, message, between)
     captures = read_captures(capture_files(paths), opener_of(bundle))
     if captures.used:
-        print_lines(_told(captures, selection, follow, lost, as_json, runs_of(paths)))
+        print_lines(_output_lines(captures, selection, follow, lost, as_json, run_directories(paths)))
     for sentence in (*captures.problems, *captures.errors):
         complain(sentence)
     if captures.errors:
         raise typer.Exit(WRONG_REQUEST)
 
 
-def _told(
+def _output_lines(
     captures: Captures, selection: Selection, follow: str | None, lost: bool, as_json: bool, runs: list[Path]
 ) -> Iterator[str]:
     everything = join(captures)
-    exchanges, names = Exchanges(everything), Names(everything, runs)
-    selected = list(selection.of(everything, captures))
+    exchanges, names = Exchanges(everything), BlockNames(everything, runs)
+    selected = list(selection.filter(everything, captures))
     shown = [transmission for transmission in selected if transmission.lost_by] if lost else selected
-    chapters = None if follow is None else list(story(names.find(follow), shown, exchanges))
+    chapters = None if follow is None else list(exchanges_about(names.find(follow), shown, exchanges))
     if as_json:
         yield from document(
             captures, count_losses(selected), shown if chapters is None else in_order(chapters), exchanges, names
         )
         return
-    wording = Wording(names, _paint())
-    yield packets_text.head(captures)
+    wording = TransmissionText(names, _paint())
+    yield packets_text.header(captures)
     if chapters is not None:
-        yield from packets_text.life(chapters, exchanges, wording)
+        yield from packets_text.exchange_lines(chapters, exchanges, wording)
         return
-    yield from packets_text.lines(shown, exchanges, wording, selection.receiver)
+    yield from packets_text.transmission_lines(shown, exchanges, wording, selection.receiver)
     if lost:
-        yield from matrix(count_losses(selected))
-    yield from packets_text.tail(captures, selected)
+        yield from loss_matrix(count_losses(selected))
+    yield from packets_text.totals(captures, selected)
 
 
 def _paint() -> Paint:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from harness.archive.directory import default_path
-from harness.archive.playable import scenario_of
+from harness.archive.recorded_scenario import load_recorded_scenario
 from harness.archive.run_record import CapturedFrames
 from harness.backend_names import BackendName
 from harness.commands._shared_options import RARE
@@ -104,7 +104,7 @@ def run_command(
     `not finished`. 130: interrupted.
     """
     console = Console()
-    asked, own_seed = scenario_of(scenario)
+    asked, own_seed = load_recorded_scenario(scenario)
     request = _with_options(asked, speedup, vehicles, gcs, capture, image_from_host, programs_of(agents or ()))
     if secured:
         request = request.secured()

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from harness.archive.archive import RunArchive
-from harness.archive.vocabulary import first_of, unknown_words
+from harness.archive.vocabulary import first_unknown, unknown_names
 from harness.backend_names import BackendName
 from harness.errors import HarnessError, ScenarioError
 from harness.play.backends import in_virtual_time
@@ -138,7 +138,7 @@ class StoryItem(pytest.Item):
     def _unknown_word(self, archive: RunArchive) -> str | None:
         """Return a description of the first word of a trace that stories do not know, or None."""
         for agent_id, trace in archive.traces.items():
-            if unknown := first_of(unknown_words(trace.runs)):
+            if unknown := first_unknown(unknown_names(trace.runs)):
                 return f"{unknown} in the trace of agent {agent_id}"
         return None
 

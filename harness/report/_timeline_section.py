@@ -12,10 +12,19 @@ from typing import TypeVar
 from markupsafe import Markup
 
 from harness.archive.connectivity import Connectivity
-from harness.archive.history import LATEST_S, History, Message, Reconcile, Vote, ends_at, history_of, possible
+from harness.archive.history import (
+    LATEST_S,
+    History,
+    Message,
+    Reconcile,
+    Vote,
+    end_of_traces,
+    history_of,
+    possible_faults,
+)
 from harness.archive.replication import replication_of
 from harness.archive.run_record import RunRecord
-from harness.archive.vocabulary import first_of, unknown_words
+from harness.archive.vocabulary import first_unknown, unknown_names
 from harness.present import text
 from harness.present.colours import Ink
 from harness.report import _timeline_charts, _timeline_lanes, facts
@@ -72,14 +81,14 @@ def section(left: ReportSource, names: Mapping[str, str]) -> TimelineSection | N
     if not traces:
         return None
     notes = []
-    faults = possible(left.record.faults)
+    faults = possible_faults(left.record.faults)
     ends_s = end_s(left)
     history = history_of(traces, faults, ends_s, whole=not left.archive.large)
-    unknown = {agent: unknown_words(trace.runs) for agent, trace in sorted(traces.items())}
+    unknown = {agent: unknown_names(trace.runs) for agent, trace in sorted(traces.items())}
     incomplete = [agent for agent, words_of_agent in unknown.items() if words_of_agent]
     all_held = not any("operation" in unknown[agent] for agent in incomplete)
     if incomplete:
-        first, more = first_of(unknown[incomplete[0]]), len(incomplete) - 1
+        first, more = first_unknown(unknown[incomplete[0]]), len(incomplete) - 1
         others = f", and such words in {more} more" if more else ""
         notes.append(f"some steps of agent {incomplete[0]} are not shown: {first} in its trace{others}")
     shades, shades_left_out = _shades(left.network, ends_s)
@@ -119,8 +128,8 @@ def section(left: ReportSource, names: Mapping[str, str]) -> TimelineSection | N
 
 def end_s(left: ReportSource) -> float:
     """Return the mission second at which the timeline ends."""
-    faults = possible(left.record.faults)
-    return max(ends_at(left.traces), *(fault.at_s for fault in faults), _planned_s(left.record), 1.0)
+    faults = possible_faults(left.record.faults)
+    return max(end_of_traces(left.traces), *(fault.at_s for fault in faults), _planned_s(left.record), 1.0)
 
 
 def _planned_s(record: RunRecord) -> float:

@@ -161,7 +161,7 @@ def flights(
 ) -> Iterator[Flight]:
     """Yield the flights of a vehicle and of the vehicles that replaced it after a loss."""
     wreck: Fix | None = None
-    for begin_s, until_s, lost in network.lives(vehicle, end_s):
+    for begin_s, until_s, lost in network.airborne_intervals(vehicle, end_s):
         flown = [fix for fix in tracks.by_vehicle[vehicle] if begin_s <= fix.at_s <= until_s]
         while wreck and flown and flown[0][1:] == wreck[1:]:  # the replacement still reports the position of the wreck
             del flown[0]

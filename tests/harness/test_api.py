@@ -81,7 +81,7 @@ def test_archive_yields_every_handler_run_and_every_held_block(tmp_path: Path) -
     assert streamed == [
         (agent, number, line, each)
         for agent, trace in archive.traces.items()
-        for number, life in enumerate(trace.lives(), 1)
+        for number, life in enumerate(trace.incarnations(), 1)
         for line, each in life
     ]
     assert len([*archive.blocks()]) == sum(len([*export.blocks()]) for export in archive.exports.by_agent.values())

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.archive.playable import scenario_of
+from harness.archive.recorded_scenario import load_recorded_scenario
 from harness.errors import HarnessError
 from tests.harness.command import harness
 from tests.pytest_plugin.inner import run, run_directories
@@ -45,7 +45,7 @@ def test_the_run_of_a_failing_test_is_played_again_and_explored(pytester: pytest
 def test_a_record_without_a_scenario_is_one_sentence(tmp_path: Path, record: str, sentence: str) -> None:
     (tmp_path / "run.json").write_text(record)
     with pytest.raises(HarnessError, match=sentence):
-        scenario_of(tmp_path)
+        load_recorded_scenario(tmp_path)
 
 
 def test_rerun_of_a_failed_test_ends_where_the_test_failed(pytester: pytest.Pytester, tmp_path: Path) -> None:

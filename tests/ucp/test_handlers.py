@@ -53,7 +53,7 @@ def traces(**keys: Any) -> Iterator[Trace]:
 
 def done(trace: Trace, handlers: dict[str, EventHandler[Any]]) -> Iterator[tuple[str, str]]:
     """(handler, what it sent, started or triggered) of a trace; fails at the first line that is not as declared."""
-    for life in trace.lives():
+    for life in trace.incarnations():
         ran: set[str] = set()
         for number, run in life:
             where = f"line {number}: {run.handler}"

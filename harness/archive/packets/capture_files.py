@@ -79,16 +79,16 @@ def read_captures(paths: Iterable[Path], opener: "Opener | None" = None) -> Capt
         except CaptureError as error:
             errors.append(str(error))
             continue
-        if capture.about is not None:
-            own = Clock(capture.about.epoch_us * 1000, capture.about.speedup, True)
+        if capture.comment is not None:
+            own = Clock(capture.comment.epoch_us * 1000, capture.comment.speedup, True)
             if clock not in (None, own):
                 errors.append(f"{path}: of another run than the captures before it; print each run separately")
                 continue
             clock = own
         used.append(capture)
-    whose = {capture.vehicle for capture in used if capture.about}
+    whose = {capture.vehicle for capture in used if capture.comment}
     for capture in used:
-        if not capture.about and capture.vehicle in whose:
+        if not capture.comment and capture.vehicle in whose:
             capture.vehicle = None  # it speaks in the name of another
     first_ns = min((capture.began_ns for capture in used if capture.began_ns is not None), default=0)
     return Captures(used, list(datagrams.values()), clock or Clock(first_ns, 1.0, False), errors)

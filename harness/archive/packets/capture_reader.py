@@ -28,11 +28,11 @@ SECURED = bytes([VERSION])
 NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
 _LAST_NS = 2**63 - 1
 
-Name = int | str
+ListenerName = int | str
 """Who listened: a vehicle's ID, or the name of a point that is no vehicle's."""
 
 
-class About(BaseModel):
+class CaptureComment(BaseModel):
     """What a run's capture says of itself, as JSON in the comment of its section; `epoch_us` is mission second 0."""
 
     ucp_harness: Literal[1]
@@ -70,7 +70,7 @@ class Capture:
     def __init__(self, number: int, path: Path) -> None:
         self.number = number
         self.path = path
-        self.about: About | None = None
+        self.comment: CaptureComment | None = None
         self.vehicle: int | None = None
         self.began_ns: int | None = None
         self.ended_ns: int | None = None
@@ -82,7 +82,7 @@ class Capture:
         self.problems: list[str] = []
 
     @property
-    def name(self) -> Name:
+    def name(self) -> ListenerName:
         return self.path.stem if self.vehicle is None else self.vehicle
 
     def listening(self, time_ns: int) -> bool:
@@ -120,25 +120,25 @@ class Capture:
                 elif not direction:
                     senders.add(datagram.sender)
         self.frames += sum(1 for _ in frames)
-        self._understand(file, sent_by)
-        self.sees_itself = self.about is not None or bool(sent_by) or self.vehicle in senders
-        epoch_ns = self.about.epoch_us * 1000 if self.about else first_ns
+        self._set_origin(file, sent_by)
+        self.sees_itself = self.comment is not None or bool(sent_by) or self.vehicle in senders
+        epoch_ns = self.comment.epoch_us * 1000 if self.comment else first_ns
         began_ns = min(first_ns, epoch_ns) if file.started_ns is None else file.started_ns
         ended_ns = last_ns if file.ended_ns is None else max(last_ns, file.ended_ns)
         if began_ns <= ended_ns:
             self.began_ns, self.ended_ns = began_ns, ended_ns
 
-    def _understand(self, file: CaptureFile, sent_by: Counter[int]) -> None:
+    def _set_origin(self, file: CaptureFile, sent_by: Counter[int]) -> None:
         self.dropped = file.dropped
-        self.about = self._read_comment(file.comment)
-        if self.about:
-            self.vehicle = self.about.vehicle
+        self.comment = self._parse_comment(file.comment)
+        if self.comment:
+            self.vehicle = self.comment.vehicle
         elif sent_by:
             self.vehicle = sent_by.most_common(1)[0][0]
         elif self.path.stem.isdecimal() and 1 <= int(self.path.stem[:6]) <= MAX_AGENT_ID:
             self.vehicle = int(self.path.stem)
-        if file.trouble:
-            self.problems.append(f"{self.path}: {file.trouble}")
+        if file.problem:
+            self.problems.append(f"{self.path}: {file.problem}")
         if self.dropped:
             self.problems.append(
                 f"{self.path}: frames that the capture itself missed, and that look like losses: {self.dropped}"
@@ -148,11 +148,11 @@ class Capture:
                 f"{self.path}: frames that were cut short, and look like losses: {cut}; capture with -s 0"
             )
 
-    def _read_comment(self, comment: bytes | None) -> About | None:
+    def _parse_comment(self, comment: bytes | None) -> CaptureComment | None:
         if comment is None or b'"ucp_harness"' not in comment:
             return None
         try:
-            return About.model_validate_json(comment)
+            return CaptureComment.model_validate_json(comment)
         except ValidationError:
             self.problems.append(
                 f"{self.path}: its comment is damaged or of a newer version: it is read as a capture from the field"

@@ -136,7 +136,7 @@ class MessageSummary(NamedTuple):
         return self.block_hash is None and self.chain_hash is None
 
     @property
-    def asks(self) -> tuple[str, bytes | None] | None:
+    def request_key(self) -> tuple[str, bytes | None] | None:
         """The subject of a request, equal to what its responses `answers`; responses do not name the asker."""
         response = RESPONSES.get(self.message)
         return None if response is None or self.is_sealed else (response, self._subject)

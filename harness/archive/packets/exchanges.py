@@ -8,7 +8,7 @@ before it, and that no later response answers.
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
-from harness.archive.packets.capture_reader import Name
+from harness.archive.packets.capture_reader import ListenerName
 from harness.archive.packets.transmissions import Transmission
 
 Outcome = Literal["answered", "response lost", "request lost", "no answer"]
@@ -17,7 +17,7 @@ _Asked = tuple[float, int]
 """When, and the number of the request."""
 
 
-class Answer(NamedTuple):
+class RequestOutcome(NamedTuple):
     """What came of a request at one vehicle: `response` is its first answer, if it gave one.
 
     It is "answered" unless the response is known to be lost to the asker.
@@ -38,19 +38,21 @@ class Exchanges:
         """In the order of sending."""
         return self._responses.get(request.number, ())
 
-    def answers(self, request: Transmission) -> list[Answer]:
+    def answers(self, request: Transmission) -> list[RequestOutcome]:
         """What came of a request at each vehicle that it reached or should have reached."""
         first: dict[int, Transmission] = {}
         for response in self.responses(request):
             first.setdefault(response.sender, response)
         answers = [
-            Answer(name, "response lost" if request.sender in response.lost_by else "answered", response)
+            RequestOutcome(name, "response lost" if request.sender in response.lost_by else "answered", response)
             for name, response in first.items()
         ]
         silent = {name for name in request.reached if name != request.sender} - first.keys()
-        answers += [Answer(name, "no answer") for name in silent if isinstance(name, int)]
+        answers += [RequestOutcome(name, "no answer") for name in silent if isinstance(name, int)]
         answers += [
-            Answer(name, "request lost") for name in request.lost_by if isinstance(name, int) and name not in first
+            RequestOutcome(name, "request lost")
+            for name in request.lost_by
+            if isinstance(name, int) and name not in first
         ]
         return sorted(answers)
 
@@ -58,10 +60,10 @@ class Exchanges:
 def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission, Transmission]]:
     """(request, response). A forged response is nobody's answer."""
     asked: dict[Subject, list[_Asked]] = {}
-    reached: dict[tuple[Name, Subject], list[_Asked]] = {}
-    sent: dict[tuple[Name, Subject], list[Transmission]] = {}
+    reached: dict[tuple[ListenerName, Subject], list[_Asked]] = {}
+    sent: dict[tuple[ListenerName, Subject], list[Transmission]] = {}
     for transmission in transmissions:
-        if subject := transmission.summary.asks:
+        if subject := transmission.summary.request_key:
             asked.setdefault(subject, []).append((transmission.at_s, transmission.number))
             for reception in transmission.received:
                 arrivals = [(reception.at_s, transmission.number)] * reception.copies
@@ -80,19 +82,19 @@ def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission
                 yield transmissions[waiting.pop()[1]], response
 
 
-class Pair(NamedTuple):
+class LinkLosses(NamedTuple):
     """Of `sent` datagrams that the receiver should have heard, `lost` never reached it."""
 
     sender: int
-    receiver: Name
+    receiver: ListenerName
     sent: int
     lost: int
 
 
-def count_losses(transmissions: Iterable[Transmission]) -> list[Pair]:
+def count_losses(transmissions: Iterable[Transmission]) -> list[LinkLosses]:
     """All pairs, by sender and receiver. What somebody forged is no agent's loss."""
-    sent: dict[tuple[int, Name], int] = {}
-    lost: dict[tuple[int, Name], int] = {}
+    sent: dict[tuple[int, ListenerName], int] = {}
+    lost: dict[tuple[int, ListenerName], int] = {}
     for transmission in transmissions:
         if transmission.origin == "forged":
             continue
@@ -101,12 +103,13 @@ def count_losses(transmissions: Iterable[Transmission]) -> list[Pair]:
         for receiver in transmission.lost_by:
             lost[transmission.sender, receiver] = lost.get((transmission.sender, receiver), 0) + 1
     pairs = (
-        Pair(sender, receiver, count, lost.get((sender, receiver), 0)) for (sender, receiver), count in sent.items()
+        LinkLosses(sender, receiver, count, lost.get((sender, receiver), 0))
+        for (sender, receiver), count in sent.items()
     )
     return sorted(pairs, key=lambda pair: (pair.sender, isinstance(pair.receiver, str), pair.receiver))
 
 
-def matrix(pairs: list[Pair]) -> Iterator[str]:
+def loss_matrix(pairs: list[LinkLosses]) -> Iterator[str]:
     """A row for each sender, a column for each receiver: lost/sent."""
     receivers = sorted({pair.receiver for pair in pairs}, key=lambda name: (isinstance(name, str), name))
     cells = {(pair.sender, pair.receiver): f"{pair.lost}/{pair.sent}" for pair in pairs}

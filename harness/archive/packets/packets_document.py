@@ -7,15 +7,17 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from harness.archive.packets.air_names import Names
+from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import Captures, Clock
-from harness.archive.packets.capture_reader import Capture, Name
-from harness.archive.packets.exchanges import Exchanges, Outcome, Pair
+from harness.archive.packets.capture_reader import Capture, ListenerName
+from harness.archive.packets.exchanges import Exchanges, LinkLosses, Outcome
 from harness.archive.packets.transmissions import Origin, Transmission
 
 SCHEMA = "ucp-packets/1"
 
-_WhoListened = Annotated[Name, Field(description="A vehicle's ID, or the name of a point that is no vehicle's.")]
+_ListenerName = Annotated[
+    ListenerName, Field(description="A vehicle's ID, or the name of a point that is no vehicle's.")
+]
 
 
 class CaptureRecord(BaseModel):
@@ -38,7 +40,7 @@ class PairRecord(BaseModel):
     ones."""
 
     sender: int
-    receiver: _WhoListened
+    receiver: _ListenerName
     sent: int
     lost: int
 
@@ -46,7 +48,7 @@ class PairRecord(BaseModel):
 class ReceptionRecord(BaseModel):
     """The reception of a datagram: the number of copies, and the times of the first (`at_s`) and the last copy."""
 
-    by: _WhoListened
+    by: _ListenerName
     at_s: float
     copies: int
     last_s: float
@@ -80,10 +82,10 @@ class DatagramRecord(BaseModel):
     chain_hash: str | None
     answer: str | None
     origin: Origin
-    seen_leaving: _WhoListened | None
+    seen_leaving: _ListenerName | None
     received: list[ReceptionRecord]
-    lost_by: list[_WhoListened]
-    not_listening: list[_WhoListened]
+    lost_by: list[_ListenerName]
+    not_listening: list[_ListenerName]
     answers: list[AnswerRecord] | None
 
 
@@ -104,7 +106,11 @@ class PacketsRecord(BaseModel):
 
 
 def document(
-    captures: Captures, pairs: Iterable[Pair], shown: Iterable[Transmission], exchanges: Exchanges, names: Names
+    captures: Captures,
+    pairs: Iterable[LinkLosses],
+    shown: Iterable[Transmission],
+    exchanges: Exchanges,
+    names: BlockNames,
 ) -> Iterator[str]:
     """Yield the lines of one JSON document, with one line per datagram."""
     clock = captures.clock
@@ -141,7 +147,7 @@ def _capture(capture: Capture, clock: Clock) -> CaptureRecord:
     )
 
 
-def _datagram(transmission: Transmission, exchanges: Exchanges, names: Names) -> DatagramRecord:
+def _datagram(transmission: Transmission, exchanges: Exchanges, names: BlockNames) -> DatagramRecord:
     summary = transmission.summary
     answers = [
         AnswerRecord(
@@ -167,5 +173,5 @@ def _datagram(transmission: Transmission, exchanges: Exchanges, names: Names) ->
         received=[ReceptionRecord(**reception._asdict()) for reception in transmission.received],
         lost_by=list(transmission.lost_by),
         not_listening=list(transmission.absent),
-        answers=answers if summary.asks else None,
+        answers=answers if summary.request_key else None,
     )

@@ -3,12 +3,12 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
-from harness.archive.packets.air_names import Names
+from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import Captures
-from harness.archive.packets.capture_reader import Name
+from harness.archive.packets.capture_reader import ListenerName
 from harness.archive.packets.datagram import MessageSummary
-from harness.archive.packets.exchanges import Answer, Exchanges, Outcome
-from harness.archive.packets.selection import Chapter, carried_to
+from harness.archive.packets.exchanges import Exchanges, Outcome, RequestOutcome
+from harness.archive.packets.selection import Exchange, block_arrivals
 from harness.archive.packets.transmissions import Transmission
 from harness.present.text import moment
 from ucp.messages import (
@@ -29,16 +29,16 @@ _INDENT = " " * 16
 Paint = Callable[[str], str]
 
 
-class Wording:
+class TransmissionText:
     """How things are said; `paint` sets off what was lost."""
 
-    def __init__(self, names: Names, paint: Paint) -> None:
+    def __init__(self, names: BlockNames, paint: Paint) -> None:
         self._names = names
         self._paint = paint
 
     def transmission(self, transmission: Transmission) -> str:
         """When, who, what, and who received it."""
-        what = f"{transmission.summary.message:<26}  {self.in_words(transmission.summary):<46}"
+        what = f"{transmission.summary.message:<26}  {self.content(transmission.summary):<46}"
         parts = [f"{transmission.at_s:>12.3f}  {transmission.sender:>5}  {what}  -> {_receivers(transmission)}"]
         if transmission.lost_by:
             parts.append(self._paint(f"lost by {_list(transmission.lost_by)}"))
@@ -56,7 +56,7 @@ class Wording:
             parts.append(f"seen by others: {transmission.sender} was not captured")
         return "  ".join(parts)
 
-    def in_words(self, summary: MessageSummary) -> str:
+    def content(self, summary: MessageSummary) -> str:
         if summary.is_sealed:
             return "sealed"
         block = "" if summary.block_hash is None else f"block {self._names.block(summary.block_hash)}"
@@ -79,14 +79,14 @@ class Wording:
             case _:
                 return block
 
-    def answers(self, answers: Iterable[Answer]) -> str:
+    def answers(self, answers: Iterable[RequestOutcome]) -> str:
         """What came of a request; vehicles of which the same is to say are together."""
-        together: dict[str, list[Name]] = {}
+        together: dict[str, list[ListenerName]] = {}
         for answer in sorted(answers, key=lambda answer: _OUTCOMES.index(answer.outcome)):
             together.setdefault(self._outcome(answer), []).append(answer.by)
-        return "answers: " + "; ".join(f"{what}: {_list(who)}" for what, who in together.items())
+        return "answers: " + "; ".join(f"{what}: {_list(names)}" for what, names in together.items())
 
-    def _outcome(self, answer: Answer) -> str:
+    def _outcome(self, answer: RequestOutcome) -> str:
         if answer.response is None:
             return self._paint(answer.outcome) if answer.outcome == "request lost" else answer.outcome
         summary = answer.response.summary
@@ -96,7 +96,7 @@ class Wording:
         return word if answer.outcome == "answered" else self._paint(f"{word}, but the response was lost")
 
 
-def head(captures: Captures) -> str:
+def header(captures: Captures) -> str:
     """What the times count from, and who listened."""
     vehicles = sorted({capture.vehicle for capture in captures.used if capture.vehicle is not None})
     points = [capture.path.name for capture in captures.used if capture.vehicle is None]
@@ -107,34 +107,34 @@ def head(captures: Captures) -> str:
     return f"{listened}{', and ' + ', '.join(points) if points else ''}; {second_0}"
 
 
-def lines(
-    transmissions: Iterable[Transmission], exchanges: Exchanges, wording: Wording, answers_of: int | None
+def transmission_lines(
+    transmissions: Iterable[Transmission], exchanges: Exchanges, text: TransmissionText, answers_of: int | None
 ) -> Iterator[str]:
     """Each transmission; below a request, what came of it at each vehicle, or at `answers_of` alone."""
     for transmission in transmissions:
-        yield wording.transmission(transmission)
-        if transmission.summary.asks:
+        yield text.transmission(transmission)
+        if transmission.summary.request_key:
             wanted = [answer for answer in exchanges.answers(transmission) if answers_of in (None, answer.by)]
             if wanted:
-                yield f"{_INDENT}   {wording.answers(wanted)}"
+                yield f"{_INDENT}   {text.answers(wanted)}"
 
 
-def life(chapters: Sequence[Chapter], exchanges: Exchanges, wording: Wording) -> Iterator[str]:
+def exchange_lines(exchanges_shown: Sequence[Exchange], exchanges: Exchanges, text: TransmissionText) -> Iterator[str]:
     """A block's story: answers below what they answer, then who never gave one, and at last whom the block reached."""
-    for chapter in chapters:
-        yield wording.transmission(chapter.begins)
-        for answer in chapter.answers:
-            yield f"    {wording.transmission(answer)}"
-        if chapter.begins.summary.asks:
-            missing = [answer for answer in exchanges.answers(chapter.begins) if answer.outcome != "answered"]
+    for exchange in exchanges_shown:
+        yield text.transmission(exchange.first)
+        for answer in exchange.answers:
+            yield f"    {text.transmission(answer)}"
+        if exchange.first.summary.request_key:
+            missing = [answer for answer in exchanges.answers(exchange.first) if answer.outcome != "answered"]
             if missing:
-                yield f"{_INDENT}   {wording.answers(missing)}"
-    reached = sorted(carried_to(chapters).items(), key=lambda item: (item[1], item[0]))
+                yield f"{_INDENT}   {text.answers(missing)}"
+    reached = sorted(block_arrivals(exchanges_shown).items(), key=lambda item: (item[1], item[0]))
     carried = ", ".join(f"{vehicle} at {at_s:.3f} s" for vehicle, at_s in reached)
     yield f"the block reached {carried or 'no vehicle'}"
 
 
-def tail(captures: Captures, transmissions: Sequence[Transmission]) -> Iterator[str]:
+def totals(captures: Captures, transmissions: Sequence[Transmission]) -> Iterator[str]:
     """Totals, and what else was in the captures."""
     lost = sum(len(transmission.lost_by) for transmission in transmissions)
     received = sum(len(transmission.received) for transmission in transmissions)
@@ -166,7 +166,7 @@ def _receivers(transmission: Transmission) -> str:
     return f"{len(transmission.received)} of {len(transmission.received) + len(transmission.lost_by)}"
 
 
-def _list(names: Iterable[Name]) -> str:
+def _list(names: Iterable[ListenerName]) -> str:
     return " ".join(map(str, names))
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from harness.archive.bounded_file import Opened
+from harness.archive.bounded_file import BoundedFile
 from harness.errors import CaptureError
 
 INBOUND, OUTBOUND = 1, 2
@@ -61,7 +61,7 @@ class CaptureFile:
     """Iterating reads the file, and tells afterwards what else was in it.
 
     `comment` is the first section's. `started_ns`, `ended_ns` and `dropped`, the frames that the capture itself
-    missed, are of its statistics; None where it has none. `trouble` says where the file broke off, if it did.
+    missed, are of its statistics; None where it has none. `problem` says where the file broke off, if it did.
     """
 
     def __init__(self, path: Path) -> None:
@@ -69,7 +69,7 @@ class CaptureFile:
         self.comment: bytes | None = None
         self.started_ns: int | None = None
         self.ended_ns: int | None = None
-        self.trouble = ""
+        self.problem = ""
         self._dropped: dict[int, int] = {}
 
     @property
@@ -79,10 +79,10 @@ class CaptureFile:
     def __iter__(self) -> Iterator[Frame]:
         """Raises CaptureError if the file cannot be read or is no capture."""
         try:
-            with Opened(self.path) as file:
+            with BoundedFile(self.path) as file:
                 magic = file.peek(4)[:4]
                 if not magic:
-                    why = file.trouble or "the capture ended before it began"
+                    why = file.problem or "the capture ended before it began"
                     raise CaptureError(f"{self.path}: empty: {why}")
                 if magic not in MAGICS:
                     raise CaptureError(
@@ -94,8 +94,8 @@ class CaptureFile:
                     yield from self._pcapng(file) if magic == _SECTION else self._pcap(file, *_PCAP[magic])
                 except _BrokenError as error:
                     broken = str(error)
-                if file.trouble or broken:
-                    self.trouble = f"{file.trouble or broken}; the part before is read"
+                if file.problem or broken:
+                    self.problem = f"{file.problem or broken}; the part before is read"
         except OSError as error:
             raise CaptureError(f"{self.path}: cannot be read: {error.strerror}") from None
 

@@ -29,7 +29,7 @@ class Selection:
         if self.between_s is not None and not self.between_s[0] <= self.between_s[1]:
             raise CaptureError("--between {:g} {:g}: the first second is not before the last".format(*self.between_s))
 
-    def of(self, transmissions: Iterable[Transmission], captures: Captures) -> Iterator[Transmission]:
+    def filter(self, transmissions: Iterable[Transmission], captures: Captures) -> Iterator[Transmission]:
         """Those that fit; with a receiver, only as far as they concern it. Raises CaptureError if it has no capture."""
         vehicles = sorted({capture.vehicle for capture in captures.used if capture.vehicle is not None})
         if self.receiver is not None and self.receiver not in vehicles:
@@ -39,8 +39,10 @@ class Selection:
             if self._fits(transmission):
                 if self.receiver is None:
                     yield transmission
-                elif self.receiver in (towards := transmission.towards(self.receiver)).reached or towards.lost_by:
-                    yield towards
+                elif (
+                    self.receiver in (narrowed := transmission.for_receiver(self.receiver)).reached or narrowed.lost_by
+                ):
+                    yield narrowed
 
     def _fits(self, transmission: Transmission) -> bool:
         return (
@@ -50,35 +52,39 @@ class Selection:
         )
 
 
-class Chapter(NamedTuple):
+class Exchange(NamedTuple):
     """A transmission that is no answer, and the answers to it that are about the block."""
 
-    begins: Transmission
+    first: Transmission
     answers: Sequence[Transmission]
 
 
-def story(block_hash: bytes, transmissions: Iterable[Transmission], exchanges: Exchanges) -> Iterator[Chapter]:
+def exchanges_about(
+    block_hash: bytes, transmissions: Iterable[Transmission], exchanges: Exchanges
+) -> Iterator[Exchange]:
     """All that is about the block, in the order of sending; answers are with what they answer."""
     answer_numbers: set[int] = set()
     for transmission in transmissions:
         answers = [answer for answer in exchanges.responses(transmission) if answer.summary.block_hash == block_hash]
         if (transmission.summary.block_hash == block_hash and transmission.number not in answer_numbers) or answers:
             answer_numbers.update(answer.number for answer in answers)
-            yield Chapter(transmission, answers)
+            yield Exchange(transmission, answers)
 
 
-def in_order(chapters: Iterable[Chapter]) -> list[Transmission]:
+def in_order(exchanges: Iterable[Exchange]) -> list[Transmission]:
     """All of a story's transmissions, each once, in the order of sending."""
     by_number = {
-        transmission.number: transmission for chapter in chapters for transmission in (chapter.begins, *chapter.answers)
+        transmission.number: transmission
+        for exchange in exchanges
+        for transmission in (exchange.first, *exchange.answers)
     }
     return [by_number[number] for number in sorted(by_number)]
 
 
-def carried_to(chapters: Iterable[Chapter]) -> dict[int, float]:
+def block_arrivals(exchanges: Iterable[Exchange]) -> dict[int, float]:
     """Vehicle -> the mission second at which the block itself first reached it."""
     first: dict[int, float] = {}
-    for transmission in in_order(chapters):
+    for transmission in in_order(exchanges):
         if transmission.summary.message in CARRY_A_BLOCK:
             for reception in transmission.received:
                 if isinstance(reception.by, int):

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal, NamedTuple
 
 from harness.archive.packets.capture_files import Captures, Clock
-from harness.archive.packets.capture_reader import Capture, Datagram, Name
+from harness.archive.packets.capture_reader import Capture, Datagram, ListenerName
 from harness.archive.packets.datagram import MessageSummary
 from harness.archive.packets.pcap import OUTBOUND
 
@@ -22,7 +22,7 @@ sent by the agent that it names."""
 class Reception(NamedTuple):
     """`copies` reached a listener, the last at `last_s`; mission seconds."""
 
-    by: Name
+    by: ListenerName
     at_s: float
     copies: int = 1
     last_s: float = 0.0
@@ -41,16 +41,16 @@ class Transmission(NamedTuple):
     sequence: int
     summary: MessageSummary
     origin: Origin
-    seen_leaving: Name | None
+    seen_leaving: ListenerName | None
     received: tuple[Reception, ...]
-    lost_by: tuple[Name, ...]
-    absent: tuple[Name, ...]
+    lost_by: tuple[ListenerName, ...]
+    absent: tuple[ListenerName, ...]
 
     @property
-    def reached(self) -> list[Name]:
+    def reached(self) -> list[ListenerName]:
         return [reception.by for reception in self.received]
 
-    def towards(self, receiver: Name) -> "Transmission":
+    def for_receiver(self, receiver: ListenerName) -> "Transmission":
         """The same, as far as it concerns one receiver."""
         return self._replace(
             received=tuple(reception for reception in self.received if reception.by == receiver),
@@ -63,17 +63,17 @@ class _Listeners:
     """Who listened, and when. A listener may have left several captures."""
 
     def __init__(self, captures: Iterable[Capture]) -> None:
-        self._of: dict[Name, list[Capture]] = {}
+        self._transmissions: dict[ListenerName, list[Capture]] = {}
         for capture in captures:
-            self._of.setdefault(capture.name, []).append(capture)
-        self.names = sorted(self._of, key=lambda name: (isinstance(name, str), name))
+            self._transmissions.setdefault(capture.name, []).append(capture)
+        self.names = sorted(self._transmissions, key=lambda name: (isinstance(name, str), name))
 
-    def listening(self, name: Name, time_ns: int) -> bool:
-        return any(capture.listening(time_ns) for capture in self._of.get(name, ()))
+    def listening(self, name: ListenerName, time_ns: int) -> bool:
+        return any(capture.listening(time_ns) for capture in self._transmissions.get(name, ()))
 
-    def would_have_seen_leave(self, sender: Name, time_ns: int) -> bool:
+    def would_record_sending(self, sender: ListenerName, time_ns: int) -> bool:
         """Not if its captures show only what reaches it, or missed frames."""
-        captures = self._of.get(sender, ())
+        captures = self._transmissions.get(sender, ())
         sound = any(capture.sees_itself for capture in captures) and not any(capture.dropped for capture in captures)
         return sound and self.listening(sender, time_ns)
 
@@ -85,23 +85,23 @@ def join(captures: Captures) -> list[Transmission]:
     transmissions = [
         transmission
         for datagram in captures.datagrams
-        for transmission in _of(datagram, by_number, listeners, captures.clock)
+        for transmission in _transmissions(datagram, by_number, listeners, captures.clock)
     ]
     transmissions.sort(key=lambda transmission: (transmission.at_s, transmission.sender, transmission.sequence))
     return [transmission._replace(number=number) for number, transmission in enumerate(transmissions)]
 
 
-def _of(
+def _transmissions(
     datagram: Datagram, captures: Mapping[int, Capture], listeners: _Listeners, clock: Clock
 ) -> Iterator[Transmission]:
-    left: list[tuple[int, Name]] = []
-    arrived: list[tuple[int, Name]] = []
+    left: list[tuple[int, ListenerName]] = []
+    arrived: list[tuple[int, ListenerName]] = []
     for time_ns, number, direction in sorted(datagram.sightings()):
         if capture := captures.get(number):
             leaving = capture.direction(datagram.sender, direction) == OUTBOUND
             (left if leaving else arrived).append((time_ns, capture.name))
     times = [time_ns for time_ns, _ in left or arrived[:1]]
-    arrivals: list[dict[Name, list[int]]] = [{} for _ in times]
+    arrivals: list[dict[ListenerName, list[int]]] = [{} for _ in times]
     for time_ns, name in arrived:
         arrivals[max(0, bisect_right(times, time_ns) - 1)].setdefault(name, []).append(time_ns)
     for index, (time_ns, reached) in enumerate(zip(times, arrivals, strict=True)):
@@ -115,7 +115,7 @@ def _of(
             sender=datagram.sender,
             sequence=datagram.sequence,
             summary=datagram.summary,
-            origin=_origin(datagram.sender, seen_leaving, listeners.would_have_seen_leave(datagram.sender, time_ns)),
+            origin=_origin(datagram.sender, seen_leaving, listeners.would_record_sending(datagram.sender, time_ns)),
             seen_leaving=seen_leaving,
             received=tuple(
                 Reception(name, clock.seconds(reached[name][0]), len(reached[name]), clock.seconds(reached[name][-1]))
@@ -127,7 +127,7 @@ def _of(
         )
 
 
-def _origin(sender: int, seen_leaving: Name | None, would_have_been_seen: bool) -> Origin:
+def _origin(sender: int, seen_leaving: ListenerName | None, would_have_been_seen: bool) -> Origin:
     if seen_leaving == sender:
         return "captured"
     return "forged" if seen_leaving is not None or would_have_been_seen else "inferred"

@@ -29,7 +29,7 @@ def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
     for capture in captures.used:
         agent_id = capture.vehicle
         trace = evidence.traces.get(agent_id) if agent_id is not None else None
-        if agent_id is None or trace is None or trace.problem or capture.about is None:
+        if agent_id is None or trace is None or trace.problem or capture.comment is None:
             continue
         if capture.dropped != 0 or capture.problems:
             continue  # only a whole capture can be held against anything

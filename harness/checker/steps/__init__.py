@@ -10,7 +10,7 @@ from collections import Counter
 from itertools import islice
 
 from harness.archive.traces import Trace
-from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, unknown_words
+from harness.archive.vocabulary import IGNORED_KINDS, first_unknown, unknown_names
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.recorded_inputs import Blocks, decoded
@@ -59,7 +59,7 @@ def check(evidence: Evidence) -> Judgement:
     for agent_id in sorted(set(evidence.roster or evidence.exports) - set(evidence.traces)):
         unjudged[agent_id] = "there is no trace"
     for agent_id, words in evidence.unknown.items():
-        unjudged.setdefault(agent_id, f"the trace has unknown words: {first_of(words)}")
+        unjudged.setdefault(agent_id, f"the trace has unknown words: {first_unknown(words)}")
     unjudged |= {
         agent_id: f"the trace is incomplete: {why}" for agent_id, why in evidence.once(cross_examine).short.items()
     }
@@ -89,12 +89,12 @@ def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: 
 
 def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Follower]) -> None:
     """Take each life of the agent through all of its steps, up to the first that it tells in unknown words."""
-    understood = not evidence.unknown.get(agent_id, {}).keys() - COMPARED_WITHOUT
-    for follower, life in zip(followers, trace.lives(), strict=True):
+    understood = not evidence.unknown.get(agent_id, {}).keys() - IGNORED_KINDS
+    for follower, life in zip(followers, trace.incarnations(), strict=True):
         if evidence.watch is not None:
             evidence.watch(follower.state, None)
         for line, run in life:
-            if not understood and unknown_words([run]).keys() - COMPARED_WITHOUT:
+            if not understood and unknown_names([run]).keys() - IGNORED_KINDS:
                 return
             follower.follow(line, run)
             if evidence.watch is not None and follower.lost is None:
@@ -119,12 +119,12 @@ def wrongly_dropped(header: CheckedHeader, line: int, aside: Dropped | Commanded
 
 def _deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost: list[str]) -> Judgement:
     deviations.sort(key=lambda deviation: (deviation.t, deviation.agent_id, deviation.line))
-    first_of: dict[tuple[int, str | None], Deviation] = {}
+    first_unknown: dict[tuple[int, str | None], Deviation] = {}
     for deviation in deviations:
-        first_of.setdefault((deviation.agent_id, _known(deviation)), deviation)
+        first_unknown.setdefault((deviation.agent_id, _known(deviation)), deviation)
     counts = Counter((deviation.agent_id, _known(deviation)) for deviation in deviations)
     findings = []
-    for (agent_id, handler), deviation in islice(first_of.items(), MAX_EVIDENCE):
+    for (agent_id, handler), deviation in islice(first_unknown.items(), MAX_EVIDENCE):
         more = counts[agent_id, handler] - 1
         again = f"; {times(more)} more later" if more else ""
         findings.append(Finding(agent_id, f"{deviation.sentence(evidence.name)}{again}", handler=handler))

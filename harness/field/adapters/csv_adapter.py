@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
-from harness.archive.bounded_file import Opened
+from harness.archive.bounded_file import BoundedFile
 from harness.archive.traces import MAX_LINE_BYTES
 from harness.field.adapters.adapter import Adapter, ChainExport, Datagram, LoggedEvent, Observation, TraceLine, Unusable
 from ucp.block import MAX_AGENT_ID
@@ -48,7 +48,7 @@ class CommaSeparated(Adapter):
 
     def observations(self, source: Path) -> Iterator[Observation]:
         layout: _Layout | None = None
-        with Opened(source, MAX_BYTES) as file:
+        with BoundedFile(source, MAX_BYTES) as file:
             for number, row in _rows(file):
                 if layout is None:
                     layout = _layout(row)
@@ -61,8 +61,8 @@ class CommaSeparated(Adapter):
                         continue
                 if row.strip("\0\r\n "):
                     yield _observation(layout.cells(row), number)
-            if file.trouble:
-                yield Unusable(file.trouble)
+            if file.problem:
+                yield Unusable(file.problem)
 
 
 class _Layout:
@@ -94,7 +94,7 @@ def _layout(row: str) -> _Layout | None:
     return None
 
 
-def _rows(file: Opened) -> Iterator[tuple[int, str]]:
+def _rows(file: BoundedFile) -> Iterator[tuple[int, str]]:
     """Each row, and the number of its first line. One may go over lines, if a quote is open, and closes."""
     waiting: deque[str] = deque()  # lines that were read ahead, for a quote that did not close
     number = 0
@@ -124,7 +124,7 @@ def _begins_a_row(line: str) -> bool:
     return any(f"{separator}{kind}{separator}" in line[:100] for kind in KINDS for separator in _SEPARATORS)
 
 
-def _line(file: Opened) -> str:
+def _line(file: BoundedFile) -> str:
     return file.readline(MAX_ROW_BYTES).decode("utf-8", "replace")
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 from rich.markup import escape
 
-from harness.archive.bounded_file import Opened
+from harness.archive.bounded_file import BoundedFile
 from harness.archive.directory import PUBLIC_KEYS_FILE, claim
 from harness.archive.exports import SUFFIX as EXPORT_SUFFIX
 from harness.archive.exports import Export
@@ -204,7 +204,7 @@ def _lines(trace: Trace, *, lived_on: bool) -> Iterator[str]:
 
 
 def _copied(capture: Path, directory: Path, name: str) -> str:
-    with Opened(capture) as file:
+    with BoundedFile(capture) as file:
         suffix = "pcapng" if file.peek(4)[:4] == PCAPNG_MAGIC else "pcap"
         path = f"{CAPTURES}/{name}.{suffix}"
         with (directory / path).open("wb") as copy:
@@ -263,7 +263,7 @@ def bring_in(
 
 def _adapter_for(path: Path, adapters: Iterable[Adapter]) -> Adapter | None:
     try:
-        with Opened(path) as file:
+        with BoundedFile(path) as file:
             beginning = file.peek(BEGINNING_BYTES)[:BEGINNING_BYTES]
     except OSError:
         return None  # whoever reads it will say so

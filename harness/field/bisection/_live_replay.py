@@ -20,7 +20,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from harness.archive.vocabulary import first_of, unknown_words
+from harness.archive.vocabulary import first_unknown, unknown_names
 from harness.checker.recorded_inputs import decoded
 from harness.errors import FieldError, HarnessError, MachineError
 from harness.field.bisection.outcome import Difference
@@ -194,7 +194,7 @@ def play_live(record: Record, command: Sequence[str], place: Path, *, speedup: f
 
     Raises MachineError, NotStartedError, ReplayFailedError; FieldError if the record is in words that nobody knows.
     """
-    if unknown := first_of(unknown_words(record.trace.runs), ("trigger", "handler", "branch", "timer")):
+    if unknown := first_unknown(unknown_names(record.trace.runs), ("trigger", "handler", "branch", "timer")):
         raise FieldError(f"{record.path}: {unknown}, so it cannot be played; give another record")
     script = script_of(record)
     try:

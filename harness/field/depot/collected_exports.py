@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError
 
 from harness.archive.archive import RunArchive
-from harness.archive.bounded_file import Opened
+from harness.archive.bounded_file import BoundedFile
 from harness.archive.exports import (
     MAX_EXPORT_BYTES,
     RUN_FILE,
@@ -28,9 +28,9 @@ from harness.archive.exports import (
     ExportedBlock,
     ExportedInception,
 )
-from harness.archive.record_file import fit
+from harness.archive.record_file import validate_leniently
 from harness.archive.traces import read_trace
-from harness.archive.vocabulary import unknown_words
+from harness.archive.vocabulary import unknown_names
 from harness.errors import ExportError
 from harness.field.depot.mission_comparison import INCEPTION, ROSTER, Carried, UnreadableFileError
 from harness.field.depot.mission_comparison import read as read_carried
@@ -153,7 +153,7 @@ def _look_beside(home: CameHome, carried: Iterable[Carried]) -> None:
         if each.kind == "trace" and each.agent_id is not None and each.agent_id not in home.latest:
             trace = read_trace(each.path, skim=True)
             home.traced.setdefault(each.agent_id, []).extend(trace.completed() if trace else ())
-            if unknown := unknown_words(trace.runs if trace else ()).get("operation"):
+            if unknown := unknown_names(trace.runs if trace else ()).get("operation"):
                 home.remarks.append(
                     f"{each.path}: {unknown}, so the completed blocks of agent {each.agent_id} are unknown"
                 )
@@ -329,11 +329,11 @@ def _edited(path: Path, which: str, claimed: str) -> str:
 def _content(path: Path, named: bool) -> bytes:
     """What is in a file, if it was named, is called as exports are, or begins as one."""
     try:
-        with Opened(path, MAX_EXPORT_BYTES) as file:
+        with BoundedFile(path, MAX_EXPORT_BYTES) as file:
             if not named and path.suffix != ".json" and _FORMAT not in file.peek(BEGINNING_BYTES):
                 raise NotAnExportError(f"{path}: not a chain export")
             data = file.read()
-            if file.trouble and len(data) >= MAX_EXPORT_BYTES:
+            if file.problem and len(data) >= MAX_EXPORT_BYTES:
                 raise ExportError(f"{path}: larger than {MAX_EXPORT_BYTES} bytes, which is too large for an export")
             return data
     except OSError as error:
@@ -361,11 +361,11 @@ def _what_is_whole(path: Path, data: bytes, problems: list[str]) -> Export:
         said = str(document.get("schema"))[:40]
         raise ExportError(f"{path}: its schema is {said!r}, and this version reads {SCHEMA!r}")
     try:
-        read, misfits = fit(_Damaged, document)
+        read, invalid_parts = validate_leniently(_Damaged, document)
     except ValueError as error:
         raise ExportError(f"{path}: {error}") from None
     if not problems:
-        problems += [f"{path}: {misfit}; the rest of it is used" for misfit in misfits]
+        problems += [f"{path}: {part}; the rest of it is used" for part in invalid_parts]
     if read.agent_id is None or read.inception is None:
         missing = "agent_id" if read.agent_id is None else "inception"
         raise ExportError(f"{path}: `{missing}` is missing or damaged, so its agent or its mission is unknown")

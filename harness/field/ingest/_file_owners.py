@@ -44,7 +44,7 @@ def glance(path: Path, left_out: list[LeftOut], opener: "Opener | None" = None) 
         return None
     named = (name for each in datagrams.values() for name in (each.summary.block_hash, each.summary.chain_hash))
     hashes = frozenset(name.hex() for name in named if name is not None)
-    return Glance(path, capture.vehicle, capture.about.epoch_us if capture.about else None, hashes, path)
+    return Glance(path, capture.vehicle, capture.comment.epoch_us if capture.comment else None, hashes, path)
 
 
 PUBLIC_SCHEMA = '"ucp-keys/1"'

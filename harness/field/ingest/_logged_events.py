@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from harness.archive.bounded_file import Opened
+from harness.archive.bounded_file import BoundedFile
 from harness.archive.exports import AgentId, Base64
 from harness.archive.traces import MAX_LINE_BYTES
 from harness.field.ingest._ingest import LeftOut
@@ -48,7 +48,7 @@ def read_logged(path: Path, left_out: list[LeftOut]) -> list[tuple[int, Loggable
     """The events of a file, each with its agent; none if it is of another kind. Raises OSError."""
     events: list[tuple[int, LoggableEvent]] = []
     damaged: list[int] = []
-    with Opened(path) as file:
+    with BoundedFile(path) as file:
         if SCHEMA.encode() not in file.peek(4096)[:4096]:
             return []
         number = 0
@@ -59,8 +59,8 @@ def read_logged(path: Path, left_out: list[LeftOut]) -> list[tuple[int, Loggable
                 events.append((line.agent_id, line.event))
             except ValidationError:
                 damaged.append(number)
-        if file.trouble:
-            left_out.append(LeftOut(path, file.trouble))
+        if file.problem:
+            left_out.append(LeftOut(path, file.problem))
     if damaged:
         more = f", and {len(damaged) - 1} more lines are" if len(damaged) > 1 else ""
         left_out.append(LeftOut(path, f"it is damaged{more}", damaged[0]))

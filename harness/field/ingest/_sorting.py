@@ -5,8 +5,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.archive.bounded_file import Opened
-from harness.archive.exports import MAX_EXPORT_BYTES, Export, export_of, not_json
+from harness.archive.bounded_file import BoundedFile
+from harness.archive.exports import MAX_EXPORT_BYTES, Export, json_error, parse_export
 from harness.archive.packets.pcap import MAGICS
 from harness.errors import CaptureError, ExportError
 from harness.field.ingest._file_owners import PUBLIC_SCHEMA, Glance, give_keys, glance, read_public_keys
@@ -68,7 +68,7 @@ class Sorter:
     def take(self, path: Path) -> None:
         """Recognise a file, and read it."""
         try:
-            with Opened(path) as file:
+            with BoundedFile(path) as file:
                 begins = file.peek(4096)[:4096]
             if begins.startswith(_BAGS):
                 self._drop(path, "a ROS bag, or a compressed recording: read it with `ucp-harness import`")
@@ -87,10 +87,10 @@ class Sorter:
             self._drop(path, str(error).removeprefix(f"{path}: "))
 
     def _take_exports(self, path: Path) -> None:
-        with Opened(path, MAX_EXPORT_BYTES) as file:
+        with BoundedFile(path, MAX_EXPORT_BYTES) as file:
             data = file.read()
-            if file.trouble:
-                self._drop(path, f"it is incomplete: {file.trouble}")
+            if file.problem:
+                self._drop(path, f"it is incomplete: {file.problem}")
                 return
         try:
             text = data.decode("utf-8").strip(_BLANK)
@@ -109,12 +109,12 @@ class Sorter:
         """The exports in a text; `line` is where it stands in the file, if it is not all of it."""
         try:
             for document in _documents(text.strip(_BLANK)):
-                self.exports.append((path, export_of(path, document)))
+                self.exports.append((path, parse_export(path, document)))
         except ExportError as error:
             self._drop(path, str(error).removeprefix(f"{path}: "), line, counts)
         except (ValueError, RecursionError) as error:
             what = "a chain export, but " if EXPORT_SCHEMA in text else ""
-            self._drop(path, what + str(not_json(path, error)).removeprefix(f"{path}: "), line, counts)
+            self._drop(path, what + str(json_error(path, error)).removeprefix(f"{path}: "), line, counts)
 
     def _drop(self, path: Path, why: str, line: int | None = None, counts: str = "line") -> None:
         self._left_out.append(LeftOut(path, why, line, counts))

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
-from harness.archive.bounded_file import Opened
+from harness.archive.bounded_file import BoundedFile
 from harness.archive.history import LATEST_S
-from harness.archive.traces import MAX_LINE_BYTES, Gap, Header, gap_in, parsed
+from harness.archive.traces import MAX_LINE_BYTES, Gap, Header, parse_gap, parse_line
 from harness.field.ingest._ingest import LeftOut
 from ucp.messages import HEADER as DATAGRAM_HEADER
 from ucp.messages import MAGIC
@@ -107,14 +107,14 @@ def jumps_in(runs: list[HandlerRun]) -> list[int]:
 def read_lives(path: Path, left_out: list[LeftOut]) -> list[Life]:
     """The lives that are in a file, in its order; none if it is no trace. Raises OSError if it cannot be read."""
     reader = TraceReader(path)
-    with Opened(path, MAX_TRACE_BYTES) as file:
+    with BoundedFile(path, MAX_TRACE_BYTES) as file:
         for number, line, ended in _lines(file):
             reader.take(number, line, ended)
             if reader.hopeless:
                 break
     lives = reader.ended(left_out)
-    if lives and file.trouble:
-        left_out.append(LeftOut(path, file.trouble))
+    if lives and file.problem:
+        left_out.append(LeftOut(path, file.problem))
     return lives
 
 
@@ -166,7 +166,7 @@ class TraceReader:
                 self._lose(number, piece, "NUL bytes here, as after a loss of power")
             elif entry := _entry(piece):
                 self._add(entry, number)
-            elif lost := gap_in(piece):
+            elif lost := parse_gap(piece):
                 self._was_lost(number, *lost)
             elif rescued := _rescued(piece):
                 lost_bytes, at_its_end = rescued
@@ -239,7 +239,7 @@ class TraceReader:
             yield LeftOut(self.path, "it is truncated at the end of the file", self._cut_off, self._counts)
 
 
-def _lines(file: Opened) -> Iterator[tuple[int, bytes, bool]]:
+def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:
     """Number, text, and whether it ended. Of a line that is too long, what follows its last NUL, or its end."""
     number, kept = 1, b""
     while text := file.readline(MAX_LINE_BYTES):
@@ -263,7 +263,7 @@ def _said(line: bytes) -> Header | Entry | None:
     if not any(word in line for word in _TELLING):
         return None
     try:
-        entry = parsed(line)
+        entry = parse_line(line)
         if isinstance(entry, Header):
             base64.b64decode(entry.initial_data or "", validate=True)
     except ValueError:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from harness.archive.traces import Trace
-from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, timer_that_ended, unknown_words
+from harness.archive.vocabulary import IGNORED_KINDS, first_unknown, timer_that_ended, unknown_names
 from harness.checker.recorded_inputs import event_of
 from harness.checker.steps.trace_header import CheckedHeader
 from ucp.events import LoggableEvent, MalformedEventsError
@@ -79,7 +79,7 @@ def lives_of(trace: Trace, header: CheckedHeader, missing: Missing) -> tuple[lis
     """The inputs of each life of the agent; and, naming the line, why not all of them if the rest cannot be used."""
     reader = _Reader(header, missing)
     lives: list[list[Input]] = []
-    for life in trace.lives():
+    for life in trace.incarnations():
         inputs: list[Input] = []
         lives.append(inputs)
         try:
@@ -100,9 +100,9 @@ class _Reader:
         current: Input | None = None
         last_s = float("-inf")
         for line, run in life:
-            words = unknown_words([run])
-            if words.keys() - COMPARED_WITHOUT:
-                raise UnusableInputError(f"line {line}: {first_of(words)}")
+            words = unknown_names([run])
+            if words.keys() - IGNORED_KINDS:
+                raise UnusableInputError(f"line {line}: {first_unknown(words)}")
             if isinstance(run.trigger, LocalTrigger):
                 if current is None:
                     raise UnusableInputError(f"line {line}: {run.handler} ran for a local event before any input")

@@ -191,8 +191,8 @@ def _read(path: Path, agent_id: int, epoch_us: int | None, opener: "Opener | Non
     glance = Capture(0, path)
     glance.read({}, most_frames=1)
     frames = [*CaptureFile(path)]
-    if glance.about is not None:
-        captured = Captured(float(glance.about.epoch_us), glance.about.speedup)
+    if glance.comment is not None:
+        captured = Captured(float(glance.comment.epoch_us), glance.comment.speedup)
     else:
         first_ns = min((frame.time_ns for frame in frames), default=0)
         captured = Captured(float(epoch_us if epoch_us is not None else first_ns // 1000), 1.0)

@@ -150,7 +150,7 @@ def _entries(trace: Trace) -> Iterator[Entry]:
     missing |= dict.fromkeys(trace.jumps, "the agent's clock was set")
     asides = deque(zip((position for position, _ in trace.asides), trace.numbered_asides(), strict=True))
     position = 0
-    for life, of_life in enumerate(trace.lives(), 1):
+    for life, of_life in enumerate(trace.incarnations(), 1):
         for line, run in of_life:
             while asides and asides[0][0] <= position:
                 yield Entry(asides[0][1][0], life, asides.popleft()[1][1])

@@ -21,7 +21,7 @@ class Exchanges:
     """`runs` are the other's handler runs, with their lines."""
 
     def __init__(self, record: Record, theirs: Trace) -> None:
-        self.runs = [numbered for life in theirs.lives() for numbered in life]
+        self.runs = [numbered for life in theirs.incarnations() for numbered in life]
         self._record = record
         self._agents = record.agent_id, theirs.header.agent_id
         self._sent: dict[tuple[object, object], list[int]] = {}

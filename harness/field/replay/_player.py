@@ -7,7 +7,7 @@ from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from harness.archive.vocabulary import COMPARED_WITHOUT, first_of, unknown_words
+from harness.archive.vocabulary import IGNORED_KINDS, first_unknown, unknown_names
 from harness.checker.reference.algorithms import ON_TIMER
 from harness.checker.reference.state import State
 from harness.checker.steps import wrongly_dropped
@@ -76,7 +76,7 @@ class Player:
         self.position = 0
         self.found = Found()
         self._tells = Tells.of(record.trace)
-        self._unknown = unknown_words(record.trace.runs)
+        self._unknown = unknown_names(record.trace.runs)
         self._blocks = RecordedBlocks(record)
         self._clock_set = ClockSet(record)
         self._resumption = Resumption(record, self._blocks)
@@ -167,14 +167,14 @@ class Player:
                 found.lost[-1] += f"; continues after line {entry.line}, where the agent was idle with a recorded chain"
                 self._follower = resumed
             return
-        words = unknown_words([run]) if self._unknown else {}
+        words = unknown_names([run]) if self._unknown else {}
         if words:
             found.unjudged += 1
-            if words.keys() - COMPARED_WITHOUT:
-                follower.lost = f"line {entry.line} has unknown words: {first_of(words)}"
+            if words.keys() - IGNORED_KINDS:
+                follower.lost = f"line {entry.line} has unknown words: {first_unknown(words)}"
                 found.lost.append(follower.lost)
                 return
-            sentence = f"line {entry.line} is compared without its unknown words: {first_of(words)}"
+            sentence = f"line {entry.line} is compared without its unknown words: {first_unknown(words)}"
             if sentence not in found.lost:
                 found.lost.append(sentence)
         else:

@@ -92,7 +92,7 @@ class Resumption:
         return steps
 
     def _take_down(self, trace: Trace, steps: _Below) -> None:
-        for life in trace.lives():
+        for life in trace.incarnations():
             top: bytes | None = self._inception
             for _, run in life:
                 for operation, block_hash in run.changes:

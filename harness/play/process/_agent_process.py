@@ -238,7 +238,7 @@ class AgentProcess:
             if status != 0:
                 raise self._failed("not exported", f"was switched off (SIGTERM) and ended with {self._process.end}")
             self.outcome, self.detail = "exported", f"switched off at {at_s:.1f} s"
-            self._rundir.bring_export(self.agent_id, self._lives[-1].directory)
+            self._rundir.copy_export(self.agent_id, self._lives[-1].directory)
 
     async def pause(self) -> None:
         """It stands still, and what reaches it waits in its socket, as much as fits there."""
@@ -303,7 +303,7 @@ class AgentProcess:
         except AgentRefusedError as error:
             self.outcome, self.detail = "not exported", str(error)
             raise MachineError(f"{error}; the part written before is kept") from None
-        self._rundir.bring_export(self.agent_id, self._lives[-1].directory)
+        self._rundir.copy_export(self.agent_id, self._lives[-1].directory)
 
     async def export_finally(self) -> None:
         """The last export, of an agent that is still alive. Raises as `export`."""
@@ -357,8 +357,8 @@ class AgentProcess:
                 self._completed_before += trace.completed() if trace else []
                 life.counted = True
             if number > 1:
-                life.trace_brought += self._rundir.bring_trace(self.agent_id, life.directory, life.trace_brought)
-                self._rundir.bring_export(self.agent_id, life.directory)
+                life.trace_brought += self._rundir.append_trace(self.agent_id, life.directory, life.trace_brought)
+                self._rundir.copy_export(self.agent_id, life.directory)
 
     def to_json(self) -> dict[str, Any]:
         lives = self._lives

@@ -11,11 +11,11 @@ from typing import Any
 
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import (
-    COMPARED_WITHOUT,
+    IGNORED_KINDS,
     tally_is_known,
     timer_that_ended,
     timers_are_known,
-    unknown_words,
+    unknown_names,
 )
 from harness.checker.recorded_inputs import decoded, event_of, sealed_of, stored_blocks
 from harness.checker.steps.follower import COUNTING, Tells
@@ -107,7 +107,7 @@ def lives(trace: Trace, header: CheckedHeader, chains: Chains, *, ended: bool) -
     """
     tells = Tells.of(trace)
     count = len(trace.starts) + 1
-    for number, runs in enumerate(trace.lives(), 1):
+    for number, runs in enumerate(trace.incarnations(), 1):
         is_last = number == count
         life = Life(header.agent_id, number, whole=ended and is_last and not trace.cut_off and trace.problem is None)
         if is_last:
@@ -147,7 +147,7 @@ class _Writer:
 
     def step(self, run: HandlerRun) -> Item:
         """Raises UnreadableError."""
-        unknown = {kind: word for kind, word in unknown_words([run]).items() if kind not in COMPARED_WITHOUT}
+        unknown = {kind: word for kind, word in unknown_names([run]).items() if kind not in IGNORED_KINDS}
         if unknown:
             raise UnreadableError(next(iter(unknown.values())))
         algorithm = HANDLERS[run.handler].algorithm

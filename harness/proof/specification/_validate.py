@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.archive import RunArchive
-from harness.archive.traces import Trace, read_trace, why_none
+from harness.archive.traces import Trace, read_trace, why_not_a_trace
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import INTERRUPTED, VIOLATED, WRONG_REQUEST
 from harness.proof.specification._recorded_lives import Chains, Life, lives, module
@@ -118,7 +118,7 @@ def recorded(paths: Iterable[Path]) -> Iterator[Recorded]:
     for path in paths:
         if path.is_file():
             trace = read_trace(path)
-            yield Recorded(str(path), [trace] if trace else [], problems=[] if trace else [why_none(path)])
+            yield Recorded(str(path), [trace] if trace else [], problems=[] if trace else [why_not_a_trace(path)])
             continue
         archive = RunArchive(path)
         traces = archive.traces

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE
-from harness.archive.traces import Line
+from harness.archive.traces import TraceLine
 from harness.errors import RunDirectoryError
 from harness.report.agent_programs import Program, programs
 from harness.report.chain_tree import ranges
@@ -33,14 +33,14 @@ class ComparedStep:
     line: int = field(compare=False)
 
     @classmethod
-    def of(cls, line: Line, names: Mapping[str, str]) -> "ComparedStep":
+    def of(cls, line: TraceLine, names: Mapping[str, str]) -> "ComparedStep":
         """Make a step from a line of a trace.
 
         `names` maps block hashes to names; other blocks get 12 digits of their hash.
         """
-        run = line.parsed()
+        run = line.parse()
         return cls(
-            line.life,
+            line.incarnation,
             run.handler,
             run.branch,
             run.trigger,
@@ -55,12 +55,12 @@ def name(block_hash: str, names: Mapping[str, str]) -> str:
     return names.get(block_hash, block_hash[:12])
 
 
-def completed_blocks(lines: Iterable[Line], agent_id: int) -> dict[str, str]:
+def completed_blocks(lines: Iterable[TraceLine], agent_id: int) -> dict[str, str]:
     """Return hash -> `<agent>.<ordinal>` for each block that the agent completed in any incarnation."""
     names: dict[str, str] = {}
     for line in lines:
         if b'"complete"' in line.text:
-            for operation, block in line.parsed().changes:
+            for operation, block in line.parse().changes:
                 if operation == "complete":
                     names.setdefault(block, f"{agent_id}.{len(names) + 1}")
     return names
@@ -239,7 +239,7 @@ def _compare_traces(a: _Run, b: _Run, agent_id: int) -> tuple[int, bool, FirstDi
     """Return the number of equal handler runs, whether they are equal to the last byte, and the first difference."""
     equal, exact = 0, True
     for line_a, line_b in zip_longest(a.archive.trace_lines(agent_id), b.archive.trace_lines(agent_id)):
-        if line_a is None or line_b is None or (line_a.life, line_a.text) != (line_b.life, line_b.text):
+        if line_a is None or line_b is None or (line_a.incarnation, line_a.text) != (line_b.incarnation, line_b.text):
             exact = False
             step_a, step_b = line_a and ComparedStep.of(line_a, a.names), line_b and ComparedStep.of(line_b, b.names)
             if step_a != step_b:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from harness.archive.archive import RunArchive
 from harness.archive.connectivity import Components, Connectivity, Losses, Topology
 from harness.archive.exports import name_blocks
-from harness.archive.history import LATEST_S, History, ends_at, history_of, in_time, possible
+from harness.archive.history import LATEST_S, History, end_of_traces, has_possible_time, history_of, possible_faults
 from harness.archive.replication import replication_of
 from harness.archive.run_record import FaultRecord
 from harness.archive.tracks import Tracks
@@ -102,7 +102,7 @@ class ExportedRun:
 
     @cached_property
     def faults(self) -> list[FaultRecord]:
-        return possible(self.archive.record.faults)
+        return possible_faults(self.archive.record.faults)
 
     @cached_property
     def network(self) -> Connectivity:
@@ -118,7 +118,7 @@ class ExportedRun:
         recorded_end_s = self.archive.record.mission_s or 0.0
         flown = (fixes[-1].at_s for fixes in self.tracks.by_vehicle.values())
         return max(
-            [ends_at(self.archive.traces), *flown, *([recorded_end_s] if 0 <= recorded_end_s <= LATEST_S else [])]
+            [end_of_traces(self.archive.traces), *flown, *([recorded_end_s] if 0 <= recorded_end_s <= LATEST_S else [])]
         )
 
     @property
@@ -230,7 +230,7 @@ class ExportedRun:
 
     def _handler_runs(self, agent: int) -> Iterator[HandlerRunSample]:
         for run in self.archive.traces[agent].runs:
-            if in_time(run):
+            if has_possible_time(run):
                 yield HandlerRunSample(self.time.at(run.t, agent), agent, run)
 
     def _drops(self, agent: int) -> Iterator[DropSample]:

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from itertools import chain, islice
 from pathlib import Path
 
-from harness.archive.bounded_file import Opened
+from harness.archive.bounded_file import BoundedFile
 from harness.report.export._samples import Level, LogLine, MissionTime
 
 MAX_BYTES = 32 * 1024 * 1024
@@ -36,7 +36,7 @@ def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) ->
     """Yield the lines of a log. Add a sentence to `problems` if a part cannot be read."""
     at_ns, zone_s = time.at(0.0), None
     try:
-        with Opened(path, MAX_BYTES) as file:
+        with BoundedFile(path, MAX_BYTES) as file:
             while line := file.readline(MAX_LINE_BYTES):
                 text = line.decode("utf-8", "replace").rstrip()
                 if timed := _TIME.match(text):
@@ -48,8 +48,8 @@ def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) ->
                     text = text[timed.end() :]
                 if text:
                     yield LogLine(at_ns, _level(text), source, text)
-            if file.trouble:
-                problems.append(f"{path}: {file.trouble}")
+            if file.problem:
+                problems.append(f"{path}: {file.problem}")
     except OSError as error:
         problems.append(f"{path}: cannot be read: {error.strerror}")
 

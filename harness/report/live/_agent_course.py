@@ -9,8 +9,8 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from harness.archive.history import COMMITTED_BY, LATEST_S, Begun, Incarnation, Reconcile, Tie, Vote
-from harness.archive.traces import Header, Held, parsed
+from harness.archive.history import COMMITTED_BY, LATEST_S, ActivityStart, HistoryReader, Reconcile, Tie, Vote
+from harness.archive.traces import Header, HeldBlocks, parse_line
 from harness.report.live._live_trace import AgentTrace
 from ucp.trace import Commanded, Dropped, Entry, HandlerRun
 from ucp.trigger import MessageTrigger
@@ -63,11 +63,11 @@ class AgentCourse:
         self._ahead: Receipt | HandlerRun | Dropped | None = None
         """An entry that was read, but is later than the requested mission second."""
         self._has_started = False
-        self._held = Held()
+        self._held = HeldBlocks()
         self._completed: dict[str, int] = {}
         self._duplicates: set[str] = set()
         self._idle_too_early = False
-        self._incarnation = Incarnation(agent_id)
+        self._incarnation = HistoryReader(agent_id)
 
     def read(self, until_s: float, at_most: int) -> bool:
         """Read up to `until_s`, but at most `at_most` lines. Return whether entries up to `until_s` remain."""
@@ -109,7 +109,7 @@ class AgentCourse:
                 entry: Receipt | Header | Entry = Receipt(float(t), int(sender), int(seq))
             else:
                 try:
-                    entry = parsed(line)
+                    entry = parse_line(line)
                 except ValueError:
                     self.problem = f"the trace of agent {self.agent_id} is damaged, and is read up to the damage"
                     return None
@@ -126,8 +126,8 @@ class AgentCourse:
         """Begin an incarnation."""
         if self._has_started:
             self.changes.append(["z", self.at_s, self.agent_id])
-        self._has_started, self._held, self._idle_too_early = True, Held(), False
-        self._incarnation = Incarnation(self.agent_id)
+        self._has_started, self._held, self._idle_too_early = True, HeldBlocks(), False
+        self._incarnation = HistoryReader(self.agent_id)
         self._duplicates.clear()
 
     def _handler_run(self, run: HandlerRun) -> None:
@@ -157,13 +157,13 @@ class AgentCourse:
 
     def _report_activity(self, run: HandlerRun) -> None:
         """Report the votes, reconciles and phases that the handler run began or ended."""
-        for step in self._incarnation.take(run):
+        for step in self._incarnation.feed(run):
             match step:
-                case Begun("vote"):
+                case ActivityStart("vote"):
                     self._add_activity(run.t, "voting", step.detail[:KEY_LENGTH])
-                case Begun("reconcile"):
+                case ActivityStart("reconcile"):
                     self._add_activity(run.t, "reconciling", step.detail)
-                case Begun():
+                case ActivityStart():
                     self._add_activity(run.t, step.detail, "")
                 case Vote():
                     self._add_activity(run.t, "voted", step.outcome[:80])

@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import ValidationError
 
-from harness.archive.connectivity import NETWORK_FILE, Network, NetworkLine, Pair
+from harness.archive.connectivity import NETWORK_FILE, NetworkLine, NetworkReplay, Pair
 from harness.archive.tracks import TRACKS_FILE, TrackLine
 from harness.report.live._agent_course import Change
 from harness.report.live._live_trace import GrowingFile
@@ -78,7 +78,7 @@ class Surroundings:
     def __init__(self, directory: Path, vehicles: Collection[int]) -> None:
         self.changes: list[Change] = []
         self._known = set(vehicles)
-        self._network = Network(vehicles)
+        self._network = NetworkReplay(vehicles)
         self._losses: dict[Pair, tuple[float, float]] = {}
         self._parts: tuple[frozenset[int], ...] = ()
         self._conditions = _TimedFile(directory / NETWORK_FILE, _NetworkEntry, self._play_network_entry)
@@ -120,7 +120,7 @@ class Surroundings:
         if not self._parts and line.asked is None:
             raise ValueError("the record begins with conditions")
         network = self._network
-        network.play(line)
+        network.apply(line)
         fault = named(line.what)
         whole = line.asked is not None or fault.takes_the_vehicle or fault.brings_a_vehicle
         pairs = [*combinations(network.vehicles, 2)] if whole else [_pair(name) for name in line.losses]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from math import floor, inf, isfinite
 
-from harness.archive.history import in_time
+from harness.archive.history import has_possible_time
 from harness.archive.traces import Trace
 from harness.report.stories.story_file import Section
 from harness.report.stories.story_names import ANSWERS, INCEPTION, LocalChain, Names, message_text
@@ -220,7 +220,7 @@ def _actions(agent_id: int, trace: Trace) -> Iterator[Action]:
     """Yield the actions of a trace. Local events belong to the action that triggered them."""
     action: Action | None = None
     for position, run in enumerate(trace.runs):
-        if not in_time(run):
+        if not has_possible_time(run):
             continue
         if isinstance(run.trigger, LocalTrigger) and action is not None:
             action.runs.append(run)

@@ -69,7 +69,7 @@ class Names:
         }
         self._chains: dict[bytes, list[str]] = {}
         for trace in traces.values():
-            for life in trace.lives():
+            for life in trace.incarnations():
                 chain = LocalChain(trace)
                 self._chains[chain.chain_hashes[0]] = []
                 for _, run in life:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-from harness.archive.traces import HEADER, Held, Trace
+from harness.archive.traces import HEADER, HeldBlocks, Trace
 from harness.checker.recorded_inputs import Blocks
 from harness.checker.steps import wrongly_dropped
 from harness.checker.steps.follower import Follower, Tells
@@ -81,8 +81,8 @@ class _Driven:
         self.strangers = [Block(2, 1_000_000, b"of two"), Block(3, 1_000_000, b"of three"), Block(4, 7, bytes(1024))]
         self.agent, self.held = self._born()
 
-    def _born(self) -> tuple[Agent, Held]:
-        return Agent(1, ROSTER, INITIAL_DATA, self.settings), Held()
+    def _born(self) -> tuple[Agent, HeldBlocks]:
+        return Agent(1, ROSTER, INITIAL_DATA, self.settings), HeldBlocks()
 
     def operate(self, program: _Program) -> None:
         operation = program.byte() % 16
@@ -201,7 +201,7 @@ class _Driven:
     def judge(self) -> None:
         """As the reference core does it."""
         header, tells = checked(self.trace.header), Tells.of(self.trace)
-        for life in self.trace.lives():
+        for life in self.trace.incarnations():
             follower = Follower(header, tells, Blocks(()), lambda since, until: False)
             for line, run in life:
                 follower.follow(line, run)

@@ -6,11 +6,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from harness.archive.packets import packets_text
-from harness.archive.packets.air_names import Names
+from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import read_captures
 from harness.archive.packets.exchanges import Exchanges, count_losses
 from harness.archive.packets.packets_document import document
-from harness.archive.packets.packets_text import Wording
+from harness.archive.packets.packets_text import TransmissionText
 from harness.archive.packets.pcap import OUTBOUND, CaptureFile, Frame
 from harness.archive.packets.transmissions import join
 from harness.errors import HarnessError
@@ -32,7 +32,7 @@ def run(data: bytes) -> None:
             _same_again([*file], Path(directory) / "again.pcapng")
         except HarnessError as error:
             sound(str(error))
-        sound(file.trouble)
+        sound(file.problem)
         _show([path])
         _show([path, sound_run() / "capture" / "2.pcapng"])
     came_home(NAME, data)
@@ -55,10 +55,10 @@ def _show(paths: list[Path]) -> None:
     for sentence in (*captures.errors, *captures.problems):
         sound(sentence)
     transmissions = join(captures)
-    exchanges, names = Exchanges(transmissions), Names(transmissions, [])
-    list(packets_text.lines(transmissions, exchanges, Wording(names, str), None))
-    packets_text.head(captures)
-    list(packets_text.tail(captures, transmissions))
+    exchanges, names = Exchanges(transmissions), BlockNames(transmissions, [])
+    list(packets_text.transmission_lines(transmissions, exchanges, TransmissionText(names, str), None))
+    packets_text.header(captures)
+    list(packets_text.totals(captures, transmissions))
     list(document(captures, count_losses(transmissions), transmissions, exchanges, names))
 
 

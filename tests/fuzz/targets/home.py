@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from harness import checker
 from harness.archive.archive import RunArchive
 from harness.archive.run_record import RogueInjection
-from harness.archive.traces import read_lines
+from harness.archive.traces import read_trace_lines
 from harness.errors import HarnessError
 from harness.field.adapters import bring_in
 from harness.field.adapters.csv_adapter import CommaSeparated
@@ -172,7 +172,7 @@ def _archive(run: Path) -> None:
 
 def _lines(path: Path) -> None:
     try:
-        for line in read_lines(path):
-            line.parsed()
+        for line in read_trace_lines(path):
+            line.parse()
     except HarnessError as error:
         sound(str(error))

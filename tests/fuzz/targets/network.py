@@ -17,7 +17,7 @@ def run(data: bytes) -> None:
         for problem in network.problems:
             sound(problem)
         for at_s in (0.0, 50.0, 1e9):
-            _ = network.links(at_s), network.lives(2, at_s)
+            _ = network.links(at_s), network.airborne_intervals(2, at_s)
 
 
 def seeds(flown: Path) -> Iterator[bytes]:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from harness.archive.traces import Header, parsed, read_trace, why_none
+from harness.archive.traces import Header, parse_line, read_trace, why_not_a_trace
 from tests.fuzz.finding import require, sound
 from tests.fuzz.targets.home import came_home, in_its_run
 from ucp.trace import Entry
@@ -19,7 +19,7 @@ def run(data: bytes) -> None:
         path.write_bytes(data)
         trace = read_trace(path)
         if trace is None:
-            sound(why_none(path))
+            sound(why_not_a_trace(path))
         else:
             for entry in (*trace.runs, *(aside for _, aside in trace.asides)):
                 _same_again(entry)
@@ -31,7 +31,7 @@ def run(data: bytes) -> None:
 
 def _same_again(entry: Entry) -> None:
     line = entry.to_line()
-    read = parsed(line.encode("ascii"))
+    read = parse_line(line.encode("ascii"))
     require(not isinstance(read, Header) and read.to_line() == line, "a line of a trace is written otherwise")
 
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from harness.archive.exports import export_of
-from harness.archive.traces import Header, parsed
+from harness.archive.exports import parse_export
+from harness.archive.traces import Header, parse_line
 from harness.play.process.agent_mission import mission_file
 from tests.fuzz.finding import FailedError, require, sound
 from tests.harness.virtual import scenario
@@ -47,10 +47,10 @@ def _judge(line: bytes, answer: dict[str, Any]) -> None:
     for sent in answer["sent"]:
         decode(base64.b64decode(sent, validate=True))
     for entry in answer.get("trace", ()):
-        require(not isinstance(parsed(json.dumps(entry).encode()), Header), "a header among what it did")
+        require(not isinstance(parse_line(json.dumps(entry).encode()), Header), "a header among what it did")
     told = answer.get("answer", {})
     if "schema" in told:
-        export_of(Path("told"), told)
+        parse_export(Path("told"), told)
     if "store" in told:
         boots = {**json.loads(_MISSION), "store": told["store"]}
         require("error" not in json.loads(_answers(json.dumps(boots).encode())[0]), "it does not boot from its store")

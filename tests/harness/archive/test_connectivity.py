@@ -104,9 +104,9 @@ def test_a_lost_vehicle_connects_nobody_until_another_takes_its_place(tmp_path: 
         (20.0, "restart", "1 2 3 4"),
         (40.0, "kill", "3 4"),
     ]
-    assert found.lives(2, 50.0) == [(0.0, 10.0, True), (20.0, 40.0, True)]
-    assert found.lives(2, 30.0) == [(0.0, 10.0, True), (20.0, 30.0, False)]
-    assert found.lives(4, 50.0) == [(0.0, 50.0, False)]
+    assert found.airborne_intervals(2, 50.0) == [(0.0, 10.0, True), (20.0, 40.0, True)]
+    assert found.airborne_intervals(2, 30.0) == [(0.0, 10.0, True), (20.0, 30.0, False)]
+    assert found.airborne_intervals(4, 50.0) == [(0.0, 50.0, False)]
     assert found.reboots == [(30.0, 3)]
 
 

@@ -8,7 +8,7 @@ import pytest
 from harness.archive import archive
 from harness.archive import history as told
 from harness.archive.archive import RunArchive
-from harness.archive.history import Message, Phase, Reconcile, Tie, Vote, ends_at, history_of
+from harness.archive.history import Message, Phase, Reconcile, Tie, Vote, end_of_traces, history_of
 from harness.archive.replication import Replication, replication_of
 from harness.archive.run_record import FaultRecord
 from harness.archive.traces import Header, Trace
@@ -65,7 +65,7 @@ def a_trace(agent: int, *lives: list[HandlerRun]) -> Trace:
 def test_a_tie_has_its_votes_and_the_phases_of_its_reconciles() -> None:
     simulated = played("forced_tie")
     traces, names = simulated.evidence.traces, simulated.evidence.names
-    found = history_of(traces, faults(simulated), ends_at(traces))
+    found = history_of(traces, faults(simulated), end_of_traces(traces))
     assert [(vote.agent, names[vote.block], vote.start_s, vote.end_s, vote.outcome) for vote in found.votes] == [
         (1, "1.1", 22.0, 32.0, "not approved"),
         (1, "1.1", 42.0, 52.0, "approved"),
@@ -87,7 +87,7 @@ def test_a_tie_has_its_votes_and_the_phases_of_its_reconciles() -> None:
 def test_a_lost_commit_is_a_message_that_one_agent_did_not_handle() -> None:
     simulated = played("lost_last_commit")
     traces, names = simulated.evidence.traces, simulated.evidence.names
-    found = history_of(traces, [], ends_at(traces))
+    found = history_of(traces, [], end_of_traces(traces))
     assert found.messages is not None
     heard = {
         names[message.block or ""]: sorted(agent for agent, _ in message.receipts)
@@ -135,9 +135,9 @@ def test_a_message_is_of_the_life_that_sent_it() -> None:
 def test_a_handler_run_without_a_possible_time_is_left_out(at_s: float) -> None:
     commit = a_run(at_s, "receive_commit_block", changes=[("complete", "aa"), ("chain+", "aa")])
     traces = {1: a_trace(1, [a_run(1.0, "build_data_block"), commit])}
-    assert history_of(traces, [], ends_at(traces)).commits == []
+    assert history_of(traces, [], end_of_traces(traces)).commits == []
     assert replication_of(traces, []) == [Replication(0.0, 0, 0, 1, None, None)]
-    assert ends_at(traces) == 1.0
+    assert end_of_traces(traces) == 1.0
 
 
 @pytest.mark.parametrize("final_reconcile", [False, True])

@@ -6,12 +6,12 @@ from random import Random
 
 import pytest
 
-from harness.archive.packets.air_names import Names, runs_of
+from harness.archive.packets.block_names import BlockNames, run_directories
 from harness.archive.packets.capture_files import Captures as Read
 from harness.archive.packets.capture_files import capture_files, read_captures
-from harness.archive.packets.exchanges import Answer, Exchanges, Pair, count_losses
-from harness.archive.packets.packets_text import Wording
-from harness.archive.packets.selection import Selection, carried_to, story
+from harness.archive.packets.exchanges import Exchanges, LinkLosses, RequestOutcome, count_losses
+from harness.archive.packets.packets_text import TransmissionText
+from harness.archive.packets.selection import Selection, block_arrivals, exchanges_about
 from harness.archive.packets.transmissions import Transmission, join
 from harness.errors import CaptureError
 from tests.harness.captures import INBOUND, OUTBOUND, Captures, PcapNg, Scene, frame, pcap, wall_ns
@@ -83,7 +83,7 @@ def test_every_loss_is_named_and_nothing_else(flown: tuple[Air, Captures], run_d
     pairs = Counter((int.from_bytes(data[4:8], "big"), name) for data, name in truth.lost())
     sent = Counter(int.from_bytes(data[4:8], "big") for data in truth.sent)
     assert count_losses(found) == [
-        Pair(sender, receiver, sent[sender], pairs[sender, receiver])
+        LinkLosses(sender, receiver, sent[sender], pairs[sender, receiver])
         for sender in sorted(sent)
         for receiver in sorted(sent)
         if sender != receiver
@@ -213,8 +213,10 @@ def test_what_an_agent_answered_did_reach_it_even_if_its_capture_missed_it(tmp_p
 
 
 def test_what_came_of_a_request_is_told_from_answers_to_losses() -> None:
-    answers = [Answer(2, "request lost"), Answer(3, "no answer"), Answer(4, "request lost")]
-    assert Wording(Names([], []), str.upper).answers(answers) == "answers: no answer: 3; REQUEST LOST: 2 4"
+    answers = [RequestOutcome(2, "request lost"), RequestOutcome(3, "no answer"), RequestOutcome(4, "request lost")]
+    assert (
+        TransmissionText(BlockNames([], []), str.upper).answers(answers) == "answers: no answer: 3; REQUEST LOST: 2 4"
+    )
 
 
 def test_packets_that_overtake_each_other_are_in_the_order_of_sending(tmp_path: Path) -> None:
@@ -322,26 +324,26 @@ def test_captures_of_another_run_are_left_out(tmp_path: Path) -> None:
 def test_the_story_of_a_block_has_all_that_is_about_it(flown: tuple[Air, Captures], run_dir: Path) -> None:
     air, _ = flown
     found = join(read(run_dir))
-    names = Names(found, runs_of([run_dir]))
+    names = BlockNames(found, run_directories([run_dir]))
     block_hash = air.agents[3].state.completed[1]
     assert names.find("3.2") == names.find(block_hash.hex()[:10]) == block_hash
-    chapters = list(story(block_hash, found, Exchanges(found)))
-    told = [one.number for chapter in chapters for one in (chapter.begins, *chapter.answers)]
-    assert len(told) == len(set(told))
-    assert set(told) >= {one.number for one in found if one.summary.block_hash == block_hash}
-    assert chapters[0].begins.summary.message == BlockAddRequest.NAME
-    assert {answer.summary.message for answer in chapters[0].answers} == {BlockAddResponse.NAME}
+    exchanges = list(exchanges_about(block_hash, found, Exchanges(found)))
+    numbers = [one.number for exchange in exchanges for one in (exchange.first, *exchange.answers)]
+    assert len(numbers) == len(set(numbers))
+    assert set(numbers) >= {one.number for one in found if one.summary.block_hash == block_hash}
+    assert exchanges[0].first.summary.message == BlockAddRequest.NAME
+    assert {answer.summary.message for answer in exchanges[0].answers} == {BlockAddResponse.NAME}
     carriers = [
         one
         for one in found
         if one.summary.block_hash == block_hash and one.summary.message in ("Commit Block", "Block Response")
     ]
-    assert set(carried_to(chapters)) == {name for one in carriers for name in one.reached}
+    assert set(block_arrivals(exchanges)) == {name for one in carriers for name in one.reached}
 
 
 def test_without_exports_blocks_are_named_by_the_order_of_proposals(run_dir: Path) -> None:
     found = join(read(run_dir))
-    with_exports, alone = Names(found, runs_of([run_dir])), Names(found, [])
+    with_exports, alone = BlockNames(found, run_directories([run_dir])), BlockNames(found, [])
     proposed = {one.summary.block_hash for one in found if one.summary.message == BlockAddRequest.NAME}
     assert len(proposed) > 5
     for block_hash in proposed:
@@ -354,7 +356,7 @@ def test_an_agent_that_was_not_captured_from_its_start_on_has_no_ordinals(tmp_pa
     scene.sequences[1] = 40
     scene.send(1, 1, PROPOSAL)
     scene.send(2, 1, CommitBlock(BLOCK, CHAIN))
-    names = Names(joined(scene, tmp_path), [])
+    names = BlockNames(joined(scene, tmp_path), [])
     digits = BLOCK.block_hash.hex()[:8]
     assert names.block(BLOCK.block_hash) == digits
     assert names.chain(CHAIN) == f"{CHAIN.hex()[:8]} ({digits})"
@@ -366,7 +368,7 @@ def test_a_selection_is_by_sender_receiver_message_and_time(run_dir: Path) -> No
     captures = read(run_dir)
     found = join(captures)
     selection = Selection(sender=2, receiver=3, message="commit block", between_s=(100, 500))
-    selected = list(selection.of(found, captures))
+    selected = list(selection.filter(found, captures))
     whole = [
         one for one in found if one.sender == 2 and one.summary.message == "Commit Block" and 100 <= one.at_s <= 500
     ]
@@ -379,4 +381,4 @@ def test_a_selection_is_by_sender_receiver_message_and_time(run_dir: Path) -> No
     with pytest.raises(CaptureError, match="the first second is not before the last"):
         Selection(between_s=(2, 1))
     with pytest.raises(CaptureError, match="no capture of that vehicle; captures are of 1, 2, 3, 4, 5"):
-        list(Selection(receiver=9).of(found, captures))
+        list(Selection(receiver=9).filter(found, captures))

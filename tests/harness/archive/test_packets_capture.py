@@ -51,7 +51,7 @@ def test_pcapng_is_read_in_either_byte_order_and_any_resolution(
         (2_000 * 10**9 // units_per_s, INBOUND, b"odd"),
         (2**33 * 10**9 // units_per_s, 0, b""),
     ]
-    assert (file.ended_ns, file.dropped, file.trouble) == (2**34 * 10**9 // units_per_s, 3, "")
+    assert (file.ended_ns, file.dropped, file.problem) == (2**34 * 10**9 // units_per_s, 3, "")
 
 
 @pytest.mark.parametrize(("swap", "nanoseconds"), [(False, False), (True, False), (False, True), (True, True)])
@@ -72,8 +72,8 @@ def test_what_is_before_the_break_is_read_wherever_the_file_breaks_off(tmp_path:
         path.write_bytes(whole[:length])
         file = CaptureFile(path)
         read.append(len(list(file)))
-        at_a_block_s_end = not file.trouble
-        assert at_a_block_s_end or file.trouble.startswith("ends within the block that starts at byte ")
+        at_a_block_s_end = not file.problem
+        assert at_a_block_s_end or file.problem.startswith("ends within the block that starts at byte ")
     assert read == sorted(read)
     assert set(read) == {0, 1, 2, 3}
 
@@ -105,7 +105,7 @@ def test_a_length_that_a_file_names_is_not_believed(tmp_path: Path) -> None:
         path.write_bytes(good + bad)
         file = CaptureFile(path)
         assert len(list(file)) == 3
-        assert file.trouble == f"is damaged at byte {len(good)}; the part before is read"
+        assert file.problem == f"is damaged at byte {len(good)}; the part before is read"
 
 
 def test_a_frame_is_unwrapped_whatever_tcpdump_put_around_it() -> None:

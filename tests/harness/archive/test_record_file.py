@@ -9,7 +9,7 @@ import pytest
 
 from harness import checker
 from harness.archive.archive import RunArchive
-from harness.archive.record_file import MAX_VALUES, DamagedRecordError, RecordFile, fit, read_record
+from harness.archive.record_file import MAX_VALUES, DamagedRecordError, RecordFile, read_record, validate_leniently
 from harness.archive.run_record import RunRecord
 from harness.play.progress import Silent
 from harness.run.run import run
@@ -121,6 +121,8 @@ def test_exports_are_checked_without_a_record_that_is_damaged_where_it_counts(wh
 
 
 def test_what_fits_nowhere_leaves_an_empty_record() -> None:
-    record, misfits = fit(RunRecord, {key: [[7]] for key in RunRecord.model_fields if key != "schema_"})
+    record, invalid_parts = validate_leniently(
+        RunRecord, {key: [[7]] for key in RunRecord.model_fields if key != "schema_"}
+    )
     assert record == RunRecord(roster=[])
-    assert {misfit.key for misfit in misfits} == {key for key in RunRecord.model_fields if key != "schema_"}
+    assert {part.key for part in invalid_parts} == {key for key in RunRecord.model_fields if key != "schema_"}

@@ -20,24 +20,24 @@ def test_a_directory_that_holds_anything_is_left_alone(tmp_path: Path) -> None:
 
 def test_the_trace_of_a_later_life_follows_the_whole_lines_of_the_earlier(tmp_path: Path) -> None:
     rundir = RunDirectory(tmp_path / "run")
-    first, second = rundir.agent(7), rundir.agent(7, life=2)
+    first, second = rundir.agent(7), rundir.agent(7, incarnation=2)
     assert (first.name, second.name) == ("agents", "7-2")
     (first / "7.trace.jsonl").write_text("one\ntw")
     (second / "7.trace.jsonl").write_text("three\n")
-    rundir.bring_trace(7, second)
+    rundir.append_trace(7, second)
     assert (first / "7.trace.jsonl").read_text() == "one\nthree\n"
     assert (second / "7.trace.jsonl").read_text() == "three\n"
-    rundir.bring_trace(7, rundir.agent(7, life=3))  # it was killed before it said anything
+    rundir.append_trace(7, rundir.agent(7, incarnation=3))  # it was killed before it said anything
     assert (first / "7.trace.jsonl").read_text() == "one\nthree\n"
 
 
 def test_the_trace_of_a_life_that_goes_on_is_brought_piece_by_piece(tmp_path: Path) -> None:
     rundir = RunDirectory(tmp_path / "run")
-    first, second = rundir.agent(7), rundir.agent(7, life=2)
+    first, second = rundir.agent(7), rundir.agent(7, incarnation=2)
     (first / "7.trace.jsonl").write_text("one\n")
     (second / "7.trace.jsonl").write_text("two\nthr")
-    brought = rundir.bring_trace(7, second)
+    copied_bytes = rundir.append_trace(7, second)
     (second / "7.trace.jsonl").write_text("two\nthree\n")
-    brought += rundir.bring_trace(7, second, brought)
+    copied_bytes += rundir.append_trace(7, second, copied_bytes)
     assert (first / "7.trace.jsonl").read_text() == "one\ntwo\nthree\n"
-    assert rundir.bring_trace(7, second, brought) == 0
+    assert rundir.append_trace(7, second, copied_bytes) == 0

@@ -73,7 +73,7 @@ def _every_life_is_kept(out: Path) -> None:
         trace = read_trace(agents / f"{agent}.trace.jsonl")
         last = read_trace(agents / f"{agent}-2" / f"{agent}.trace.jsonl")
         assert trace is not None and last is not None and not trace.problem
-        first_life, second_life = ([run for _, run in life] for life in trace.lives())
+        first_life, second_life = ([run for _, run in life] for life in trace.incarnations())
         assert second_life == last.runs
         assert max(run.t for run in first_life) < min(run.t for run in second_life)
         assert (second_life[0].trigger.kind == "boot") == boots

@@ -49,7 +49,7 @@ def test_a_run_is_one_flight_and_nothing_is_left_out(whole: Path) -> None:
     for agent, trace in flight.traces.items():
         of_archive = read_trace(trace_of(whole, agent))
         assert of_archive and trace.runs == of_archive.runs and trace.asides == of_archive.asides
-        assert list(trace.lives().__next__()) == list(of_archive.lives().__next__())
+        assert list(trace.incarnations().__next__()) == list(of_archive.incarnations().__next__())
         assert not trace.gaps
 
 
@@ -73,7 +73,7 @@ def test_what_follows_a_damaged_line_is_used_and_the_gap_is_known(home: Path) ->
     trace = homecoming.largest().traces[2]
     assert len(trace.runs) == len(lines) - 3
     assert trace.gaps == [Gap(4, 2, len(lines[5]) + len(lines[6]))]
-    assert [line for line, _ in next(trace.lives())] == [2, 3, 4, 5, *range(8, len(lines) + 1)]
+    assert [line for line, _ in next(trace.incarnations())] == [2, 3, 4, 5, *range(8, len(lines) + 1)]
     (left_out,) = homecoming.left_out
     assert left_out.sentence == f"{path}, line 6: it is damaged, and so is the rest up to line 7"
 

@@ -11,7 +11,7 @@ from scapy.layers.l2 import Ether
 from scapy.packet import Packet
 from scapy.utils import rdpcap
 
-from harness.archive.record_file import fit
+from harness.archive.record_file import validate_leniently
 from harness.archive.run_record import InjectedMessages, RunRecord
 from harness.errors import ScenarioError
 from harness.play.process.process_preflight import on_the_air
@@ -140,7 +140,7 @@ def test_forged_commit_is_found_and_reported(tmp_path: Path) -> None:
 
 def test_invalid_rogue_record_is_left_out_of_the_report() -> None:
     hostile = {"at_s": 1, "what": "<script>", "detail": "x", "refused": {"<b>": 2}}
-    record, _ = fit(RunRecord, {"rogue": [hostile, {"at_s": "soon"}]})
+    record, _ = validate_leniently(RunRecord, {"rogue": [hostile, {"at_s": "soon"}]})
     told = section(record.rogue)
     assert told is not None
     assert [(row.what, row.message, row.sent) for row in told.rows] == [("<script>", "none: <b>", "2")]

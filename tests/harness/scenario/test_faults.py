@@ -59,7 +59,7 @@ def test_blocks_that_only_a_killed_agent_held_are_told_and_no_violation() -> Non
 def test_a_restarted_agent_begins_with_nothing_and_gets_everything_back() -> None:
     simulated = played([{"at_s": 300, "kill": [2]}, {"at_s": 330, "restart": [2]}], final_reconcile=True)
     trace = simulated.evidence.traces[2]
-    first, second = ([run for _, run in life] for life in trace.lives())
+    first, second = ([run for _, run in life] for life in trace.incarnations())
     assert max(run.t for run in first) <= 300 < 330 <= min(run.t for run in second)
     assert second[0].state.chain == 0
     completed = simulated.evidence.exports[2].completed
@@ -99,7 +99,7 @@ def test_a_reboot_with_its_disk_loses_no_block(seed: int) -> None:
     agent = simulated.played.agents["2"]
     assert (agent["outcome"], agent["restarts"], agent["reboots"], agent["completed_before"]) == ("exported", 0, 2, [])
     trace = simulated.evidence.traces[2]
-    first, second, third = ([run for _, run in life] for life in trace.lives())
+    first, second, third = ([run for _, run in life] for life in trace.incarnations())
     assert max(run.t for run in first) <= 203 < 223 <= min(run.t for run in second)
     assert (second[0].t, second[0].trigger) == (223, BootTrigger(first[-1].state.chain))
     assert (third[0].t, third[0].handler) == (412, "reconcile_finalize")

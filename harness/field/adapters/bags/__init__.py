@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from harness.archive.bounded_file import Opened
+from harness.archive.bounded_file import BoundedFile
 from harness.field.adapters.bags import _mcap_bag, _sqlite, _version_1
 from harness.field.adapters.bags._decompression import MAX_FILE_BYTES, ZSTD_MAGIC, Broken, Found, Item, unpacked_file
 
@@ -44,12 +44,12 @@ def messages(path: Path) -> Iterator[BagMessage | Broken]:
 
 def _items(path: Path, scratch: Path) -> Iterator[Item]:
     trouble = ""
-    with Opened(path, MAX_FILE_BYTES) as file:
+    with BoundedFile(path, MAX_FILE_BYTES) as file:
         if file.packed:
             path = scratch / "unpacked"
             with path.open("wb") as copy:
                 shutil.copyfileobj(file, copy)
-            trouble = file.trouble
+            trouble = file.problem
     if _magic(path) == ZSTD_MAGIC:
         packed, path = path, scratch / "unzstd"
         trouble = unpacked_file(packed, path)

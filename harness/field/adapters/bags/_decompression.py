@@ -7,7 +7,7 @@ from mmap import mmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from harness.archive.bounded_file import Opened
+from harness.archive.bounded_file import BoundedFile
 
 Buffer = bytes | mmap
 """A file's content, or a chunk's."""
@@ -111,7 +111,7 @@ def unpacked_file(path: Path, copy: Path) -> str:
     """Unpack what zstd packed; why it is not whole, if so."""
     unpacker: Any = _unpacker("zstd")
     written = 0
-    with Opened(path, MAX_FILE_BYTES) as file, copy.open("wb") as unpacked_copy:
+    with BoundedFile(path, MAX_FILE_BYTES) as file, copy.open("wb") as unpacked_copy:
         while written < MAX_FILE_BYTES and not unpacker.eof:
             part = file.read(_AT_ONCE) if unpacker.needs_input else b""
             if unpacker.needs_input and not part:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from harness.archive.archive import RunArchive
-from harness.archive.history import ends_at, history_of
+from harness.archive.history import end_of_traces, history_of
 from harness.archive.traces import SUFFIX, Trace
 from harness.errors import RunDirectoryError
 from harness.report.live import feed as feeds
@@ -182,7 +182,7 @@ def intervals(told: list[Change]) -> list[tuple[str, float, float, str]]:
 
 def of_report(traces: dict[int, Trace]) -> list[tuple[str, float, float, str]]:
     """The same intervals as the report has them."""
-    history = history_of(traces, [], ends_at(traces), whole=False)
+    history = history_of(traces, [], end_of_traces(traces), whole=False)
     votes = [("vote", vote.start_s, vote.end_s, vote.outcome) for vote in history.votes]
     return sorted([*votes, *(("reconcile", one.start_s, one.end_s, one.reason) for one in history.reconciles)])
 

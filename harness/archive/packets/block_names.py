@@ -17,14 +17,14 @@ from ucp.messages import BlockAddRequest, CommitBlock
 DIGITS = 8
 
 
-class Names:
+class BlockNames:
     """Of all blocks and chains that were spoken of."""
 
     def __init__(self, transmissions: Iterable[Transmission], runs: Iterable[Path]) -> None:
         """`runs` are directories that may hold exports."""
         self._blocks: dict[bytes, str] = {}
         self._top_of: dict[bytes, bytes | None] = {}
-        self._spoken_of: set[bytes] = set()
+        self._mentioned: set[bytes] = set()
         self._sealed = False
         """Whether of some messages nobody here knows which block they are about."""
         self._from_start: set[int] = set()
@@ -49,17 +49,17 @@ class Names:
         top = self._top_of[chain_hash]
         return f"{digits} ({'inception' if top is None else self.block(top)})"
 
-    def find(self, wanted: str) -> bytes:
+    def find(self, query: str) -> bytes:
         """The block of that name, or whose hash begins so. Raises CaptureError if there is none, or several."""
-        named = [block_hash for block_hash, name in self._blocks.items() if name == wanted]
-        hashes = named or [block_hash for block_hash in self._spoken_of if block_hash.hex().startswith(wanted.lower())]
-        hashes = [block_hash for block_hash in hashes if block_hash in self._spoken_of]
+        named = [block_hash for block_hash, name in self._blocks.items() if name == query]
+        hashes = named or [block_hash for block_hash in self._mentioned if block_hash.hex().startswith(query.lower())]
+        hashes = [block_hash for block_hash in hashes if block_hash in self._mentioned]
         if len(hashes) == 1:
             return hashes[0]
         if hashes:
-            raise CaptureError(f"--follow {wanted} fits {len(hashes)} blocks: give more digits of the hash")
+            raise CaptureError(f"--follow {query} fits {len(hashes)} blocks: give more digits of the hash")
         way_out = "--bundle shows what is sealed" if self._sealed else "give a name or a hash that is printed here"
-        raise CaptureError(f"--follow {wanted}: no known message is about that block; {way_out}")
+        raise CaptureError(f"--follow {query}: no known message is about that block; {way_out}")
 
     def _learn_from_exports(self, run: Path) -> None:
         try:
@@ -77,7 +77,7 @@ class Names:
         summary = transmission.summary
         self._sealed |= summary.is_sealed
         if summary.block_hash is not None:
-            self._spoken_of.add(summary.block_hash)
+            self._mentioned.add(summary.block_hash)
         if transmission.origin == "forged":
             return
         if summary.message == CommitBlock.NAME and summary.chain_hash is not None:
@@ -96,7 +96,7 @@ class Names:
             self._blocks[summary.block_hash] = f"{transmission.sender}.{ordinal}"
 
 
-def runs_of(paths: Iterable[Path]) -> list[Path]:
+def run_directories(paths: Iterable[Path]) -> list[Path]:
     """The run directories among `paths`, or that captures among them lie in."""
     runs = [
         path if path.is_dir() else path.resolve().parent.parent

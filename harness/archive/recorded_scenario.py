@@ -8,7 +8,7 @@ from harness.errors import ScenarioError
 from harness.scenario import Scenario, load_scenario
 
 
-def scenario_of(path: Path) -> tuple[Scenario, int | None]:
+def load_recorded_scenario(path: Path) -> tuple[Scenario, int | None]:
     """The scenario of a file, or of the library by its name; of a run directory its scenario, and the seed it had.
 
     Raises HarnessError.
