@@ -1,1 +1,3 @@
-"""What a run leaves: written while it goes on, and read back whatever has become of it since."""
+"""The run directory and its files: written while a run is active, and read afterwards by checker, report and
+commands.
+"""

@@ -31,7 +31,7 @@ from harness.archive.history import has_possible_time
 from harness.archive.lag import LAG_FILE, LagLine, MeasuredLag
 from harness.archive.record_file import RecordFile, read_record
 from harness.archive.run_record import JudgedRecord, RunRecord
-from harness.archive.traces import SUFFIX, Trace, TraceLine, read_trace, read_trace_lines, why_not_a_trace
+from harness.archive.traces import SUFFIX, HandlerRunLine, Trace, read_trace, read_trace_lines, why_not_a_trace
 from harness.archive.tracks import TRACKS_FILE, Tracks, read_tracks
 from harness.errors import RunDirectoryError
 from ucp.trace import HandlerRun
@@ -165,7 +165,7 @@ class RunArchive:
         """The trace of each agent, in order of IDs. All traces are then in memory."""
         return self._read_traces[0]
 
-    def trace_lines(self, agent_id: int) -> Iterator[TraceLine]:
+    def trace_lines(self, agent_id: int) -> Iterator[HandlerRunLine]:
         """Yield the lines of an agent's handler runs. Raises RunDirectoryError at a damaged line."""
         assert self.directory is not None
         return read_trace_lines(agents_directory(self.directory) / f"{agent_id}{SUFFIX}")
@@ -212,7 +212,7 @@ class RunArchive:
         traces: dict[int, Trace] = {}
         problems, gaps = [], []
         skim = self._skim and self.large
-        of_the_run = self.record.known_agents  # none without a record, as for exports from the field
+        known_agents = self.record.known_agents  # none without a record, as for exports from the field
         for path in self._trace_files:
             if path.is_file() and path.stat().st_size > MAX_TRACE_BYTES:
                 problems.append(
@@ -226,7 +226,7 @@ class RunArchive:
                 problems.append(f"{path}: {why_not_a_trace(path)}; it is left out")
                 continue
             agent_id = trace.header.agent_id
-            if agent_id in traces or (of_the_run and agent_id not in of_the_run):
+            if agent_id in traces or (known_agents and agent_id not in known_agents):
                 problems.append(f"{path}: its agent is not in this run, or has another trace; it is left out")
                 continue
             recorded = self.record.agents.get(str(agent_id))
@@ -327,15 +327,17 @@ class RunArchive:
             return
         if not (self.directory / RUN_FILE).exists():
             yield f"{RUN_FILE} is missing: scenario, verdict and figures are unknown"
-        without = [agent_id for agent_id in self.roster if agent_id not in self.traces]
-        if without and not self.traces:
+        agents_without_trace = [agent_id for agent_id in self.roster if agent_id not in self.traces]
+        if agents_without_trace and not self.traces:
             yield "no agent has a trace: there is no timeline"
         else:
-            yield from (f"agent {agent_id}: no trace, and so no lane in the timeline" for agent_id in without)
+            yield from (
+                f"agent {agent_id}: no trace, and so no lane in the timeline" for agent_id in agents_without_trace
+            )
         if not (self.directory / NETWORK_FILE).is_file():
             yield f"{NETWORK_FILE} is missing: the network conditions are unknown"
-        flew = self.record.vehicles or (self.record.scenario and self.record.scenario.flight)
-        if flew and not (self.directory / TRACKS_FILE).is_file():
+        vehicles_flew = self.record.vehicles or (self.record.scenario and self.record.scenario.flight)
+        if vehicles_flew and not (self.directory / TRACKS_FILE).is_file():
             yield f"{TRACKS_FILE} is missing: the positions of the vehicles are unknown"
 
     def within(self, sentence: str) -> str:

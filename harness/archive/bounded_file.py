@@ -1,4 +1,9 @@
-"""Read files of any origin within bounds: whole files, and JSON Lines line by line."""
+"""Read files of unknown origin within limits: whole files, and JSON Lines one line at a time.
+
+Records may come from other people and other machines. A file may be damaged, compressed, endless or not a regular file.
+Readers in this package therefore limit the bytes they read, and report a problem as a sentence in place of an
+exception.
+"""
 
 import errno
 import io
@@ -18,16 +23,21 @@ _CHUNK_BYTES = 256 * 1024
 
 
 class BoundedFile(io.BufferedReader):
-    """The content, from its beginning. `problem` says, once it was read to its end, why there is no more."""
+    """The content of a file as a binary stream, decompressed if the file is gzip data.
+
+    `problem` is empty, or says why the content ends early. It is known after the stream was read to its end.
+    """
 
     def __init__(self, path: Path, most_bytes: int = MAX_BYTES) -> None:
-        """Raises OSError if there is no such file, it may not be read, or is a fifo, a device or a socket."""
+        """Open the file for at most `most_bytes` of content. Raises OSError if it cannot be opened or is no regular
+        file.
+        """
         self._content = _Content(path, most_bytes)
         super().__init__(self._content, _CHUNK_BYTES)
 
     @property
     def packed(self) -> bool:
-        """Whether gzip packed the file."""
+        """True if the file is gzip data."""
         return self._content.packed
 
     @property
@@ -67,7 +77,7 @@ class _Content(io.RawIOBase):
         super().close()
 
     def _next(self, most: int) -> bytes:
-        """Up to so many bytes; none at the end."""
+        """Return up to `most` bytes of content. Empty at the end."""
         return self._unpacked(most) if self.packed else self._file.read(most)
 
     def _unpacked(self, most: int) -> bytes:
@@ -93,8 +103,12 @@ class _Content(io.RawIOBase):
 
 
 def open_plain_file(path: Path) -> int:
-    """A descriptor to read the file by. Raises OSError if there is none, it may not be read, or is none (a fifo)."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a fifo would wait for its writer
+    """Open a regular file for reading and return its descriptor.
+
+    Raises OSError if the file does not exist, may not be read, or is a directory, fifo, device or socket.
+    """
+    # Without O_NONBLOCK, opening a fifo would block until a process writes to it.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         is_directory = stat.S_ISDIR(os.fstat(descriptor).st_mode)
         os.close(descriptor)
@@ -108,14 +122,17 @@ def _unpacker() -> Any:
 
 MAX_LINES = 50_000
 MAX_LINES_BYTES = 32 * 1024 * 1024
-"""Tracks of 50 vehicles take 1.6 MB for 20 minutes."""
+"""Maximum size of a JSON Lines file. The tracks of 50 vehicles take 1.6 MB for a mission of 20 minutes."""
 MAX_LINE_BYTES = 4 * 1024 * 1024
 
 Record = TypeVar("Record", bound=BaseModel)
 
 
 class JsonLines(Generic[Record]):
-    """The lines of a file that are what `model` says. A file that is not there, or nowhere (None), has none."""
+    """The lines of a JSON Lines file that are valid for `model`.
+
+    A missing file, or None as the path, has no lines. Lines that are not valid are skipped and counted.
+    """
 
     def __init__(self, path: Path | None, model: type[Record]) -> None:
         self._path, self._model = path, model
@@ -150,11 +167,11 @@ class JsonLines(Generic[Record]):
             self._problem = f"cannot be read: {error.strerror}"
 
     def leave_out(self) -> None:
-        """The last line means nothing after all."""
+        """Count the last yielded line as unusable, because the caller rejected it."""
         self._left_out += 1
 
     def problems(self) -> list[str]:
-        """A sentence, for people, on each thing that was wrong with what was read."""
+        """Return a sentence for each problem that the iteration found, for output to the user."""
         problems = []
         if self._left_out:
             lines = "1 damaged or unknown line is" if self._left_out == 1 else ""

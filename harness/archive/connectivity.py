@@ -1,8 +1,9 @@
-"""Who could reach whom at which second of a run: `network.jsonl` read back.
+"""The connectivity of the vehicles over mission time, read from `network.jsonl`.
 
-A link is between two vehicles that hear each other, both ways, directly; one that loses everything is none. A change
-that the scenario made is on record as the conditions that it asked for; one that flight made, as the pairs whose loss
-over the radio changed. A pair is cut while either loses everything.
+A link joins two vehicles that receive each other directly. A pair that loses all messages has no link. Two kinds of
+change are recorded. A change in the scenario is recorded as the network conditions that it requests. A change through
+flight is recorded as the radio losses of the pairs that changed. A pair has no link while either of the two causes a
+total loss.
 """
 
 from bisect import bisect_right
@@ -25,15 +26,18 @@ from netem.radio import components
 NETWORK_FILE = "network.jsonl"
 
 Pair = tuple[int, int]
-"""Two vehicles, the lower ID first."""
+"""Two vehicle IDs, the lower one first."""
 Link = tuple[int, int]
-"""From a sender to a receiver."""
+"""The vehicle IDs of a sender and a receiver."""
 Components = tuple[frozenset[int], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Topology:
-    """From `at_s` on the living vehicles fell into these components, the largest first; `what` changed them."""
+    """The connected components of the living vehicles from mission second `at_s` on, the largest first.
+
+    `what` names the change that caused them.
+    """
 
     at_s: float
     what: str
@@ -42,9 +46,9 @@ class Topology:
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """From `at_s` on links between living vehicles lost this share of messages, on average and at worst, 0..1.
+    """The mean and the highest loss of the links between living vehicles from mission second `at_s` on, 0 to 1.
 
-    Links that lose everything are none.
+    Links with a loss of 1 are not counted, because they are no links.
     """
 
     at_s: float
@@ -53,15 +57,15 @@ class Losses:
 
 
 QUALITY_LIMITS = (0.05, 0.25, 0.6, 1.0)
-"""A link that loses less than the first of these is of quality 0; who loses everything, of quality 4, has none."""
+"""Limits between the grades of link quality. Grade 0 has a loss below the first limit. Grade 4 is a loss of 1."""
 
 
 SAME_LOSS = 0.05
-"""Losses of a pair that differ by less are one."""
+"""Smaller changes of a pair's loss are not recorded."""
 
 
 def quality(loss: float) -> int:
-    """Of a link that loses this share of messages."""
+    """Return the grade of a link with this loss, from 0 (best) to 4 (no link)."""
     return bisect_right(QUALITY_LIMITS, loss)
 
 
@@ -71,36 +75,43 @@ def _differs(loss: float, before: float) -> bool:
 
 @dataclass(frozen=True)
 class Connectivity:
-    """The states of the network, no two in a row alike; none if there is no record of it."""
+    """The states of the network over mission time. All lists are empty if the network was not recorded.
+
+    Consecutive states differ.
+    """
 
     vehicles: tuple[int, ...]
     states: list[Topology]
     losses: list[Losses]
-    """Likewise, to a tenth of a per cent."""
+    """The losses over time, rounded to a tenth of a per cent. Consecutive entries differ."""
     reboots: list[tuple[float, int]]
-    """When an agent went down, while its vehicle flew on."""
+    """Mission second and agent ID of each stop of an agent whose vehicle flew on."""
     problems: list[str]
     pair_losses: dict[Pair, list[tuple[float, float]]]
-    """From when on each pair of vehicles loses which share of messages, both ways together, to a twentieth. 1.0 is no
-    link, or a vehicle that is lost."""
+    """The mission seconds at which the loss of each pair changed, with the new loss, which is the mean of both
+    directions. Changes below SAME_LOSS are left out, unless the grade changes. 1.0 means no link, or a lost vehicle.
+    """
     _cut: dict[Pair, list[float]]
-    """When each pair was cut, joined, cut again, and so on."""
+    """The times at which each pair lost its link, got it back, lost it again, and so on."""
     _lost: dict[int, list[float]]
-    """When each vehicle was lost, back, lost again, and so on."""
+    """The times at which each vehicle was lost, replaced, lost again, and so on."""
 
     def links(self, at_s: float) -> list[Pair]:
-        """The links between living vehicles."""
+        """Return the links between living vehicles at mission second `at_s`."""
         living = [vehicle for vehicle in self.vehicles if not _is_on(self._lost.get(vehicle, ()), at_s)]
         return [pair for pair in combinations(living, 2) if not _is_on(self._cut.get(pair, ()), at_s)]
 
     def loss(self, pair: Pair, at_s: float) -> float:
-        """What a pair loses then, to a twentieth."""
+        """Return the loss of a pair at mission second `at_s`, as in `pair_losses`."""
         losses = self.pair_losses.get(pair, [])
         at = bisect_right(losses, at_s, key=itemgetter(0))
         return losses[at - 1][1] if at else 1.0
 
     def airborne_intervals(self, vehicle: int, end_s: float) -> list[tuple[float, float, bool]]:
-        """From when to when the vehicle was in the air, and whether it was then lost; nothing goes beyond `end_s`."""
+        """Return the intervals in which the vehicle flew, as (start, end, lost at the end).
+
+        They end at `end_s` at the latest.
+        """
         times = [at_s for at_s in self._lost.get(vehicle, ()) if at_s <= end_s]
         ends = [0.0, *times, *([end_s] if len(times) % 2 == 0 else [])]
         return [(ends[at], ends[at + 1], at < len(times)) for at in range(0, len(ends) - 1, 2)]
@@ -119,7 +130,7 @@ class NetworkLine(BaseModel):
 
 
 class NetworkReplay:
-    """The network while its record is read, line by line."""
+    """The state of the network after each line of its record. `apply` takes the lines in order."""
 
     def __init__(self, vehicles: Collection[int]) -> None:
         self.vehicles = tuple(sorted(vehicles))
@@ -128,7 +139,8 @@ class NetworkReplay:
         self._out_of_range: set[Pair] = set()
         self._cut_off: set[Pair] = set()
         self._scripted: dict[Pair, tuple[float, float]] = {}
-        """What each pair loses in either direction, over which the radio loses more."""
+        """The losses that the scenario requests for each pair, lower to higher ID and back. Radio losses come on
+        top."""
         self._radio_losses: dict[Pair, float] = {}
 
     @property
@@ -136,7 +148,7 @@ class NetworkReplay:
         return self._out_of_range | self._cut_off
 
     def apply(self, line: NetworkLine) -> None:
-        """Raises ValueError, TypeError, AttributeError or KeyError if the line means nothing."""
+        """Apply a change. Raises ValueError, TypeError, AttributeError or KeyError if the line is invalid."""
         losses = {self._pairs[name]: loss for name, loss in line.losses.items()}
         if line.asked is not None:
             conditions = NetworkConditions.from_json(line.asked)
@@ -154,13 +166,13 @@ class NetworkReplay:
             self.lost -= set(line.agents)
 
     def losses(self, at_s: float) -> Losses:
-        """What the links lose now."""
+        """Return the mean and the highest loss of the current links."""
         lost = [loss for pair in self._scripted if self._is_up(pair) for loss in self._directions(pair)]
         mean = sum(lost) / len(lost) if lost else 0.0
         return Losses(at_s, round(mean, 3), round(max(lost, default=0.0), 3))
 
     def by_link(self) -> dict[Link, float]:
-        """What each link loses now, in either direction: everything where there is none."""
+        """Return the current loss of each link, in each direction. 1.0 without a link."""
         losses: dict[Link, float] = {}
         for low, high in self._scripted:
             there, back = (1.0, 1.0) if self.lost & {low, high} else self._directions((low, high))
@@ -168,11 +180,11 @@ class NetworkReplay:
         return losses
 
     def directions(self, pair: Pair) -> tuple[float, float]:
-        """What the pair loses now, there and back: everything where there is no link."""
+        """Return the current loss of a pair, from the lower to the higher ID and back. 1.0 without a link."""
         return self._directions(pair) if self._is_up(pair) else (1.0, 1.0)
 
     def by_pair(self) -> dict[Pair, float]:
-        """What each pair loses now, both ways together."""
+        """Return the current loss of each pair as the mean of both directions. 1.0 without a link."""
         return {pair: sum(self._directions(pair)) / 2 if self._is_up(pair) else 1.0 for pair in self._scripted}
 
     def _is_up(self, pair: Pair) -> bool:
@@ -207,12 +219,12 @@ def _asked_loss(conditions: NetworkConditions, sender: int, receiver: int) -> fl
 
 
 def _loss(link: LinkConditions) -> float:
-    """The share of messages that it loses in the long run."""
+    """Return the long-term mean loss of a link, 0 to 1."""
     return link.loss.mean if isinstance(link.loss, GilbertElliott) else link.loss
 
 
 def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectivity:
-    """The network among `vehicles`. A line that means nothing, or comes before the first conditions, is left out."""
+    """Read the connectivity of `vehicles`. Invalid lines, and lines before the first conditions, are left out."""
     lines = JsonLines(path, NetworkLine)
     network = NetworkReplay(vehicles)
     states: list[Topology] = []
@@ -250,9 +262,10 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
 
 
 def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
-    """From when on which links lose how much, 0..1: first all, then those that changed; what means nothing is left out.
+    """Yield mission seconds and link losses, 0 to 1: first those of all links, then those of changed links.
 
-    A link that is cut, out of range, or of a vehicle that is lost, loses everything.
+    The loss is 1 for a link that is partitioned, out of radio range, or belongs to a lost vehicle. Invalid lines are
+    left out.
     """
     network = NetworkReplay(vehicles)
     before: dict[Link, float] = {}
@@ -272,7 +285,7 @@ def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[t
 
 
 def _append_state(states: list[Topology], state: Topology) -> None:
-    """Add the state if it is another than the last; one that lasted no time was none."""
+    """Append a state that differs from the last one. It replaces a last state of the same second."""
     if states and states[-1].at_s == state.at_s:
         states.pop()
     if not states or states[-1].components != state.components:
@@ -288,5 +301,5 @@ def _toggle(times: dict[Key, list[float]], keys: Iterable[Key], at_s: float) -> 
 
 
 def _is_on(times: Sequence[float], at_s: float) -> bool:
-    """Whether what is switched at these times is on."""
+    """Return whether a state that changes at each of these times, and is off at first, is on at `at_s`."""
     return bisect_right(times, at_s) % 2 == 1

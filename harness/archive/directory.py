@@ -1,16 +1,16 @@
-"""The run directory: all that a run leaves, and all that anything after the run needs.
+"""The run directory: the files of a run. Every later command reads them.
 
-run.json            scenario as resolved, seed, versions, backend, engine, verdict
-agents/7.*          mission file, chain export, trace and log of agent 7; its store, if it keeps one
-agents/7-2/         those of its second life, if it was killed and began again; export and trace are above, too
-vehicles/7/         the vehicle's own files, its output, telemetry.tlog; of its second life in vehicles/7-2/
-capture/7.pcapng    every frame that vehicle 7 sent and every one that reached it, if asked for (netem.capture)
-network.jsonl       every change of conditions as the kernel applied it, and its counters at the end
-tracks.jsonl        where the vehicles were, in metres north, east and up from the middle of the field
+run.json            resolved scenario, seed, versions, backend, engine, verdict
+agents/7.*          mission file, chain export, trace and log of agent 7, and its store if it keeps one
+agents/7-2/         files of its second incarnation after a kill; export and trace are also copied to agents/
+vehicles/7/         files of vehicle 7, its output and telemetry.tlog; vehicles/7-2/ is for its replacement
+capture/7.pcapng    all frames that vehicle 7 sent or received, if captures were requested (netem.capture)
+network.jsonl       each change of conditions as the kernel applied it, and the kernel's counters at the end
+tracks.jsonl        positions of the vehicles, in metres north, east and up from the centre of the field
 replay.yaml         the scenario with the changes that the user made by hand (harness.play.interventions)
-rogue.jsonl         what the rogue node has sent, if the timeline injects; rogue.log has what it had to say
-lag.jsonl           how late the machine woke programs, and how busy each agent was (harness.archive.lag)
-lab.log             what the lab itself had to say
+rogue.jsonl         datagrams that the rogue node sent, if the timeline injects any; rogue.log is its output
+lag.jsonl           delays of programs that the machine woke late, and the load of each agent (harness.archive.lag)
+lab.log             output of the lab
 report.html  report.md  junit.xml  chains.svg
 """
 
@@ -41,10 +41,10 @@ ROGUE_CONTROL = "rogue.control"
 
 
 class RunDirectory:
-    """The directory of a run while it is played: where everybody works, and what is taken down as it happens.
+    """The directory of a run in progress. Backends work in it, and the mission appends its records to it.
 
-    Raises RunDirectoryError if it cannot be made, or holds anything already. What is written into it raises OSError
-    where the disk refuses, unless it says otherwise.
+    Raises RunDirectoryError if the directory cannot be made or is not empty. Methods that write raise OSError on a disk
+    error, unless they document another error.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,43 +55,45 @@ class RunDirectory:
         self.rogue_log = self.path / "rogue.log"
         self.lag = self.path / LAG_FILE
         self.keys: Mapping[int, Path] = {}
-        """Where each vehicle has its keys while it is played: elsewhere, for nothing secret is kept here."""
+        """The directory with the keys of each vehicle during the run. It lies outside the run directory, which holds
+        no secrets."""
         claim(path, self.agents, self.vehicles)
 
     def vehicle(self, vehicle_id: int, incarnation: int = 1) -> Path:
-        """The directory in which a vehicle works; each that takes the place of a lost one has its own."""
+        """Make and return the directory of a vehicle. A replacement of a lost vehicle has a directory of its own."""
         path = self.vehicles / (str(vehicle_id) if incarnation == 1 else f"{vehicle_id}-{incarnation}")
         path.mkdir(exist_ok=True)
         return path
 
     def agent(self, agent_id: int, incarnation: int = 1) -> Path:
-        """The directory in which an agent works; each life of it has its own."""
+        """Make and return the directory of an agent. Each incarnation after the first has a directory of its own."""
         path = self.agents if incarnation == 1 else self.agents / f"{agent_id}-{incarnation}"
         path.mkdir(exist_ok=True)
         return path
 
     def capture(self) -> Path:
-        """The directory for captures. Raises OSError."""
+        """Make and return the directory for captures."""
         path = self.path / "capture"
         path.mkdir()
         return path
 
     def write_mission(self, directory: Path, agent_id: int, mission: Mapping[str, Any]) -> Path:
-        """Write what ucp/contract/CONTRACT.md tells an agent at its start, and return the file."""
+        """Write the mission file, which an agent reads at its start (ucp/contract/CONTRACT.md), and return its path."""
         path = directory / f"{agent_id}.mission.json"
         write_json_atomically(path, dict(mission))
         return path
 
     def copy_export(self, agent_id: int, directory: Path) -> None:
-        """Copy the export of a later life, if there is one, to where the checker looks for it."""
+        """Copy the export of a later incarnation, if there is one, to the directory in which the checker expects it."""
         export = directory / f"{agent_id}{SUFFIX}"
         if directory != self.agents and export.exists():
             shutil.copyfile(export, self.agents / export.name)
 
     def append_trace(self, agent_id: int, directory: Path, copied_bytes: int = 0) -> int:
-        """Append what is new in the trace of a later life, after `brought` bytes, to the agent's; how many bytes it is.
+        """Append the new part of a later incarnation's trace to the agent's trace, and return its size in bytes.
 
-        Half a last line, which the agent was killed over or still writes, is left out.
+        `copied_bytes` is the size of the part that was appended before. An incomplete last line is left out: the agent
+        was killed while it wrote the line, or is still writing it.
         """
         later = directory / f"{agent_id}{traces.SUFFIX}"
         if not later.exists():
@@ -107,26 +109,26 @@ class RunDirectory:
         return len(added)
 
     def keep_exports_before_final_reconcile(self) -> None:
-        """Copy the exports as they stand: how the mission left the chains, before anybody put them in order."""
+        """Copy the current exports, which hold the chains before the operator's final reconcile."""
         kept = self.path / BEFORE_FINAL_RECONCILE
         kept.mkdir()
         for path in export_paths(self.path):
             shutil.copyfile(path, kept / path.name)
 
     def write_public_keys(self, keys: "PublicKeys") -> None:
-        """What everybody may know of a secured mission's keys: by it signatures are checked. Raises OSError."""
+        """Write the public keys of a secured mission. The checker verifies signatures with them."""
         write_json_atomically(self.path / PUBLIC_KEYS_FILE, keys.to_json())
 
     def append_network(self, record: Mapping[str, Any]) -> None:
-        """A change of the network or a fault of agents, at `at_s` mission seconds, as it was made."""
+        """Append a change of the network, or a fault of agents, as it was applied at mission second `at_s`."""
         self._append(NETWORK_FILE, record)
 
     def append_injected(self, record: Mapping[str, Any]) -> None:
-        """A datagram of the rogue node, or several that are only counted, at `at_s` mission seconds."""
+        """Append a datagram of the rogue node, or the number of several, sent at mission second `at_s`."""
         self._append(ROGUE_FILE, record)
 
     def append_tracks(self, at_s: float, places: Mapping[int, Place]) -> None:
-        """Where vehicles were at `at_s` mission seconds."""
+        """Append the positions of vehicles at mission second `at_s`."""
         tracks = {str(vehicle): place.to_json() for vehicle, place in places.items()}
         self._append(TRACKS_FILE, {"at_s": round(at_s, 3), "places": tracks})
 
@@ -135,7 +137,7 @@ class RunDirectory:
             file.write(json.dumps(record, separators=(",", ":")) + "\n")
 
     def write_record(self, record: RunRecord) -> None:
-        """Write run.json whole or not at all. Raises MachineError if the disk is full."""
+        """Write run.json completely or not at all. Raises MachineError if the disk is full."""
         try:
             write_json_atomically(self.path / RUN_FILE, record.to_json())
         except OSError as error:
@@ -146,9 +148,9 @@ class RunDirectory:
 
 
 def claim(directory: Path, *inner: Path) -> None:
-    """Make the directory, or take an empty one, and directories in it.
+    """Make the directory, or use an existing empty one, and make the directories `inner` in it.
 
-    Raises RunDirectoryError if it cannot be made, or holds anything already.
+    Raises RunDirectoryError if the directory cannot be made or is not empty.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -165,7 +167,7 @@ def claim(directory: Path, *inner: Path) -> None:
 
 
 def default_path(name: str) -> Path:
-    """`runs/<scenario's name>-<local time>` under the current directory; a number is added if it exists."""
+    """Return `runs/<name of the scenario>-<local time>` in the current directory, with a number if that path exists."""
     words = "".join(character if character.isalnum() else " " for character in name).split()
     base = RUNS / f"{'_'.join(words).lower()[:60] or 'run'}-{time.strftime('%Y%m%d-%H%M%S')}"
     candidate, number = base, 2

@@ -1,4 +1,7 @@
-"""Event data as the exports of a mission have it: in plain, or sealed to the depot, whose key then opens it."""
+"""The event data of blocks, in plain or sealed.
+
+A secured mission may seal event data: the agents encrypt it for the depot, and only the depot's key opens it.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,24 +17,29 @@ if TYPE_CHECKING:
 
 
 class SealedError(MalformedEventsError):
-    """Event data that is sealed, and no key opens: the end of a sentence."""
+    """Event data is sealed, and no given key opens it. The message completes a sentence about the block."""
 
 
 @dataclass(frozen=True)
 class EventData:
-    """Reads the events of blocks; `sealed` says whether the mission seals them, `depot` is who opens them, if here."""
+    """A reader of the event data of one mission. `sealed` is true if the mission seals it, and `depot` holds the key if
+    given.
+    """
 
     sealed: bool = False
     depot: "Depot | None" = None
 
     @property
     def is_closed(self) -> bool:
-        """Whether nothing of it can be read here."""
+        """True if the data is sealed and no key was given."""
         return self.sealed and self.depot is None
 
     @classmethod
     def of(cls, exports: Iterable[Export], depot: "Depot | None" = None) -> "EventData":
-        """Of exports of one mission. Raises ExportError for another depot's key, or one where nothing is sealed."""
+        """Return the reader for the exports of one mission.
+
+        Raises ExportError if `depot` is given, and the mission seals its data for another depot or not at all.
+        """
         inception = next((export.inception.data for export in exports), b"")
         key = sealed_to(inception)
         if depot is not None and key != depot.public_key:
@@ -46,11 +54,14 @@ class EventData:
         return cls(key is not None, depot)
 
     def of_block(self, block: ExportedBlock) -> bytes:
-        """The events, as a block has them (Section 3.1). Raises SealedError."""
+        """Return the plain event data of a block (Section 3.1). Raises SealedError."""
         return self.opened(block.event_bytes, block.agent_id, block.timestamp_us)
 
     def opened(self, event_data: bytes, agent_id: int, timestamp_us: int) -> bytes:
-        """The same of a block's own bytes."""
+        """Return the plain form of a block's event data. `agent_id` and `timestamp_us` are those of the block.
+
+        Raises SealedError.
+        """
         if not self.sealed:
             return event_data
         if self.depot is None:
@@ -63,5 +74,5 @@ class EventData:
             raise SealedError(str(error)) from None
 
     def events(self, block: ExportedBlock) -> list[LoggableEvent]:
-        """Oldest first. Raises MalformedEventsError, for sealed ones SealedError."""
+        """Return the events of a block, oldest first. Raises SealedError, or MalformedEventsError for damaged data."""
         return decode_events(self.of_block(block))

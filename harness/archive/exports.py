@@ -1,7 +1,8 @@
-"""Read chain exports (`ucp-chain-export/1`), from a run or from the field, and name their blocks.
+"""Read chain exports (`ucp-chain-export/1`) of a run or from the field, and name their blocks.
 
-Exports come back truncated, edited, twice, or from another mission. Each gets one clear sentence; the rest are read.
-Only the shape is judged here: whether the hashes recompute is characteristic 4, and the checker's to say.
+Exports from the field may be truncated, edited, duplicated or from another mission. Each unusable file gets one
+sentence, and the other files are read. This module validates only the format. Whether the hashes recompute is
+characteristic 4, which the checker decides.
 """
 
 import base64
@@ -25,12 +26,12 @@ from ucp.state import AgentState
 RUN_FILE = "run.json"
 SUFFIX = ".chain.json"
 BEFORE_FINAL_RECONCILE = "before_final_reconcile"
-"""Directory in a run's with the exports as the mission left them."""
+"""Directory in a run directory with the exports from before the final reconcile."""
 MAX_EXPORT_BYTES = 64 * 1024 * 1024
-"""Some 35,000 blocks."""
+"""Maximum size of an export, about 35,000 blocks."""
 
 MAX_SIGNATURE = 4 * (64 // 3 + 1)
-"""Characters of 64 bytes in base64."""
+"""Length of 64 bytes in base64, in characters."""
 
 Hash = Annotated[str, Field(pattern=rf"^[0-9a-f]{{{2 * HASH_BYTES}}}$")]
 AgentId = Annotated[int, Field(ge=1, le=MAX_AGENT_ID, strict=True)]
@@ -49,8 +50,10 @@ EncodedEventData = Annotated[Base64, Field(max_length=4 * (MAX_EVENT_DATA_BYTES 
 
 
 class ExportedBlock(BaseModel):
-    """An exported block. `chain_hash` is null outside the chain. `signature` is that of the block's agent in a secured
-    mission."""
+    """An exported block. `chain_hash` is null outside the chain.
+
+    `signature` is made by the block's agent, in a secured mission only.
+    """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -65,7 +68,7 @@ class ExportedBlock(BaseModel):
 
     @property
     def event_bytes(self) -> bytes:
-        """The loggable events, as a block has them (Section 3.1)."""
+        """The loggable events in the encoding of a block (Section 3.1). They may be sealed."""
         return base64.b64decode(self.event_data)
 
 
@@ -80,7 +83,7 @@ class ExportedInception(BaseModel):
 
     @property
     def data(self) -> bytes:
-        """What all agents of the mission were given (Section 3.4.1)."""
+        """The initial data that all agents of the mission received (Section 3.4.1)."""
         return base64.b64decode(self.block_data)
 
 
@@ -111,17 +114,17 @@ class Export(BaseModel):
 
     @property
     def top_chain_hash(self) -> str:
-        """That of the last block of the chain, or of the inception block."""
+        """The chain hash of the last block of the chain, or of the inception block if the chain has no other."""
         top = self.chain[-1].chain_hash if self.chain else None
         return top or self.inception.chain_hash
 
     @cached_property
     def chain_of_block_hashes(self) -> tuple[str, ...]:
-        """The chain without the inception block, oldest first."""
+        """Block hashes of the chain without the inception block, oldest first."""
         return tuple(block.block_hash for block in self.chain)
 
     def blocks(self) -> Iterable[ExportedBlock]:
-        """Every block that the agent holds, wherever it holds it."""
+        """Yield each block that the agent holds: in its chain, its deque and its reconcile stack."""
         yield from self.chain
         yield from self.blocks_to_be_committed
         yield from self.reconcile_stack
@@ -129,21 +132,25 @@ class Export(BaseModel):
 
 @dataclass
 class Exports:
-    """The exports of one mission by agent, and a sentence for each file that could not be used."""
+    """The exports of one mission by agent. `errors` has a sentence for each unusable file."""
 
     by_agent: dict[int, Export] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
 
 
 class ExportMaker:
-    """Exports of agents in this process, without a file between. Blocks that agents share are made once."""
+    """A maker of exports of agents in this process, without files. Agents that hold the same block share one object for
+    it.
+    """
 
     def __init__(self) -> None:
         self._blocks: dict[tuple[bytes, bytes | None, bytes | None], ExportedBlock] = {}
         self._event_data: dict[bytes, str] = {}
 
     def export(self, state: AgentState, exported_at_us: int, signatures: Mapping[bytes, bytes] | None = None) -> Export:
-        """What `read_export` would read of a file with `ucp.export.export_chain` of the same."""
+        """Return the export that `read_export` would read from a file that `ucp.export.export_chain` wrote of this
+        state.
+        """
         inception, signed = state.chain.inception, signatures or {}
         return Export.model_construct(
             schema_=SCHEMA,
@@ -185,7 +192,7 @@ def _base64(data: bytes) -> str:
 
 
 def read_export(path: Path) -> Export:
-    """Raises ExportError: one sentence that names the file, what is wrong with it and where."""
+    """Read an export. Raises ExportError with one sentence that names the file, the error and its place."""
     try:
         if path.stat().st_size > MAX_EXPORT_BYTES:
             raise ExportError(f"{path}: larger than {MAX_EXPORT_BYTES} bytes, which is too large for an export")
@@ -202,7 +209,7 @@ def read_export(path: Path) -> Export:
 
 
 def json_error(path: Path, error: ValueError | RecursionError) -> ExportError:
-    """What json found wrong with an export."""
+    """Return the error for an export that is not JSON."""
     where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else "its nesting"
     if isinstance(error, ValueError) and not isinstance(error, json.JSONDecodeError):
         where = "a number of thousands of digits"
@@ -210,7 +217,7 @@ def json_error(path: Path, error: ValueError | RecursionError) -> ExportError:
 
 
 def parse_export(path: Path, document: Any) -> Export:
-    """The export that a JSON document is. Raises ExportError, as `read_export` of the file that it is in."""
+    """Return the export in a JSON document. `path` is its file. Raises ExportError like `read_export`."""
     if not isinstance(document, dict) or "schema" not in document:
         raise ExportError(f"{path}: not a chain export (it has no `schema`)")
     if document["schema"] != SCHEMA:
@@ -222,11 +229,10 @@ def parse_export(path: Path, document: Any) -> Export:
 
 
 def read_exports(paths: Iterable[Path]) -> Exports:
-    """Read the exports of one mission; what cannot be used is told in `errors`.
+    """Read the exports of one mission. `errors` of the result has a sentence for each unusable file.
 
-    Of exports of several missions those of the mission with the most exports are used, or of the first file if
-    missions tie. Of two different exports of one agent neither can be believed over the other: the later one is used
-    and the other is told.
+    If the exports belong to several missions, the mission with the most exports is used, or that of the first file if
+    several have the most. Of two different exports of one agent, the later one is used.
     """
     exports = Exports()
     read: list[tuple[Path, Export]] = []
@@ -265,21 +271,21 @@ def read_exports(paths: Iterable[Path]) -> Exports:
 
 
 def export_paths(directory: Path) -> list[Path]:
-    """The exports of a run directory, or of a directory that holds exports; by agent ID where the name has one."""
+    """Return the exports in a run directory, or in a directory of exports, in order of agent IDs."""
     return sorted(agents_directory(directory).glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
 
 
 def agents_directory(directory: Path) -> Path:
-    """Where the exports and traces of a run directory are; a directory that holds them by itself is it."""
+    """Return the directory of exports and traces: `agents` in a run directory, else the directory itself."""
     agents = directory / "agents"
     return agents if agents.is_dir() else directory
 
 
 def export_files(paths: Iterable[Path]) -> list[Path]:
-    """The exports in run directories, in directories that hold exports, and those that are named themselves.
+    """Return the exports in run directories and directories of exports, and the files among `paths`.
 
-    A run directory may have none, and so may one with traces. Raises RunDirectoryError if a path does not exist, or is
-    a directory of other things.
+    A run directory or a directory of traces may have no exports. Raises RunDirectoryError if a path does not exist, or
+    is a directory of other files.
     """
     files: list[Path] = []
     for path in paths:
@@ -307,9 +313,10 @@ def _first_problem(error: ValidationError) -> str:
 
 
 def name_blocks(exports: Mapping[int, Export]) -> dict[str, str]:
-    """Block hash -> "4.11", the ordinal counting from 1 that agent's completed blocks.
+    """Return the names of all blocks by block hash. `4.11` is the 11th block that agent 4 completed.
 
-    An agent whose own export is missing (it died) is counted by the timestamps of its blocks on the others.
+    If the export of an agent is missing, because the agent was killed, the order of its blocks follows from their
+    timestamps in the exports of other agents.
     """
     completed: dict[int, dict[str, int]] = {
         agent_id: dict.fromkeys(export.completed, 0) for agent_id, export in exports.items()

@@ -1,6 +1,6 @@
-"""The course of a run: what each agent voted on, committed and reconciled when, and which messages went between them.
+"""The history of a run: votes, reconciles and commits of each agent, and the messages between agents.
 
-Everything comes from the traces. A vote or reconcile that an agent's loss or the end of the run cut short ends there.
+The traces are the only source. If an agent is lost, or the run ends, its vote and its reconcile end at that time.
 """
 
 import math
@@ -17,7 +17,7 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 LATEST_S = 1e7
-"""No mission is as long; a handler run with a later time, or with none that can be, is left out."""
+"""Handler runs with a later mission second are left out, because no mission is that long."""
 
 PhaseName = Literal["phase 1", "phase 2", "phase 3", "finalize"]
 PHASES: dict[str, PhaseName] = {
@@ -26,7 +26,7 @@ PHASES: dict[str, PhaseName] = {
     "reconcile_phase_3": "phase 3",
     "reconcile_finalize": "finalize",
 }
-"""Handler -> the phase that it begins."""
+"""The phase that each handler begins."""
 
 CUT_SHORT = "cut short"
 COMMITTED_BY = {
@@ -36,17 +36,20 @@ COMMITTED_BY = {
     "receive_response_block_for_hash": "fetched",
     "reconcile_finalize": "put back",
 }
-"""Handler -> how it came to the block that it committed."""
+"""The source of the block that each handler committed, as shown in reports."""
 REASONS = {
     "vote_timer_expiration": "vote not approved",
     "receive_request_next_in_sequence": "chain diverged",
 }
-"""Handler -> why it began a reconcile."""
+"""The reason why each handler began a reconcile."""
 
 
 @dataclass(frozen=True, slots=True)
 class Vote:
-    """From proposal to outcome, in mission seconds; the outcome is the branch of Algorithm 5, or CUT_SHORT."""
+    """The vote of an agent on its own block, in mission seconds.
+
+    `outcome` is the branch of Algorithm 5, or CUT_SHORT.
+    """
 
     agent: int
     block: str
@@ -57,7 +60,7 @@ class Vote:
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """Rounds of one phase in a row."""
+    """A phase of a reconcile, with the number of its rounds."""
 
     name: PhaseName
     start_s: float
@@ -67,7 +70,10 @@ class Phase:
 
 @dataclass(frozen=True, slots=True)
 class Reconcile:
-    """`phases` follow each other without a gap. `done` is False if it was cut short."""
+    """A reconcile of an agent, in mission seconds.
+
+    `phases` follow each other without a gap. `done` is false if the reconcile was cut short.
+    """
 
     agent: int
     start_s: float
@@ -79,7 +85,7 @@ class Reconcile:
 
 @dataclass(frozen=True, slots=True)
 class Commit:
-    """A block came onto the chain; `how` is a value of COMMITTED_BY."""
+    """The addition of a block to a chain. `how` is a value of COMMITTED_BY."""
 
     agent: int
     at_s: float
@@ -89,7 +95,7 @@ class Commit:
 
 @dataclass(frozen=True, slots=True)
 class Tie:
-    """Phase 2 ended in a tie, which went as `branch` says."""
+    """The end of phase 2 in a tie. `branch` names its result."""
 
     agent: int
     at_s: float
@@ -97,7 +103,7 @@ class Tie:
 
 
 class ActivityStart(NamedTuple):
-    """An agent began a vote, a reconcile or a phase of one.
+    """The start of a vote, of a reconcile, or of a phase of a reconcile.
 
     `detail` is the hash of the block, the reason of the reconcile, or the name of the phase.
     """
@@ -108,12 +114,16 @@ class ActivityStart(NamedTuple):
 
 
 HistoryEvent = ActivityStart | Vote | Reconcile | Tie | Commit
-"""What a handler run began, ended or did."""
+"""A change of an agent's history that one handler run causes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A broadcast, numbered by its sender, and the handler runs that it triggered: (agent, mission second)."""
+    """A broadcast.
+
+    `seq` is the sequence number of its sender. `receipts` has the agent and the mission second of each handler run that
+    the broadcast triggered.
+    """
 
     sender: int
     at_s: float
@@ -125,7 +135,7 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """All in order of time, agent by agent. `messages` is None where they were left out."""
+    """The history of all agents, agent by agent and in order of time. `messages` is None if they were not requested."""
 
     votes: list[Vote]
     reconciles: list[Reconcile]
@@ -135,19 +145,19 @@ class History:
 
 
 def has_possible_time(run: HandlerRun) -> bool:
-    """Whether the handler ran when it can have run."""
+    """Return whether the recorded time of a handler run is possible."""
     return 0 <= run.t <= LATEST_S
 
 
 def incarnations(trace: Trace) -> list[list[HandlerRun]]:
-    """The handler runs of each life of an agent that have a possible time."""
+    """Return the handler runs of each incarnation of an agent. Runs with an impossible time are left out."""
     return [[run for _, run in runs if has_possible_time(run)] for runs in trace.incarnations()]
 
 
 def history_of(
     traces: Mapping[int, Trace], faults: Iterable[FaultRecord], end_s: float, *, whole: bool = True
 ) -> History:
-    """`end_s` is when the run ended, in mission seconds; without `whole` traces there are no messages."""
+    """Return the history of a run that ended at mission second `end_s`. With `whole=False` it has no messages."""
     ends: dict[int, list[float]] = defaultdict(list)
     for fault in faults:
         if fault.kind.ends_a_life:
@@ -179,10 +189,10 @@ def _append(history: History, steps: Iterable[HistoryEvent]) -> None:
 
 
 class HistoryReader:
-    """The course of an agent between its start and its end, read one handler run after another.
+    """A reader of the handler runs of one incarnation, one after another.
 
-    The report and the live page both use this class, so a vote or a reconcile begins and ends in both at the same
-    time. A reconcile that begins during a vote does not end the vote. The vote ends when its timer expires.
+    The report and the live page both use this class, so both show the same start and end of each vote and reconcile. A
+    reconcile that begins during a vote does not end the vote. The vote ends when its timer expires.
     """
 
     def __init__(self, agent: int) -> None:
@@ -194,7 +204,7 @@ class HistoryReader:
         self._phases: list[Phase] = []
 
     def feed(self, run: HandlerRun) -> Iterator[HistoryEvent]:
-        """Yield the steps of the next handler run."""
+        """Yield the history events of the next handler run."""
         self._now_s = run.t
         if run.handler == "process_next_deque_block" and run.branch == "proposed":
             self._vote = next((sent.block or "" for sent in run.sent), ""), run.t
@@ -211,7 +221,7 @@ class HistoryReader:
                 yield Commit(self._agent, run.t, block, COMMITTED_BY.get(run.handler, "otherwise"))
 
     def end(self, at_s: float) -> Iterator[HistoryEvent]:
-        """Yield the vote and the reconcile that the end of the incarnation cuts short."""
+        """Yield the vote and the reconcile that the end of the incarnation at `at_s` cuts short."""
         at_s = max(at_s, self._now_s)
         yield from self._end_vote(at_s, CUT_SHORT)
         yield from self._end_reconcile(at_s, done=False)
@@ -223,7 +233,7 @@ class HistoryReader:
             yield Vote(self._agent, block, since_s, max(at_s, since_s), outcome)
 
     def _continue_reconcile(self, run: HandlerRun) -> Iterator[HistoryEvent]:
-        """Yield the steps of the reconcile that is under way."""
+        """Yield the history events of a handler run during a reconcile."""
         if run.branch.startswith("tie:"):
             yield Tie(self._agent, run.t, run.branch)
         if run.handler == "reconcile_finalize" and run.branch == "done":
@@ -252,7 +262,11 @@ class HistoryReader:
 
 
 def _messages(traces: Mapping[int, Trace]) -> list[Message]:
-    """Sequence numbers begin anew with each life: a message is the last of its number that was sent by then."""
+    """Return all messages with their receipts.
+
+    Sequence numbers begin again with each incarnation. A receipt therefore belongs to the latest message with its
+    number that was sent before it.
+    """
     sent: dict[tuple[object, object], list[Message]] = defaultdict(list)
     for agent, trace in sorted(traces.items()):
         for run in trace.runs:
@@ -264,10 +278,10 @@ def _messages(traces: Mapping[int, Trace]) -> list[Message]:
         for run in trace.runs:
             if not isinstance(run.trigger, MessageTrigger):
                 continue
-            of_this_number = sent.get((run.trigger.sender, run.trigger.sequence))
-            if of_this_number and has_possible_time(run):
-                by_then = bisect_right([message.at_s for message in of_this_number], run.t)
-                of_this_number[max(by_then - 1, 0)].receipts.append((agent, run.t))
+            same_number = sent.get((run.trigger.sender, run.trigger.sequence))
+            if same_number and has_possible_time(run):
+                sent_before = bisect_right([message.at_s for message in same_number], run.t)
+                same_number[max(sent_before - 1, 0)].receipts.append((agent, run.t))
     return sorted(
         (message for messages in sent.values() for message in messages),
         key=lambda message: (message.at_s, message.sender),
@@ -275,12 +289,12 @@ def _messages(traces: Mapping[int, Trace]) -> list[Message]:
 
 
 def end_of_traces(traces: Mapping[int, Trace]) -> float:
-    """When the last handler ran, in mission seconds; 0 if none did."""
+    """Return the mission second of the last handler run. 0 without any."""
     return max((run.t for trace in traces.values() for run in trace.runs if has_possible_time(run)), default=0.0)
 
 
 def possible_faults(faults: Iterable[FaultRecord]) -> list[FaultRecord]:
-    """Those with a possible time, in order."""
+    """Return the faults with a possible time, in order of time."""
     return sorted(
         (fault for fault in faults if math.isfinite(fault.at_s) and 0 <= fault.at_s <= LATEST_S),
         key=lambda fault: fault.at_s,

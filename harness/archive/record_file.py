@@ -1,7 +1,8 @@
-"""Read run.json whatever its state: whole, half written, of another version, or edited.
+"""Read run.json in any condition: complete, truncated, of another version, or edited.
 
-What does not fit is taken out, the smallest part that can be spared, until the rest fits: of a list with one wrong
-entry the others are left, and of an entry that lacks a key nothing.
+Invalid parts are removed, each as small as possible, until the rest is valid. A list loses only its invalid entries. An
+entry without a required key is removed as a whole. Rejecting the whole file instead would lose the record of every
+killed run.
 """
 
 import json
@@ -18,10 +19,10 @@ from harness.errors import RunDirectoryError
 
 Model = TypeVar("Model", bound=BaseModel)
 Place = tuple[dict[Any, Any] | list[Any], Any]
-"""A part of a document: what holds it, and its key or index there."""
+"""A part of a document: the object or list that contains it, and its key or index there."""
 
 MAX_ROUNDS = 100
-"""Each round takes a part out of whatever is wrong: more than parts are within each other are not needed."""
+"""Maximum number of validations. Each one removes the invalid parts that it finds. Documents are not nested deeper."""
 MAX_ERRORS = 20_000
 MAX_NAME = 80
 UNKNOWN_KEY = "extra_forbidden"
@@ -34,7 +35,10 @@ NOT_AN_OBJECT = "input should be an object"
 
 @dataclass(frozen=True)
 class InvalidPart:
-    """`key` of the document has something that is wrong: the first is `where`, and `more` follow."""
+    """The invalid parts of one top-level key.
+
+    `where` and `what` describe the first one, and `more` counts the others.
+    """
 
     key: str
     where: str
@@ -47,10 +51,10 @@ class InvalidPart:
 
 
 def validate_leniently(model: type[Model], document: dict[str, Any]) -> tuple[Model, list[InvalidPart]]:
-    """What fits `model`, all of whose keys have defaults, and what was taken out of `document` because it does not.
+    """Return the valid part of `document` as a `model`, and a description of the removed parts.
 
-    Keys that the model does not know are passed over, and half a character in a text becomes a question mark. Raises
-    ValueError if more than `MAX_MISFITS` things are wrong.
+    All keys of the model must have defaults. Unknown keys are ignored. A lone surrogate in a text becomes a question
+    mark. `document` is changed. Raises ValueError if it has more than MAX_ERRORS errors.
     """
     invalid_parts: dict[str, InvalidPart] = {}
     for _ in range(MAX_ROUNDS):
@@ -82,9 +86,9 @@ def _by_key(document: dict[str, Any], errors: Sequence[ErrorDetails]) -> Iterato
 
 
 def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, list[int | str]]:
-    """The innermost part on the way to an error, and the way there.
+    """Return the innermost part of the document that contains an error, and the path to it.
 
-    Steps that the document does not have say which type was tried.
+    `loc` may have further steps, which name the types that pydantic tried. They are left out of the path.
     """
     place: Place = document, loc[0]
     value: Any = document
@@ -98,7 +102,7 @@ def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, l
 
 
 def _repair(place: Place, problem: ErrorDetails) -> bool:
-    """Text with half a character in it is as good with a question mark there."""
+    """Replace lone surrogates in a text by question marks. Return whether that was possible."""
     holder, key = place
     if problem["type"] == LONE_SURROGATE and isinstance(text := holder[key], str):
         holder[key] = text.encode(errors="replace").decode()
@@ -107,7 +111,7 @@ def _repair(place: Place, problem: ErrorDetails) -> bool:
 
 
 def _remove(places: Sequence[Place]) -> None:
-    """A part of a list does not move the others before they are taken out."""
+    """Remove parts of a document. Parts of one list are removed together, so that their indices stay valid."""
     lists: dict[int, tuple[list[Any], set[int]]] = {}
     for holder, key in places:
         if isinstance(holder, dict):
@@ -120,29 +124,29 @@ def _remove(places: Sequence[Place]) -> None:
 
 MAX_BYTES = 64 * 1024 * 1024
 MAX_VALUES = 2_000_000
-"""Of 100,000 scripted fates, which are as many as there can be, a record has 1,200,000 values."""
+"""Maximum number of values. A record of 100,000 scripted fates, which is the maximum, has 1,200,000 values."""
 
 
 class DamagedRecordError(RunDirectoryError):
-    """There is no `run.json`, or what there is was cut off or edited."""
+    """`run.json` is missing, truncated or edited."""
 
 
 @dataclass(frozen=True)
 class RecordFile:
-    """`record` is what can be used of a file, and `problems` are sentences that name it, on what cannot."""
+    """The content of a run.json. `record` is its valid part, and `problems` has a sentence for each invalid part."""
 
     record: RunRecord = field(default_factory=RunRecord)
     judged: JudgedRecord | None = None
-    """The same, if all that a judgement needs is there and sound: half of it would make wrong verdicts."""
+    """The record if all keys that the checker needs are valid, else None. Half of them would give wrong verdicts."""
     problems: list[str] = field(default_factory=list)
     error: RunDirectoryError | None = None
-    """Why nothing of it can be used."""
+    """The reason why no part of the file can be used, else None."""
 
 
 def read_record(path: Path) -> RecordFile:
-    """The record in `path`. A file of which nothing can be used has an `error`, in one sentence.
+    """Read the record in `path`. If no part can be used, the result has an `error`.
 
-    The error is a DamagedRecordError, unless the file is sound and of another schema.
+    The error is a DamagedRecordError, unless the file is intact and has another schema.
     """
     try:
         return _read(path)

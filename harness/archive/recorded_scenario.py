@@ -1,4 +1,4 @@
-"""What to play: a scenario, or once more what a run directory says was played."""
+"""Find the scenario to play: a scenario file, or the scenario that a run directory recorded."""
 
 from pathlib import Path
 
@@ -9,9 +9,9 @@ from harness.scenario import Scenario, load_scenario
 
 
 def load_recorded_scenario(path: Path) -> tuple[Scenario, int | None]:
-    """The scenario of a file, or of the library by its name; of a run directory its scenario, and the seed it had.
+    """Return a scenario and its seed: from a scenario file, from the library by name, or from a run directory.
 
-    Raises HarnessError.
+    The seed is None unless `path` is a run directory. Raises HarnessError.
     """
     if not (path / RUN_FILE).is_file():
         return load_scenario(path), None

@@ -1,7 +1,7 @@
-"""How far the data had spread when: the agents' chains along mission time, from their traces.
+"""The spread of the mission data over time: the agents' chains at each mission second, computed from their traces.
 
-The figures are those of the checker (`harness.checker._figures`), at every moment instead of at the end: chains are
-those of living agents, and copies those of each completed block in these chains.
+The checker computes the same figures (`harness.checker._figures`) for the end of a run. Only chains of living agents
+count. Copies are counted in these chains, for each completed block.
 """
 
 from collections import Counter
@@ -16,9 +16,10 @@ from ucp.trace import HandlerRun
 
 @dataclass(frozen=True, slots=True)
 class Replication:
-    """From `at_s` on: blocks in the mutual and in the longest chain, and distinct chains.
+    """The figures from mission second `at_s` on: lengths in blocks, the number of distinct chains, and copies per
+    block.
 
-    Copies are None until a block is completed.
+    Copies are None until an agent completes a block.
     """
 
     at_s: float
@@ -30,7 +31,7 @@ class Replication:
 
 
 def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -> list[Replication]:
-    """How things stood from 0 s on, and after each moment that changed it."""
+    """Return the figures at 0 s, and after each change."""
     steps: list[tuple[float, int, int, FaultRecord | HandlerRun]] = []
     for fault in faults:
         steps += [(fault.at_s, 0, agent, fault) for agent in fault.agents or () if agent in traces]
@@ -55,17 +56,21 @@ def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -
 
 
 class _Chains:
-    """The chains of the living agents, each a path of prefixes: what two chains share, they share by prefix."""
+    """The chains of the living agents, with shared counts.
+
+    Each chain is a path of prefix numbers. Equal prefixes of different chains have the same number, so a common prefix
+    is found by comparing one number.
+    """
 
     def __init__(self, agents: Iterable[int]) -> None:
         self._paths: dict[int, list[tuple[int, str]]] = {agent: [] for agent in agents}
         self._incarnation = dict.fromkeys(self._paths, 1)
         self._prefixes: dict[tuple[int, str], int] = {}
         self._sharing: Counter[int] = Counter()
-        self._mutual = 0  # at most as long as the mutual chain
+        self._mutual = 0  # a lower bound of the length of the mutual chain
         self._copies: Counter[str] = Counter()
         self._completed: set[str] = set()
-        self._blocks_with: Counter[int] = Counter()  # so many copies
+        self._blocks_with: Counter[int] = Counter()  # number of copies -> number of completed blocks with that many
         self._copies_of_completed = 0
 
     def apply_fault(self, agent: int, fault: FaultRecord) -> None:
@@ -77,7 +82,9 @@ class _Chains:
             self._paths.setdefault(agent, [])
 
     def apply_run(self, agent: int, incarnation: int, run: HandlerRun) -> None:
-        """A run of a life that was taken already changes nothing any more."""
+        """Apply the changes of a handler run. The first run of a new incarnation empties the chain. Runs of a lost
+        incarnation are ignored.
+        """
         if incarnation > self._incarnation[agent]:
             self._incarnation[agent] = incarnation
             self._empty(agent)

@@ -1,4 +1,4 @@
-"""The runs in a folder, the newest first."""
+"""The runs in a folder, newest first."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from harness.archive.run_record import RunRecord
 from harness.errors import RunDirectoryError
 
 RUNS = Path("runs")
-"""Where runs are that were given no directory."""
+"""Folder of runs that were started without --out."""
 
 
 @dataclass(frozen=True)
 class PastRun:
-    """A run directory, and what can be read of its record; `problem` is a sentence if nothing can."""
+    """A run directory with its record. `problem` is the reason why the record cannot be read, else None."""
 
     path: Path
     record: RunRecord
@@ -28,7 +28,10 @@ class PastRun:
 
 
 def past_runs(folder: Path, most: int) -> Iterator[PastRun]:
-    """So many of the newest, by when their records were written last. Raises RunDirectoryError if it is no folder."""
+    """Yield the newest runs in `folder`, at most `most`, by the time at which their records were last written.
+
+    Raises RunDirectoryError if it is no folder.
+    """
     try:
         written = [(path.stat().st_mtime_ns, path) for path in folder.glob(f"*/{RUN_FILE}")]
     except OSError as error:

@@ -55,8 +55,11 @@ class JudgementRecord(_Model):
 
 
 class NetworkState(_Model):
-    """The state of the network from mission second `at_s` on. `what` names the change, and `detail` describes the state
-    in words. `fully_connected` is true without any loss or partition."""
+    """The state of the network from mission second `at_s` on.
+
+    `what` names the change, and `detail` describes the state in words. `fully_connected` is true without any loss or
+    partition.
+    """
 
     at_s: float
     what: str
@@ -438,7 +441,7 @@ class RunRecord(JudgedRecord):
     """A sentence for each file that the checker could not read, or only in part."""
 
     @model_validator(mode="after")
-    def _staggered_as_the_scenario_says(self) -> "RunRecord":
+    def _copy_stagger_of_scenario(self) -> "RunRecord":
         if self.scenario is not None:
             self.stagger = self.scenario.stagger
         return self
@@ -446,14 +449,14 @@ class RunRecord(JudgedRecord):
     @property
     def known_agents(self) -> list[int]:
         """The IDs of all agents in the record, ascending, also of agents without files."""
-        asked = self.scenario.roster if self.scenario else ()
-        return sorted({*self.roster, *asked, *map(int, self.agents), *map(int, self.vehicles)})
+        requested = self.scenario.roster if self.scenario else ()
+        return sorted({*self.roster, *requested, *map(int, self.agents), *map(int, self.vehicles)})
 
     @property
     def judgements(self) -> dict[str, CharacteristicRecord | JudgementRecord]:
         """The judgements on the characteristics by number, and those of the further checks by key."""
-        beside = {key: judgement for key in BESIDE if (judgement := getattr(self, key)) is not None}
-        return {**self.characteristics, **beside}
+        further = {key: judgement for key in BESIDE if (judgement := getattr(self, key)) is not None}
+        return {**self.characteristics, **further}
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON document with all keys."""

@@ -1,7 +1,7 @@
-"""Read traces (`ucp-trace/2` and `/1`): the handler runs of one agent, with the blocks it held after each.
+"""Read traces (`ucp-trace/2` and `/1`): the handler runs of one agent, and the blocks that it held after each of them.
 
-A trace that ends in half a line is that of a killed agent, and is read up to there. Anything else that is not a trace
-is told in `problem`, and what came before it still counts.
+A trace that ends within a line belongs to a killed agent. It is read up to that line. Other damage is reported in
+`problem`, and the lines before it are used.
 """
 
 import json
@@ -22,7 +22,7 @@ from ucp.trace import Commanded, Dropped, Entry, HandlerRun
 SUFFIX = ".trace.jsonl"
 MAX_LINE_BYTES = 16 * 1024 * 1024
 LARGEST = 2**64
-"""No whole number in a header is as large; larger ones are none that a float can hold."""
+"""Limit of integers in a header. A larger one cannot be a setting, because it does not fit into 64 bits."""
 PLACES = ("chain", "deque", "stack")
 _HEADER_KEYS = ("schema", "agent_id", "roster", "initial_data", "settings", "clock", "secured")
 
@@ -31,9 +31,11 @@ Version = Literal["ucp-trace/1", "ucp-trace/2"]
 
 
 class Header(BaseModel):
-    """`initial_data` is in base64; None in version 1, which has no inputs in full either.
+    """The header of a trace. `initial_data` is in base64. It is None in version 1, which does not record complete
+    inputs.
 
-    In a `secured` mission datagrams were longer than they are here, and some were dropped that look good.
+    In a `secured` mission the recorded datagrams are plain. The sent ones were longer, and a datagram that looks valid
+    here may have been dropped.
     """
 
     model_config = ConfigDict(extra="ignore", populate_by_name=True)
@@ -57,14 +59,14 @@ class Header(BaseModel):
         return self
 
     def to_line(self) -> str:
-        """The line that it is in a trace."""
+        """Return the header as a line of a trace."""
         fields = self.model_dump(by_alias=True)
         in_order = {name: fields[name] for name in _HEADER_KEYS if fields[name] is not None}
         return json.dumps(in_order, separators=(",", ":")) + "\n"
 
     @property
     def has_inputs(self) -> bool:
-        """Whether the trace has all that reached the agent in full."""
+        """True if the trace records each input of the agent completely."""
         return self.schema_ != "ucp-trace/1"
 
 
@@ -84,7 +86,8 @@ _ONLY_RECEIVES = re.compile(
     "reconciling":(?:true|false),"idle":(?:true|false),"top":"[0-9a-f]*"\}\}\n""",
     re.VERBOSE,
 )
-"""A line as agents write it whose handler took a message in, and nothing changed. Whatever else fits is as sound."""
+"""A line, as agents of this project write it, of a handler run that received a message and changed nothing. A line
+that matches needs no further validation."""
 
 _LOST = re.compile(rb'\{"lost_lines":(\d{1,9}),"lost_bytes":(\d{1,12})\}')
 
@@ -94,9 +97,10 @@ ASIDE = TypeAdapter(Dropped | Commanded)
 
 
 class Gap(NamedTuple):
-    """Lines of a trace are lost or damaged: `position` runs stand before them, and what follows is of a later state.
+    """A place in a trace at which lines are missing or damaged. `position` is the number of runs before it.
 
-    `lines` and `lost_bytes` are those that stand in the file and say nothing; nobody knows how many were never written.
+    `lines` and `lost_bytes` count the unreadable lines in the file. The number of lines that were never written is
+    unknown.
     """
 
     position: int
@@ -106,10 +110,11 @@ class Gap(NamedTuple):
 
 @dataclass
 class Trace:
-    """`runs` of all lives of the agent; those with index n >= starts[k] are of life k + 2, after the kth restart.
+    """The trace of one agent, in all its incarnations.
 
-    `asides` are the lines of other things, each with the number of runs that stand before it. A trace from the field
-    (`harness.field.ingest`) may have `gaps`; one of a run has none, and ends where it is damaged.
+    `starts` has the index in `runs` at which each incarnation after the first begins. `asides` are the entries that are
+    no handler runs, each with the number of runs before it. A trace from the field (`harness.field.ingest`) may have
+    `gaps`. The trace of a run has none, because its reading ends at the first damaged line.
     """
 
     header: Header
@@ -118,15 +123,18 @@ class Trace:
     asides: list[tuple[int, Dropped | Commanded]] = field(default_factory=list)
     problem: str | None = None
     cut_off: bool = False
-    """Whether it ends in half a line, which is not read."""
+    """True if the file ends within a line. That line is not read."""
     gaps: list[Gap] = field(default_factory=list)
     jumps: list[int] = field(default_factory=list)
-    """Positions of runs before which the agent's clock was set, as it seems: their time goes back, or far ahead."""
+    """Positions of runs before which the time goes back, or far ahead. The agent's clock was probably set there."""
     lines: tuple[Sequence[int], Sequence[int]] | None = None
-    """In which line of its file each of `runs`, and of `asides`, stands; None where they stand one after another."""
+    """Line numbers of `runs` and of `asides` in the file. None if the file has no other lines."""
 
     def incarnations(self) -> Iterator[Iterator[tuple[int, HandlerRun]]]:
-        """Each life of the agent: its runs, with their lines, which count from 1. A life begins with a header line."""
+        """Yield the handler runs of each incarnation, with line numbers from 1.
+
+        A header line begins each incarnation.
+        """
         bounds = [0, *self.starts, len(self.runs)]
         for incarnation, (start, end) in enumerate(pairwise(bounds), 1):
             yield self._numbered(start, end, incarnation)
@@ -143,7 +151,7 @@ class Trace:
         )
 
     def numbered_asides(self) -> Iterator[tuple[int, Dropped | Commanded]]:
-        """The lines of other things, with their numbers."""
+        """Yield the asides with their line numbers."""
         if self.lines is not None:
             yield from zip(self.lines[1], (aside for _, aside in self.asides), strict=True)
             return
@@ -151,7 +159,7 @@ class Trace:
             yield position + 1 + bisect_right(self.starts, position) + count, aside
 
     def extend(self, entries: Iterable[Entry]) -> None:
-        """These lines follow."""
+        """Append further entries."""
         for entry in entries:
             if isinstance(entry, HandlerRun):
                 self.runs.append(entry)
@@ -159,7 +167,10 @@ class Trace:
                 self.asides.append((len(self.runs), entry))
 
     def entries(self) -> Iterator[Header | Gap | Entry]:
-        """What its lines say, in order: the header again with each life, and where some are lost, a gap."""
+        """Yield all entries in order.
+
+        The header is repeated for each incarnation, and a gap stands for missing lines.
+        """
         starts = Counter([0, *self.starts])
         gaps = {gap.position: gap for gap in self.gaps}
         positions = [position for position, _ in self.asides]
@@ -175,7 +186,10 @@ class Trace:
                 yield self.runs[position]
 
     def skimmed(self) -> "Trace":
-        """The trace without the handler runs that only took a message in; lines are then not counted by `lives`."""
+        """Return the trace without handler runs that only received a message.
+
+        Line numbers of `incarnations` are then wrong.
+        """
         kept = [not only_receives(run) for run in self.runs]
         before = [0, *accumulate(kept)]
         return replace(
@@ -189,32 +203,33 @@ class Trace:
         )
 
     def completed(self) -> list[str]:
-        """Hashes of the blocks that the agent completed, in order."""
+        """Return the hashes of the blocks that the agent completed, in order."""
         return [block for run in self.runs for operation, block in run.changes if operation == "complete"]
 
     def chain_changed_at(self) -> float:
-        """When the chain last changed, in mission seconds; 0 if it never did."""
+        """Return the mission second of the last change of the chain. 0 without any."""
         return max(
             (run.t for run in self.runs if any("chain" in operation for operation, _ in run.changes)), default=0.0
         )
 
 
 class HeldBlocks:
-    """Where an agent holds which block, how often, and which blocks it has completed."""
+    """The blocks that an agent holds: in which place, how often, and which ones it has completed."""
 
     def __init__(self) -> None:
         self.places: dict[str, Counter[str]] = {place: Counter() for place in PLACES}
         self.size = dict.fromkeys(PLACES, 0)
-        """How many blocks are where."""
+        """Number of blocks in each place."""
         self.copies: Counter[str] = Counter()
         self.completed: dict[str, None] = {}
         self.not_in_chain: set[str] = set()
         """Completed blocks that are not in the chain."""
         self.impossible: str | None = None
-        """What the last run's changes claim to remove although it was not there."""
+        """A description of a change of the last run that is impossible, for example the removal of a block that the
+        agent did not hold."""
 
     def replay(self, run: HandlerRun) -> None:
-        """The changes of the next run of the same life."""
+        """Apply the changes of the next handler run of the same incarnation."""
         self.impossible = None
         for operation, block in run.changes:
             if operation == "complete":
@@ -242,30 +257,33 @@ class HeldBlocks:
 
 
 def parse_line(line: bytes) -> Header | Entry:
-    """What a line of a trace says. Raises ValueError if it says nothing."""
+    """Return the entry in a line of a trace. Raises ValueError if the line is invalid."""
     if b'"handler"' in line:
         return HANDLER_RUN.validate_json(line)
     return ASIDE.validate_json(line) if b'"schema"' not in line else HEADER.validate_json(line)
 
 
 def gap_line(gap: Gap) -> str:
-    """What stands in a trace in the place of lines that are lost: whoever reads runs only stops there."""
+    """Return the line that stands for lost lines in an imported trace.
+
+    Programs that read only handler runs stop there.
+    """
     return f'{{"lost_lines":{gap.lines},"lost_bytes":{gap.lost_bytes}}}\n'
 
 
 def parse_gap(line: bytes) -> tuple[int, int] | None:
-    """How many lines, and bytes, are lost where this line stands; None if it does not say so."""
+    """Return the numbers of lost lines and lost bytes if this line stands for lost lines, else None."""
     match = _LOST.fullmatch(line.strip())
     return None if match is None else (int(match[1]), int(match[2]))
 
 
 def only_receives(run: HandlerRun) -> bool:
-    """Whether the handler took a message in, and nothing changed."""
+    """Return whether the handler received a message and changed nothing."""
     return not run.changes and run.handler.startswith("receive_")
 
 
 def why_not_a_trace(path: Path) -> str:
-    """What is wrong with a file that does not even begin as a trace."""
+    """Return the reason why the file does not begin like a trace."""
     try:
         with path.open("rb") as file:
             header = json.loads(file.readline(MAX_LINE_BYTES))
@@ -280,9 +298,10 @@ def why_not_a_trace(path: Path) -> str:
 
 
 def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
-    """The trace in `path`; None if there is none, or it does not even begin as one.
+    """Read the trace in `path`. Returns None if there is no file, or it does not begin like a trace.
 
-    With `skim`, handler runs that only took a message in are left out unseen; lines are then not counted by `lives`.
+    With `skim`, handler runs that only received a message are skipped without validation. Line numbers of
+    `incarnations` are then wrong.
     """
     trace: Trace | None = None
     try:
@@ -323,8 +342,8 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
 Record = TypeVar("Record")
 
 
-class TraceLine(NamedTuple):
-    """A handler run as it stands in a trace; lines and lives count from 1."""
+class HandlerRunLine(NamedTuple):
+    """A line of a trace with a handler run. Line numbers and incarnations count from 1."""
 
     path: Path
     number: int
@@ -333,14 +352,14 @@ class TraceLine(NamedTuple):
     text: bytes
 
     def parse(self) -> HandlerRun:
-        """Raises RunDirectoryError if it is none."""
+        """Return the handler run. Raises RunDirectoryError if the line is invalid."""
         return _validated(HANDLER_RUN, self.path, self.number, self.text)
 
 
-def read_trace_lines(path: Path) -> Iterator[TraceLine]:
-    """The handler runs of a trace; half a last line, over which an agent was killed, is none.
+def read_trace_lines(path: Path) -> Iterator[HandlerRunLine]:
+    """Yield the lines with handler runs. An incomplete last line, left by a killed agent, is skipped.
 
-    Raises RunDirectoryError, when it comes there, if the file cannot be read or a line is not what it should be.
+    Raises RunDirectoryError at an invalid line, or if the file cannot be read or is empty.
     """
     incarnation = number = agent_id = 0
     try:
@@ -350,7 +369,7 @@ def read_trace_lines(path: Path) -> Iterator[TraceLine]:
                 if not text.endswith(b"\n") and len(text) < MAX_LINE_BYTES:
                     break
                 if incarnation and b'"handler"' in text:
-                    yield TraceLine(path, number, agent_id, incarnation, text)
+                    yield HandlerRunLine(path, number, agent_id, incarnation, text)
                 elif incarnation and b'"schema"' not in text:
                     _validated(ASIDE, path, number, text)
                 else:

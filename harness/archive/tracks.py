@@ -1,4 +1,4 @@
-"""Where the vehicles of a run were: `tracks.jsonl` read back, in mission seconds and metres from the field's centre."""
+"""The positions of the vehicles over mission time, read from `tracks.jsonl`, in metres from the centre of the field."""
 
 from bisect import bisect_right
 from collections.abc import Collection
@@ -15,11 +15,11 @@ TRACKS_FILE = "tracks.jsonl"
 
 MissionSeconds = Annotated[float, Field(ge=0, le=1e9)]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
-"""Nothing flies a thousand kilometres from the field."""
+"""Coordinates of more than 1000 km are invalid."""
 
 
 class Fix(NamedTuple):
-    """A vehicle was here at `at_s`."""
+    """The position of a vehicle at mission second `at_s`."""
 
     at_s: float
     north_m: float
@@ -29,13 +29,18 @@ class Fix(NamedTuple):
 
 @dataclass(frozen=True)
 class Tracks:
-    """The fixes of each vehicle, one at least, in order of time; `problems` are sentences on what could not be read."""
+    """The positions of each vehicle, at least one, in order of time.
+
+    `problems` has a sentence for each unreadable part.
+    """
 
     by_vehicle: dict[int, list[Fix]]
     problems: list[str]
 
     def at(self, vehicle: int, at_s: float) -> Fix:
-        """Where it was at any second: straight between two fixes, still before the first and after the last."""
+        """Return the position of a vehicle at any second: interpolated between two fixes, constant before the first
+        and after the last.
+        """
         fixes = self.by_vehicle[vehicle]
         position = bisect_right(fixes, at_s, key=attrgetter("at_s"))
         before, after = fixes[max(position - 1, 0)], fixes[min(position, len(fixes) - 1)]
@@ -43,7 +48,7 @@ class Tracks:
 
 
 def between(before: Fix, after: Fix, at_s: float) -> Fix:
-    """Where a vehicle is that goes straight from one place to the next at one speed."""
+    """Return the position of a vehicle that flies straight and at constant speed from one fix to the next."""
     share = (at_s - before.at_s) / (after.at_s - before.at_s)
     return Fix(
         at_s,
@@ -54,7 +59,7 @@ def between(before: Fix, after: Fix, at_s: float) -> Fix:
 
 
 class TrackLine(BaseModel):
-    """A line of `tracks.jsonl`: where vehicles were at one moment; metres north, east and up."""
+    """A line of `tracks.jsonl`: the positions of vehicles at one moment, in metres north, east and up."""
 
     model_config = ConfigDict(strict=True)
 
@@ -63,7 +68,7 @@ class TrackLine(BaseModel):
 
 
 def read_tracks(path: Path | None, vehicles: Collection[int]) -> Tracks:
-    """The tracks of those of `vehicles` that have any. A line that names another vehicle means nothing."""
+    """Read the tracks of `vehicles`. A vehicle without fixes has none. Lines that name another vehicle are left out."""
     lines = JsonLines(path, TrackLine)
     fixes: dict[int, list[Fix]] = {}
     known = set(vehicles)

@@ -1,7 +1,7 @@
-"""Words of a trace that the harness does not know: names of handlers, timers, branches, messages and the like.
+"""The known names in traces: names of handlers, timers, branches, messages and operations.
 
-An agent that names what it does otherwise than CONTRACT.md is not wrong in what it does. What depends on such a word
-cannot be told: it is "not applicable", or "not known", and no accusation.
+An agent may use names that are not in CONTRACT.md and still behave correctly. A check that depends on an unknown name
+gives "not applicable" or "unknown", never a violation.
 """
 
 from collections.abc import Collection, Iterable
@@ -15,7 +15,7 @@ from ucp.trigger import KINDS, LocalTrigger, MessageTrigger, TimerTrigger, Unkno
 Kind = Literal["trigger", "handler", "timer", "branch", "message", "operation", "tally"]
 
 UnknownNames = dict[Kind, str]
-"""Kind -> the first unknown word of that kind, in words: "unknown timer name 'x'"."""
+"""Kind -> a description of the first unknown name of that kind, such as "unknown timer name 'x'"."""
 
 TIMERS = frozenset(ON_TIMER)
 MESSAGES = frozenset(message.NAME for message in ON_MESSAGE)
@@ -36,27 +36,25 @@ BRANCHES = {
     )
     for name, handler in HANDLERS.items()
 }
-"""Handler -> the branches that it can take, those of wrong agents among them."""
+"""Handler -> the branches that it can take, including those of wrong agents."""
 TALLIES = {
     name: VOTES if handler.tally in ("vote_count", "reconcile_vote_count") else None
     for name, handler in HANDLERS.items()
 }
-"""Handler -> the keys of its tally; None if they are block hashes."""
+"""Handler -> the keys of its tally. None if the keys are block hashes."""
 
 IGNORED_KINDS: frozenset[Kind] = frozenset(("branch", "tally", "timer"))
-"""Of a step with unknown words of these kinds all the rest can be judged; with others it is not known what it was.
-
-Which timer ended, its handler tells.
-"""
+"""Kinds of unknown names that are ignored while the rest of the step is compared. A step with an unknown name of
+another kind cannot be compared. An unknown timer does no harm, because the handler determines the timer."""
 
 _TIMER_OF = {handler.name: timer for timer, handler in ON_TIMER.items()}
 
 MAX_SHOWN = 40
-"""More of an unknown word is not shown."""
+"""Maximum number of characters of an unknown name that a message shows."""
 
 
 def unknown_names(runs: Iterable[HandlerRun]) -> UnknownNames:
-    """The first unknown word of each kind; a branch is one of the handler that takes it."""
+    """Return the first unknown name of each kind. A branch is unknown if its handler cannot take it."""
     unknown: UnknownNames = {}
     for handler, branch in dict.fromkeys((run.handler, run.branch) for run in runs):
         if handler not in HANDLERS:
@@ -93,34 +91,37 @@ def unknown_names(runs: Iterable[HandlerRun]) -> UnknownNames:
 
 
 def tally_is_known(run: HandlerRun) -> bool:
-    """Whether all keys of its tally are of that handler's."""
+    """Return whether all keys of the tally are known for the handler."""
     keys = TALLIES.get(run.handler)
     return not run.tally or keys is None or keys.issuperset(run.tally)
 
 
 def has_unknown_kind(trigger: UnknownTrigger) -> bool:
-    """Whether the trigger names a kind that the contract does not have, rather than none or a malformed one."""
+    """Return whether the trigger names a kind that the contract lacks, as opposed to no kind or a malformed one."""
     return bool(trigger.fields) and KINDS.isdisjoint(trigger.fields)
 
 
 def timer_that_ended(run: HandlerRun, trigger: TimerTrigger) -> str:
-    """The timer that triggered the run. For an unknown name, the timer whose handler ran, if there is one."""
+    """Return the timer that triggered the run.
+
+    For an unknown name, this is the timer that starts the run's handler, if any.
+    """
     name = trigger.timer
     return name if name in TIMERS else _TIMER_OF.get(run.handler, name)
 
 
 def timers_are_known(run: HandlerRun) -> bool:
-    """Whether all timers that it started are named as they are known."""
+    """Return whether all timers that the run started have known names."""
     return not run.started or TIMERS.issuperset(run.started)
 
 
 def branch_is_known(run: HandlerRun) -> bool:
-    """Whether its handler can take this branch."""
+    """Return whether the run's handler can take its branch."""
     return run.branch in BRANCHES.get(run.handler, ())
 
 
 def first_unknown(unknown: UnknownNames, kinds: Collection[Kind] | None = None) -> str | None:
-    """The first unknown word, of these kinds if they are given; None if there is none."""
+    """Return the description of the first unknown name, of the given kinds or of any kind. None if there is none."""
     return next((description for kind, description in unknown.items() if kinds is None or kind in kinds), None)
 
 

@@ -1,6 +1,6 @@
-"""What crossed the air: captures of several vehicles put together, each datagram with who received it and who did not.
+"""The datagrams of a run, joined from the captures of several vehicles, with the receivers and the losses of each.
 
-`pcap` and `datagram` read frames, `capture` one file and `files` all of them; `transmissions` joins what they saw,
-`exchanges` finds the responses to each request, `story` the life of a block, `losses` counts; `text` and `document`
-tell it to people and to programs.
+`pcap` and `datagram` read frames, `capture_reader` reads one file, and `capture_files` reads all files of a mission.
+`transmissions` joins the sightings of each datagram. `exchanges` finds the responses to each request, and counts
+losses. `selection` filters, `packets_text` writes text, and `packets_document` writes JSON.
 """

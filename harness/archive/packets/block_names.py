@@ -1,7 +1,8 @@
-"""Names of blocks and chains for people: `3.12` where it can be known, else the first digits of the hash.
+"""Names of blocks and chains for output: `3.12` if known, else the first digits of the hash.
 
-A block's ordinal is known from a run's exports. Without them an agent's first proposals tell it, if the capture saw the
-agent from its first datagram on: it proposes its blocks in the order in which it completed them.
+The exports of a run give the names. Without exports, the order of an agent's first proposals gives them, because an
+agent proposes its blocks in the order in which it completed them. That requires a capture from the agent's first
+datagram on.
 """
 
 from collections.abc import Iterable
@@ -18,15 +19,15 @@ DIGITS = 8
 
 
 class BlockNames:
-    """Of all blocks and chains that were spoken of."""
+    """The names of all blocks and chains in a set of transmissions."""
 
     def __init__(self, transmissions: Iterable[Transmission], runs: Iterable[Path]) -> None:
-        """`runs` are directories that may hold exports."""
+        """Learn the names. `runs` are directories that may hold exports."""
         self._blocks: dict[bytes, str] = {}
         self._top_of: dict[bytes, bytes | None] = {}
         self._mentioned: set[bytes] = set()
         self._sealed = False
-        """Whether of some messages nobody here knows which block they are about."""
+        """True if some messages are sealed, so that their blocks are unknown."""
         self._from_start: set[int] = set()
         self._proposed: dict[int, int] = {}
         for run in runs:
@@ -42,7 +43,7 @@ class BlockNames:
         return self._blocks.get(block_hash)
 
     def chain(self, chain_hash: bytes) -> str:
-        """With the block on its top, if that is known."""
+        """Return the first digits of a chain hash, with the block on top of the chain if it is known."""
         digits = chain_hash.hex()[:DIGITS]
         if chain_hash not in self._top_of:
             return digits
@@ -50,7 +51,10 @@ class BlockNames:
         return f"{digits} ({'inception' if top is None else self.block(top)})"
 
     def find(self, query: str) -> bytes:
-        """The block of that name, or whose hash begins so. Raises CaptureError if there is none, or several."""
+        """Return the hash of the block with this name, or with this beginning of its hash.
+
+        Raises CaptureError if no block or several blocks match.
+        """
         named = [block_hash for block_hash, name in self._blocks.items() if name == query]
         hashes = named or [block_hash for block_hash in self._mentioned if block_hash.hex().startswith(query.lower())]
         hashes = [block_hash for block_hash in hashes if block_hash in self._mentioned]
@@ -64,7 +68,7 @@ class BlockNames:
     def _learn_from_exports(self, run: Path) -> None:
         try:
             exports = RunArchive(run).exports.by_agent
-        except RunDirectoryError:  # captures from the field
+        except RunDirectoryError:  # Captures from the field have no run directory.
             return
         self._blocks |= {bytes.fromhex(block_hash): name for block_hash, name in name_blocks(exports).items()}
         for export in exports.values():
@@ -97,7 +101,7 @@ class BlockNames:
 
 
 def run_directories(paths: Iterable[Path]) -> list[Path]:
-    """The run directories among `paths`, or that captures among them lie in."""
+    """Return the run directories among `paths`, and the run directories that contain captures among `paths`."""
     runs = [
         path if path.is_dir() else path.resolve().parent.parent
         for path in paths

@@ -1,4 +1,4 @@
-"""Finds captures and reads them together: those of one mission, on one clock."""
+"""Find capture files, and read those of one mission together, with one clock."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,14 +11,15 @@ if TYPE_CHECKING:
     from ucp.secure.opening import Opener
 
 DIRECTORY = "capture"
-"""Of a run directory."""
+"""Directory of captures in a run directory."""
 SUFFIXES = (".pcapng", ".pcap")
 
 
 class Clock(NamedTuple):
-    """Mission seconds: `epoch_ns` is second 0. `of_run` is false where no capture says so: then it is the first packet.
+    """The conversion of capture time to mission seconds. `epoch_ns` is mission second 0.
 
-    Captures from the field are as far apart as their vehicles' clocks.
+    `of_run` is false if no capture has a comment with the start of the run. Then `epoch_ns` is the time of the first
+    packet. Captures from the field differ by the errors of the vehicles' clocks.
     """
 
     epoch_ns: int
@@ -30,7 +31,7 @@ class Clock(NamedTuple):
 
 
 class Captures(NamedTuple):
-    """`errors` has a sentence for each file that could not be used."""
+    """The captures of one mission. `errors` has a sentence for each unusable file."""
 
     used: list[Capture]
     datagrams: list[Datagram]
@@ -39,14 +40,14 @@ class Captures(NamedTuple):
 
     @property
     def problems(self) -> list[str]:
-        """A sentence for each thing that was wrong with a file that could be used."""
+        """A sentence for each problem of a usable file."""
         return [problem for capture in self.used for problem in capture.problems]
 
 
 def capture_files(paths: Iterable[Path]) -> list[Path]:
-    """The captures in run directories, in directories of captures, and those that are named themselves; each once.
+    """Return the captures in run directories and directories of captures, and the files among `paths`, each once.
 
-    Raises RunDirectoryError if a path does not exist, or a directory holds none.
+    Raises RunDirectoryError if a path does not exist, or a directory holds no capture.
     """
     files: list[Path] = []
     for path in paths:
@@ -64,9 +65,10 @@ def capture_files(paths: Iterable[Path]) -> list[Path]:
 
 
 def read_captures(paths: Iterable[Path], opener: "Opener | None" = None) -> Captures:
-    """All captures of the mission of the first that names one; captures from the field may be of any.
+    """Read all captures of one mission. The first capture with a comment determines the mission.
 
-    `opener` opens what a secured mission sealed.
+    Captures from the field have no comment and are always used. `opener` decrypts the sealed datagrams of a secured
+    mission.
     """
     used: list[Capture] = []
     errors: list[str] = []
@@ -89,6 +91,6 @@ def read_captures(paths: Iterable[Path], opener: "Opener | None" = None) -> Capt
     whose = {capture.vehicle for capture in used if capture.comment}
     for capture in used:
         if not capture.comment and capture.vehicle in whose:
-            capture.vehicle = None  # it speaks in the name of another
+            capture.vehicle = None  # Its name or content suggests a vehicle that already has a capture of its own.
     first_ns = min((capture.began_ns for capture in used if capture.began_ns is not None), default=0)
     return Captures(used, list(datagrams.values()), clock or Clock(first_ns, 1.0, False), errors)

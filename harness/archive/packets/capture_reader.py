@@ -1,7 +1,8 @@
-"""Reads one capture, a listening point: what it saw of each datagram goes to those that it shares with the others.
+"""Read one capture file: the datagrams that one vehicle, or one other observation point, sent or received.
 
-A vehicle's capture says whose it is in a comment (`ucp-harness run --capture`). One from the field is that of the
-vehicle whose datagrams leave it, else of the one in its name, `7.pcap`, else of no vehicle: a point that only listens.
+The capture of a run names its vehicle in a comment (`ucp-harness run --capture`). A capture from the field has no
+comment. It belongs to the sender of its outbound datagrams, else to the vehicle in its file name, such as `7.pcap`.
+Otherwise it is an observation point without a vehicle.
 """
 
 import hashlib
@@ -29,11 +30,11 @@ NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
 _LAST_NS = 2**63 - 1
 
 ListenerName = int | str
-"""Who listened: a vehicle's ID, or the name of a point that is no vehicle's."""
+"""The ID of the vehicle that captured, or the name of another observation point."""
 
 
 class CaptureComment(BaseModel):
-    """What a run's capture says of itself, as JSON in the comment of its section; `epoch_us` is mission second 0."""
+    """The comment in a capture of a run, as JSON in the section header. `epoch_us` is mission second 0."""
 
     ucp_harness: Literal[1]
     vehicle: AgentId
@@ -42,9 +43,10 @@ class CaptureComment(BaseModel):
 
 
 class Datagram:
-    """One datagram's bytes, wherever and how often they were seen: `seen` has a time in ns and a place by turns.
+    """A datagram, identified by its bytes, with all its sightings in all captures.
 
-    A place is the number of the capture and the frame's direction, in one number.
+    `seen` is a flat array, because there may be millions of sightings. It alternates a time in ns with a number that
+    encodes the capture and the direction of the frame.
     """
 
     __slots__ = ("seen", "sender", "sequence", "summary")
@@ -56,15 +58,15 @@ class Datagram:
         self.seen = array("q")
 
     def sightings(self) -> Iterable[tuple[int, int, int]]:
-        """(time in ns, number of the capture, direction)."""
+        """Return (time in ns, number of the capture, direction) of each sighting."""
         seen = self.seen
         return ((seen[i], seen[i + 1] >> 2, seen[i + 1] & 3) for i in range(0, len(seen), 2))
 
 
 class Capture:
-    """One file, as read. It listened from `began_ns` to `ended_ns`; None if nothing says so.
+    """A capture file. It covers the time from `began_ns` to `ended_ns`, None if unknown.
 
-    `sees_itself`: it shows what leaves its vehicle, and not only what reaches it.
+    `sees_itself` is true if the file also contains the datagrams that its vehicle sent.
     """
 
     def __init__(self, number: int, path: Path) -> None:
@@ -91,14 +93,14 @@ class Capture:
     def read(
         self, datagrams: dict[bytes, Datagram], most_frames: int | None = None, opener: "Opener | None" = None
     ) -> None:
-        """Add what the file saw, or its first frames, to `datagrams`; what is sealed `opener` opens.
+        """Add the datagrams of the file, or of its first frames, to `datagrams`. `opener` decrypts sealed datagrams.
 
-        Raises CaptureError if it is no capture.
+        Raises CaptureError if the file is not a capture.
         """
         file = CaptureFile(self.path)
         first_ns, last_ns = _LAST_NS, -1
         sent_by: Counter[int] = Counter()
-        senders: set[int] = set()  # of datagrams whose direction the file does not say
+        senders: set[int] = set()  # senders of datagrams without a direction in the file
         frames = iter(file)
         for frame in islice(frames, most_frames):
             self.frames += 1
@@ -160,7 +162,7 @@ class Capture:
             return None
 
     def direction(self, sender: int, direction: int) -> int:
-        """Of a datagram, where the file does not say: what names the vehicle itself as its sender leaves it."""
+        """Return the direction of a datagram. If the file lacks it, datagrams from the vehicle itself are outbound."""
         return direction or (OUTBOUND if sender == self.vehicle else INBOUND)
 
 
@@ -170,7 +172,7 @@ def _plain(payload: bytes) -> Datagram:
 
 
 def _secured(payload: bytes, opener: "Opener | None") -> Datagram:
-    """Of what is sealed, who says it, when, and which message it is, are in the clear."""
+    """Return a datagram of a secured mission. Without `opener`, only its sender, sequence number and type are known."""
     clear = read_clear(payload)
     if clear.type == REVOCATION:
         raise NotUcpError("a revocation of keys")

@@ -1,10 +1,11 @@
-"""From a frame to the UCP datagram in it, and a summary of its message.
+"""Extract the UCP datagram from a frame, and summarise its message.
 
-A frame that was damaged on its way is told by its checksums, as the receiver's kernel does, which drops it. A UDP
-checksum that holds no more than the sum of the addresses is one that the sender's kernel leaves to its network card,
-and in a private network there is none: that is a sound frame.
+A frame with a wrong checksum was damaged, and the receiver's kernel dropped it. There is one exception: a UDP checksum
+that covers only the addresses. The sender's kernel writes it and leaves the rest to the network card, but a virtual
+network has no card. Such a frame is intact.
 
-Agents of a run listen on one port. In the field they may on another: what begins like a UCP message is taken for one.
+Agents of a run use one port. In the field they may use another, so a payload that begins like a UCP message is accepted
+from any port.
 """
 
 import struct
@@ -32,12 +33,12 @@ _ETHERTYPES = {0x0806: "ARP", 0x86DD: "IPv6", 0x888E: "EAPOL"}
 _PROTOCOLS = {1: "ICMP", 2: "IGMP", 6: "TCP"}
 _UDP = 17
 _OUTGOING = 4
-"""The packet type of tcpdump's cooked headers for what the host itself sent."""
+"""Packet type in Linux cooked headers of a packet that the host itself sent."""
 _ENDS = struct.Struct("!4H")
 
 
 class NotUcpError(ValueError):
-    """There is no sound UCP datagram in this frame. `reason` is one of a few words, for counting."""
+    """The frame contains no intact UCP datagram. `reason` is one of a few fixed texts, so that it can be counted."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -45,7 +46,10 @@ class NotUcpError(ValueError):
 
 
 def unwrap(frame: Frame) -> tuple[bytes, int]:
-    """(UDP payload, direction). Raises NotUcpError for a frame that carries none, or that was cut or damaged."""
+    """Return the UDP payload and the direction of a frame.
+
+    Raises NotUcpError if the frame contains no UDP payload, or is truncated or damaged.
+    """
     ethertype, packet, direction = _network_layer(frame)
     if ethertype != _ETHERTYPE_IPV4:
         raise NotUcpError(_ETHERTYPES.get(ethertype, "neither IPv4 nor IPv6"))
@@ -67,7 +71,7 @@ def unwrap(frame: Frame) -> tuple[bytes, int]:
 
 
 def _network_layer(frame: Frame) -> tuple[int, bytes, int]:
-    """(Ethertype, packet, direction)."""
+    """Return (Ethertype, packet, direction)."""
     data, link_type, direction = frame.data, frame.link_type, frame.direction
     if link_type == _ETHERNET:
         start = 14
@@ -103,7 +107,10 @@ def _udp(addresses: bytes, segment: bytes) -> bytes:
 
 
 def _sum(data: bytes) -> int:
-    """The Internet checksum's sum of 16-bit words (RFC 1071), 0 if it fits: in ones' complement a remainder."""
+    """Return the sum of 16-bit words for the Internet checksum (RFC 1071), modulo 65535.
+
+    0 means that the checksum is right.
+    """
     return int.from_bytes(data + b"\0" if len(data) % 2 else data, "big") % 0xFFFF
 
 
@@ -113,16 +120,16 @@ RESPONSES: dict[str, str] = {
     ChainHashSuccessorQuery.NAME: NextInSequenceResponse.NAME,
     RequestForBlock.NAME: BlockResponse.NAME,
 }
-"""Request -> its response; a Commit Block is neither."""
+"""Request -> its response. A Commit Block is neither of them."""
 
 CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
 TOP_OF_CHAIN = "top of chain"
 
 
 class MessageSummary(NamedTuple):
-    """`message` is its name, all that is known of one that is sealed.
+    """The type and content of a message. Of a sealed message only the type, `message`, is known.
 
-    `answer` is what a response answers: approve, disapprove, yes, no, top of chain, block.
+    `answer` is the content of a response: approve, disapprove, yes, no, top of chain, or block.
     """
 
     message: str
@@ -132,22 +139,30 @@ class MessageSummary(NamedTuple):
 
     @property
     def is_sealed(self) -> bool:
-        """Whether it is not known what it says: every message names a block or a chain."""
+        """True if the content is unknown. Each readable message names a block or a chain."""
         return self.block_hash is None and self.chain_hash is None
 
     @property
     def request_key(self) -> tuple[str, bytes | None] | None:
-        """The subject of a request, equal to what its responses `answers`; responses do not name the asker."""
+        """The type and subject of the responses to this request, for comparison with `answers`. None if this is no
+        request.
+
+        Responses do not name the agent that asked.
+        """
         response = RESPONSES.get(self.message)
         return None if response is None or self.is_sealed else (response, self._subject)
 
     @property
     def answers(self) -> tuple[str, bytes | None] | None:
+        """The type and subject of this response. None if this is no response."""
         return None if self.answer is None else (self.message, self._subject)
 
     @property
     def _subject(self) -> bytes | None:
-        """A successor is asked for by chain and named by block; all else that names a block is about the block."""
+        """The chain or block that request and response both name.
+
+        A Next In Sequence response names the found block too, but the request named only the chain.
+        """
         return self.chain_hash if self.message == NextInSequenceResponse.NAME else self.block_hash or self.chain_hash
 
 

@@ -1,8 +1,8 @@
-"""Requests with their responses, and the losses between each two vehicles.
+"""Match requests with their responses, and count the losses of each link.
 
-Responses are broadcast and do not name the asker. But an agent answers what reaches it at once or never, and in order:
-so, from the last response back to the first, each answers the last request on its subject that reached the responder
-before it, and that no later response answers.
+Responses are broadcast and do not name the agent that asked. But an agent answers each request at once or never, and in
+order. Therefore the responses of an agent are assigned from the last to the first: each answers the latest request on
+its subject that reached the agent before it, and that no later response answers.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -14,13 +14,13 @@ from harness.archive.packets.transmissions import Transmission
 Outcome = Literal["answered", "response lost", "request lost", "no answer"]
 Subject = tuple[str, bytes | None]
 _Asked = tuple[float, int]
-"""When, and the number of the request."""
+"""The time of a request and its number."""
 
 
 class RequestOutcome(NamedTuple):
-    """What came of a request at one vehicle: `response` is its first answer, if it gave one.
+    """The outcome of a request at vehicle `by`. `response` is its first response, or None.
 
-    It is "answered" unless the response is known to be lost to the asker.
+    The outcome is "answered" unless the response is known to be lost on its way to the agent that asked.
     """
 
     by: int
@@ -29,17 +29,19 @@ class RequestOutcome(NamedTuple):
 
 
 class Exchanges:
+    """The responses to each request."""
+
     def __init__(self, transmissions: Sequence[Transmission]) -> None:
         self._responses: dict[int, list[Transmission]] = {}
         for request, response in sorted(_match(transmissions), key=lambda pair: pair[1].number):
             self._responses.setdefault(request.number, []).append(response)
 
     def responses(self, request: Transmission) -> Sequence[Transmission]:
-        """In the order of sending."""
+        """Return the responses to a request in the order of sending."""
         return self._responses.get(request.number, ())
 
     def answers(self, request: Transmission) -> list[RequestOutcome]:
-        """What came of a request at each vehicle that it reached or should have reached."""
+        """Return the outcome of a request at each vehicle that received or lost it."""
         first: dict[int, Transmission] = {}
         for response in self.responses(request):
             first.setdefault(response.sender, response)
@@ -58,7 +60,7 @@ class Exchanges:
 
 
 def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission, Transmission]]:
-    """(request, response). A forged response is nobody's answer."""
+    """Yield (request, response) pairs. A forged response answers no request."""
     asked: dict[Subject, list[_Asked]] = {}
     reached: dict[tuple[ListenerName, Subject], list[_Asked]] = {}
     sent: dict[tuple[ListenerName, Subject], list[Transmission]] = {}
@@ -72,7 +74,7 @@ def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission
         elif (subject := transmission.summary.answers) and transmission.origin != "forged":
             sent.setdefault((transmission.sender, subject), []).append(transmission)
     for (name, subject), responses in sent.items():
-        # Where it is not known what reached the responder, all that others asked may have.
+        # If it is unknown which requests reached the responder, any request of another agent may have reached it.
         others = (what for what in asked.get(subject, ()) if transmissions[what[1]].sender != name)
         waiting = sorted(reached.get((name, subject)) or others)
         for response in reversed(responses):
@@ -83,7 +85,7 @@ def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission
 
 
 class LinkLosses(NamedTuple):
-    """Of `sent` datagrams that the receiver should have heard, `lost` never reached it."""
+    """Losses on a link: the receiver should have received `sent` datagrams, and did not receive `lost` of them."""
 
     sender: int
     receiver: ListenerName
@@ -92,7 +94,7 @@ class LinkLosses(NamedTuple):
 
 
 def count_losses(transmissions: Iterable[Transmission]) -> list[LinkLosses]:
-    """All pairs, by sender and receiver. What somebody forged is no agent's loss."""
+    """Return the losses of all links, sorted by sender and receiver. Forged datagrams are not counted."""
     sent: dict[tuple[int, ListenerName], int] = {}
     lost: dict[tuple[int, ListenerName], int] = {}
     for transmission in transmissions:
@@ -110,7 +112,7 @@ def count_losses(transmissions: Iterable[Transmission]) -> list[LinkLosses]:
 
 
 def loss_matrix(pairs: list[LinkLosses]) -> Iterator[str]:
-    """A row for each sender, a column for each receiver: lost/sent."""
+    """Yield the lines of a table of lost/sent, with a row for each sender and a column for each receiver."""
     receivers = sorted({pair.receiver for pair in pairs}, key=lambda name: (isinstance(name, str), name))
     cells = {(pair.sender, pair.receiver): f"{pair.lost}/{pair.sent}" for pair in pairs}
     width = max(map(len, [*cells.values(), *map(str, receivers)]), default=0)

@@ -1,4 +1,4 @@
-"""Transmissions for people, in the order of sending, a line for each that stands by itself: for `less` and `grep`."""
+"""Write transmissions as text, one line each, in the order of sending, for use with `less` and `grep`."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -22,7 +22,7 @@ from ucp.messages import (
 )
 
 _NAMED = 10
-"""More receivers than these are counted, not named."""
+"""Maximum number of receivers that are listed by ID. More receivers are only counted."""
 _OUTCOMES: tuple[Outcome, ...] = ("answered", "response lost", "no answer", "request lost")
 _INDENT = " " * 16
 
@@ -30,14 +30,14 @@ Paint = Callable[[str], str]
 
 
 class TransmissionText:
-    """How things are said; `paint` sets off what was lost."""
+    """The text of transmissions and outcomes. `paint` highlights losses."""
 
     def __init__(self, names: BlockNames, paint: Paint) -> None:
         self._names = names
         self._paint = paint
 
     def transmission(self, transmission: Transmission) -> str:
-        """When, who, what, and who received it."""
+        """Return the line of a transmission: time, sender, message and receivers."""
         what = f"{transmission.summary.message:<26}  {self.content(transmission.summary):<46}"
         parts = [f"{transmission.at_s:>12.3f}  {transmission.sender:>5}  {what}  -> {_receivers(transmission)}"]
         if transmission.lost_by:
@@ -80,7 +80,7 @@ class TransmissionText:
                 return block
 
     def answers(self, answers: Iterable[RequestOutcome]) -> str:
-        """What came of a request; vehicles of which the same is to say are together."""
+        """Return the outcomes of a request. Vehicles with the same outcome are listed together."""
         together: dict[str, list[ListenerName]] = {}
         for answer in sorted(answers, key=lambda answer: _OUTCOMES.index(answer.outcome)):
             together.setdefault(self._outcome(answer), []).append(answer.by)
@@ -97,7 +97,7 @@ class TransmissionText:
 
 
 def header(captures: Captures) -> str:
-    """What the times count from, and who listened."""
+    """Return the line with the captured vehicles and the start of mission time."""
     vehicles = sorted({capture.vehicle for capture in captures.used if capture.vehicle is not None})
     points = [capture.path.name for capture in captures.used if capture.vehicle is None]
     clock = captures.clock
@@ -110,7 +110,9 @@ def header(captures: Captures) -> str:
 def transmission_lines(
     transmissions: Iterable[Transmission], exchanges: Exchanges, text: TransmissionText, answers_of: int | None
 ) -> Iterator[str]:
-    """Each transmission; below a request, what came of it at each vehicle, or at `answers_of` alone."""
+    """Yield the line of each transmission, and below a request its outcomes, at all vehicles or only at
+    `answers_of`.
+    """
     for transmission in transmissions:
         yield text.transmission(transmission)
         if transmission.summary.request_key:
@@ -120,7 +122,10 @@ def transmission_lines(
 
 
 def exchange_lines(exchanges_shown: Sequence[Exchange], exchanges: Exchanges, text: TransmissionText) -> Iterator[str]:
-    """A block's story: answers below what they answer, then who never gave one, and at last whom the block reached."""
+    """Yield the lines of the exchanges about a block: each with its answers and missing answers.
+
+    The last line lists the vehicles that the block reached.
+    """
     for exchange in exchanges_shown:
         yield text.transmission(exchange.first)
         for answer in exchange.answers:
@@ -135,7 +140,7 @@ def exchange_lines(exchanges_shown: Sequence[Exchange], exchanges: Exchanges, te
 
 
 def totals(captures: Captures, transmissions: Sequence[Transmission]) -> Iterator[str]:
-    """Totals, and what else was in the captures."""
+    """Yield the lines with totals, and with the other contents of the captures."""
     lost = sum(len(transmission.lost_by) for transmission in transmissions)
     received = sum(len(transmission.received) for transmission in transmissions)
     counted = [

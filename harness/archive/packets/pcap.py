@@ -1,7 +1,7 @@
-"""Capture files, frame by frame: pcapng and pcap, of either byte order, as anybody may have left them.
+"""Read capture files (pcapng and pcap, both byte orders) frame by frame, from any origin.
 
-Read here rather than by scapy, whose reader drops the section's comment and the statistics, does not say where a file
-breaks off, and believes any length that a file names. Formats: draft-ietf-opsawg-pcapng, draft-ietf-opsawg-pcap.
+scapy is not used, because its reader drops the comment and the statistics of a section, does not report where a file is
+damaged, and trusts any length in a file. Formats: draft-ietf-opsawg-pcapng, draft-ietf-opsawg-pcap.
 """
 
 import struct
@@ -13,10 +13,10 @@ from harness.archive.bounded_file import BoundedFile
 from harness.errors import CaptureError
 
 INBOUND, OUTBOUND = 1, 2
-"""Directions of a frame, as in the flags of pcapng; 0 is unknown."""
+"""Directions of a frame, as in the flags of pcapng. 0 is unknown."""
 
 MAX_BLOCK_BYTES = 1024 * 1024
-"""Four times the longest frame that tcpdump captures."""
+"""Maximum size of a block, four times the longest frame that tcpdump captures."""
 MAX_INTERFACES = 1024
 
 _SECTION, _INTERFACE, _STATISTICS, _PACKET = b"\x0a\x0d\x0d\x0a", 1, 5, 6
@@ -31,11 +31,14 @@ _PCAP = {  # magic -> byte order, nanoseconds in a unit of the fraction
 }
 PCAPNG_MAGIC = _SECTION
 MAGICS = (_SECTION, *_PCAP)
-"""What a capture begins with."""
+"""The first bytes of capture files."""
 
 
 class Frame(NamedTuple):
-    """`time_ns` since the Unix epoch; `length` is that on the wire, of which `data` may be a part."""
+    """A captured frame.
+
+    `time_ns` counts from the Unix epoch. `length` is the length on the wire, and `data` may be shorter.
+    """
 
     time_ns: int
     direction: int
@@ -54,14 +57,15 @@ class _Interface(NamedTuple):
 
 
 class _BrokenError(Exception):
-    """What follows cannot be read."""
+    """The rest of the file cannot be read."""
 
 
 class CaptureFile:
-    """Iterating reads the file, and tells afterwards what else was in it.
+    """A capture file. Iteration reads its frames and sets the attributes.
 
-    `comment` is the first section's. `started_ns`, `ended_ns` and `dropped`, the frames that the capture itself
-    missed, are of its statistics; None where it has none. `problem` says where the file broke off, if it did.
+    `comment` is the comment of the first section. `started_ns`, `ended_ns` and `dropped` (the number of frames that the
+    capture missed) come from the statistics and are None without them. `problem` describes where the reading ended
+    early, if it did.
     """
 
     def __init__(self, path: Path) -> None:
@@ -77,7 +81,7 @@ class CaptureFile:
         return sum(self._dropped.values()) if self._dropped else None
 
     def __iter__(self) -> Iterator[Frame]:
-        """Raises CaptureError if the file cannot be read or is no capture."""
+        """Yield the frames. Raises CaptureError if the file cannot be read or is not a capture."""
         try:
             with BoundedFile(self.path) as file:
                 magic = file.peek(4)[:4]
@@ -153,7 +157,7 @@ class CaptureFile:
 
 
 def _blocks(file: BinaryIO) -> Iterator[tuple[int, str, int, bytes]]:
-    """(offset in the file, byte order, type, body) of each pcapng block."""
+    """Yield (offset in the file, byte order, type, body) of each pcapng block."""
     offset, order = 0, "<"
     lengths = struct.Struct("<2I")
     while head := file.read(8):
@@ -196,7 +200,7 @@ def _halves(order: str, value: bytes) -> int:
 
 
 def _options(order: str, data: bytes) -> dict[int, bytes]:
-    """Option code -> value; of several of one code the first."""
+    """Return the options by code. Of several options with the same code, the first is used."""
     options: dict[int, bytes] = {}
     position, head = 0, struct.Struct(order + "2H")
     while position + head.size <= len(data):

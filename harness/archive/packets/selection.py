@@ -1,4 +1,4 @@
-"""Select transmissions: by sender, message or time, or all that concern one block."""
+"""Select transmissions by sender, receiver, message, time or block."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,11 @@ MESSAGES = [message.NAME for message in TYPE_CODES]
 
 @dataclass(frozen=True)
 class Selection:
-    """None selects all; `message` is a message's name, in any case. Raises CaptureError for what there cannot be."""
+    """Conditions on transmissions. A condition that is None accepts every transmission. The case of `message` is
+    ignored.
+
+    Raises CaptureError for an unknown message or an empty time interval.
+    """
 
     sender: int | None = None
     receiver: int | None = None
@@ -30,7 +34,10 @@ class Selection:
             raise CaptureError("--between {:g} {:g}: the first second is not before the last".format(*self.between_s))
 
     def filter(self, transmissions: Iterable[Transmission], captures: Captures) -> Iterator[Transmission]:
-        """Those that fit; with a receiver, only as far as they concern it. Raises CaptureError if it has no capture."""
+        """Yield the transmissions that meet the conditions. With a receiver, other receivers are removed from them.
+
+        Raises CaptureError if the receiver has no capture.
+        """
         vehicles = sorted({capture.vehicle for capture in captures.used if capture.vehicle is not None})
         if self.receiver is not None and self.receiver not in vehicles:
             known = f"captures are of {', '.join(map(str, vehicles))}" if vehicles else "nor of any other vehicle"
@@ -53,7 +60,7 @@ class Selection:
 
 
 class Exchange(NamedTuple):
-    """A transmission that is no answer, and the answers to it that are about the block."""
+    """A transmission that answers nothing, and the answers to it that concern the selected block."""
 
     first: Transmission
     answers: Sequence[Transmission]
@@ -62,7 +69,7 @@ class Exchange(NamedTuple):
 def exchanges_about(
     block_hash: bytes, transmissions: Iterable[Transmission], exchanges: Exchanges
 ) -> Iterator[Exchange]:
-    """All that is about the block, in the order of sending; answers are with what they answer."""
+    """Yield all exchanges about a block in the order of sending."""
     answer_numbers: set[int] = set()
     for transmission in transmissions:
         answers = [answer for answer in exchanges.responses(transmission) if answer.summary.block_hash == block_hash]
@@ -72,7 +79,7 @@ def exchanges_about(
 
 
 def in_order(exchanges: Iterable[Exchange]) -> list[Transmission]:
-    """All of a story's transmissions, each once, in the order of sending."""
+    """Return all transmissions of some exchanges, each once, in the order of sending."""
     by_number = {
         transmission.number: transmission
         for exchange in exchanges
@@ -82,7 +89,7 @@ def in_order(exchanges: Iterable[Exchange]) -> list[Transmission]:
 
 
 def block_arrivals(exchanges: Iterable[Exchange]) -> dict[int, float]:
-    """Vehicle -> the mission second at which the block itself first reached it."""
+    """Return the mission second at which the block itself first reached each vehicle."""
     first: dict[int, float] = {}
     for transmission in in_order(exchanges):
         if transmission.summary.message in CARRY_A_BLOCK:

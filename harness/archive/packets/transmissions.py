@@ -1,8 +1,8 @@
-"""What was sent, and who received it: the sightings of all captures, put together.
+"""Join the sightings of all captures into transmissions, each with its receivers.
 
-A datagram is known by its bytes. An agent that starts anew may send the very same again, so each sighting elsewhere
-belongs to the last time before it that the datagram was sent. Where a capture of its sender was listening and did not
-see it leave, somebody else sent it.
+A datagram is identified by its bytes. A restarted agent may send the same bytes again. Therefore each reception belongs
+to the latest transmission of the datagram before it. If a complete capture of the sender does not contain the
+transmission, the datagram is forged.
 """
 
 from bisect import bisect_right
@@ -15,12 +15,14 @@ from harness.archive.packets.datagram import MessageSummary
 from harness.archive.packets.pcap import OUTBOUND
 
 Origin = Literal["captured", "inferred", "forged"]
-"""Seen leaving its sender; or its sender was not captured then, and `at_s` is when it first reached somebody; or not
-sent by the agent that it names."""
+"""The origin of a transmission. `captured`: the capture of its sender contains it. `inferred`: its sender was not
+captured then, and `at_s` is the time of the first reception. `forged`: the agent that it names did not send it."""
 
 
 class Reception(NamedTuple):
-    """`copies` reached a listener, the last at `last_s`; mission seconds."""
+    """The reception of a datagram by one listener: the number of copies, and the mission seconds of the first and
+    last copy.
+    """
 
     by: ListenerName
     at_s: float
@@ -29,10 +31,10 @@ class Reception(NamedTuple):
 
 
 class Transmission(NamedTuple):
-    """A datagram sent once, at mission second `at_s`; `number` counts from 0 in the order of sending.
+    """A datagram, sent once at mission second `at_s`. `number` counts from 0 in the order of sending.
 
-    `seen_leaving` is the listener whose capture saw it leave. `lost_by` listened and did not receive it; `absent` were
-    not listening then, or no longer, so that nobody knows.
+    `seen_leaving` is the listener whose capture contains the sending. The listeners in `lost_by` captured at that time
+    but did not receive the datagram. Those in `absent` did not capture at that time, so their reception is unknown.
     """
 
     number: int
@@ -51,7 +53,7 @@ class Transmission(NamedTuple):
         return [reception.by for reception in self.received]
 
     def for_receiver(self, receiver: ListenerName) -> "Transmission":
-        """The same, as far as it concerns one receiver."""
+        """Return the transmission with one receiver only."""
         return self._replace(
             received=tuple(reception for reception in self.received if reception.by == receiver),
             lost_by=tuple(name for name in self.lost_by if name == receiver),
@@ -60,7 +62,7 @@ class Transmission(NamedTuple):
 
 
 class _Listeners:
-    """Who listened, and when. A listener may have left several captures."""
+    """The captured vehicles and observation points, each with its captures."""
 
     def __init__(self, captures: Iterable[Capture]) -> None:
         self._transmissions: dict[ListenerName, list[Capture]] = {}
@@ -72,14 +74,17 @@ class _Listeners:
         return any(capture.listening(time_ns) for capture in self._transmissions.get(name, ()))
 
     def would_record_sending(self, sender: ListenerName, time_ns: int) -> bool:
-        """Not if its captures show only what reaches it, or missed frames."""
+        """Return whether a datagram that the sender sent at this time must be in its captures.
+
+        It need not be if the captures contain only received datagrams, or have missed frames.
+        """
         captures = self._transmissions.get(sender, ())
         sound = any(capture.sees_itself for capture in captures) and not any(capture.dropped for capture in captures)
         return sound and self.listening(sender, time_ns)
 
 
 def join(captures: Captures) -> list[Transmission]:
-    """All transmissions, in the order of sending."""
+    """Return all transmissions in the order of sending."""
     by_number = {capture.number: capture for capture in captures.used}
     listeners = _Listeners(captures.used)
     transmissions = [
@@ -94,6 +99,7 @@ def join(captures: Captures) -> list[Transmission]:
 def _transmissions(
     datagram: Datagram, captures: Mapping[int, Capture], listeners: _Listeners, clock: Clock
 ) -> Iterator[Transmission]:
+    """Yield the transmissions of one datagram."""
     left: list[tuple[int, ListenerName]] = []
     arrived: list[tuple[int, ListenerName]] = []
     for time_ns, number, direction in sorted(datagram.sightings()):

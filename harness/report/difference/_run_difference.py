@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE
-from harness.archive.traces import TraceLine
+from harness.archive.traces import HandlerRunLine
 from harness.errors import RunDirectoryError
 from harness.report.agent_programs import Program, programs
 from harness.report.chain_tree import ranges
@@ -33,7 +33,7 @@ class ComparedStep:
     line: int = field(compare=False)
 
     @classmethod
-    def of(cls, line: TraceLine, names: Mapping[str, str]) -> "ComparedStep":
+    def of(cls, line: HandlerRunLine, names: Mapping[str, str]) -> "ComparedStep":
         """Make a step from a line of a trace.
 
         `names` maps block hashes to names; other blocks get 12 digits of their hash.
@@ -55,7 +55,7 @@ def name(block_hash: str, names: Mapping[str, str]) -> str:
     return names.get(block_hash, block_hash[:12])
 
 
-def completed_blocks(lines: Iterable[TraceLine], agent_id: int) -> dict[str, str]:
+def completed_blocks(lines: Iterable[HandlerRunLine], agent_id: int) -> dict[str, str]:
     """Return hash -> `<agent>.<ordinal>` for each block that the agent completed in any incarnation."""
     names: dict[str, str] = {}
     for line in lines:

@@ -1,4 +1,4 @@
-"""One archive for all: whoever reads a run, whatever has become of it, is told the same."""
+"""RunArchive: all commands report the same problems of a run, complete or damaged."""
 
 import re
 import shutil
@@ -28,55 +28,55 @@ FILES = [
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def intact_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of three agents in virtual time."""
     asked = scenario(agents=3, duration_s=300, network={"loss": 0.3})
     return run(asked, 3, tmp_path_factory.mktemp("whole") / "run", Silent(), backend="sim").directory
 
 
-def lose(path: Path, _: float) -> None:
+def delete(path: Path, _: float) -> None:
     path.unlink(missing_ok=True)
 
 
-def cut(path: Path, where: float) -> None:
+def truncate(path: Path, where: float) -> None:
     if path.exists():
         content = path.read_bytes()
         path.write_bytes(content[: int(where * len(content))])
 
 
-def cut_at_a_line(path: Path, where: float) -> None:
+def truncate_at_line(path: Path, where: float) -> None:
     if path.exists():
         lines = path.read_bytes().splitlines(keepends=True)
         path.write_bytes(b"".join(lines[: int(where * len(lines))]))
 
 
-def spoil(path: Path, where: float) -> None:
+def corrupt(path: Path, where: float) -> None:
     if path.exists() and (content := bytearray(path.read_bytes())):
         content[int(where * len(content))] ^= 0x15
         path.write_bytes(content)
 
 
-def put_in_the_place_of_the_first(path: Path, _: float) -> None:
+def replace_first_export(path: Path, _: float) -> None:
     if path.exists() and path.parent.name == "agents":
         path.with_name(f"1{path.name[1:]}").write_bytes(path.read_bytes())
 
 
-def of_another_version(path: Path, _: float) -> None:
+def change_schema(path: Path, _: float) -> None:
     if path.exists():
         path.write_bytes(path.read_bytes().replace(b'/1"', b'/9"', 1))
 
 
-DAMAGES = [lose, cut, cut_at_a_line, spoil, put_in_the_place_of_the_first, of_another_version]
+DAMAGES = [delete, truncate, truncate_at_line, corrupt, replace_first_export, change_schema]
 DAMAGE = st.tuples(st.sampled_from(DAMAGES), st.sampled_from(FILES), st.floats(0, 1, exclude_max=True))
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(damages=st.lists(DAMAGE, min_size=1, max_size=3), large=st.booleans())
-def test_all_tools_say_the_same_of_a_damaged_run(
-    whole: Path, tmp_path_factory: pytest.TempPathFactory, damages: list[Any], large: bool
+def test_all_commands_report_the_same_problems_of_a_damaged_run(
+    intact_run: Path, tmp_path_factory: pytest.TempPathFactory, damages: list[Any], large: bool
 ) -> None:
     directory = tmp_path_factory.mktemp("damaged") / "run"
-    shutil.copytree(whole, directory)
+    shutil.copytree(intact_run, directory)
     for damage, name, where in damages:
         damage(directory / name, where)
     with pytest.MonkeyPatch.context() as patch:
@@ -93,7 +93,7 @@ def test_all_tools_say_the_same_of_a_damaged_run(
 
 
 def reported(directory: Path) -> set[str] | None:
-    """What the report says is damaged or missing; None if it refuses a record of another version."""
+    """Return the damaged or missing files that the report names. None if it rejects a record of another version."""
     try:
         remains = read_source(RunArchive(directory, skim=True))
     except RunDirectoryError as error:
@@ -105,61 +105,64 @@ def reported(directory: Path) -> set[str] | None:
 
 
 def logged(directory: Path) -> set[str]:
-    return set(told_by(lambda: logbook.read(RunArchive(directory)).errors))
+    return set(problems_of(lambda: logbook.read(RunArchive(directory)).errors))
 
 
 def compared(directory: Path) -> set[str]:
     ended = "the end of the run is not recorded"
-    return {error for error in told_by(lambda: compare(directory, directory).errors) if ended not in error}
+    return {error for error in problems_of(lambda: compare(directory, directory).errors) if ended not in error}
 
 
-def told_by(ask: Callable[[], list[str]]) -> Iterator[str]:
-    """What a tool tells of a run; one that refuses it has its own sentence."""
+def problems_of(command: Callable[[], list[str]]) -> Iterator[str]:
+    """Yield the problems that a command reports.
+
+    A command that rejects the run raises an error with its own sentence.
+    """
     try:
-        yield from ask()
+        yield from command()
     except HarnessError:
         return
 
 
-def test_a_whole_run_has_neither_problems_nor_gaps(whole: Path) -> None:
-    archive = RunArchive(whole)
+def test_intact_run_has_neither_problems_nor_gaps(intact_run: Path) -> None:
+    archive = RunArchive(intact_run)
     assert (archive.problems, archive.gaps) == ([], [])
     assert archive.roster == [1, 2, 3] == [*archive.traces] == [*archive.exports.by_agent]
 
 
-def test_files_from_the_field_may_have_any_names(whole: Path, tmp_path: Path) -> None:
+def test_archive_reads_exports_with_any_file_name(intact_run: Path, tmp_path: Path) -> None:
     for agent, name in ((1, "1"), (2, "the blue one"), (3, "unnamed (2)")):
         for kind in ("chain.json", "trace.jsonl"):
-            shutil.copy(whole / "agents" / f"{agent}.{kind}", tmp_path / f"{name}.{kind}")
+            shutil.copy(intact_run / "agents" / f"{agent}.{kind}", tmp_path / f"{name}.{kind}")
     archive = RunArchive(tmp_path)
     assert archive.problems == []
     assert [*archive.traces] == [*archive.exports.by_agent] == [1, 2, 3]
 
 
-def test_the_record_is_found_in_whichever_directory_has_it(whole: Path, tmp_path: Path) -> None:
-    shutil.copy(whole / "agents" / "2.chain.json", tmp_path)
-    (whole / "agents" / "2.chain.json").rename(moved := whole / "agents" / "2.chain.away")
+def test_archive_finds_the_record_in_any_given_directory(intact_run: Path, tmp_path: Path) -> None:
+    shutil.copy(intact_run / "agents" / "2.chain.json", tmp_path)
+    (intact_run / "agents" / "2.chain.json").rename(moved := intact_run / "agents" / "2.chain.away")
     try:
-        archive = RunArchive(tmp_path, whole)
+        archive = RunArchive(tmp_path, intact_run)
         assert archive.recorded
-        assert archive.directory == whole
+        assert archive.directory == intact_run
         assert [*archive.exports.by_agent] == [*archive.traces] == [1, 2, 3]
     finally:
-        moved.rename(whole / "agents" / "2.chain.json")
+        moved.rename(intact_run / "agents" / "2.chain.json")
 
 
-def test_a_run_without_a_record_is_reported_with_whoever_left_a_trace(whole: Path, tmp_path: Path) -> None:
+def test_report_of_run_without_record_lists_agents_with_traces(intact_run: Path, tmp_path: Path) -> None:
     directory = tmp_path / "run"
-    shutil.copytree(whole, directory)
+    shutil.copytree(intact_run, directory)
     (directory / "run.json").write_text("{")
     (directory / "agents" / "3.trace.jsonl").rename(directory / "agents" / "another name.trace.jsonl")
     (directory / "agents" / "3.chain.json").unlink()
     assert write_report(RunArchive(directory)).exists()
 
 
-def test_what_skimming_leaves_out_is_told_all_the_same(whole: Path, tmp_path: Path) -> None:
+def test_skimmed_archive_reports_the_same_problems(intact_run: Path, tmp_path: Path) -> None:
     directory = tmp_path / "run"
-    shutil.copytree(whole, directory)
+    shutil.copytree(intact_run, directory)
     trace = directory / "agents" / "2.trace.jsonl"
     lines = trace.read_bytes().splitlines(keepends=True)
     taken_in = next(number for number, line in enumerate(lines) if b'"changes":[],' in line and b'"receive_' in line)
@@ -174,22 +177,22 @@ def test_what_skimming_leaves_out_is_told_all_the_same(whole: Path, tmp_path: Pa
         assert len(skimmed.traces[1].runs) < len(read.traces[1].runs)
 
 
-def noting(reader: Callable[..., Any], read: list[object]) -> Callable[..., Any]:
-    """The reader, which notes what it is asked for."""
+def recording(reader: Callable[..., Any], read: list[object]) -> Callable[..., Any]:
+    """Return the reader in a wrapper that records each path it reads."""
 
-    def reads(what: Any, **options: Any) -> Any:
+    def recorded(what: Any, **options: Any) -> Any:
         what = what if isinstance(what, Path) else tuple(what)
         read.append(what)
         return reader(what, **options)
 
-    return reads
+    return recorded
 
 
-def test_each_file_is_read_once(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_archive_reads_each_file_once(intact_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[object] = []
     for reader in ("read_trace", "read_record", "read_exports"):
-        monkeypatch.setattr(archive_module, reader, noting(getattr(archive_module, reader), read))
-    archive = RunArchive(whole)
+        monkeypatch.setattr(archive_module, reader, recording(getattr(archive_module, reader), read))
+    archive = RunArchive(intact_run)
     checker.check(checker.gather(archive))
     remains = read_source(archive)
     assert remains.traces

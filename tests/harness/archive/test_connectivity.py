@@ -1,4 +1,4 @@
-"""Who could reach whom, from the record of a network's changes."""
+"""Connectivity: links and components of vehicles follow from the recorded changes of the network."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ def network(directory: Path, *lines: dict[str, Any], vehicles: int = 4) -> Conne
     return read_connectivity(directory / NETWORK_FILE, range(1, vehicles + 1))
 
 
-def told(connectivity: Connectivity) -> list[tuple[float, str, str]]:
+def states_of(connectivity: Connectivity) -> list[tuple[float, str, str]]:
     return [(state.at_s, state.what, in_words(state.components)) for state in connectivity.states]
 
 
@@ -31,33 +31,33 @@ def partition(at_s: float, *groups: list[int]) -> dict[str, Any]:
     return {"at_s": at_s, "what": "partition", "asked": {**ALL, "partition": list(groups)}}
 
 
-def test_a_partition_parts_and_a_heal_joins(tmp_path: Path) -> None:
+def test_partition_separates_and_heal_joins_components(tmp_path: Path) -> None:
     heal = {"at_s": 20.0, "what": "heal", "asked": ALL}
     found = network(tmp_path, partition(10.0, [1, 2]), heal)
-    assert told(found) == [(0.0, "start", "1 2 3 4"), (10.0, "partition", "1 2 | 3 4"), (20.0, "heal", "1 2 3 4")]
+    assert states_of(found) == [(0.0, "start", "1 2 3 4"), (10.0, "partition", "1 2 | 3 4"), (20.0, "heal", "1 2 3 4")]
     assert found.links(9.9) == [(1, 2), (1, 3), (1, 4), (2, 3), (2, 4), (3, 4)]
     assert found.links(10.0) == [(1, 2), (3, 4)]
     assert len(found.links(20.0)) == 6
 
 
-def test_what_lasts_no_time_is_no_state(tmp_path: Path) -> None:
+def test_state_without_duration_is_left_out(tmp_path: Path) -> None:
     heal = {"at_s": 10.0, "what": "heal", "asked": ALL}
-    assert told(network(tmp_path, partition(10.0, [1, 2]), heal)) == [(0.0, "start", "1 2 3 4")]
-    assert told(network(tmp_path, out_of_range(0.0, "1-2", "1-3", "1-4"))) == [(0.0, "range", "2 3 4 | 1")]
+    assert states_of(network(tmp_path, partition(10.0, [1, 2]), heal)) == [(0.0, "start", "1 2 3 4")]
+    assert states_of(network(tmp_path, out_of_range(0.0, "1-2", "1-3", "1-4"))) == [(0.0, "range", "2 3 4 | 1")]
 
 
-def test_through_others_is_connected_too_and_loss_alone_cuts_nothing(tmp_path: Path) -> None:
+def test_relayed_vehicles_are_connected_and_loss_cuts_no_link(tmp_path: Path) -> None:
     found = network(tmp_path, out_of_range(5.0, "1-3", "1-4", "2-4"), out_of_range(9.0, "1-2", loss=0.99))
-    assert told(found) == [(0.0, "start", "1 2 3 4")]
+    assert states_of(found) == [(0.0, "start", "1 2 3 4")]
     assert found.links(9.0) == [(1, 2), (2, 3), (3, 4)]
 
 
-def test_a_link_that_is_dead_in_one_direction_is_none(tmp_path: Path) -> None:
+def test_pair_without_one_direction_has_no_link(tmp_path: Path) -> None:
     asked = {**ALL, "links": {f"1>{other}": {"loss": 1.0} for other in (2, 3, 4)}}
-    assert told(network(tmp_path, {"at_s": 3.0, "what": "schedule", "asked": asked}))[-1][2] == "2 3 4 | 1"
+    assert states_of(network(tmp_path, {"at_s": 3.0, "what": "schedule", "asked": asked}))[-1][2] == "2 3 4 | 1"
 
 
-def test_a_partition_holds_while_vehicles_come_into_range_and_go(tmp_path: Path) -> None:
+def test_partition_lasts_while_vehicles_enter_and_leave_range(tmp_path: Path) -> None:
     both = {**ALL, "partition": [[1]], "links": {"1>4": {"loss": 1.0}}}
     found = network(
         tmp_path,
@@ -66,10 +66,10 @@ def test_a_partition_holds_while_vehicles_come_into_range_and_go(tmp_path: Path)
         out_of_range(15.0, "1-4", loss=0.0),
         {"at_s": 20.0, "what": "heal", "asked": ALL},
     )
-    assert told(found)[1:] == [(10.0, "partition", "2 3 4 | 1"), (20.0, "heal", "1 2 3 4")]
+    assert states_of(found)[1:] == [(10.0, "partition", "2 3 4 | 1"), (20.0, "heal", "1 2 3 4")]
 
 
-def test_what_the_scenario_cuts_stays_cut_when_it_comes_into_range(tmp_path: Path) -> None:
+def test_scripted_cut_lasts_when_the_pair_enters_range(tmp_path: Path) -> None:
     deaf = {**ALL, "links": {f"1>{other}": {"loss": 1.0} for other in (2, 3, 4)}}
     found = network(
         tmp_path,
@@ -77,20 +77,20 @@ def test_what_the_scenario_cuts_stays_cut_when_it_comes_into_range(tmp_path: Pat
         {"at_s": 10.0, "what": "loss", "asked": deaf},
         out_of_range(15.0, "1-2", "1-3", "1-4", loss=0.0),
     )
-    assert [state[2] for state in told(found)] == ["1 2 3 4", "2 3 4 | 1"]
+    assert [state[2] for state in states_of(found)] == ["1 2 3 4", "2 3 4 | 1"]
 
 
-def test_the_final_reconcile_does_away_with_range(tmp_path: Path) -> None:
+def test_final_reconcile_ignores_radio_range(tmp_path: Path) -> None:
     heard_again = {"1-2": 0.0, "1-3": 0.0, "1-4": 0.0}
     found = network(
         tmp_path,
         out_of_range(5.0, "1-2", "1-3", "1-4"),
         {"at_s": 30.0, "what": "final reconcile", "asked": ALL, "losses": heard_again},
     )
-    assert told(found)[1:] == [(5.0, "range", "2 3 4 | 1"), (30.0, "final reconcile", "1 2 3 4")]
+    assert states_of(found)[1:] == [(5.0, "range", "2 3 4 | 1"), (30.0, "final reconcile", "1 2 3 4")]
 
 
-def test_a_lost_vehicle_connects_nobody_until_another_takes_its_place(tmp_path: Path) -> None:
+def test_lost_vehicle_has_no_links_until_its_replacement(tmp_path: Path) -> None:
     found = network(
         tmp_path,
         out_of_range(5.0, "1-3", "1-4", "2-4"),
@@ -99,7 +99,7 @@ def test_a_lost_vehicle_connects_nobody_until_another_takes_its_place(tmp_path: 
         {"at_s": 30.0, "what": "reboot", "agents": [3]},
         {"at_s": 40.0, "what": "kill", "agents": [2, 1]},
     )
-    assert told(found)[1:] == [
+    assert states_of(found)[1:] == [
         (10.0, "crash", "3 4 | 1"),
         (20.0, "restart", "1 2 3 4"),
         (40.0, "kill", "3 4"),
@@ -110,8 +110,8 @@ def test_a_lost_vehicle_connects_nobody_until_another_takes_its_place(tmp_path: 
     assert found.reboots == [(30.0, 3)]
 
 
-def test_what_a_flight_made_of_the_network_is_what_the_run_said_of_it(tmp_path: Path) -> None:
-    """Against the words that the run itself recorded, while five fly apart and together under a partition."""
+def test_flight_changes_agree_with_the_recorded_details(tmp_path: Path) -> None:
+    """Compare with the details in run.json, while five vehicles fly apart and together during a partition."""
     scenario = Scenario.model_validate(
         {
             "name": "pulse",
@@ -127,9 +127,9 @@ def test_what_a_flight_made_of_the_network_is_what_the_run_said_of_it(tmp_path: 
     write_flight(tmp_path, scenario, ways, 300)
     found = read_connectivity(tmp_path / NETWORK_FILE, ways)
     lines = [json.loads(line) for line in (tmp_path / NETWORK_FILE).read_text().splitlines()]
-    said = {line["at_s"]: line["detail"] for line in lines if line["what"] == "range"}
-    assert len(set(said.values())) > 4
-    for at_s, detail in said.items():
+    details = {line["at_s"]: line["detail"] for line in lines if line["what"] == "range"}
+    assert len(set(details.values())) > 4
+    for at_s, detail in details.items():
         state = [state for state in found.states if state.at_s <= at_s][-1]
         assert in_words(state.components) == detail
 
@@ -152,14 +152,14 @@ def test_what_a_flight_made_of_the_network_is_what_the_run_said_of_it(tmp_path: 
         json.dumps({"at_s": 1, "what": "x" * 1000}),
     ],
 )
-def test_a_damaged_line_is_left_out_and_said(tmp_path: Path, damaged: str) -> None:
+def test_damaged_line_is_left_out_and_reported(tmp_path: Path, damaged: str) -> None:
     start = json.dumps({"at_s": 0, "what": "start", "asked": ALL})
     (tmp_path / NETWORK_FILE).write_text("\n".join([start, damaged, json.dumps(partition(2.0, [1]))]))
     found = read_connectivity(tmp_path / NETWORK_FILE, [1, 2])
-    assert told(found) == [(0.0, "start", "1 2"), (2.0, "partition", "1 | 2")]
+    assert states_of(found) == [(0.0, "start", "1 2"), (2.0, "partition", "1 | 2")]
     assert found.problems == ["network.jsonl: 1 damaged or unknown line is left out"]
 
 
-def test_a_record_that_does_not_begin_with_conditions_says_nothing(tmp_path: Path) -> None:
+def test_record_without_initial_conditions_has_no_states(tmp_path: Path) -> None:
     write_lines(tmp_path / NETWORK_FILE, [out_of_range(5.0, "1-2")])
     assert read_connectivity(tmp_path / NETWORK_FILE, [1, 2]).states == []

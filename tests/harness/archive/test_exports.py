@@ -1,4 +1,4 @@
-"""Exports from the field: each bad one gets one clear sentence, and the rest are read."""
+"""Exports from the field: each unusable file gives one sentence, and the others are read."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ def paths(air: Air, tmp_path: Path) -> list[Path]:
     return write_exports(air, tmp_path, traces=False)
 
 
-def test_what_an_agent_exports_is_read_back(air: Air, paths: list[Path]) -> None:
+def test_reader_restores_the_written_export(air: Air, paths: list[Path]) -> None:
     exports = read_exports(paths)
     assert not exports.errors
     assert list(exports.by_agent) == [1, 2, 3]
@@ -47,9 +47,7 @@ def test_what_an_agent_exports_is_read_back(air: Air, paths: list[Path]) -> None
         (lambda text: json.dumps({**json.loads(text), "completed": ["xyz"]}), "`completed.0` is wrong"),
     ],
 )
-def test_a_damaged_export_is_told_in_one_sentence_and_the_rest_are_read(
-    paths: list[Path], damage, sentence: str
-) -> None:
+def test_damaged_export_is_reported_and_others_are_read(paths: list[Path], damage, sentence: str) -> None:
     paths[0].write_text(damage(paths[0].read_text()))
     exports = read_exports(paths)
     assert list(exports.by_agent) == [2, 3]
@@ -59,12 +57,12 @@ def test_a_damaged_export_is_told_in_one_sentence_and_the_rest_are_read(
     assert "\n" not in error
 
 
-def test_fields_that_this_version_does_not_know_are_ignored(paths: list[Path]) -> None:
+def test_reader_ignores_unknown_fields(paths: list[Path]) -> None:
     edit(paths[0], lambda export: export.update(signature="..."))
     assert read_export(paths[0]).agent_id == 1
 
 
-def test_an_export_of_another_mission_is_left_out(paths: list[Path], tmp_path: Path) -> None:
+def test_export_of_another_mission_is_left_out(paths: list[Path], tmp_path: Path) -> None:
     other = Air([1, 2, 3, 4])
     other.agents[4].state.chain.__init__(type(other.agents[4].state.chain.inception)(b"another mission"))
     stranger = write_exports(other, tmp_path / "other", traces=False)[3]
@@ -74,7 +72,7 @@ def test_an_export_of_another_mission_is_left_out(paths: list[Path], tmp_path: P
     assert "agent 4 belongs to another mission" in error
 
 
-def test_the_same_export_twice_counts_once(paths: list[Path], tmp_path: Path) -> None:
+def test_duplicate_export_counts_once(paths: list[Path], tmp_path: Path) -> None:
     copy = tmp_path / "copy.chain.json"
     copy.write_bytes(paths[1].read_bytes())
     exports = read_exports([*paths, copy])
@@ -83,7 +81,7 @@ def test_the_same_export_twice_counts_once(paths: list[Path], tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("later_first", [False, True])
-def test_of_two_exports_of_one_agent_the_later_is_used_and_the_other_told(
+def test_later_of_two_exports_is_used_and_the_other_reported(
     paths: list[Path], tmp_path: Path, later_first: bool
 ) -> None:
     later = tmp_path / "later.chain.json"
@@ -95,7 +93,7 @@ def test_of_two_exports_of_one_agent_the_later_is_used_and_the_other_told(
     assert error.startswith(str(paths[1]))
 
 
-def test_a_file_that_cannot_be_read_is_told(tmp_path: Path) -> None:
+def test_unreadable_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="cannot be read"):
         read_export(tmp_path / "nowhere.chain.json")
     binary = tmp_path / "binary.chain.json"
@@ -112,7 +110,7 @@ json_values = st.recursive(
 
 
 @given(field=st.sampled_from([field.alias or name for name, field in Export.model_fields.items()]), value=json_values)
-def test_any_value_in_any_field_is_read_or_refused_and_nothing_worse(
+def test_any_value_in_any_field_is_read_or_rejected(
     tmp_path_factory: pytest.TempPathFactory, field: str, value: object
 ) -> None:
     path = tmp_path_factory.mktemp("exports") / "1.chain.json"
@@ -124,7 +122,7 @@ def test_any_value_in_any_field_is_read_or_refused_and_nothing_worse(
         assert "\n" not in str(error)
 
 
-def test_blocks_are_named_by_their_agent_s_order_even_if_its_export_is_missing(paths: list[Path]) -> None:
+def test_block_names_follow_the_order_of_agents_without_exports(paths: list[Path]) -> None:
     everything = name_blocks(read_exports(paths).by_agent)
     completed = read_export(paths[1]).completed
     assert [everything[block_hash] for block_hash in completed] == [f"2.{n}" for n in range(1, len(completed) + 1)]

@@ -1,4 +1,4 @@
-"""The course of a run: known runs have known votes, reconciles and messages, and the spread is what chains say."""
+"""History and replication: votes, reconciles and messages of known runs, and the spread of blocks over time."""
 
 from pathlib import Path
 from typing import Any
@@ -6,9 +6,8 @@ from typing import Any
 import pytest
 
 from harness.archive import archive
-from harness.archive import history as told
 from harness.archive.archive import RunArchive
-from harness.archive.history import Message, Phase, Reconcile, Tie, Vote, end_of_traces, history_of
+from harness.archive.history import CUT_SHORT, Message, Phase, Reconcile, Tie, Vote, end_of_traces, history_of
 from harness.archive.replication import Replication, replication_of
 from harness.archive.run_record import FaultRecord
 from harness.archive.traces import Header, Trace
@@ -39,7 +38,7 @@ ROUGH: dict[str, Any] = {
 }
 
 
-def played(name: str) -> Simulated:
+def simulated_run(name: str) -> Simulated:
     return simulate(load_scenario(SCENARIOS / f"{name}.yaml"), 1, tracing=True)
 
 
@@ -48,22 +47,22 @@ def faults(simulated: Simulated) -> list[FaultRecord]:
     return simulated.evidence.record.faults
 
 
-def a_run(at_s: float, handler: str, branch: str = "", **keys: Any) -> HandlerRun:
+def handler_run(at_s: float, handler: str, branch: str = "", **keys: Any) -> HandlerRun:
     state = StateSummary(0, 0, 0, reconciling=False, idle=True, top="")
     given = {"trigger": EventTrigger(1), "changes": [], "sent": [], **keys}
     return HandlerRun(at_s, handler, 1, branch=branch, state=state, **given)
 
 
-def a_trace(agent: int, *lives: list[HandlerRun]) -> Trace:
+def trace_of(agent: int, *incarnations: list[HandlerRun]) -> Trace:
     trace = Trace(Header(agent_id=agent, roster=[1, 2, 3], settings={}, clock={}))
-    for number, life in enumerate(lives):
+    for number, life in enumerate(incarnations):
         trace.starts += [len(trace.runs)] if number else []
         trace.runs += life
     return trace
 
 
-def test_a_tie_has_its_votes_and_the_phases_of_its_reconciles() -> None:
-    simulated = played("forced_tie")
+def test_tie_has_votes_and_phases_of_both_reconciles() -> None:
+    simulated = simulated_run("forced_tie")
     traces, names = simulated.evidence.traces, simulated.evidence.names
     found = history_of(traces, faults(simulated), end_of_traces(traces))
     assert [(vote.agent, names[vote.block], vote.start_s, vote.end_s, vote.outcome) for vote in found.votes] == [
@@ -84,8 +83,8 @@ def test_a_tie_has_its_votes_and_the_phases_of_its_reconciles() -> None:
     assert len(found.reconciles) == simulated.result.figures["reconciles"]
 
 
-def test_a_lost_commit_is_a_message_that_one_agent_did_not_handle() -> None:
-    simulated = played("lost_last_commit")
+def test_lost_commit_lacks_the_receipt_of_one_agent() -> None:
+    simulated = simulated_run("lost_last_commit")
     traces, names = simulated.evidence.traces, simulated.evidence.names
     found = history_of(traces, [], end_of_traces(traces))
     assert found.messages is not None
@@ -101,30 +100,35 @@ def test_a_lost_commit_is_a_message_that_one_agent_did_not_handle() -> None:
     assert (2, "4.2") not in how
 
 
-def test_what_a_loss_cuts_short_ends_with_it_and_the_rest_with_the_run() -> None:
-    proposed = a_run(5.0, "process_next_deque_block", "proposed", sent=[Sent("Block Add Request", 0, "aa")])
+def test_vote_ends_at_the_loss_or_at_the_end_of_the_run() -> None:
+    proposed = handler_run(5.0, "process_next_deque_block", "proposed", sent=[Sent("Block Add Request", 0, "aa")])
     begun = [
-        a_run(6.0, "reconcile_begin", "begun", trigger=OperatorTrigger("reconcile")),
-        a_run(6.0, "reconcile_phase_1"),
+        handler_run(6.0, "reconcile_begin", "begun", trigger=OperatorTrigger("reconcile")),
+        handler_run(6.0, "reconcile_phase_1"),
     ]
-    traces = {1: a_trace(1, [proposed, *begun], [a_run(30.0, "process_next_deque_block", "proposed")])}
+    traces = {1: trace_of(1, [proposed, *begun], [handler_run(30.0, "process_next_deque_block", "proposed")])}
     found = history_of(traces, [FaultRecord(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
-    assert found.votes == [Vote(1, "aa", 5.0, 8.0, told.CUT_SHORT), Vote(1, "", 30.0, 50.0, told.CUT_SHORT)]
+    assert found.votes == [
+        Vote(1, "aa", 5.0, 8.0, CUT_SHORT),
+        Vote(1, "", 30.0, 50.0, CUT_SHORT),
+    ]
     phases = [Phase("phase 1", 6.0, 8.0, 1)]
     assert found.reconciles == [Reconcile(1, 6.0, 8.0, "asked by the operator", phases, done=False)]
 
 
-def test_what_an_agent_still_did_while_it_was_killed_ends_at_its_next_life_at_the_latest() -> None:
-    proposed = [a_run(at_s, "process_next_deque_block", "proposed") for at_s in (8.2, 30.0)]
-    traces = {1: a_trace(1, [proposed[0]], [proposed[1]])}
+def test_vote_of_killed_agent_ends_before_its_next_incarnation() -> None:
+    proposed = [handler_run(at_s, "process_next_deque_block", "proposed") for at_s in (8.2, 30.0)]
+    traces = {1: trace_of(1, [proposed[0]], [proposed[1]])}
     found = history_of(traces, [FaultRecord(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
     assert [(vote.start_s, vote.end_s) for vote in found.votes] == [(8.2, 30.0), (30.0, 50.0)]
 
 
-def test_a_message_is_of_the_life_that_sent_it() -> None:
-    sends = [[a_run(at_s, "build_data_block", sent=[Sent("Commit Block", 0, None)])] for at_s in (1.0, 20.0)]
-    hears = [a_run(at_s, "receive_commit_block", trigger=MessageTrigger("Commit Block", 1, 0)) for at_s in (2.0, 21.0)]
-    found = history_of({1: a_trace(1, *sends), 2: a_trace(2, hears)}, [], 30.0)
+def test_receipt_belongs_to_the_sending_incarnation() -> None:
+    sends = [[handler_run(at_s, "build_data_block", sent=[Sent("Commit Block", 0, None)])] for at_s in (1.0, 20.0)]
+    hears = [
+        handler_run(at_s, "receive_commit_block", trigger=MessageTrigger("Commit Block", 1, 0)) for at_s in (2.0, 21.0)
+    ]
+    found = history_of({1: trace_of(1, *sends), 2: trace_of(2, hears)}, [], 30.0)
     assert found.messages == [
         Message(1, 1.0, "Commit Block", None, [(2, 2.0)]),
         Message(1, 20.0, "Commit Block", None, [(2, 21.0)]),
@@ -132,9 +136,9 @@ def test_a_message_is_of_the_life_that_sent_it() -> None:
 
 
 @pytest.mark.parametrize("at_s", [float("nan"), float("inf"), -1.0, 1e300])
-def test_a_handler_run_without_a_possible_time_is_left_out(at_s: float) -> None:
-    commit = a_run(at_s, "receive_commit_block", changes=[("complete", "aa"), ("chain+", "aa")])
-    traces = {1: a_trace(1, [a_run(1.0, "build_data_block"), commit])}
+def test_handler_run_with_impossible_time_is_left_out(at_s: float) -> None:
+    commit = handler_run(at_s, "receive_commit_block", changes=[("complete", "aa"), ("chain+", "aa")])
+    traces = {1: trace_of(1, [handler_run(1.0, "build_data_block"), commit])}
     assert history_of(traces, [], end_of_traces(traces)).commits == []
     assert replication_of(traces, []) == [Replication(0.0, 0, 0, 1, None, None)]
     assert end_of_traces(traces) == 1.0
@@ -142,7 +146,7 @@ def test_a_handler_run_without_a_possible_time_is_left_out(at_s: float) -> None:
 
 @pytest.mark.parametrize("final_reconcile", [False, True])
 @pytest.mark.parametrize("seed", range(4))
-def test_in_the_end_the_spread_is_what_the_checker_says(seed: int, final_reconcile: bool) -> None:
+def test_replication_at_the_end_equals_the_checker_figures(seed: int, final_reconcile: bool) -> None:
     simulated = simulate(scenario(**ROUGH, final_reconcile=final_reconcile), seed, tracing=True)
     end, figures = replication_of(simulated.evidence.traces, faults(simulated))[-1], simulated.result.figures
     assert end.copies_mean is not None
@@ -155,7 +159,7 @@ def test_in_the_end_the_spread_is_what_the_checker_says(seed: int, final_reconci
     }.items() <= figures.items()
 
 
-def test_at_every_moment_the_spread_is_that_of_the_chains_replayed() -> None:
+def test_replication_equals_the_replayed_chains_at_every_moment() -> None:
     simulated = simulate(scenario(agents=5, duration_s=900, network={"loss": 0.3}), 3, tracing=True)
     traces = simulated.evidence.traces
     chains: dict[int, list[str]] = {agent: [] for agent in traces}
@@ -187,13 +191,13 @@ def test_at_every_moment_the_spread_is_that_of_the_chains_replayed() -> None:
 
 
 def changes(at_s: float, *operations: str) -> HandlerRun:
-    """A handler run with changes such as "chain+ aa"."""
-    return a_run(at_s, "", changes=[(one.split()[0], one.split()[1]) for one in operations])
+    """Return a handler run with changes such as "chain+ aa"."""
+    return handler_run(at_s, "", changes=[(one.split()[0], one.split()[1]) for one in operations])
 
 
-def test_the_mutual_chain_shrinks_when_one_agent_takes_blocks_off() -> None:
+def test_mutual_chain_shrinks_when_an_agent_removes_blocks() -> None:
     both = [changes(1.0, "chain+ aa"), changes(2.0, "chain+ bb")]
-    traces = {1: a_trace(1, both), 2: a_trace(2, [*both, changes(3.0, "chain- bb"), changes(4.0, "chain+ cc")])}
+    traces = {1: trace_of(1, both), 2: trace_of(2, [*both, changes(3.0, "chain- bb"), changes(4.0, "chain+ cc")])}
     assert [
         (one.at_s, one.mutual_chain, one.longest_chain, one.distinct_chains) for one in replication_of(traces, [])
     ] == [
@@ -205,9 +209,9 @@ def test_the_mutual_chain_shrinks_when_one_agent_takes_blocks_off() -> None:
 
 
 @pytest.mark.parametrize(("disk", "copies"), [("lost", [2, 1, 1, 2]), ("kept", [2, 2, 2, 2])])
-def test_what_is_on_a_lost_disk_is_no_copy_any_more(disk: Any, copies: list[int]) -> None:
+def test_block_on_a_lost_disk_is_no_copy(disk: Any, copies: list[int]) -> None:
     first, again = changes(1.0, "complete aa", "chain+ aa"), changes(9.0, "chain+ aa")
-    traces = {1: a_trace(1, [first], [again]), 2: a_trace(2, [changes(1.0, "chain+ aa")])}
+    traces = {1: trace_of(1, [first], [again]), 2: trace_of(2, [changes(1.0, "chain+ aa")])}
     downs = [
         FaultRecord(at_s=at_s, what=what, detail="", agents=[1], disk=disk)
         for at_s, what in ((5.0, "reboot"), (7.0, "boot"))
@@ -216,7 +220,7 @@ def test_what_is_on_a_lost_disk_is_no_copy_any_more(disk: Any, copies: list[int]
     assert [[one for one in found if one.at_s <= at_s][-1].copies_min for at_s in (1.0, 5.0, 7.0, 9.0)] == copies
 
 
-def test_large_traces_tell_the_same_without_the_messages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_skimmed_large_traces_give_the_same_history(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ran = run(scenario(**ROUGH), 5, tmp_path / "run", Silent(), backend="sim")
     all_of_it = RunArchive(ran.directory)
     whole = all_of_it.traces
@@ -236,7 +240,7 @@ def test_large_traces_tell_the_same_without_the_messages(tmp_path: Path, monkeyp
     assert replication_of(whole, []) == replication_of(part, [])
 
 
-def test_a_trace_that_is_none_or_not_of_this_run_is_left_out_in_one_sentence(tmp_path: Path) -> None:
+def test_invalid_or_foreign_trace_is_left_out_and_reported(tmp_path: Path) -> None:
     ran = run(scenario(agents=3, duration_s=60), 1, tmp_path / "run", Silent(), backend="sim")
     agents = ran.directory / "agents"
     (agents / "8.trace.jsonl").write_text("[" * 100_000)

@@ -1,4 +1,4 @@
-"""Captures of several vehicles put together: who received what, who lost it, who answered, and who forged."""
+"""Joined captures: receivers, losses, answers and forgeries of each datagram."""
 
 from collections import Counter
 from pathlib import Path
@@ -42,7 +42,7 @@ def read(*paths: Path) -> Read:
     return read_captures(capture_files(paths))
 
 
-def joined(scene: Scene, path: Path, *without: int) -> list[Transmission]:
+def transmissions_of(scene: Scene, path: Path, *without: int) -> list[Transmission]:
     return join(read(scene.write(path / "run", *without)))
 
 
@@ -51,8 +51,8 @@ def received(one: Transmission) -> dict[int | str, tuple[float, int]]:
 
 
 @pytest.fixture(scope="module")
-def flown() -> tuple[Air, Captures]:
-    """Agents that lose 15 % of what they should hear, hear some of it twice, and reconcile."""
+def finished_flight() -> tuple[Air, Captures]:
+    """Play five agents that lose 15 % of their messages, receive some twice, and reconcile."""
     rng = Random(3)
     once = uniform_latency(rng, loss=0.15)
     air = Air(range(1, 6), lambda *delivery: once(*delivery) * (1 + (rng.random() < 0.1)))
@@ -65,15 +65,15 @@ def flown() -> tuple[Air, Captures]:
 
 
 @pytest.fixture(scope="module")
-def run_dir(flown: tuple[Air, Captures], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    air, captures = flown
+def run_dir(finished_flight: tuple[Air, Captures], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    air, captures = finished_flight
     run = captures.write(tmp_path_factory.mktemp("packets") / "run")
     write_exports(air, run / "agents")
     return run
 
 
-def test_every_loss_is_named_and_nothing_else(flown: tuple[Air, Captures], run_dir: Path) -> None:
-    _, truth = flown
+def test_losses_are_exactly_those_of_the_medium(finished_flight: tuple[Air, Captures], run_dir: Path) -> None:
+    _, truth = finished_flight
     found = join(read(run_dir))
     datagrams = {(int.from_bytes(data[4:8], "big"), int.from_bytes(data[8:12], "big")): data for data in truth.sent}
     assert {(datagrams[one.sender, one.sequence], name) for one in found for name in one.lost_by} == truth.lost()
@@ -90,9 +90,9 @@ def test_every_loss_is_named_and_nothing_else(flown: tuple[Air, Captures], run_d
     ]
 
 
-def test_every_response_is_matched_to_what_its_agent_answered(flown: tuple[Air, Captures], run_dir: Path) -> None:
-    """The agents' traces say which message made an agent send what."""
-    air, _ = flown
+def test_each_response_matches_the_request_in_the_trace(finished_flight: tuple[Air, Captures], run_dir: Path) -> None:
+    """Compare with the agents' traces, which record the message that triggered each response."""
+    air, _ = finished_flight
     found = join(read(run_dir))
     exchanges = Exchanges(found)
     matched = {
@@ -111,13 +111,13 @@ def test_every_response_is_matched_to_what_its_agent_answered(flown: tuple[Air, 
     assert matched == traced
 
 
-def test_a_request_shows_who_answered_and_why_others_did_not(tmp_path: Path) -> None:
+def test_request_has_an_outcome_for_each_vehicle(tmp_path: Path) -> None:
     scene = Scene(1, 2, 3, 4, 5)
     scene.send(10, 1, PROPOSAL, {2: 0.01, 3: 0.01, 4: 0.01})
     scene.send(10.02, 2, APPROVE)
     scene.send(10.03, 3, DISAPPROVE, {2: 0.01})
     scene.ends(20)
-    request, *responses = joined(scene, tmp_path)
+    request, *responses = transmissions_of(scene, tmp_path)
     answers = Exchanges([request, *responses]).answers(request)
     assert [(answer.by, answer.outcome) for answer in answers] == [
         (2, "answered"),
@@ -133,7 +133,7 @@ def test_a_request_shows_who_answered_and_why_others_did_not(tmp_path: Path) -> 
     ]
 
 
-def test_each_kind_of_request_has_its_response(tmp_path: Path) -> None:
+def test_each_type_of_request_matches_its_response(tmp_path: Path) -> None:
     scene = Scene(1, 2)
     pairs = [
         (PROPOSAL, APPROVE),
@@ -146,38 +146,41 @@ def test_each_kind_of_request_has_its_response(tmp_path: Path) -> None:
         scene.send(number, 1, request)
         scene.send(number + 0.02, 2, response)
     scene.ends(10)
-    found = joined(scene, tmp_path)
+    found = transmissions_of(scene, tmp_path)
     exchanges = Exchanges(found)
     assert [exchanges.responses(one) for one in found[::2]] == [[one] for one in found[1::2]]
 
 
-def test_a_response_answers_the_last_request_that_reached_its_agent(tmp_path: Path) -> None:
-    """Agents 1 and 3 ask the same; 2 does not answer the first time, and only 3's second request reaches it."""
+def test_response_answers_the_last_received_request(tmp_path: Path) -> None:
+    """Let agents 1 and 3 send equal requests.
+
+    Agent 2 does not answer the first one, and only receives the second one of 3.
+    """
     scene = Scene(1, 2, 3)
     scene.send(1, 3, QUERY)
     scene.send(2, 1, QUERY, {3: 0.01})
     scene.send(3, 3, QUERY)
     scene.send(3.02, 2, ChainContainResponse(CHAIN, True))
     scene.ends(10)
-    found = joined(scene, tmp_path)
+    found = transmissions_of(scene, tmp_path)
     exchanges = Exchanges(found)
     assert [len(exchanges.responses(one)) for one in found] == [0, 0, 1, 0]
     assert [answer.outcome for answer in exchanges.answers(found[1])] == ["request lost", "no answer"]
 
 
-def test_requests_that_come_at_once_are_answered_in_their_order(tmp_path: Path) -> None:
+def test_simultaneous_requests_are_answered_in_order(tmp_path: Path) -> None:
     scene = Scene(1, 2, 3)
     scene.send(1, 1, QUERY)
     scene.send(1.001, 3, QUERY, {2: 0.01})
     scene.send(1.02, 2, ChainContainResponse(CHAIN, True))
     scene.send(1.021, 2, ChainContainResponse(CHAIN, True))
     scene.ends(10)
-    found = joined(scene, tmp_path)
+    found = transmissions_of(scene, tmp_path)
     exchanges = Exchanges(found)
     assert [exchanges.responses(one) for one in found[:2]] == [[found[2]], [found[3]]]
 
 
-def test_a_request_that_came_twice_is_answered_twice(tmp_path: Path) -> None:
+def test_duplicated_request_is_answered_twice(tmp_path: Path) -> None:
     scene = Scene(1, 2)
     scene.send(0, 1, QUERY)
     scene.send(1, 1, QUERY, {2: [0.01, 0.5]})
@@ -186,83 +189,83 @@ def test_a_request_that_came_twice_is_answered_twice(tmp_path: Path) -> None:
     scene.send(1.22, 2, ChainContainResponse(CHAIN, True))
     scene.send(1.52, 2, ChainContainResponse(CHAIN, True))
     scene.ends(10)
-    found = joined(scene, tmp_path)
+    found = transmissions_of(scene, tmp_path)
     _, twice, first, again, second, third = found
     assert received(twice) == {2: (1.01, 2)}
     exchanges = Exchanges(found)
     assert [exchanges.responses(one) for one in (twice, again)] == [[first, third], [second]]
 
 
-def test_without_a_capture_an_agent_answers_the_last_that_another_asked(tmp_path: Path) -> None:
+def test_uncaptured_agent_answers_the_last_request_of_another(tmp_path: Path) -> None:
     scene = Scene(1, 2, 3)
     scene.send(1, 1, QUERY)
     scene.send(2, 3, QUERY)
     scene.send(3, 3, ChainContainResponse(CHAIN, True))
     scene.ends(10)
-    found = joined(scene, tmp_path, 3)
+    found = transmissions_of(scene, tmp_path, 3)
     assert [len(Exchanges(found).responses(one)) for one in found] == [1, 0, 0]
 
 
-def test_what_an_agent_answered_did_reach_it_even_if_its_capture_missed_it(tmp_path: Path) -> None:
+def test_answered_request_arrived_although_the_capture_lacks_it(tmp_path: Path) -> None:
     scene = Scene(1, 2)
     scene.send(1, 1, QUERY, {})
     scene.send(2, 2, ChainContainResponse(CHAIN, True))
     scene.ends(10)
-    found = joined(scene, tmp_path)
+    found = transmissions_of(scene, tmp_path)
     assert [(answer.by, answer.outcome) for answer in Exchanges(found).answers(found[0])] == [(2, "answered")]
 
 
-def test_what_came_of_a_request_is_told_from_answers_to_losses() -> None:
+def test_outcomes_are_listed_from_answers_to_losses() -> None:
     answers = [RequestOutcome(2, "request lost"), RequestOutcome(3, "no answer"), RequestOutcome(4, "request lost")]
     assert (
         TransmissionText(BlockNames([], []), str.upper).answers(answers) == "answers: no answer: 3; REQUEST LOST: 2 4"
     )
 
 
-def test_packets_that_overtake_each_other_are_in_the_order_of_sending(tmp_path: Path) -> None:
+def test_overtaking_packets_are_listed_in_order_of_sending(tmp_path: Path) -> None:
     scene = Scene(1, 2)
     scene.send(2, 1, APPROVE, {2: 0.1})
     scene.send(1, 1, PROPOSAL, {2: 9.0})
-    found = joined(scene, tmp_path)
+    found = transmissions_of(scene, tmp_path)
     assert [(one.at_s, received(one)) for one in found] == [(1, {2: (10, 1)}), (2, {2: (2.1, 1)})]
 
 
-def test_an_agent_that_starts_anew_sends_the_same_again(tmp_path: Path) -> None:
+def test_restarted_agent_may_send_the_same_bytes_again(tmp_path: Path) -> None:
     scene = Scene(1, 2, 3)
     scene.send(60, 1, QUERY, {3: 0.01})
     scene.sequences[1] = 0
     scene.send(5, 1, QUERY, {2: 0.01})
     scene.ends(100)
-    found = joined(scene, tmp_path)
+    found = transmissions_of(scene, tmp_path)
     assert [(one.at_s, one.sequence, one.reached, one.lost_by) for one in found] == [
         (5, 0, [2], (3,)),
         (60, 0, [3], (2,)),
     ]
 
 
-def test_without_its_sender_s_capture_a_loss_is_inferred_from_others(tmp_path: Path) -> None:
+def test_loss_is_inferred_without_the_capture_of_the_sender(tmp_path: Path) -> None:
     scene = Scene(1, 2, 3)
     scene.send(5, 1, QUERY, {2: 0.01})
     scene.send(6, 1, QUERY, {})
     scene.ends(10)
-    (seen,) = joined(scene, tmp_path, 1)
+    (seen,) = transmissions_of(scene, tmp_path, 1)
     assert (seen.origin, seen.at_s, seen.reached, seen.lost_by) == ("inferred", pytest.approx(5.01), [2], (3,))
 
 
-def test_a_vehicle_that_does_not_listen_yet_or_any_more_loses_nothing(tmp_path: Path) -> None:
+def test_vehicle_without_running_capture_loses_nothing(tmp_path: Path) -> None:
     scene = Scene(1, 2, 3)
-    scene.files[3] = PcapNg()  # from the field: nothing says that it listened before its first packet
+    scene.files[3] = PcapNg()  # A capture from the field does not contain the time at which it began.
     scene.send(1, 1, QUERY, {})
     scene.sees(3, 2, OUTBOUND, encode(3, 0, QUERY))
     scene.send(3, 1, QUERY, {})
     scene.ends(4, 2)
     scene.send(5, 1, QUERY, {})
     scene.ends(10, 1, 3)
-    found = [one for one in joined(scene, tmp_path) if one.sender == 1]
+    found = [one for one in transmissions_of(scene, tmp_path) if one.sender == 1]
     assert [(one.lost_by, one.absent) for one in found] == [((2,), (3,)), ((2, 3), ()), ((3,), (2,))]
 
 
-def test_what_its_sender_never_sent_is_forged(tmp_path: Path) -> None:
+def test_datagram_missing_in_the_capture_of_its_sender_is_forged(tmp_path: Path) -> None:
     scene = Scene(1, 2, 3)
     scene.send(1, 1, QUERY)
     forged = encode(1, 77, PROPOSAL)
@@ -283,7 +286,7 @@ def test_what_its_sender_never_sent_is_forged(tmp_path: Path) -> None:
     assert not any(pair.sender == 1 and pair.sent > 1 for pair in count_losses(found))
 
 
-def test_a_capture_that_missed_frames_accuses_nobody(tmp_path: Path) -> None:
+def test_incomplete_capture_proves_no_forgery(tmp_path: Path) -> None:
     scene = Scene(1, 2)
     scene.send(1, 1, QUERY)
     scene.sees(2, 5, INBOUND, encode(1, 77, PROPOSAL))
@@ -295,8 +298,8 @@ def test_a_capture_that_missed_frames_accuses_nobody(tmp_path: Path) -> None:
     ]
 
 
-def test_captures_from_the_field_count_from_the_first_packet(tmp_path: Path) -> None:
-    """What names the vehicle of the file as its sender has left it; a point that is no vehicle's only listens."""
+def test_field_captures_count_time_from_the_first_packet(tmp_path: Path) -> None:
+    """Give a file the vehicle's ID as its name: its own datagrams are outbound. Other files are observation points."""
     query, answer = frame(1, encode(1, 0, QUERY)), frame(2, encode(2, 0, ChainContainResponse(CHAIN, True)))
     (tmp_path / "1.pcap").write_bytes(pcap([(1_000_000, query), (1_500_000, answer)]))
     (tmp_path / "2.pcap").write_bytes(pcap([(1_250_000, query), (1_250_000, answer)]))
@@ -310,7 +313,7 @@ def test_captures_from_the_field_count_from_the_first_packet(tmp_path: Path) -> 
     assert Exchanges([request, response]).responses(request) == [response]
 
 
-def test_captures_of_another_run_are_left_out(tmp_path: Path) -> None:
+def test_capture_of_another_run_is_left_out(tmp_path: Path) -> None:
     scene = Scene(1, 2)
     scene.send(1, 1, QUERY)
     run = scene.write(tmp_path / "run")
@@ -321,8 +324,8 @@ def test_captures_of_another_run_are_left_out(tmp_path: Path) -> None:
     assert [one.received for one in join(captures)] == [()]
 
 
-def test_the_story_of_a_block_has_all_that_is_about_it(flown: tuple[Air, Captures], run_dir: Path) -> None:
-    air, _ = flown
+def test_exchanges_about_a_block_include_all_its_messages(finished_flight: tuple[Air, Captures], run_dir: Path) -> None:
+    air, _ = finished_flight
     found = join(read(run_dir))
     names = BlockNames(found, run_directories([run_dir]))
     block_hash = air.agents[3].state.completed[1]
@@ -341,7 +344,7 @@ def test_the_story_of_a_block_has_all_that_is_about_it(flown: tuple[Air, Capture
     assert set(block_arrivals(exchanges)) == {name for one in carriers for name in one.reached}
 
 
-def test_without_exports_blocks_are_named_by_the_order_of_proposals(run_dir: Path) -> None:
+def test_block_names_follow_proposals_without_exports(run_dir: Path) -> None:
     found = join(read(run_dir))
     with_exports, alone = BlockNames(found, run_directories([run_dir])), BlockNames(found, [])
     proposed = {one.summary.block_hash for one in found if one.summary.message == BlockAddRequest.NAME}
@@ -351,12 +354,12 @@ def test_without_exports_blocks_are_named_by_the_order_of_proposals(run_dir: Pat
         assert alone.block(block_hash) == with_exports.block(block_hash)
 
 
-def test_an_agent_that_was_not_captured_from_its_start_on_has_no_ordinals(tmp_path: Path) -> None:
+def test_late_capture_gives_no_block_names(tmp_path: Path) -> None:
     scene = Scene(1, 2)
     scene.sequences[1] = 40
     scene.send(1, 1, PROPOSAL)
     scene.send(2, 1, CommitBlock(BLOCK, CHAIN))
-    names = BlockNames(joined(scene, tmp_path), [])
+    names = BlockNames(transmissions_of(scene, tmp_path), [])
     digits = BLOCK.block_hash.hex()[:8]
     assert names.block(BLOCK.block_hash) == digits
     assert names.chain(CHAIN) == f"{CHAIN.hex()[:8]} ({digits})"
@@ -364,7 +367,7 @@ def test_an_agent_that_was_not_captured_from_its_start_on_has_no_ordinals(tmp_pa
         names.find("1.1")
 
 
-def test_a_selection_is_by_sender_receiver_message_and_time(run_dir: Path) -> None:
+def test_selection_filters_by_sender_receiver_message_and_time(run_dir: Path) -> None:
     captures = read(run_dir)
     found = join(captures)
     selection = Selection(sender=2, receiver=3, message="commit block", between_s=(100, 500))

@@ -1,4 +1,4 @@
-"""Reading captures: both formats, either byte order, and whatever a kill or an enemy has made of them."""
+"""Capture files: both formats, both byte orders, truncated files and hostile files."""
 
 import struct
 from pathlib import Path
@@ -24,7 +24,7 @@ def three_packets(order: str = "<", resolution: int = 9) -> PcapNg:
     file.packet(2_000, INBOUND, b"odd")
     file.packet(2**33, 0, b"")
     file.statistics(2**33, dropped=1)
-    file.statistics(2**34, dropped=3)  # and no more: the later ones count all
+    file.statistics(2**34, dropped=3)  # The last statistics count. They include the earlier ones.
     return file
 
 
@@ -40,7 +40,7 @@ def reason(data: bytes, link_type: int = ETHERNET, length: int | None = None) ->
 
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(("resolution", "units_per_s"), [(9, 10**9), (6, 10**6), (0x80 | 10, 2**10)])
-def test_pcapng_is_read_in_either_byte_order_and_any_resolution(
+def test_reader_accepts_pcapng_of_any_byte_order_and_resolution(
     tmp_path: Path, order: str, resolution: int, units_per_s: int
 ) -> None:
     path = tmp_path / "file"
@@ -55,7 +55,7 @@ def test_pcapng_is_read_in_either_byte_order_and_any_resolution(
 
 
 @pytest.mark.parametrize(("swap", "nanoseconds"), [(False, False), (True, False), (False, True), (True, True)])
-def test_pcap_is_read_in_its_four_forms(tmp_path: Path, swap: bool, nanoseconds: bool) -> None:
+def test_reader_accepts_the_four_forms_of_pcap(tmp_path: Path, swap: bool, nanoseconds: bool) -> None:
     order, magic = ">" if swap else "<", 0xA1B23C4D if nanoseconds else 0xA1B2C3D4
     path = tmp_path / "file"
     path.write_bytes(
@@ -64,7 +64,7 @@ def test_pcap_is_read_in_its_four_forms(tmp_path: Path, swap: bool, nanoseconds:
     assert list(CaptureFile(path)) == [Frame(5 * 10**9 + (6 if nanoseconds else 6000), 0, 113, b"odd", 90)]
 
 
-def test_what_is_before_the_break_is_read_wherever_the_file_breaks_off(tmp_path: Path) -> None:
+def test_reader_yields_frames_before_any_truncation(tmp_path: Path) -> None:
     whole = three_packets().data
     path = tmp_path / "file"
     read = []
@@ -79,9 +79,7 @@ def test_what_is_before_the_break_is_read_wherever_the_file_breaks_off(tmp_path:
 
 
 @given(st.data())
-def test_nothing_that_a_file_holds_breaks_the_reader(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
+def test_reader_survives_any_content(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     whole = data.draw(st.sampled_from([three_packets().data, three_packets(">").data, pcap([(1, frame(7, QUERY))])]))
     damaged = bytearray(whole)
     for position, value in data.draw(st.lists(st.tuples(st.integers(0, len(whole) - 1), st.integers(0, 255)))):
@@ -98,7 +96,7 @@ def test_nothing_that_a_file_holds_breaks_the_reader(
         assert capture.frames <= 4
 
 
-def test_a_length_that_a_file_names_is_not_believed(tmp_path: Path) -> None:
+def test_reader_limits_the_block_length(tmp_path: Path) -> None:
     path = tmp_path / "file"
     good = three_packets().data
     for bad in struct.pack("<2I", 6, 0xFFFFFFF0), struct.pack("<2I", 77, 8), struct.pack("<3I", 77, 12, 16):
@@ -108,7 +106,7 @@ def test_a_length_that_a_file_names_is_not_believed(tmp_path: Path) -> None:
         assert file.problem == f"is damaged at byte {len(good)}; the part before is read"
 
 
-def test_a_frame_is_unwrapped_whatever_tcpdump_put_around_it() -> None:
+def test_unwrap_accepts_each_link_type_of_tcpdump() -> None:
     ethernet = frame(7, QUERY)
     packet = ethernet[14:]
     assert payload(ethernet) == QUERY
@@ -121,7 +119,7 @@ def test_a_frame_is_unwrapped_whatever_tcpdump_put_around_it() -> None:
     assert unwrap(Frame(0, 0, 276, cooked_2, len(cooked_2))) == (QUERY, OUTBOUND)
 
 
-def test_what_is_no_ucp_datagram_has_a_name() -> None:
+def test_frame_without_ucp_datagram_has_a_reason() -> None:
     ethernet = frame(7, QUERY)
     assert reason(ethernet[:12] + b"\x08\x06" + bytes(28)) == "ARP"
     assert reason(ethernet[:12] + b"\x86\xdd" + bytes(40)) == "IPv6"
@@ -131,12 +129,12 @@ def test_what_is_no_ucp_datagram_has_a_name() -> None:
     assert reason(b"") == "neither IPv4 nor IPv6"
 
 
-def test_agents_may_listen_on_another_port() -> None:
+def test_unwrap_accepts_ucp_on_another_port() -> None:
     assert payload(frame(7, QUERY, port=15000)) == QUERY
 
 
-def test_every_flipped_bit_of_a_datagram_is_damage() -> None:
-    """As the receiver's kernel sees it, which drops such a frame."""
+def test_unwrap_detects_every_flipped_bit() -> None:
+    """Compare with the receiver's kernel, which drops such a frame."""
     ethernet = frame(7, QUERY)
     for bit in range(8 * 14, 8 * len(ethernet)):
         flipped = bytearray(ethernet)
@@ -145,7 +143,7 @@ def test_every_flipped_bit_of_a_datagram_is_damage() -> None:
             unwrap(Frame(0, 0, ETHERNET, bytes(flipped), len(flipped)))
 
 
-def test_a_checksum_left_to_the_network_card_is_no_damage() -> None:
+def test_unwrap_accepts_an_offloaded_checksum() -> None:
     ethernet = bytearray(frame(7, QUERY))
     addresses = ethernet[26:34]
     total = sum(struct.unpack("!4H", addresses)) + 17 + len(QUERY) + 8
@@ -155,7 +153,7 @@ def test_a_checksum_left_to_the_network_card_is_no_damage() -> None:
     assert payload(bytes(ethernet)) == QUERY
 
 
-def test_a_capture_says_whose_it_is(tmp_path: Path) -> None:
+def test_capture_belongs_to_a_vehicle_by_comment_sender_or_name(tmp_path: Path) -> None:
     def vehicle(name: str, data: bytes) -> int | None:
         path = tmp_path / name
         path.write_bytes(data)
@@ -165,8 +163,8 @@ def test_a_capture_says_whose_it_is(tmp_path: Path) -> None:
 
     foreign = PcapNg()
     foreign.packet(1, OUTBOUND, frame(7, QUERY))
-    assert vehicle("range.pcapng", three_packets().data) == 7  # by its comment
-    assert vehicle("3.pcapng", foreign.data) == 7  # by what leaves it
-    assert vehicle("3.pcap", pcap([(1, frame(7, QUERY))])) == 3  # by its name
+    assert vehicle("range.pcapng", three_packets().data) == 7  # from its comment
+    assert vehicle("3.pcapng", foreign.data) == 7  # from the sender of its outbound datagrams
+    assert vehicle("3.pcap", pcap([(1, frame(7, QUERY))])) == 3  # from its file name
     assert vehicle("range.pcap", pcap([(1, frame(7, QUERY))])) is None
     assert vehicle("99999999999999999999.pcap", pcap([])) is None

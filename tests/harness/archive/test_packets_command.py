@@ -1,4 +1,4 @@
-"""`ucp-harness packets` as a user runs it."""
+"""The command `ucp-harness packets`, as a user calls it."""
 
 import json
 import re
@@ -22,7 +22,7 @@ BEFORE, AFTER = bytes(32), bytes(range(32))
 
 @pytest.fixture
 def run_dir(tmp_path: Path) -> Path:
-    """Vehicle 1 proposes and commits a block; 3 misses the commit, and 1 misses what 3 voted."""
+    """Write captures in which vehicle 1 proposes and commits a block, 3 loses the commit, and 1 loses the vote of 3."""
     scene = Scene(1, 2, 3)
     scene.send(10, 1, BlockAddRequest(BLOCK.block_hash, BEFORE))
     scene.send(10.02, 2, BlockAddResponse(BLOCK.block_hash, True))
@@ -34,7 +34,7 @@ def run_dir(tmp_path: Path) -> Path:
     return scene.write(tmp_path / "run")
 
 
-def test_what_was_sealed_is_opened_with_a_bundle(tmp_path: Path) -> None:
+def test_bundle_decrypts_sealed_datagrams(tmp_path: Path) -> None:
     asks, answers = session(1), session(2)
     scene = Scene(1, 2, 3)
     request, vote = BlockAddRequest(BLOCK.block_hash, BEFORE), BlockAddResponse(BLOCK.block_hash, True)
@@ -45,7 +45,7 @@ def test_what_was_sealed_is_opened_with_a_bundle(tmp_path: Path) -> None:
     write_bundle(tmp_path / "3.bundle.json", KEYS.bundle(3))
     sealed, opened = harness("packets", run_dir), harness("packets", run_dir, "--bundle", tmp_path / "3.bundle.json")
     assert "Block Add Request" in sealed.stdout and "answers:" not in sealed.stdout
-    assert "answers: approve: 2; no answer: 3" in words(opened.stdout)
+    assert "answers: approve: 2; no answer: 3" in normalized_lines(opened.stdout)
 
     write_bundle(tmp_path / "other.json", KeySet.derived(bytes(31) + b"1", (1, 2, 3)).bundle(3))
     other = harness("packets", run_dir, "--bundle", tmp_path / "other.json")
@@ -55,15 +55,15 @@ def test_what_was_sealed_is_opened_with_a_bundle(tmp_path: Path) -> None:
     assert (refused.returncode, len(sentences(refused.stderr))) == (2, 1)
 
 
-def words(text: str) -> list[str]:
-    """Lines with single spaces."""
+def normalized_lines(text: str) -> list[str]:
+    """Return the lines with single spaces."""
     return [re.sub(" +", " ", line).strip() for line in text.splitlines()]
 
 
-def test_each_datagram_is_a_line_with_who_received_it_and_what_came_of_it(run_dir: Path) -> None:
+def test_output_lists_receivers_and_outcomes_of_each_datagram(run_dir: Path) -> None:
     done = harness("packets", run_dir)
     assert (done.returncode, done.stderr) == (0, "")
-    assert words(done.stdout) == [
+    assert normalized_lines(done.stdout) == [
         "captures of 1 2 3; mission second 0 is 2026-09-21 14:13:20.000 UTC, speedup 20",
         "10.000 1 Block Add Request block 1.1 on chain 00000000 -> 2 3",
         "answers: approve: 2; disapprove, but the response was lost: 3",
@@ -76,10 +76,10 @@ def test_each_datagram_is_a_line_with_who_received_it_and_what_came_of_it(run_di
     ]
 
 
-def test_losses_alone_end_with_what_was_lost_between_each_two(run_dir: Path) -> None:
+def test_lost_option_ends_with_the_loss_table(run_dir: Path) -> None:
     done = harness("packets", run_dir / "capture", "--lost")
     assert done.returncode == 0
-    assert words(done.stdout)[1:-3] == [
+    assert normalized_lines(done.stdout)[1:-3] == [
         "10.030 3 Block Add Response disapprove block 1.1 -> 2 lost by 1",
         "20.000 1 Commit Block block 1.1 makes chain 00010203 (1.1) -> 2 lost by 3 again at 2: 2 copies until 20.020 s",
         "lost/sent, from (down) to (across)",
@@ -90,10 +90,10 @@ def test_losses_alone_end_with_what_was_lost_between_each_two(run_dir: Path) -> 
     ]
 
 
-def test_a_block_is_followed_from_its_proposal_to_whom_it_reached(run_dir: Path) -> None:
+def test_follow_option_lists_a_block_until_its_last_receiver(run_dir: Path) -> None:
     done = harness("packets", run_dir, "--follow", "1.1")
     assert done.returncode == 0
-    assert words(done.stdout)[1:] == [
+    assert normalized_lines(done.stdout)[1:] == [
         "10.000 1 Block Add Request block 1.1 on chain 00000000 -> 2 3",
         "10.020 2 Block Add Response approve block 1.1 -> 1 3",
         "10.030 3 Block Add Response disapprove block 1.1 -> 2 lost by 1",
@@ -103,16 +103,16 @@ def test_a_block_is_followed_from_its_proposal_to_whom_it_reached(run_dir: Path)
     ]
 
 
-def test_filters_leave_what_was_asked_for(run_dir: Path) -> None:
+def test_filters_select_the_requested_datagrams(run_dir: Path) -> None:
     done = harness("packets", run_dir, "--to", 3, "--from", 1, "--message", "block add request", "--between", 0, 15)
-    assert words(done.stdout)[1:3] == [
+    assert normalized_lines(done.stdout)[1:3] == [
         "10.000 1 Block Add Request block 1.1 on chain 00000000 -> 3",
         "answers: disapprove, but the response was lost: 3",
     ]
-    assert words(done.stdout)[3] == "1 datagram, received 1 time, lost 0 times"
+    assert normalized_lines(done.stdout)[3] == "1 datagram, received 1 time, lost 0 times"
 
 
-def test_as_json_it_follows_its_schema(run_dir: Path) -> None:
+def test_json_output_follows_its_schema(run_dir: Path) -> None:
     document = json.loads(harness("packets", run_dir, "--json").stdout)
     record = PacketsRecord.model_validate(document, extra="forbid")
     assert (record.epoch_us, record.speedup, record.of_run) == (1_790_000_000_000_000, 20.0, True)
@@ -152,17 +152,17 @@ def test_as_json_it_follows_its_schema(run_dir: Path) -> None:
     assert lost["losses"] == document["losses"]
 
 
-def test_a_capture_that_was_killed_is_read_as_far_as_it_goes(run_dir: Path) -> None:
+def test_truncated_capture_is_read_up_to_its_end(run_dir: Path) -> None:
     file = run_dir / "capture" / "2.pcapng"
     file.write_bytes(file.read_bytes()[:-40])
     done = harness("packets", run_dir)
     assert done.returncode == 0
     assert "4 datagrams" in done.stdout
-    (said,) = sentences(done.stderr)
-    assert re.fullmatch(rf"{file}: ends within the block that starts at byte \d+; the part before is read", said)
+    (sentence,) = sentences(done.stderr)
+    assert re.fullmatch(rf"{file}: ends within the block that starts at byte \d+; the part before is read", sentence)
 
 
-def test_a_file_that_is_no_capture_is_told_and_the_others_are_read(run_dir: Path) -> None:
+def test_invalid_capture_is_reported_and_others_are_read(run_dir: Path) -> None:
     bad = run_dir / "capture" / "4.pcapng"
     for content, why in (
         (b"text", "not a pcapng or pcap file; "),
@@ -187,24 +187,24 @@ def test_a_file_that_is_no_capture_is_told_and_the_others_are_read(run_dir: Path
         ),
     ],
 )
-def test_a_mistake_is_one_sentence(run_dir: Path, arguments: list[str], sentence: str) -> None:
+def test_wrong_argument_gives_one_sentence(run_dir: Path, arguments: list[str], sentence: str) -> None:
     done = harness("packets", *arguments, cwd=run_dir.parent)
     assert (done.returncode, done.stdout) == (2, "")
     assert sentences(done.stderr) == [sentence]
 
 
-def test_a_capture_from_the_field_is_enough(tmp_path: Path) -> None:
+def test_command_reads_a_field_capture_without_a_run(tmp_path: Path) -> None:
     file = tmp_path / "7.pcap"
     file.write_bytes(pcap([(1_790_000_000_000_000, frame(7, encode(7, 0, CommitBlock(BLOCK, AFTER))))]))
     done = harness("packets", file)
     digits = BLOCK.block_hash.hex()[:8]
-    assert words(done.stdout)[:2] == [
+    assert normalized_lines(done.stdout)[:2] == [
         "captures of 7; second 0 is 2026-09-21 14:13:20.000 UTC",
         f"0.000 7 Commit Block block {digits} makes chain 00010203 ({digits}) -> no vehicle",
     ]
 
 
-def test_a_reader_that_has_seen_enough_ends_it_quietly(tmp_path: Path) -> None:
+def test_closed_output_pipe_causes_no_error(tmp_path: Path) -> None:
     file = PcapNg(1)
     for number in range(5000):
         file.packet(wall_ns(number), OUTBOUND, frame(1, encode(1, number, CommitBlock(BLOCK, AFTER))))

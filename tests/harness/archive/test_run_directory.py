@@ -1,4 +1,4 @@
-"""Nothing is overwritten: a directory of results is new or empty."""
+"""The run directory: it is new or empty, and traces of later incarnations are appended."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from harness.archive.directory import RunDirectory, claim
 from harness.errors import RunDirectoryError
 
 
-def test_a_directory_that_holds_anything_is_left_alone(tmp_path: Path) -> None:
+def test_run_directory_refuses_a_directory_with_files(tmp_path: Path) -> None:
     (tmp_path / "kept").touch()
     with pytest.raises(RunDirectoryError, match="is not empty: choose another --out"):
         claim(tmp_path)
@@ -18,7 +18,7 @@ def test_a_directory_that_holds_anything_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "new" / "one" / "inner").is_dir()
 
 
-def test_the_trace_of_a_later_life_follows_the_whole_lines_of_the_earlier(tmp_path: Path) -> None:
+def test_trace_of_later_incarnation_follows_complete_lines(tmp_path: Path) -> None:
     rundir = RunDirectory(tmp_path / "run")
     first, second = rundir.agent(7), rundir.agent(7, incarnation=2)
     assert (first.name, second.name) == ("agents", "7-2")
@@ -27,11 +27,11 @@ def test_the_trace_of_a_later_life_follows_the_whole_lines_of_the_earlier(tmp_pa
     rundir.append_trace(7, second)
     assert (first / "7.trace.jsonl").read_text() == "one\nthree\n"
     assert (second / "7.trace.jsonl").read_text() == "three\n"
-    rundir.append_trace(7, rundir.agent(7, incarnation=3))  # it was killed before it said anything
+    rundir.append_trace(7, rundir.agent(7, incarnation=3))  # This incarnation was killed before it wrote a trace.
     assert (first / "7.trace.jsonl").read_text() == "one\nthree\n"
 
 
-def test_the_trace_of_a_life_that_goes_on_is_brought_piece_by_piece(tmp_path: Path) -> None:
+def test_trace_of_running_incarnation_is_appended_in_parts(tmp_path: Path) -> None:
     rundir = RunDirectory(tmp_path / "run")
     first, second = rundir.agent(7), rundir.agent(7, incarnation=2)
     (first / "7.trace.jsonl").write_text("one\n")

@@ -1,4 +1,4 @@
-"""Tracks as a run leaves them, and as somebody may have left them."""
+"""Tracks: complete, damaged and hostile files."""
 
 import json
 from pathlib import Path
@@ -19,14 +19,14 @@ def tracks_file(directory: Path, *lines: str | dict[str, Any]) -> Path:
     return path
 
 
-def test_places_come_back_in_order_of_time(tmp_path: Path) -> None:
+def test_fixes_are_sorted_by_time(tmp_path: Path) -> None:
     later = {"at_s": 2.0, "places": {"1": [12.0, 24.0, 5.0]}}
     tracks = read_tracks(tracks_file(tmp_path, later, GOOD), [1, 2, 3])
     assert tracks.by_vehicle == {1: [Fix(1.0, 10.0, 20.0, 5.0), Fix(2.0, 12.0, 24.0, 5.0)], 2: [Fix(1.0, -1.0, 0.0)]}
     assert tracks.problems == []
 
 
-def test_between_two_looks_a_vehicle_flew_straight_and_outside_them_it_stood(tmp_path: Path) -> None:
+def test_position_is_interpolated_between_fixes_only(tmp_path: Path) -> None:
     later = {"at_s": 3.0, "places": {"1": [20.0, 0.0, 5.0]}}
     tracks = read_tracks(tracks_file(tmp_path, GOOD, later), [1, 2])
     assert tracks.at(1, 1.5) == Fix(1.5, 12.5, 15.0, 5.0)
@@ -35,7 +35,7 @@ def test_between_two_looks_a_vehicle_flew_straight_and_outside_them_it_stood(tmp
     assert tracks.at(1, 9.0) == Fix(9.0, 20.0, 0.0, 5.0)
 
 
-def test_without_a_file_there_are_no_tracks(tmp_path: Path) -> None:
+def test_missing_file_has_no_tracks(tmp_path: Path) -> None:
     assert read_tracks(tmp_path / TRACKS_FILE, [1]).by_vehicle == {}
     assert read_tracks(tmp_path / TRACKS_FILE, [1]).problems == []
 
@@ -68,7 +68,7 @@ def test_without_a_file_there_are_no_tracks(tmp_path: Path) -> None:
         "\ud83d",
     ],
 )
-def test_a_damaged_line_is_left_out_and_said(tmp_path: Path, damaged: str) -> None:
+def test_damaged_line_is_left_out_and_reported(tmp_path: Path, damaged: str) -> None:
     path = tmp_path / TRACKS_FILE
     text = "\n".join([json.dumps(GOOD), damaged, json.dumps(GOOD | {"at_s": 2.0})])
     path.write_text(text, encoding="utf-8", errors="surrogatepass")
@@ -77,7 +77,7 @@ def test_a_damaged_line_is_left_out_and_said(tmp_path: Path, damaged: str) -> No
     assert tracks.problems == ["tracks.jsonl: 1 damaged or unknown line is left out"]
 
 
-def test_reading_ends_at_its_bounds_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reader_stops_at_its_limits_and_reports_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bounded_file, "MAX_LINES_BYTES", 3 * 1024 * 1024)
     monkeypatch.setattr(bounded_file, "MAX_LINE_BYTES", 1024 * 1024)
     tracks = read_tracks(tracks_file(tmp_path, GOOD, "x" * 1024 * 1024, GOOD), [1, 2])
@@ -96,6 +96,6 @@ def test_reading_ends_at_its_bounds_and_says_so(tmp_path: Path, monkeypatch: pyt
     assert tracks.problems == ["tracks.jsonl: only the first 2 lines or 3 MiB are read"]
 
 
-def test_a_directory_in_place_of_the_file_holds_no_tracks(tmp_path: Path) -> None:
+def test_directory_in_place_of_the_file_has_no_tracks(tmp_path: Path) -> None:
     (tmp_path / TRACKS_FILE).mkdir()
     assert read_tracks(tmp_path / TRACKS_FILE, [1]).by_vehicle == {}

@@ -1,4 +1,4 @@
-"""A word that nobody knows is no accusation and makes no figure silently 0; a wrong number of a handler is found."""
+"""Unknown names in traces: they cause no violation and no wrong figure, but a wrong algorithm number is found."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -39,7 +39,10 @@ Rename = Callable[[HandlerRun], HandlerRun]
 
 @pytest.fixture(scope="module")
 def honest() -> Evidence:
-    """Of a run in which nothing is wrong; its record lacks what agents counted, which is then taken from traces."""
+    """Return the evidence of a correct run.
+
+    Its record lacks the agents' counters, so the checker takes them from traces.
+    """
     evidence = simulate(scenario(**EVENTFUL), 3, tracing=True).evidence
     assert evidence.record is not None
     for agent in evidence.record.agents.values():
@@ -47,12 +50,12 @@ def honest() -> Evidence:
     return evidence
 
 
-def foreign(word: str) -> str:
-    return f"x-{word}"
+def unknown_name(name: str) -> str:
+    return f"x-{name}"
 
 
-def words() -> Iterator[tuple[str, Rename]]:
-    """Each word of the vocabulary, and how an agent says it that has another one for it."""
+def renamings() -> Iterator[tuple[str, Rename]]:
+    """Yield each name of the vocabulary with a function that replaces it in a handler run."""
     for name, handler in HANDLERS.items():
         yield f"handler {name}", handler_renamed(name)
         for branch in handler.branches:
@@ -71,22 +74,24 @@ def words() -> Iterator[tuple[str, Rename]]:
 
 def handler_renamed(name: str) -> Rename:
     def rename(run: HandlerRun) -> HandlerRun:
-        trigger = LocalTrigger(foreign(name)) if run.trigger == LocalTrigger(name) else run.trigger
-        return dataclasses.replace(run, handler=foreign(name) if run.handler == name else run.handler, trigger=trigger)
+        trigger = LocalTrigger(unknown_name(name)) if run.trigger == LocalTrigger(name) else run.trigger
+        return dataclasses.replace(
+            run, handler=unknown_name(name) if run.handler == name else run.handler, trigger=trigger
+        )
 
     return rename
 
 
 def branch_renamed(name: str, branch: str) -> Rename:
     return lambda run: (
-        dataclasses.replace(run, branch=foreign(branch)) if (run.handler, run.branch) == (name, branch) else run
+        dataclasses.replace(run, branch=unknown_name(branch)) if (run.handler, run.branch) == (name, branch) else run
     )
 
 
 def timer_renamed(timer: str) -> Rename:
     def rename(run: HandlerRun) -> HandlerRun:
-        trigger = TimerTrigger(foreign(timer)) if run.trigger == TimerTrigger(timer) else run.trigger
-        started = {foreign(name) if name == timer else name: after for name, after in (run.started or {}).items()}
+        trigger = TimerTrigger(unknown_name(timer)) if run.trigger == TimerTrigger(timer) else run.trigger
+        started = {unknown_name(name) if name == timer else name: after for name, after in (run.started or {}).items()}
         return dataclasses.replace(run, trigger=trigger, started=started or None)
 
     return rename
@@ -96,9 +101,9 @@ def message_renamed(message: str) -> Rename:
     def rename(run: HandlerRun) -> HandlerRun:
         trigger = run.trigger
         if isinstance(trigger, MessageTrigger) and trigger.message == message:
-            trigger = dataclasses.replace(trigger, message=foreign(message))
+            trigger = dataclasses.replace(trigger, message=unknown_name(message))
         sent = [
-            dataclasses.replace(each, message=foreign(message)) if each.message == message else each
+            dataclasses.replace(each, message=unknown_name(message)) if each.message == message else each
             for each in run.sent
         ]
         return dataclasses.replace(run, trigger=trigger, sent=sent)
@@ -108,101 +113,107 @@ def message_renamed(message: str) -> Rename:
 
 def operation_renamed(operation: str) -> Rename:
     return lambda run: dataclasses.replace(
-        run, changes=[(foreign(name) if name == operation else name, block) for name, block in run.changes]
+        run, changes=[(unknown_name(name) if name == operation else name, block) for name, block in run.changes]
     )
 
 
 def trigger_renamed(kind: str) -> Rename:
     return lambda run: dataclasses.replace(
         run,
-        trigger=parse({foreign(key) if key == kind else key: value for key, value in run.trigger.to_json().items()}),
+        trigger=parse(
+            {unknown_name(key) if key == kind else key: value for key, value in run.trigger.to_json().items()}
+        ),
     )
 
 
 def tally_renamed(vote: str) -> Rename:
     return lambda run: (
-        dataclasses.replace(run, tally={foreign(key) if key == vote else key: n for key, n in run.tally.items()})
+        dataclasses.replace(run, tally={unknown_name(key) if key == vote else key: n for key, n in run.tally.items()})
         if run.tally
         else run
     )
 
 
-def told_by(evidence: Evidence, rename: Rename, agents: set[int]) -> Evidence:
-    """The evidence, if these agents had told it so."""
+def with_renamed_steps(evidence: Evidence, rename: Rename, agents: set[int]) -> Evidence:
+    """Return the evidence with the names of these agents' handler runs replaced."""
     traces: dict[int, Trace] = {}
     for agent_id, trace in evidence.traces.items():
-        told = [rename(run) for run in trace.runs] if agent_id in agents else trace.runs
-        traces[agent_id] = dataclasses.replace(trace, runs=told)
+        runs = [rename(run) for run in trace.runs] if agent_id in agents else trace.runs
+        traces[agent_id] = dataclasses.replace(trace, runs=runs)
     before = evidence.before_final_reconcile
     return Evidence(evidence.exports, traces, evidence.record, before_final_reconcile=before)
 
 
-def test_the_run_is_sound_and_takes_nearly_every_word(honest: Evidence) -> None:
+def test_run_is_correct_and_uses_nearly_every_name(honest: Evidence) -> None:
     assert not check(honest).bad
-    unsaid = [word for word, rename in words() if told_by(honest, rename, {1, 2, 3, 4}).traces == honest.traces]
-    assert all(word.startswith("branch ") for word in unsaid)
-    assert len(unsaid) < 30
+    unused = [
+        label
+        for label, rename in renamings()
+        if with_renamed_steps(honest, rename, {1, 2, 3, 4}).traces == honest.traces
+    ]
+    assert all(label.startswith("branch ") for label in unused)
+    assert len(unused) < 30
 
 
 @pytest.mark.parametrize("agents", [{1}, {1, 2, 3, 4}], ids=["one agent", "all"])
-def test_no_unknown_word_is_an_accusation_or_makes_a_figure_0(honest: Evidence, agents: set[int]) -> None:
+def test_unknown_name_causes_no_violation_and_no_zero_figure(honest: Evidence, agents: set[int]) -> None:
     known = check(honest)
-    for word, rename in words():
-        told = told_by(honest, rename, agents)
-        if told.traces == honest.traces:
+    for label, rename in renamings():
+        changed = with_renamed_steps(honest, rename, agents)
+        if changed.traces == honest.traces:
             continue
-        result = check(told)
+        result = check(changed)
         assert not result.bad, (
-            word,
+            label,
             [(result.judgements[key].reason, result.judgements[key].evidence[:2]) for key in result.bad],
         )
-        assert any("unknown" in judgement.reason for judgement in result.judgements.values()), word
+        assert any("unknown" in judgement.reason for judgement in result.judgements.values()), label
         for name, figure in result.figures.items():
-            assert figure in (known.figures[name], None), (word, name, figure)
+            assert figure in (known.figures[name], None), (label, name, figure)
 
 
-def test_a_known_handler_with_another_s_number_is_a_contradiction_in_the_evidence_and_nothing_else(
+def test_wrong_algorithm_number_is_only_a_contradiction_of_records(
     honest: Evidence,
 ) -> None:
     def misnumber(run: HandlerRun) -> HandlerRun:
         return dataclasses.replace(run, algorithm=7) if run.handler == "receive_commit_block" else run
 
-    result = check(told_by(honest, misnumber, {1}))
+    result = check(with_renamed_steps(honest, misnumber, {1}))
     assert result.bad == ("records",)
     (finding,) = result.beside["records"].evidence
     assert finding.detail == "its trace has receive_commit_block as Algorithm 7, but it is Algorithm 6"
 
 
-def test_a_mistake_is_found_though_timers_and_branches_have_other_names(honest: Evidence) -> None:
-    def otherwise(run: HandlerRun) -> HandlerRun:
+def test_deviation_is_found_despite_unknown_timers_and_branches(honest: Evidence) -> None:
+    def rename_branch_and_timers(run: HandlerRun) -> HandlerRun:
         for timer in TIMERS:
             run = timer_renamed(timer)(run)
-        return dataclasses.replace(run, branch=foreign(run.branch))
+        return dataclasses.replace(run, branch=unknown_name(run.branch))
 
-    told = told_by(honest, otherwise, {1})
-    assert not check(told).bad
-    runs = told.traces[1].runs
+    changed = with_renamed_steps(honest, rename_branch_and_timers, {1})
+    assert not check(changed).bad
+    runs = changed.traces[1].runs
     position = next(
         position for position, run in enumerate(runs) if run.handler == "vote_timer_expiration" and run.changes
     )
     runs[position] = dataclasses.replace(runs[position], sent=[])
-    judgement = check(told).beside["steps"]
+    judgement = check(changed).beside["steps"]
     assert judgement.verdict == "deviates"
     (finding, *_) = judgement.evidence
     assert "it sent nothing; it should have sent Commit Block" in finding.detail
 
 
-def test_what_was_lost_is_not_known_where_nobody_knows_what_was_completed(honest: Evidence) -> None:
-    told = told_by(honest, operation_renamed("complete"), {2})
-    survived = survival(told)
+def test_losses_are_unknown_if_completed_blocks_are_unknown(honest: Evidence) -> None:
+    changed = with_renamed_steps(honest, operation_renamed("complete"), {2})
+    survived = survival(changed)
     assert (survived.completed, survived.gone, survived.losses[0].completed) == (None, None, None)
     assert "the number of lost completed blocks is unknown" in " ".join(in_words(survived))
-    assert check(told).figures["blocks"] is None
+    assert check(changed).figures["blocks"] is None
 
 
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of which agent 1 has other words for its voting timer, for a branch, and for what it completes."""
+    """Write a run in which agent 1 uses unknown names for its voting timer, a branch, and a completed block."""
     path = tmp_path_factory.mktemp("run") / "run"
     assert not run(scenario(**EVENTFUL), 3, path, Silent(), "sim").result.bad
     for agent, old, new in (
@@ -217,7 +228,7 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_report_says_that_it_does_not_show_all(directory: Path) -> None:
+def test_report_names_the_steps_that_it_omits(directory: Path) -> None:
     page = write_report(RunArchive(directory)).read_text()
     assert "some steps of agent 1 are not shown: unknown timer name &#39;vote&#39; in its trace" in page
     assert "and such words in 2 more" in page
@@ -225,7 +236,7 @@ def test_a_report_says_that_it_does_not_show_all(directory: Path) -> None:
 
 
 @pytest.mark.parametrize(("agent", "because"), [(1, "unknown timer name 'vote'"), (3, "unknown branch 'builds' of")])
-def test_a_replay_accuses_nobody_over_a_word(directory: Path, agent: int, because: str) -> None:
+def test_replay_reports_no_violation_for_an_unknown_name(directory: Path, agent: int, because: str) -> None:
     found = Player(open_record(directory / "agents" / f"{agent}.trace.jsonl")).to_end()
     assert not found.deviations
     assert found.steps
@@ -233,12 +244,10 @@ def test_a_replay_accuses_nobody_over_a_word(directory: Path, agent: int, becaus
     assert because in found.lost[0]
 
 
-def test_a_reconstruction_plays_an_agent_up_to_the_first_line_that_nobody_understands(
-    directory: Path, tmp_path: Path
-) -> None:
+def test_reconstruction_plays_an_agent_up_to_an_unknown_name(directory: Path, tmp_path: Path) -> None:
     ended = harness("reconstruct", directory, "--out", tmp_path / "again.yaml")
-    said = ended.stdout + ended.stderr
-    assert "agent 4 can be played only in part: line" in said
-    assert "unknown operation 'done'" in said
-    assert "agent 1" not in said, "which timer ended, its handler tells"
-    assert "deviates from the protocol" not in said
+    output = ended.stdout + ended.stderr
+    assert "agent 4 can be played only in part: line" in output
+    assert "unknown operation 'done'" in output
+    assert "agent 1" not in output, "the handler determines the timer"
+    assert "deviates from the protocol" not in output
