@@ -28,7 +28,7 @@ from benchmarks import clean_runs
 from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
 from harness.errors import HarnessError
-from harness.field.ingest import sort_out
+from harness.field.ingest import ingest_files
 from harness.field.reconstruct import reconstruct
 from harness.play.backends import BACKENDS
 from harness.play.mission import play_on
@@ -119,11 +119,11 @@ def fly(number: int, backend: BackendName) -> Tried:
         expected = _bring_home(run, home, kind_of(number), Random(f"home {number}"))
         began = time.monotonic()
         try:
-            made = reconstruct(sort_out([home]).largest(), "again")
+            made = reconstruct(ingest_files([home]).largest(), "again")
         except HarnessError as error:
             return Tried(kind_of(number), backend, expected, 0, 0, time.monotonic() - began, 0, (str(error),))
         took_s = time.monotonic() - began
-        inputs = sum(len(happenings) for happenings in made.table.happenings.values())
+        inputs = sum(len(timed_inputs) for timed_inputs in made.table.inputs.values())
         reproduced = len(made.reproduced) if made.difference is None else 0
         why = tuple(made.problems)
         return Tried(kind_of(number), backend, expected, reproduced, made.blocks, took_s, inputs, why)

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from harness.archive.exports import Export
 from harness.archive.packets.packets_document import PacketsRecord
 from harness.archive.run_record import RunRecord
-from harness.field.adapters.written_records import ImportRecord
+from harness.field.adapters.imported_records import ImportRecord
 from harness.field.depot.mission_files import Manifest
 from harness.field.depot.record_lines import ConsolidatedLine
 from harness.field.replay.replay_document import ReplayDocument

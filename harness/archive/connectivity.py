@@ -172,7 +172,7 @@ class NetworkReplay:
         return Losses(at_s, round(mean, 3), round(max(lost, default=0.0), 3))
 
     def by_link(self) -> dict[Link, float]:
-        """Return the current loss of each link, in each direction. 1.0 without a link."""
+        """Return the current loss of each link, in each direction. 1.0 if it passes no message."""
         losses: dict[Link, float] = {}
         for low, high in self._scripted:
             there, back = (1.0, 1.0) if self.lost & {low, high} else self._directions((low, high))

@@ -16,9 +16,9 @@ from harness.commands._shared_options import RARE
 from harness.commands.terminal import complain, print_json
 from harness.errors import HarnessError, InterruptedRunError, MachineError
 from harness.field.bisection import (
-    CannotBeTriedError,
-    Found,
+    BisectionResult,
     Outcome,
+    UntestableError,
     Workshop,
     bisect,
     differences,
@@ -179,7 +179,7 @@ def _try_once(
                 outcome, _ = workshop.play(code)
                 console.print(Text(f"{command or code}: {outcome.sentence}"), soft_wrap=True)
                 outcomes.append(outcome)
-    except CannotBeTriedError as error:
+    except UntestableError as error:
         complain(
             f"{code} cannot be tried: {error}; name the repository with --repository (the installed code is in {ROOT})"
         )
@@ -217,7 +217,7 @@ def _keep(path: Path, outcome: Outcome) -> None:
         raise MachineError(f"{path} cannot be written: {error.strerror}") from None
 
 
-def _show(console: Console, found: Found, good: str, bad: str) -> None:
+def _show(console: Console, found: BisectionResult, good: str, bad: str) -> None:
     lines: list[str] = []
     if not found.first:
         lines.append(f"the outcome at {bad} is that at {good}: {found.bad.sentence}")
@@ -234,11 +234,11 @@ def _show(console: Console, found: Found, good: str, bad: str) -> None:
     lines += found.changes[:CHANGES_SHOWN]
     if len(found.changes) > CHANGES_SHOWN:
         lines.append(f"and {len(found.changes) - CHANGES_SHOWN} more; --json has all")
-    if found.parting is not None and found.parting.first is not None:
-        run = found.parting.agents[found.parting.first].run
+    if found.first_difference is not None and found.first_difference.first is not None:
+        run = found.first_difference.agents[found.first_difference.first].run
         assert run is not None, "it is what makes it the first"
         where = " and ".join(f"{step.handler} ({step.branch})" if step else "nothing more" for step in (run.a, run.b))
-        lines.append(f"the runs differ first at {run.at_s:.3f} s, at agent {found.parting.first}: {where}")
+        lines.append(f"the runs differ first at {run.at_s:.3f} s, at agent {found.first_difference.first}: {where}")
     for line in lines:
         console.print(Text(line), soft_wrap=True)
 

@@ -13,9 +13,9 @@ from harness.commands._shared_options import DepotKey, depot_of, refuse_existing
 from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
 from harness.field.depot import record_outputs
-from harness.field.depot.collected_exports import came_home
+from harness.field.depot.collected_exports import collect_exports
 from harness.field.depot.consolidation import Consolidation, consolidate
-from harness.field.depot.record_lines import Reconciled
+from harness.field.depot.record_lines import ReconcileResult
 from harness.field.depot.record_outputs import in_words
 from harness.report.logbook.map_files import geojson, kml
 from harness.report.logbook.positions import Track
@@ -64,7 +64,7 @@ def consolidate_command(
         )
     if final_reconcile and out is None:
         raise ExportError("--reconcile writes the exports next to the record: name the record with -o NAME.jsonl")
-    record = consolidate(came_home(paths), depot_of(depot_key))
+    record = consolidate(collect_exports(paths), depot_of(depot_key))
     reconciliation = _reconcile(record, out.with_suffix(".reconciled")) if final_reconcile and out is not None else None
     reconciled = reconciliation.line if reconciliation else None
     print_lines(in_words(record, reconciled, opened=depot_key is not None))
@@ -74,7 +74,7 @@ def consolidate_command(
 
         write_new(html_file, [draw(record, reconciliation)])
         print_lines([str(html_file)])
-    findings = [*record.home.problems, *record.home.left_out]
+    findings = [*record.collected.problems, *record.collected.left_out]
     for sentence in findings[:MOST_TOLD]:
         complain(sentence)
     if len(findings) > MOST_TOLD:
@@ -95,7 +95,7 @@ def _reconcile(record: Consolidation, directory: Path) -> "Reconciliation":
 
 def _written(
     record: Consolidation,
-    reconciled: Reconciled | None,
+    reconciled: ReconcileResult | None,
     out: Path | None,
     kml_file: Path | None,
     geojson_file: Path | None,

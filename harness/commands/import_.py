@@ -9,11 +9,11 @@ from rich.console import Console
 
 from harness.commands.terminal import complain, print_lines
 from harness.errors import FieldError
-from harness.field.adapters import bring_in
+from harness.field.adapters import import_records
 from harness.field.adapters.adapter import Adapter, load_adapter
-from harness.field.adapters.csv_adapter import CommaSeparated
+from harness.field.adapters.csv_adapter import CsvAdapter
+from harness.field.adapters.imported_records import ImportedFlight
 from harness.field.adapters.rosbag_adapter import RosBag
-from harness.field.adapters.written_records import ImportedFlight
 
 
 class Format(Enum):
@@ -23,7 +23,7 @@ class Format(Enum):
     ROSBAG = "rosbag"
 
 
-ADAPTERS: dict[Format, type[Adapter]] = {Format.CSV: CommaSeparated, Format.ROSBAG: RosBag}
+ADAPTERS: dict[Format, type[Adapter]] = {Format.CSV: CsvAdapter, Format.ROSBAG: RosBag}
 
 
 def import_command(
@@ -47,7 +47,7 @@ def import_command(
     own = [load_adapter(adapter)] if adapter else []
     adapters = [ADAPTERS[format_]()] if format_ else [*own, *(kind() for kind in ADAPTERS.values())]
     with Console(stderr=True).status("searching for files") as status:
-        record = bring_in(sources, adapters, out, status.update, by_content=format_ is None)
+        record = import_records(sources, adapters, out, status.update, by_content=format_ is None)
     for remark in (*record.left_out, *record.remarks):
         complain(remark.sentence)
     print_lines(_told(flight, out) for flight in record.flights)

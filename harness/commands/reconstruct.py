@@ -9,7 +9,7 @@ from rich.console import Console
 from harness.commands._shared_options import BundleOption, DepotKey, depot_of, opener_of
 from harness.commands.terminal import complain, print_json
 from harness.errors import VIOLATED, RunDirectoryError
-from harness.field.ingest import sort_out
+from harness.field.ingest import ingest_files
 from harness.field.reconstruct import reconstruct, write
 
 
@@ -31,11 +31,11 @@ def reconstruct_command(
         raise RunDirectoryError(f"{out} exists: choose another --out; existing files are not overwritten")
     with Console(stderr=True).status("reading the records") as status:
         opener, depot = opener_of(bundle), depot_of(depot_key)
-        homecoming = sort_out(paths, opener)
-        flight = homecoming.largest()
+        result = ingest_files(paths, opener)
+        flight = result.largest()
         name = f"{paths[0].resolve().name} flown again"[:200]
         reconstruction = reconstruct(flight, name, status.update, opener=opener, depot=depot)
-    left_out = [*homecoming.sentences()]
+    left_out = [*result.sentences()]
     write(reconstruction, out, paths, left_out)
     for sentence in left_out:
         complain(sentence)

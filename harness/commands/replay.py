@@ -13,11 +13,11 @@ from harness.checker.steps.core_in_use import IN_USE
 from harness.checker.steps.implementation import REFERENCE
 from harness.commands.terminal import complain, print_json
 from harness.errors import VIOLATED, WRONG_REQUEST, InterruptedRunError
-from harness.field.replay import Found, Player, Record, open_record, open_records
-from harness.field.replay.breakpoints import place
+from harness.field.replay import Player, Record, ReplayResult, open_record, open_records
+from harness.field.replay.breakpoints import parse_breakpoint
 from harness.field.replay.prompt import Prompt
-from harness.field.replay.replay_document import ReplayedRecord, document, head, replayed, summary
-from harness.field.replay.replay_names import Names
+from harness.field.replay.replay_document import ReplayedRecord, document, header_text, replayed, summary
+from harness.field.replay.replay_names import ReplayNames
 from harness.play.core_version import edited_files
 
 
@@ -64,15 +64,15 @@ def _play(console: Console, records: Sequence[Record], until: float | None, as_j
     told, differ, judged = list[ReplayedRecord](), False, False
     for record in records:
         _complain_of(record)
-        names = Names(record)
-        found = Player(record, until).to_end()
+        names = ReplayNames(record)
+        result = Player(record, until).to_end()
         in_use = Player(record, until, IN_USE).to_end()  # so that a debugger stops in the handlers of `ucp`
-        differ |= bool(found.deviations)
-        judged |= bool(found.steps)
+        differ |= bool(result.deviations)
+        judged |= bool(result.steps)
         if as_json:
-            told.append(replayed(record, found, names))
+            told.append(replayed(record, result, names))
         else:
-            _show(console, [head(record), *summary(record, found, names), *_in_use(in_use, found)])
+            _show(console, [header_text(record), *summary(record, result, names), *_in_use(in_use, result)])
     if as_json:
         print_json(document(told))
     raise typer.Exit(VIOLATED if differ else 0 if judged else WRONG_REQUEST)
@@ -83,28 +83,28 @@ def _ask(
 ) -> NoReturn:
     """Step through a record as the user says; when no more is said, play the rest."""
     _complain_of(record)
-    names = Names(record)
+    names = ReplayNames(record)
     player = Player(record, until, IN_USE if debug else REFERENCE)
     if debug:
-        places = [place(words, names) for words in breaks]
+        places = [parse_breakpoint(words, names) for words in breaks]
         while not player.at_end:
             upcoming = player.entries[player.position]
             player.forward(into_debugger=any(at(upcoming) for at in places))
     else:
         prompt = Prompt(player, names, console, breaks)
-        _show(console, [head(record)])
+        _show(console, [header_text(record)])
         prompt.begin(at_start)
         prompt.cmdloop()
         if prompt.quit:
-            raise typer.Exit(VIOLATED if player.found.deviations else 0)
-    found = Player(record, until).to_end()
-    _show(console, [*summary(record, found, names), *_in_use(Player(record, until, IN_USE).to_end(), found)])
-    raise typer.Exit(VIOLATED if found.deviations else 0 if found.steps else WRONG_REQUEST)
+            raise typer.Exit(VIOLATED if player.result.deviations else 0)
+    result = Player(record, until).to_end()
+    _show(console, [*summary(record, result, names), *_in_use(Player(record, until, IN_USE).to_end(), result)])
+    raise typer.Exit(VIOLATED if result.deviations else 0 if result.steps else WRONG_REQUEST)
 
 
-def _in_use(in_use: Found, found: Found) -> list[Text]:
+def _in_use(in_use: ReplayResult, result: ReplayResult) -> list[Text]:
     """Return a sentence if the core of this installation does not play the record as the reference does."""
-    if [each.line for each in in_use.deviations] == [each.line for each in found.deviations]:
+    if [each.line for each in in_use.deviations] == [each.line for each in result.deviations]:
         return []
     edited = f", with the edited {', '.join(edited_files())}," if edited_files() else ""
     if in_use.first is None:

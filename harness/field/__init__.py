@@ -1,1 +1,1 @@
-"""What came home from a real flight: sorted, stepped through, and played again."""
+"""Tools for the records of real flights: ingest, import, replay, reconstruction, bisection and the depot."""

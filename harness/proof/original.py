@@ -138,7 +138,9 @@ def prove_original(name: str, code: Path, bounds: Bounds, limits: Limits) -> Ori
             found = json.loads(ended.stdout)
             return Original(name, found["findings"], found["complete"], found["lines"])
         except (ValueError, KeyError, TypeError):
-            raise OriginalError(f"--against {name}: the prover cannot explore this core: {ended.last_words}") from None
+            raise OriginalError(
+                f"--against {name}: the prover cannot explore this core: {ended.last_error_line}"
+            ) from None
 
 
 def is_edited(code: Path) -> bool:

@@ -1,8 +1,7 @@
-"""States of the code: commits of a repository, each checked out in a clone, and processes that run with them.
+"""States of the code: commits that are checked out in a clone, and processes that run with them.
 
-The clone shares the repository's objects and has everything else for itself: working tree, index, and the state of
-`git bisect`. So the repository and its working tree stay as they are, whatever happens, and what a clone leaves behind
-that was killed is one temporary directory.
+The clone shares the objects of the repository, but has its own working tree, index and `git bisect` state. The
+repository therefore never changes. If the process is killed, only one temporary directory remains.
 """
 
 import os
@@ -19,42 +18,47 @@ from typing import Literal
 from harness.errors import HarnessError, InterruptedRunError, MachineError
 
 ROOT = Path(__file__).parents[2]
-"""Of the harness that runs now."""
+"""The directory of the running harness."""
 GRACE_S = 30.0
-"""A run that is asked to stop takes its lab down first."""
+"""Time for a run to stop, because it removes its lab first."""
 
 
 @dataclass(frozen=True)
-class Ended:
-    """How a process ended; `status` is None if it took too long and was stopped."""
+class ProcessResult:
+    """The end of a process. `status` is None if the process exceeded its time limit and was stopped."""
 
     status: int | None
     stdout: str
     stderr: str
 
     @property
-    def last_words(self) -> str:
+    def last_error_line(self) -> str:
         lines = [line.strip() for line in self.stderr.splitlines() if line.strip()]
         return lines[-1].removeprefix("ucp-harness: ")[:300] if lines else "it said nothing"
 
     def raised_in(self, directory: Path) -> str | None:
-        """The exception that ended it, and the innermost line of `directory` that it came through; None if none did."""
+        """Return the exception that ended the process, with the innermost line in `directory` of its traceback, else
+        None.
+        """
         if "Traceback (most recent call last)" not in self.stderr:
             return None
         frames = re.findall(r'File "([^"\n]+)", line (\d+), in (\S+)', self.stderr)
-        ours = [(Path(file), line, name) for file, line, name in frames if Path(file).is_relative_to(directory)]
-        if not ours:
+        matching_frames = [
+            (Path(file), line, name) for file, line, name in frames if Path(file).is_relative_to(directory)
+        ]
+        if not matching_frames:
             return None
-        file, line, name = ours[-1]
-        return f"{self.last_words} ({file.relative_to(directory.parent)}:{line}, {name})"
+        file, line, name = matching_frames[-1]
+        return f"{self.last_error_line} ({file.relative_to(directory.parent)}:{line}, {name})"
 
 
 def run_python(
     arguments: Sequence[str], *, first: Sequence[Path], cwd: Path, limit_s: float | None, stdin: str | None = None
-) -> Ended:
-    """Run this interpreter with these directories before all other places of modules.
+) -> ProcessResult:
+    """Run this interpreter with the directories `first` at the beginning of the module path.
 
-    It has a session of its own, and is stopped in order, then at all events, if whoever waits for it is interrupted.
+    The process has its own session. If the caller is interrupted, the process receives SIGTERM, and SIGKILL after
+    GRACE_S.
     """
     environment = {
         **os.environ,
@@ -77,9 +81,9 @@ def run_python(
     )
     try:
         stdout, stderr = process.communicate(stdin, timeout=limit_s)
-        return Ended(process.returncode, stdout, stderr)
+        return ProcessResult(process.returncode, stdout, stderr)
     except subprocess.TimeoutExpired:
-        return Ended(None, "", "")
+        return ProcessResult(None, "", "")
     finally:
         _stop(process)
 
@@ -100,7 +104,7 @@ def _stop(process: "subprocess.Popen[str]") -> None:
 
 @contextmanager
 def interrupted_by_sigterm() -> Iterator[None]:
-    """What is inside is interrupted by SIGTERM as by Ctrl-C, and leaves nothing behind. Raises InterruptedRunError."""
+    """Treat SIGTERM like Ctrl-C in this context, so that temporary files are removed. Raises InterruptedRunError."""
 
     def interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt
@@ -119,17 +123,24 @@ Mark = Literal["good", "bad", "skip"]
 _FIRST_BAD = re.compile(r"^([0-9a-f]{40,64}) is the first", re.MULTILINE)
 _HASH_LINE = re.compile(r"^([0-9a-f]{40,64})$", re.MULTILINE)
 _ENVIRONMENT = {"LC_ALL": "C", "GIT_TERMINAL_PROMPT": "0", "GIT_LFS_SKIP_SMUDGE": "1"}
-_FOREIGN = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE", "GIT_OBJECT_DIRECTORY", "GIT_COMMON_DIR", "GIT_PREFIX")
-"""What a hook or `git bisect run` may have set, and would lead git elsewhere."""
+_GIT_LOCATION_VARIABLES = (
+    "GIT_DIR",
+    "GIT_WORK_TREE",
+    "GIT_INDEX_FILE",
+    "GIT_OBJECT_DIRECTORY",
+    "GIT_COMMON_DIR",
+    "GIT_PREFIX",
+)
+"""Variables that a hook or `git bisect run` may have set. They would lead git to another repository."""
 
 
 class RepositoryError(HarnessError):
-    """The repository, or a revision, is not one that can be bisected."""
+    """The repository or the revision cannot be bisected."""
 
 
 @dataclass(frozen=True)
 class Commit:
-    """`files` are those that it changes, as git names them."""
+    """A commit. `files` has the paths of the changed files."""
 
     hash: str
     date: str
@@ -143,14 +154,14 @@ class Commit:
 
 
 @dataclass(frozen=True)
-class Narrowed:
-    """The first bad commit, or those that it may be, where what lies between cannot be tried."""
+class SuspectCommits:
+    """The first bad commit. Several if the commits between them cannot be played."""
 
     first: tuple[str, ...]
 
 
 class History:
-    """Made by `clone`; `tree` is its working tree."""
+    """A clone of the repository. `tree` is its working tree."""
 
     def __init__(self, repository: Path, tree: Path) -> None:
         self._repository = repository
@@ -158,7 +169,7 @@ class History:
 
     @classmethod
     def clone(cls, repository: Path, tree: Path) -> "History":
-        """Raises RepositoryError."""
+        """Clone the repository into `tree`. Raises RepositoryError."""
         history = cls(repository, tree)
         top = history._git(repository, "rev-parse", "--git-common-dir").strip()
         source = str((repository / top).resolve())
@@ -166,10 +177,12 @@ class History:
         return history
 
     def resolve(self, revision: str) -> str:
-        """The commit that a revision of the repository is. Raises RepositoryError."""
+        """Return the commit hash of a revision of the repository. Raises RepositoryError."""
         try:
-            asked = f"{revision}^{{commit}}"
-            return self._git(self._repository, "rev-parse", "--verify", "--quiet", "--end-of-options", asked).strip()
+            commit_expression = f"{revision}^{{commit}}"
+            return self._git(
+                self._repository, "rev-parse", "--verify", "--quiet", "--end-of-options", commit_expression
+            ).strip()
         except RepositoryError:
             raise RepositoryError(f"{self._repository}: no commit {revision!r}; `git log` lists the commits") from None
 
@@ -178,36 +191,41 @@ class History:
         self._git(self.tree, "clean", "--quiet", "-xffd")
 
     def between(self, good: str, bad: str) -> int:
-        """How many commits come after the good one, up to the bad one."""
+        """Return the number of commits after the good one, up to the bad one."""
         return int(self._git(self.tree, "rev-list", "--count", f"{good}..{bad}"))
 
-    def begin(self, good: str, bad: str) -> "str | Narrowed":
-        """The commit to try first, checked out."""
+    def begin(self, good: str, bad: str) -> "str | SuspectCommits":
+        """Start the bisection, check out the first commit to play, and return its hash."""
         return self._next(self._git(self.tree, "bisect", "start", bad, good, accept=(0, 2)))
 
-    def mark(self, mark: Mark) -> "str | Narrowed":
-        """What becomes of the commit that was tried; the one to try next, checked out, or what has come out."""
+    def mark(self, mark: Mark) -> "str | SuspectCommits":
+        """Record the verdict on the current commit, and check out the next one.
+
+        Returns its hash, or the result of the bisection.
+        """
         return self._next(self._git(self.tree, "bisect", mark, accept=(0, 2)))
 
-    def _next(self, said: str) -> "str | Narrowed":
-        if first := _FIRST_BAD.search(said):
-            return Narrowed((first[1],))
-        if "could be any of" in said:
-            return Narrowed(tuple(_HASH_LINE.findall(said)))
+    def _next(self, output: str) -> "str | SuspectCommits":
+        if first := _FIRST_BAD.search(output):
+            return SuspectCommits((first[1],))
+        if "could be any of" in output:
+            return SuspectCommits(tuple(_HASH_LINE.findall(output)))
         self._git(self.tree, "clean", "--quiet", "-xffd")
         return self._git(self.tree, "rev-parse", "HEAD").strip()
 
     def commit(self, commit: str) -> Commit:
         form = "--format=%H%x00%as%x00%an%x00%s%x00"
-        said = self._git(self.tree, "show", "--no-patch", form, commit)
-        parts = said.split("\0")
+        output = self._git(self.tree, "show", "--no-patch", form, commit)
+        parts = output.split("\0")
         names = self._git(self.tree, "diff-tree", "--no-commit-id", "--name-only", "-r", "-m", "--root", commit)
         return Commit(parts[0].strip(), parts[1], parts[2], parts[3], tuple(dict.fromkeys(names.splitlines())))
 
     def _git(self, where: Path, *arguments: str, accept: tuple[int, ...] = (0,)) -> str:
-        environment = {key: value for key, value in os.environ.items() if key not in _FOREIGN} | _ENVIRONMENT
+        environment = {
+            key: value for key, value in os.environ.items() if key not in _GIT_LOCATION_VARIABLES
+        } | _ENVIRONMENT
         try:
-            ended = subprocess.run(
+            process = subprocess.run(
                 ["git", "-c", "core.hooksPath=/dev/null", "-c", "advice.detachedHead=false", *arguments],
                 cwd=where,
                 env=environment,
@@ -221,9 +239,9 @@ class History:
             raise MachineError("git is not installed: apt install git") from None
         except NotADirectoryError:
             raise RepositoryError(f"{where}: not a directory") from None
-        if ended.returncode not in accept:
-            said = " ".join((ended.stderr.strip() or ended.stdout.strip()).split())
-            if "not a git repository" in said:
+        if process.returncode not in accept:
+            output = " ".join((process.stderr.strip() or process.stdout.strip()).split())
+            if "not a git repository" in output:
                 raise RepositoryError(f"{where}: not in a git repository; name one with --repository")
-            raise RepositoryError(f"{where}: git {arguments[0]}: {said[:300] or f'ended with {ended.returncode}'}")
-        return ended.stdout + (ended.stderr if arguments[0] == "bisect" else "")
+            raise RepositoryError(f"{where}: git {arguments[0]}: {output[:300] or f'ended with {process.returncode}'}")
+        return process.stdout + (process.stderr if arguments[0] == "bisect" else "")

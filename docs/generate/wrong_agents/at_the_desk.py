@@ -18,7 +18,7 @@ from docs.generate.wrong_agents.trials_page import rows_of
 from harness.archive.exports import agents_directory
 from harness.archive.traces import SUFFIX
 from harness.field.replay import Player, open_record
-from harness.field.replay.replay_names import Names
+from harness.field.replay.replay_names import ReplayNames
 from harness.play.progress import Silent
 from harness.run.parallel import Failed, sweep
 from harness.run.run import run
@@ -78,7 +78,7 @@ def _first_differences(traces: Sequence[Path]) -> Iterator[Named]:
         record = open_record(trace)
         first = Player(record).to_end().first
         if first is not None:
-            yield Named(first.t, first.handler, first.difference(Names(record).of))
+            yield Named(first.t, first.handler, first.difference(ReplayNames(record).of))
 
 
 def row(quirk: str, brought: AtTheDesk) -> str:

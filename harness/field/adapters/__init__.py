@@ -1,12 +1,12 @@
-"""Import records of other implementations, so that the harness reads them as its own.
+"""Import records of other implementations, so that the harness can read them like its own.
 
-An adapter reads a source and yields observations: lines of traces, exports, datagrams, logged events. CSV files and ROS
-bags have adapters here, and a user can name an adapter of their own. `written_records` writes the observations as
-traces, exports and captures, with `import.json` beside them.
+An adapter reads a source and yields observations: lines of traces, exports, datagrams and logged events. CSV files and
+ROS bags have adapters here, and a user can name an adapter of their own. `imported_records` writes the observations as
+traces, exports and captures, with `import.json` in the same directory.
 """
 
 from harness.field.adapters.adapter import Adapter, ChainExport, Datagram, LoggedEvent, Observation, TraceLine, Unusable
-from harness.field.adapters.written_records import bring_in
+from harness.field.adapters.imported_records import import_records
 
 __all__ = [
     "Adapter",
@@ -16,5 +16,5 @@ __all__ = [
     "Observation",
     "TraceLine",
     "Unusable",
-    "bring_in",
+    "import_records",
 ]

@@ -1,8 +1,8 @@
-"""The interface of an adapter, and how an adapter is found.
+"""The interface of an adapter, and a function that loads a user's adapter.
 
-An adapter reads records of another implementation, or of a recorder beside it, and says what they say, one observation
-after another. It invents nothing: an agent that did not write down its handler runs has no trace, but what was heard
-of it is still a capture.
+An adapter reads the records of another implementation, or of a separate recorder, and yields their contents one
+observation after another. It invents nothing. For example, an agent that did not record its handler runs gets no trace,
+but the datagrams that a recorder received from it still make a capture.
 """
 
 import importlib
@@ -17,20 +17,21 @@ from harness.errors import FieldError
 
 @dataclass(frozen=True, slots=True)
 class TraceLine:
-    """A line of an agent's trace as the agent contract has it (`ucp-trace/2`): the header, a handler run, and so on.
+    """A line of an agent's trace in the format of the agent contract (`ucp-trace/2`), such as the header or a handler
+    run.
 
-    Of one agent they come in its order, the header first.
+    The lines of one agent come in their original order, the header first.
     """
 
     agent_id: int
     text: str | bytes
     where: int | None = None
-    """Here and below: in which line, row or message of the source it stands, counting from 1."""
+    """Number of the line, row or message in the source, from 1. The classes below have the same field."""
 
 
 @dataclass(frozen=True, slots=True)
 class Datagram:
-    """A UDP datagram that agent `agent_id` sent, or received, at `time_ns`, nanoseconds since the Unix epoch."""
+    """A UDP datagram that agent `agent_id` sent or received at `time_ns`, in nanoseconds since the Unix epoch."""
 
     agent_id: int
     time_ns: int
@@ -41,7 +42,7 @@ class Datagram:
 
 @dataclass(frozen=True, slots=True)
 class LoggedEvent:
-    """An event that the agent was given to log at `time_ns`, nanoseconds since the Unix epoch (Section 3.1)."""
+    """An event that the agent received for logging at `time_ns`, in nanoseconds since the Unix epoch (Section 3.1)."""
 
     agent_id: int
     time_ns: int
@@ -60,10 +61,10 @@ class ChainExport:
 
 @dataclass(frozen=True, slots=True)
 class Unusable:
-    """A part of the source that says nothing usable: `why` ends a sentence, as "it has no time".
+    """An unusable part of the source. `why` completes a sentence, as in "it has no time".
 
-    With `of_a_trace` it may have been a line of a trace: that of `agent_id`, or if nobody knows, of any of them, is
-    then not whole across this place.
+    With `of_a_trace`, the part may have been a line of a trace. The trace of `agent_id` then has a gap here. If
+    `agent_id` is None, all traces have a gap.
     """
 
     why: str
@@ -78,37 +79,46 @@ Observation = TraceLine | Datagram | LoggedEvent | ChainExport | Unusable
 
 
 class Adapter:
-    """Subclass it, say what your format looks like, and read it.
+    """The base class of adapters. A subclass recognises its format and reads it.
 
-    `counts` says what `where` counts: "line", "row", "message".
+    `counts` is the unit of `where`: "line", "row" or "message".
     """
 
     counts: ClassVar[str] = "line"
 
     def recognises(self, source: Path, beginning: bytes) -> bool:
-        """Whether a file is of this format, by its name or by its first bytes. By default any is."""
+        """Return whether a file has this format, judged by its name or its first bytes.
+
+        The default accepts every file.
+        """
         return True
 
     def part_of(self, source: Path) -> Path:
-        """What a file is a part of, if one recording goes over several; else the file itself."""
+        """Return the recording that a file belongs to, if a recording may consist of several files.
+
+        The default is the file.
+        """
         return source
 
     def observations(self, source: Path) -> Iterator[Observation]:
-        """What a file says, in its order.
+        """Yield the contents of a file in order.
 
-        What it raises ends the reading of this file, is told with the file's name, and what came before is used.
+        An exception ends the reading of this file. It is reported with the name of the file, and the earlier
+        observations are used.
         """
         raise NotImplementedError
 
 
-_HOW = "give MODULE:CLASS, such as my_logs:MyAdapter or path/to/my_logs.py:MyAdapter (docs/how-to/import-other-logs.md)"
+_USAGE = (
+    "give MODULE:CLASS, such as my_logs:MyAdapter or path/to/my_logs.py:MyAdapter (docs/how-to/import-other-logs.md)"
+)
 
 
 def load_adapter(name: str) -> Adapter:
-    """Raises FieldError if there is no such adapter, or it cannot be made."""
+    """Import and create the adapter `MODULE:CLASS`. Raises FieldError if that is not possible."""
     module_name, separator, class_name = name.rpartition(":")
     if not separator or not module_name or not class_name.isidentifier():
-        raise FieldError(f"{name!r} is not an adapter: {_HOW}")
+        raise FieldError(f"{name!r} is not an adapter: {_USAGE}")
     try:
         if module_name.endswith(".py"):
             path = Path(module_name)
@@ -119,8 +129,8 @@ def load_adapter(name: str) -> Adapter:
         else:
             module = importlib.import_module(module_name)
         adapter = getattr(module, class_name)()
-    except Exception as error:  # it is anybody's code
-        raise FieldError(f"the adapter {name} cannot be loaded: {type(error).__name__}: {error}; {_HOW}") from None
+    except Exception as error:  # A user's module may raise anything.
+        raise FieldError(f"the adapter {name} cannot be loaded: {type(error).__name__}: {error}; {_USAGE}") from None
     if not isinstance(adapter, Adapter):
         raise FieldError(
             f"{name} is not a subclass of harness.field.adapters.Adapter: see docs/how-to/import-other-logs.md"

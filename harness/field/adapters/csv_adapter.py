@@ -1,16 +1,16 @@
-"""Records as CSV, one in a row, as anybody can write them with what a spreadsheet or three lines of a program have.
+"""Records in a CSV file, one per row. A spreadsheet or a short program can write such a file.
 
-The columns, in any order, named in the first row:
+The first row names the columns, in any order:
 
-time_s   seconds since the Unix epoch, as 1790000000.123456; may be empty for `trace` and `export`
+time_s   seconds since the Unix epoch, such as 1790000000.123456; may be empty for `trace` and `export`
 agent    the agent's ID
 kind     trace, sent, received, event or export
 event    the event's ID, for `event` only
-data     of `trace` a line of the agent's trace, of `export` its chain export, as JSON; of `sent` and `received` the
-         datagram, of `event` the event's data, in base64
+data     for `trace` a line of the agent's trace, and for `export` its chain export, both as JSON;
+         for `sent` and `received` the datagram, and for `event` the event's data, in base64
 
-Commas, semicolons or tabs separate them. A row that is damaged is left out, and takes no other along, even if a quote
-in it is never closed.
+The separator is a comma, a semicolon or a tab. A damaged row is left out, and does not affect other rows, even if a
+quote in it is never closed.
 """
 
 import base64
@@ -30,7 +30,7 @@ COLUMNS = ("time_s", "agent", "kind", "event", "data")
 KINDS = ("trace", "sent", "received", "event", "export")
 MAX_BYTES = 1024 * 1024 * 1024
 MAX_LINES_OF_A_ROW = 20_000
-"""An export that a spreadsheet or a person has laid out over lines."""
+"""Maximum number of lines in a row. A spreadsheet or a person may format an export over many lines."""
 MAX_ROW_BYTES = 4 * MAX_LINE_BYTES
 LAST_NS = 2**63 - 1
 MAX_EVENT_ID = 254
@@ -38,8 +38,8 @@ _SEPARATORS = (",", ";", "\t")
 _BOM = "\ufeff"
 
 
-class CommaSeparated(Adapter):
-    """Reads CSV."""
+class CsvAdapter(Adapter):
+    """The adapter for CSV files."""
 
     counts = "row"
 
@@ -66,21 +66,21 @@ class CommaSeparated(Adapter):
 
 
 class _Layout:
-    """Which column is where."""
+    """The positions of the columns, and the separator."""
 
     def __init__(self, separator: str, places: dict[str, int]) -> None:
         self._separator = separator
         self._places = places
 
     def cells(self, row: str) -> dict[str, str] | None:
-        """By the column's name; None if the row has others than the first."""
+        """Return the cells of a row by column name. None if the row does not have the columns of the first row."""
         last = max(self._places.values())
         try:
             cells = next(csv.reader([row], delimiter=self._separator, strict=True), [])
         except csv.Error:
             cells = []
         if len(cells) != last + 1 and self._places["data"] == last:
-            cells = row.rstrip("\r\n").split(self._separator, last)  # JSON that nobody has quoted
+            cells = row.rstrip("\r\n").split(self._separator, last)  # JSON without quotes
         if len(cells) <= last:
             return None
         return {name: cells[place] for name, place in self._places.items()}
@@ -95,32 +95,35 @@ def _layout(row: str) -> _Layout | None:
 
 
 def _rows(file: BoundedFile) -> Iterator[tuple[int, str]]:
-    """Each row, and the number of its first line. One may go over lines, if a quote is open, and closes."""
-    waiting: deque[str] = deque()  # lines that were read ahead, for a quote that did not close
+    """Yield each row with the number of its first line.
+
+    A row may extend over several lines if a quote is open and closes.
+    """
+    read_ahead: deque[str] = deque()  # lines after a quote that did not close
     number = 0
-    while line := waiting.popleft() if waiting else _line(file):
+    while line := read_ahead.popleft() if read_ahead else _line(file):
         number += 1
         if line.count('"') % 2 == 0:
             yield number, line
             continue
         row, row_bytes = [line], len(line)
         while len(row) <= MAX_LINES_OF_A_ROW and row_bytes <= MAX_ROW_BYTES:
-            following = waiting.popleft() if waiting else _line(file)
-            if not following:
+            next_line = read_ahead.popleft() if read_ahead else _line(file)
+            if not next_line:
                 break
-            row_bytes += len(following)
-            row.append(following)
-            if following.count('"') % 2:
+            row_bytes += len(next_line)
+            row.append(next_line)
+            if next_line.count('"') % 2:
                 break
-        if sum(each.count('"') for each in row) % 2 == 0 and not any(map(_begins_a_row, row[1:])):
+        if sum(each.count('"') for each in row) % 2 == 0 and not any(map(_starts_like_a_row, row[1:])):
             yield number, "".join(row)
             number += len(row) - 1
         else:
             yield number, line
-            waiting.extendleft(reversed(row[1:]))
+            read_ahead.extendleft(reversed(row[1:]))
 
 
-def _begins_a_row(line: str) -> bool:
+def _starts_like_a_row(line: str) -> bool:
     return any(f"{separator}{kind}{separator}" in line[:100] for kind in KINDS for separator in _SEPARATORS)
 
 

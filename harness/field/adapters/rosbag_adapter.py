@@ -1,19 +1,19 @@
-"""ROS bags, of version 1 and 2, on a machine without ROS: the package `rosbags` knows the messages.
+"""ROS bags of versions 1 and 2, read without ROS. The package `rosbags` decodes the messages.
 
-The thesis's agents were ROS nodes. By convention agent 7 has these topics, any of which may be missing:
+The agents of the thesis were ROS nodes. By convention agent 7 has these topics, and any of them may be missing:
 
 /ucp/7/trace     std_msgs/String           lines of its trace, the header first
 /ucp/7/sent      std_msgs/UInt8MultiArray  each datagram that it broadcast
-/ucp/7/received  std_msgs/UInt8MultiArray  each datagram that reached it
-/ucp/7/event     std_msgs/UInt8MultiArray  each event that it was given to log: its ID, and then its data
+/ucp/7/received  std_msgs/UInt8MultiArray  each datagram that it received
+/ucp/7/event     std_msgs/UInt8MultiArray  each event that it received for logging: its ID, then its data
 /ucp/7/chain     std_msgs/String           its chain export
 
-The time of a datagram or an event is that at which the bag recorded it. Other names are a subclass away:
+The time of a datagram or an event is the time at which the bag recorded it. A subclass can use other topic names:
 
     class OurBags(RosBag):
         topics = {"/uav{agent}/swarm/rx": "received", "/uav{agent}/swarm/tx": "sent"}
 
-and so are other types: `payload` says what a message says.
+A subclass can also use other message types by overriding `payload`.
 """
 
 import re
@@ -30,18 +30,18 @@ from harness.field.adapters.bags import (
     BagMessage,
     messages,
 )
-from harness.field.adapters.bags._decompression import Broken, message_data
+from harness.field.adapters.bags._decompression import Damage, message_data
 
 METADATA = "metadata.yaml"
 _METADATA_BEGINS = b"rosbag2_bagfile_information"
 _JOURNALS = ("-wal", "-shm")
-_OTHERS_TOLD = 5
+_MAX_TOPICS_LISTED = 5
 
 
 class RosBag(Adapter):
-    """Reads bags; `topics` says what is on which, `{agent}` standing for the agent's ID.
+    """The adapter for ROS bags. `topics` maps topic names to their contents, where `{agent}` stands for the agent's ID.
 
-    What is on a topic is `trace`, `sent`, `received`, `event` or `chain`.
+    The contents of a topic are `trace`, `sent`, `received`, `event` or `chain`.
     """
 
     counts = "message"
@@ -57,7 +57,7 @@ class RosBag(Adapter):
         return beginning.startswith(MAGICS)
 
     def part_of(self, source: Path) -> Path:
-        """A bag of version 2 is a directory."""
+        """Return the directory of a bag of version 2, or the file of a bag of version 1."""
         if (source.parent / METADATA).is_file():
             return source.parent
         return source.with_name(source.name[:-4]) if source.name.endswith(_JOURNALS) else source
@@ -65,44 +65,47 @@ class RosBag(Adapter):
     def observations(self, source: Path) -> Iterator[Observation]:
         if source.name == METADATA or source.name.endswith(_JOURNALS):
             return
-        _types("ROS2_HUMBLE")  # to say at once that the package is missing
-        others: Counter[str] = Counter()
+        _types("ROS2_HUMBLE")  # Report a missing package before reading.
+        other_topics: Counter[str] = Counter()
         number = 0
         for message in messages(source):
-            if isinstance(message, Broken):
+            if isinstance(message, Damage):
                 yield Unusable(message.why, number + 1, of_a_trace=True)
                 continue
             number = message.number
-            named = next((topic for topic in self._patterns if topic.fullmatch(message.topic)), None)
-            agent = named and named.fullmatch(message.topic)
-            if named is None or agent is None:
-                others[message.topic] += 1
+            pattern = next((topic for topic in self._patterns if topic.fullmatch(message.topic)), None)
+            agent = pattern and pattern.fullmatch(message.topic)
+            if pattern is None or agent is None:
+                other_topics[message.topic] += 1
             else:
-                yield from self._said(message, int(agent[1]), self._patterns[named])
-        if others:
-            names = ", ".join(topic[:60] for topic, _ in others.most_common(_OTHERS_TOLD))
-            more = ", ..." if len(others) > _OTHERS_TOLD else ""
-            yield Unusable(f"{others.total()} messages are on topics of no agent: {names}{more}")
+                yield from self._observations(message, int(agent[1]), self._patterns[pattern])
+        if other_topics:
+            names = ", ".join(topic[:60] for topic, _ in other_topics.most_common(_MAX_TOPICS_LISTED))
+            more = ", ..." if len(other_topics) > _MAX_TOPICS_LISTED else ""
+            yield Unusable(f"{other_topics.total()} messages are on topics of no agent: {names}{more}")
 
     def payload(self, message: BagMessage) -> str | bytes:
-        """The text of a String, and the bytes of a UInt8MultiArray. What it raises is told of the message."""
+        """Return the text of a String, or the bytes of a UInt8MultiArray.
+
+        Exceptions are reported with the number of the message.
+        """
         content = self.decoded(message).data
         return content if isinstance(content, str) else bytes(content)
 
     def decoded(self, message: BagMessage) -> Any:
-        """The message as rosbags has it, an object with the fields of its type."""
+        """Return the message that rosbags decoded, an object with the fields of the message type."""
         data = message_data(message.data)
         if "/msg/" in message.type_name:
             return self._version_2.deserialize_cdr(data, message.type_name)
         return self._version_1.deserialize_ros1(data, message.type_name.replace("/", "/msg/"))
 
-    def _said(self, message: BagMessage, agent: int, kind: str) -> Iterator[Observation]:
+    def _observations(self, message: BagMessage, agent: int, kind: str) -> Iterator[Observation]:
         number = message.number
         try:
             content = self.payload(message)
         except MachineError:
             raise
-        except Exception as error:  # rosbags has many ways to say that bytes are no message of a type
+        except Exception as error:  # rosbags raises many kinds of exceptions for damaged messages.
             why = f"it is a damaged {message.type_name[:40] or 'message of a known type'} ({type(error).__name__})"
             yield Unusable(why, number, kind == "trace", agent)
             return

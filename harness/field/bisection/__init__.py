@@ -1,21 +1,21 @@
-"""Find the change of the code, or the agent, that changes how a scenario or a record plays.
+"""Find the commit, or compare agents, when a scenario or a record plays differently than before.
 
-A subject is a scenario, a run, or records of a flight (`outcome`). `code_state` checks out a commit in a clone of its
-own, and runs processes with it. `_playing` plays the subject there and returns its outcome. `_bisecting` searches the
-first commit whose outcome differs. Records are given to another commit's core in a process (`_record_core`), or to
-another agent over UDP while its peers are played from a script (`_live_replay`, `_scripted_peers`).
+A subject is a scenario, a run, or the records of a flight (`outcome`). `code_state` checks out a commit in a separate
+clone, and runs processes with it. `_playing` plays the subject with it and returns the outcome. `_bisecting` searches
+for the first commit with a different outcome. Records are played by the core of another commit in a separate process
+(`_record_core`), or by another agent program over UDP with scripted peers (`_live_replay`, `_scripted_peers`).
 """
 
-from harness.field.bisection._bisecting import Found, Tried, bisect
-from harness.field.bisection._playing import CannotBeTriedError, Workshop
+from harness.field.bisection._bisecting import BisectionResult, Trial, bisect
+from harness.field.bisection._playing import UntestableError, Workshop
 from harness.field.bisection.outcome import Outcome, Subject, differences, subject_of
 
 __all__ = [
-    "CannotBeTriedError",
-    "Found",
+    "BisectionResult",
     "Outcome",
     "Subject",
-    "Tried",
+    "Trial",
+    "UntestableError",
     "Workshop",
     "bisect",
     "differences",

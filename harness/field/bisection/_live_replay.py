@@ -1,10 +1,12 @@
-"""One agent's record, given to another agent as a process, datagram for datagram, by UDP.
+"""Replay the record of one agent with another agent process, datagram by datagram, over UDP.
 
-The agent is alone in a lab but for one node that plays all its peers: it sends what the record says that they sent, at
-these times. The record's own events cannot be logged by another agent, for a mission has no word for that. So a block
-of the agent's own comes to it as committed by a peer, at the moment at which the record committed it, and a reconcile
-that came of a vote of its own is commanded. All else the agent does by itself, and its messages are compared with the
-record's.
+The agent runs in a lab with only one other node, which plays all peers. This node sends the datagrams that the peers
+sent according to the record, at the same times.
+
+Events of the record cannot be logged by another agent, because the agent contract has no command for that. Therefore a
+peer commits the agent's own blocks at the times at which the agent committed them in the record. A reconcile that
+followed one of its own votes is started by command. The agent does everything else by itself, and its messages are
+compared with those in the record.
 """
 
 import asyncio
@@ -23,7 +25,7 @@ from typing import Any
 from harness.archive.vocabulary import first_unknown, unknown_names
 from harness.checker.recorded_inputs import decoded
 from harness.errors import FieldError, HarnessError, MachineError
-from harness.field.bisection.outcome import Difference
+from harness.field.bisection.outcome import RecordDifference
 from harness.field.replay import Record
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
 from harness.play.process.agent_mission import mission_file
@@ -49,24 +51,24 @@ from ucp.trace import Dropped, HandlerRun, Recorded, in_base64
 from ucp.trigger import LocalTrigger, MessageTrigger, OperatorTrigger
 
 START_LIMIT_S, ANSWER_LIMIT_S, GRACE_S = 30.0, 10.0, 5.0
-HEAD_START_S = 2.0
-"""By when those who play the peers are there."""
+START_DELAY_S = 2.0
+"""Time until mission second 0. The node of the peers has started by then."""
 SLACK_S, SLACK_WALL_S = 1.0, 0.15
-"""How far in time a message may be from the record's, in mission seconds, and more in wall seconds."""
-SHOWN = 12
+"""Tolerated time difference between a message and the record, in mission seconds, plus wall seconds."""
+HASH_DIGITS = 12
 
 
 class NotStartedError(HarnessError):
-    """The agent does not start."""
+    """The agent process does not start."""
 
 
 class ReplayFailedError(HarnessError):
-    """The agent ends by itself, or does not do as it is told."""
+    """The agent process ends by itself, or rejects a command."""
 
 
 @dataclass(frozen=True)
-class Said:
-    """A message that the record's agent sent, as it should be heard."""
+class ExpectedMessage:
+    """A message that the recorded agent sent, and that the replaying agent should send."""
 
     t: float
     line: int
@@ -75,8 +77,11 @@ class Said:
 
 
 @dataclass(frozen=True)
-class Given:
-    """A datagram that the agent is given; `after` is the question of its own that it answers, if it does."""
+class ScriptedDatagram:
+    """A datagram for the agent.
+
+    `after` is the agent's query that it answers, if any, and `asked_s` the time of the query.
+    """
 
     t: float
     datagram: str
@@ -90,63 +95,66 @@ class Given:
 
 @dataclass(frozen=True)
 class Script:
-    """What the agent is given: datagrams and commands by mission second; and what it should say."""
+    """The datagrams and commands for the agent by mission second, and its expected messages."""
 
-    datagrams: list[Given]
+    datagrams: list[ScriptedDatagram]
     questions: list[tuple[float, str]]
-    """When it asked what: datagrams in base64."""
+    """Mission second and datagram (base64) of each query of the agent."""
     reconciles: list[float]
-    expected: list[Said]
+    expected: list[ExpectedMessage]
     finished: list[float]
-    """When a reconcile ended."""
+    """Mission seconds at which a reconcile ended."""
     lines: list[tuple[float, int]]
-    """When which line of the record was."""
+    """Mission second and line number of each line of the record."""
     ends_s: float
 
     def line_at(self, at_s: float) -> int:
-        """The record's last line by then."""
+        """Return the number of the last line of the record at that time."""
         return self.lines[max(0, bisect_right(self.lines, at_s, key=itemgetter(0)) - 1)][1] if self.lines else 0
 
-    def is_close(self, at_s: float, slack_s: float) -> bool:
-        """Whether that is so near to the end of a reconcile that a process may, or may not yet, answer."""
-        place = bisect_left(self.finished, at_s - slack_s)
-        return place < len(self.finished) and self.finished[place] <= at_s + slack_s
+    def is_near_reconcile_end(self, at_s: float, slack_s: float) -> bool:
+        """Return whether a reconcile ended about that time.
+
+        A process may then answer queries a little earlier or later.
+        """
+        index = bisect_left(self.finished, at_s - slack_s)
+        return index < len(self.finished) and self.finished[index] <= at_s + slack_s
 
 
 def script_of(record: Record) -> Script:
-    """The first life of the record; another one would begin with what was on a disk."""
-    datagrams: list[Given] = []
+    """Return the script of the first incarnation. A later incarnation would need the content of the disk."""
+    datagrams: list[ScriptedDatagram] = []
     reconciles: list[float] = []
-    expected: list[Said] = []
+    expected: list[ExpectedMessage] = []
     questions: dict[tuple[type, bytes], tuple[float, str]] = {}
-    asked: list[tuple[float, str]] = []
+    sent_question: list[tuple[float, str]] = []
     finished: list[float] = []
     reconciling = False
     peer = min(member for member in record.header.roster if member != record.agent_id)
-    runs = [(entry.line, entry.what) for entry in record.entries if entry.life <= 1]
+    runs = [(entry.line, entry.content) for entry in record.entries if entry.incarnation <= 1]
     for line, run in runs:
         if isinstance(run, Dropped):
-            datagrams.append(Given(run.t, run.datagram.text))
+            datagrams.append(ScriptedDatagram(run.t, run.datagram.text))
         elif isinstance(run, HandlerRun):
             if reconciling and not run.state.reconciling:
                 finished.append(run.t)
             reconciling = run.state.reconciling
             if isinstance(run.trigger, MessageTrigger) and run.input is not None:
-                datagrams.append(_answering(questions, run.t, run.input))
-            if run.handler == "reconcile_begin" and run.branch == "begun" and _by_itself(run):
+                datagrams.append(_scripted_answer(questions, run.t, run.input))
+            if run.handler == "reconcile_begin" and run.branch == "begun" and _starts_locally(run):
                 reconciles.append(run.t)
             for text, message in _messages(run):
-                if (question := _question(message)) is not None:
+                if (question := _question_key(message)) is not None:
                     questions[question] = run.t, text
-                    asked.append((run.t, text))
+                    sent_question.append((run.t, text))
                 if run.handler == "vote_timer_expiration" and isinstance(message, CommitBlock):
-                    datagrams.append(Given(run.t, in_base64(encode(peer, line, message))))
+                    datagrams.append(ScriptedDatagram(run.t, in_base64(encode(peer, line, message))))
                 elif not isinstance(message, BlockAddRequest):
-                    expected.append(Said(run.t, line, run.handler, message))
+                    expected.append(ExpectedMessage(run.t, line, run.handler, message))
     datagrams.sort(key=lambda given: given.t)
     return Script(
         datagrams,
-        asked,
+        sent_question,
         reconciles,
         expected,
         finished,
@@ -155,8 +163,8 @@ def script_of(record: Record) -> Script:
     )
 
 
-def _question(message: Message) -> tuple[type, bytes] | None:
-    """The type of what answers it, and what about; None if it asks nothing."""
+def _question_key(message: Message) -> tuple[type, bytes] | None:
+    """Return the type of the response to a query, and its subject. None if the message is no query."""
     match message:
         case ChainContainQuery():
             return ChainContainResponse, message.chain_hash
@@ -167,52 +175,58 @@ def _question(message: Message) -> tuple[type, bytes] | None:
     return None
 
 
-def _answering(questions: Mapping[tuple[type, bytes], tuple[float, str]], t: float, datagram: Recorded) -> Given:
+def _scripted_answer(
+    questions: Mapping[tuple[type, bytes], tuple[float, str]], t: float, datagram: Recorded
+) -> ScriptedDatagram:
     try:
         message = decoded(datagram).message
     except MalformedDatagramError:
-        return Given(t, datagram.text)
+        return ScriptedDatagram(t, datagram.text)
     about = message.block.block_hash if isinstance(message, BlockResponse) else getattr(message, "chain_hash", b"")
-    asked = questions.get((type(message), about))
-    return Given(t, datagram.text, asked[1], asked[0]) if asked else Given(t, datagram.text)
+    sent_question = questions.get((type(message), about))
+    return (
+        ScriptedDatagram(t, datagram.text, sent_question[1], sent_question[0])
+        if sent_question
+        else ScriptedDatagram(t, datagram.text)
+    )
 
 
-def _by_itself(run: HandlerRun) -> bool:
+def _starts_locally(run: HandlerRun) -> bool:
     return isinstance(run.trigger, OperatorTrigger) or run.trigger == LocalTrigger("vote_timer_expiration")
 
 
 def _messages(run: HandlerRun) -> Iterator[tuple[str, Message]]:
-    """What it sent, with its datagrams in base64."""
+    """Yield each sent message with its datagram in base64."""
     for sent in run.sent:
         if sent.datagram is not None:
             with suppress(MalformedDatagramError):
                 yield sent.datagram.text, decoded(sent.datagram).message
 
 
-def play_live(record: Record, command: Sequence[str], place: Path, *, speedup: float) -> list[Difference]:
-    """What the agent says otherwise than the record.
+def play_live(record: Record, command: Sequence[str], directory: Path, *, speedup: float) -> list[RecordDifference]:
+    """Replay the record with an agent process, and return the differences.
 
-    Raises MachineError, NotStartedError, ReplayFailedError; FieldError if the record is in words that nobody knows.
+    Raises MachineError, NotStartedError, ReplayFailedError, or FieldError if the record has unknown names.
     """
     if unknown := first_unknown(unknown_names(record.trace.runs), ("trigger", "handler", "branch", "timer")):
         raise FieldError(f"{record.path}: {unknown}, so it cannot be played; give another record")
     script = script_of(record)
     try:
-        heard = asyncio.run(_Air(record, script, command, place, speedup).play())
+        received = asyncio.run(_LiveReplay(record, script, command, directory, speedup).play())
     except LabUnavailable as error:
         raise MachineError(str(error)) from None
     except NetemError as error:
         raise MachineError(f"the lab failed: {error}") from None
-    found = sorted(_compare(script, heard, SLACK_S + SLACK_WALL_S * speedup), key=itemgetter(0))
+    found = sorted(_compare(script, received, SLACK_S + SLACK_WALL_S * speedup), key=itemgetter(0))
     return [difference for _, difference in found]
 
 
-class _Air:
-    def __init__(self, record: Record, script: Script, command: Sequence[str], place: Path, speedup: float) -> None:
+class _LiveReplay:
+    def __init__(self, record: Record, script: Script, command: Sequence[str], directory: Path, speedup: float) -> None:
         self._record = record
         self._script = script
         self._command = command
-        self._place = place
+        self._place = directory
         self._speedup = speedup
         self._peers_id = next(number for number in range(MAX_AGENT_ID, 0, -1) if number not in record.header.roster)
 
@@ -235,7 +249,7 @@ class _Air:
             control = AgentControl(directory / f"{agent_id}.control")
             try:
                 await self._wait_until_it_answers(control, agent, log)
-                return await self._fly(lab, control, agent, log)
+                return await self._run_mission(lab, control, agent, log)
             finally:
                 control.close()
                 await agent.terminate(GRACE_S)
@@ -269,9 +283,11 @@ class _Air:
                     raise NotStartedError(f"the agent did not answer within {START_LIMIT_S:g} s") from None
                 await asyncio.sleep(0.02)
 
-    async def _fly(self, lab: Lab, control: AgentControl, agent: LabProcess, log: Path) -> list[tuple[float, Message]]:
-        epoch_us = round((time.time() + HEAD_START_S) * MICROSECONDS)
-        script, heard = self._place / "script.jsonl", self._place / "heard.jsonl"
+    async def _run_mission(
+        self, lab: Lab, control: AgentControl, agent: LabProcess, log: Path
+    ) -> list[tuple[float, Message]]:
+        epoch_us = round((time.time() + START_DELAY_S) * MICROSECONDS)
+        script, received = self._place / "script.jsonl", self._place / "heard.jsonl"
         lines = [given.to_json() for given in self._script.datagrams]
         lines += [{"t": at_s, "question": question} for at_s, question in self._script.questions]
         script.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
@@ -283,7 +299,7 @@ class _Air:
                 "-m",
                 "harness.field.bisection._scripted_peers",
                 script.name,
-                heard.name,
+                received.name,
                 str(epoch_us),
                 str(self._speedup),
             ],
@@ -302,7 +318,7 @@ class _Air:
         if done:
             raise ReplayFailedError(f"the agent ended by itself with {agent.end}: {_last_line(log)}")
         ending.cancel()
-        return _heard(heard, self._record.agent_id)
+        return _received(received, self._record.agent_id)
 
     async def _command_reconciles(self, control: AgentControl, epoch_us: int) -> None:
         for t in self._script.reconciles:
@@ -316,12 +332,12 @@ class _Air:
             raise ReplayFailedError(f"the agent does not {command}: {error}") from None
 
     def _wall_s(self, epoch_us: int, mission_s: float) -> float:
-        """From now on until then."""
+        """Return the wall seconds from now until a mission second."""
         return max(0.0, epoch_us / MICROSECONDS + mission_s / self._speedup - time.time())
 
 
-def _heard(path: Path, agent_id: int) -> list[tuple[float, Message]]:
-    heard: list[tuple[float, Message]] = []
+def _received(path: Path, agent_id: int) -> list[tuple[float, Message]]:
+    received: list[tuple[float, Message]] = []
     for text in path.read_text(encoding="utf-8").splitlines():
         line = json.loads(text)
         try:
@@ -329,8 +345,8 @@ def _heard(path: Path, agent_id: int) -> list[tuple[float, Message]]:
         except MalformedDatagramError:
             continue
         if datagram.sender == agent_id and not isinstance(datagram.message, BlockAddRequest):
-            heard.append((float(line["t"]), datagram.message))
-    return heard
+            received.append((float(line["t"]), datagram.message))
+    return received
 
 
 def _last_line(log: Path) -> str:
@@ -338,34 +354,41 @@ def _last_line(log: Path) -> str:
     return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "it said nothing")
 
 
-def _compare(script: Script, heard: list[tuple[float, Message]], slack_s: float) -> Iterator[tuple[float, Difference]]:
-    """What is lacking, or said otherwise, and what nobody should have heard, with the mission second of each.
+def _compare(
+    script: Script, received: list[tuple[float, Message]], slack_s: float
+) -> Iterator[tuple[float, RecordDifference]]:
+    """Yield missing, different and unexpected messages, each with its mission second.
 
-    Who reconciles answers nobody: what is, or is not, answered around the end of a reconcile is no difference.
+    An agent does not answer during a reconcile. Messages about the end of a reconcile are therefore not compared.
     """
-    left = list(heard)
-    for said in script.expected:
-        near = [each for each in left if abs(each[0] - said.t) <= slack_s]
-        same = next((each for each in near if each[1] == said.message), None)
-        if same is not None:
-            left.remove(same)
+    unmatched = list(received)
+    for expected_message in script.expected:
+        candidates = [each for each in unmatched if abs(each[0] - expected_message.t) <= slack_s]
+        equal_message = next((each for each in candidates if each[1] == expected_message.message), None)
+        if equal_message is not None:
+            unmatched.remove(equal_message)
             continue
-        other = next((each for each in near if _about(each[1]) == _about(said.message)), None)
-        if other is not None:
-            left.remove(other)
-        elif script.is_close(said.t, slack_s):
+        same_subject = next(
+            (each for each in candidates if _subject(each[1]) == _subject(expected_message.message)), None
+        )
+        if same_subject is not None:
+            unmatched.remove(same_subject)
+        elif script.is_near_reconcile_end(expected_message.t, slack_s):
             continue
-        did = f"it sent {_words(other[1])}" if other is not None else "it did not send it"
-        detail = f"{did}; the record sent {_words(said.message)}, at {said.t:g} s"
-        yield said.t, Difference(line=said.line, handler=said.handler, detail=detail)
-    for t, message in left:
-        if not script.is_close(t, slack_s):
-            detail = f"it sent {_words(message)} at {t:.1f} s; the record has no such message"
-            yield t, Difference(line=script.line_at(t), handler=None, detail=detail)
+        did = f"it sent {_message_text(same_subject[1])}" if same_subject is not None else "it did not send it"
+        detail = f"{did}; the record sent {_message_text(expected_message.message)}, at {expected_message.t:g} s"
+        yield (
+            expected_message.t,
+            RecordDifference(line=expected_message.line, handler=expected_message.handler, detail=detail),
+        )
+    for t, message in unmatched:
+        if not script.is_near_reconcile_end(t, slack_s):
+            detail = f"it sent {_message_text(message)} at {t:.1f} s; the record has no such message"
+            yield t, RecordDifference(line=script.line_at(t), handler=None, detail=detail)
 
 
-def _about(message: Message) -> tuple[type, Any]:
-    """What a message is an answer to."""
+def _subject(message: Message) -> tuple[type, Any]:
+    """Return the type of a message and the block or chain that it is about."""
     for name in ("chain_hash", "block_hash"):
         if type(message).__name__ == "BlockAddResponse" and name == "chain_hash":
             continue
@@ -374,14 +397,14 @@ def _about(message: Message) -> tuple[type, Any]:
     return type(message), None
 
 
-def _words(message: Message) -> str:
-    """ "Block Add Response (block hash 5f0c…, approve True)"."""
+def _message_text(message: Message) -> str:
+    """Return a text such as "Block Add Response (block hash 5f0c…, approve True)"."""
     parts = []
     for each in fields(message):
         value = getattr(message, each.name)
-        shown = value.hex()[:SHOWN] if isinstance(value, bytes) else value
+        shown = value.hex()[:HASH_DIGITS] if isinstance(value, bytes) else value
         if each.name == "block":
-            shown = value.block_hash.hex()[:SHOWN]
+            shown = value.block_hash.hex()[:HASH_DIGITS]
         if value is not None:
             parts.append(f"{each.name.replace('_', ' ')} {shown}")
     return f"{message.NAME} ({', '.join(parts)})"

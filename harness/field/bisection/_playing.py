@@ -1,4 +1,4 @@
-"""Playing a subject with a state of the code in the place of the installed one, or with another agent command."""
+"""Play a subject with another state of the code, or with another agent command."""
 
 import json
 import shlex
@@ -18,29 +18,28 @@ from harness.errors import (
     InterruptedRunError,
 )
 from harness.field.bisection._live_replay import NotStartedError, ReplayFailedError, play_live
-from harness.field.bisection.outcome import Difference, OfAgent, Outcome, Subject, of_run
+from harness.field.bisection.outcome import AgentResult, Outcome, RecordDifference, Subject, outcome_of_run
 from harness.field.replay import open_record
-from harness.run.code_state import ROOT, Ended, run_python
+from harness.run.code_state import ROOT, ProcessResult, run_python
 from harness.scenario import Scenario
 
 SPEEDUP = 20.0
-"""Mission seconds per second, of a record that is given to a process."""
+"""Mission seconds per second, when an agent process replays a record."""
 RECORD_CORE = "harness.field.bisection._record_core"
-"""The module that runs as a process and gives records to the core under test."""
+"""The module that plays records with the core under test. It runs as a process."""
 CODE = "{code}"
-"""In an agent command: the directory of the state of the code."""
+"""A placeholder in an agent command for the directory of the code."""
 
 
-class CannotBeTriedError(HarnessError):
-    """Nothing can be said of this state of the code: it does not start, or does not know what it is asked to play."""
+class UntestableError(HarnessError):
+    """The subject cannot be played with this state of the code, because the code does not start or lacks a feature."""
 
 
 class Workshop:
-    """Plays the subject, each time in a new directory below `directory`; nothing may take longer than `limit_s`.
+    """A player of one subject. Each play has a new directory in `directory` and at most `limit_s` seconds.
 
-    Without `command` a scenario is played in virtual time, whole, by the state of the code that is tried, and records
-    are given to its core. With it a scenario is played as processes by the harness that runs now, and one agent's
-    record is given to the agent as a process.
+    Without `command`, the code under test plays a scenario in virtual time, and its core plays records. With `command`,
+    the installed harness plays a scenario with agent processes, and an agent process replays the record of one agent.
     """
 
     def __init__(
@@ -60,135 +59,145 @@ class Workshop:
         self._count = 0
 
     @property
-    def plays_the_same(self) -> bool:
-        """Whether the same code gives the same run, so that it means something where two runs part."""
+    def is_deterministic(self) -> bool:
+        """True if the same code always gives the same run, so that the first difference between two runs is
+        meaningful.
+        """
         return self.subject.scenario is not None and self._command is None
 
     def play(self, code: Path) -> tuple[Outcome, Path]:
-        """What comes of it with this state of the code, and the run directory. Raises CannotBeTriedError."""
+        """Play the subject with the code in this directory. Returns the outcome and the run directory.
+
+        Raises UntestableError.
+        """
         self._count += 1
-        place = self._directory / f"play-{self._count}"
-        place.mkdir()
+        directory = self._directory / f"play-{self._count}"
+        directory.mkdir()
         if self.subject.scenario is None and self._command is not None:
-            return self._given_by_udp(code, self._command, place), place
+            return self._play_live(code, self._command, directory), directory
         if self.subject.scenario is None:
-            return self._given_records(code, place), place
+            return self._play_records(code, directory), directory
         if self._command is None:
-            return self._in_virtual_time(code, self.subject.scenario, place)
-        return self._as_processes(code, self.subject.scenario, self._command, place)
+            return self._play_in_virtual_time(code, self.subject.scenario, directory)
+        return self._play_as_processes(code, self.subject.scenario, self._command, directory)
 
     # A scenario
 
-    def _in_virtual_time(self, code: Path, scenario: Scenario, place: Path) -> tuple[Outcome, Path]:
+    def _play_in_virtual_time(self, code: Path, scenario: Scenario, directory: Path) -> tuple[Outcome, Path]:
         if not (code / "ucp").is_dir():
-            raise CannotBeTriedError("it has no directory ucp/")
-        starts = run_python(["-c", "import ucp.agent, harness.cli"], first=[code], cwd=place, limit_s=self._limit_s)
-        if starts.status != 0:
-            raise CannotBeTriedError(f"it does not start: {starts.last_words}")
-        run_dir = place / "run"
+            raise UntestableError("it has no directory ucp/")
+        start_check = run_python(
+            ["-c", "import ucp.agent, harness.cli"], first=[code], cwd=directory, limit_s=self._limit_s
+        )
+        if start_check.status != 0:
+            raise UntestableError(f"it does not start: {start_check.last_error_line}")
+        run_dir = directory / "run"
         played = run_python(
             [
-                *("-m", "harness.cli", "run", str(_scenario_file(scenario, place)), "--backend", "sim"),
+                *("-m", "harness.cli", "run", str(_scenario_file(scenario, directory)), "--backend", "sim"),
                 *("--seed", str(self.subject.seed), "--out", str(run_dir)),
             ],
             first=[code],
-            cwd=place,
+            cwd=directory,
             limit_s=self._limit_s,
         )
         if crashed := played.raised_in(code / "ucp"):
             return Outcome(subject=self.subject.in_words, crashed=crashed), run_dir
-        return self._judged(played, run_dir, exact=True), run_dir
+        return self._judge(played, run_dir, exact=True), run_dir
 
-    def _as_processes(self, code: Path, scenario: Scenario, command: str, place: Path) -> tuple[Outcome, Path]:
-        asked = _with_command(scenario, _words(command, code), self._speedup)
-        run_dir = place / "run"
+    def _play_as_processes(self, code: Path, scenario: Scenario, command: str, directory: Path) -> tuple[Outcome, Path]:
+        scenario_to_play = _with_command(scenario, _split_command(command, code), self._speedup)
+        run_dir = directory / "run"
         played = run_python(
             [
-                *("-m", "harness.cli", "run", str(_scenario_file(asked, place)), "--backend", "process"),
+                *("-m", "harness.cli", "run", str(_scenario_file(scenario_to_play, directory)), "--backend", "process"),
                 *("--seed", str(self.subject.seed), "--out", str(run_dir)),
             ],
             first=[ROOT],
-            cwd=place,
+            cwd=directory,
             limit_s=self._limit_s,
         )
-        return self._judged(played, run_dir, exact=False), run_dir
+        return self._judge(played, run_dir, exact=False), run_dir
 
-    def _judged(self, played: Ended, run_dir: Path, *, exact: bool) -> Outcome:
-        """By the judge that runs now, whichever state of the code was played. Raises CannotBeTriedError."""
+    def _judge(self, played: ProcessResult, run_dir: Path, *, exact: bool) -> Outcome:
+        """Return the outcome of a run, judged by the installed checker and not by the code under test.
+
+        Raises UntestableError.
+        """
         if played.status is None:
-            raise CannotBeTriedError(f"it did not end within {self._limit_s:g} s; allow more time with --limit-s")
-        said = played.last_words.replace(f"{run_dir.parent}/", "")
+            raise UntestableError(f"it did not end within {self._limit_s:g} s; allow more time with --limit-s")
+        message = played.last_error_line.replace(f"{run_dir.parent}/", "")
         if played.status == INTERRUPTED:
             raise InterruptedRunError("interrupted")
         archive = RunArchive(run_dir) if (run_dir / "run.json").is_file() else None
         if archive is not None and archive.record.outcome == "not supported":
-            raise CannotBeTriedError(archive.record.outcome_detail or said)
+            raise UntestableError(archive.record.outcome_detail or message)
         if played.status == CANNOT_HERE:
-            raise MachineCannotError(said)
+            raise MachineCannotError(message)
         if (
             played.status not in (0, VIOLATED, WRONG_REQUEST, INCOMPLETE)
             or archive is None
             or not archive.exports.by_agent
         ):
-            raise CannotBeTriedError(said)
-        return of_run(
+            raise UntestableError(message)
+        return outcome_of_run(
             self.subject.in_words, checker.check(checker.gather(archive)), archive.exports.by_agent, exact=exact
         )
 
     # Records
 
-    def _given_records(self, code: Path, place: Path) -> Outcome:
+    def _play_records(self, code: Path, directory: Path) -> Outcome:
         if not (code / "ucp").is_dir():
-            raise CannotBeTriedError("it has no directory ucp/")
-        only = place / "core"
-        only.mkdir()
-        (only / "ucp").symlink_to(code.resolve() / "ucp", target_is_directory=True)
-        whose = [] if self.subject.agent is None else [str(self.subject.agent)]
+            raise UntestableError("it has no directory ucp/")
+        core_directory = directory / "core"
+        core_directory.mkdir()
+        (core_directory / "ucp").symlink_to(code.resolve() / "ucp", target_is_directory=True)
+        agent_argument = [] if self.subject.agent is None else [str(self.subject.agent)]
         played = run_python(
-            ["-m", RECORD_CORE, str(self.subject.path), *whose],
-            first=[only, ROOT],
-            cwd=place,
+            ["-m", RECORD_CORE, str(self.subject.path), *agent_argument],
+            first=[core_directory, ROOT],
+            cwd=directory,
             limit_s=self._limit_s,
         )
         if played.status is None:
-            raise CannotBeTriedError(f"it did not end within {self._limit_s:g} s; allow more time with --limit-s")
-        if crashed := played.raised_in(only / "ucp"):
+            raise UntestableError(f"it did not end within {self._limit_s:g} s; allow more time with --limit-s")
+        if crashed := played.raised_in(core_directory / "ucp"):
             file = f"/{RECORD_CORE.replace('.', '/')}.py"
             if f'{file}"' in played.stderr and ", in main" in played.stderr:
                 return Outcome(subject=self.subject.in_words, crashed=crashed)
-            raise CannotBeTriedError(f"it does not start: {crashed}")
+            raise UntestableError(f"it does not start: {crashed}")
         try:
             document = json.loads(played.stdout) if played.status == 0 else {}
             agents = {
-                int(agent): OfAgent(differences=[Difference.model_validate(each) for each in differences])
+                int(agent): AgentResult(differences=[RecordDifference.model_validate(each) for each in differences])
                 for agent, differences in document["agents"].items()
             }
         except (ValueError, KeyError, TypeError):
-            raise CannotBeTriedError(played.last_words) from None
+            raise UntestableError(played.last_error_line) from None
         return Outcome(subject=self.subject.in_words, agents=agents)
 
-    def _given_by_udp(self, code: Path, command: str, place: Path) -> Outcome:
+    def _play_live(self, code: Path, command: str, directory: Path) -> Outcome:
         record = open_record(self.subject.path, self.subject.agent)
-        words = _words(command, code)
+        arguments = _split_command(command, code)
         try:
-            said = play_live(record, words, place, speedup=self._speedup or SPEEDUP)
+            message = play_live(record, arguments, directory, speedup=self._speedup or SPEEDUP)
         except NotStartedError as error:
-            raise CannotBeTriedError(str(error)) from None
+            raise UntestableError(str(error)) from None
         except ReplayFailedError as error:
             return Outcome(subject=self.subject.in_words, crashed=str(error))
-        return Outcome(subject=self.subject.in_words, agents={record.agent_id: OfAgent(differences=said)})
+        return Outcome(subject=self.subject.in_words, agents={record.agent_id: AgentResult(differences=message)})
 
 
 class MachineCannotError(HarnessError):
-    """This machine cannot play it, whichever state of the code it is."""
+    """The subject cannot be played on this machine with any state of the code."""
 
     exit_status = CANNOT_HERE
 
 
-def _scenario_file(scenario: Scenario, place: Path) -> Path:
-    """The scenario without `expect`, and without what is as by default: another state of the code may not know it."""
+def _scenario_file(scenario: Scenario, directory: Path) -> Path:
+    """Write the scenario without `expect` and without default values, which other states of the code may not know."""
     document = scenario.model_dump(mode="json", exclude_defaults=True, exclude={"expect"})
-    file = place / "scenario.yaml"
+    file = directory / "scenario.yaml"
     file.write_text(json.dumps(document), encoding="utf-8")  # JSON is YAML
     return file
 
@@ -198,14 +207,14 @@ def _with_command(scenario: Scenario, command: Sequence[str], speedup: float | N
     return scenario.model_copy(update={"agent_command": list(command), **speed})
 
 
-def _words(command: str, code: Path) -> list[str]:
-    """Raises HarnessError if the command is none."""
+def _split_command(command: str, code: Path) -> list[str]:
+    """Return the words of the command. Raises HarnessError if it is empty or malformed."""
     try:
-        words = [word.replace(CODE, str(code)) for word in shlex.split(command)]
+        arguments = [word.replace(CODE, str(code)) for word in shlex.split(command)]
     except ValueError as error:
         raise HarnessError(f"--agent-command {command!r} is not a command: {error}") from None
-    if not words:
+    if not arguments:
         raise HarnessError("--agent-command is empty: name a program, with its arguments")
-    if shutil.which(words[0]) is None:
-        raise CannotBeTriedError(f"there is no program {words[0]}")
-    return words
+    if shutil.which(arguments[0]) is None:
+        raise UntestableError(f"there is no program {arguments[0]}")
+    return arguments

@@ -1,4 +1,4 @@
-"""A subject of bisection, the outcome of playing it once, and the difference of two outcomes."""
+"""A subject of bisection, the outcome of playing it once, and the differences of two outcomes."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,76 +16,86 @@ from harness.scenario.load import MAX_SCENARIO_BYTES
 from harness.scenario.verdict_names import BAD_IN_WORDS, kind_of
 
 MAX_OUTCOME_BYTES = 64 * 1024 * 1024
-TOLD = 8
-"""More differences of two outcomes nobody reads."""
-OF_CHANCE = ("2", "5", "6", "liveness")
-"""Judgements that depend on how far processes had come when they were stopped."""
+TIMING_DEPENDENT = ("2", "5", "6", "liveness")
+"""Keys of judgements that depend on the progress of the agent processes at the end of the run."""
 
 
 class _Model(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
-class Difference(_Model):
-    """Where a core does other than a record."""
+class RecordDifference(_Model):
+    """A difference between a core and a record."""
 
     line: int
     handler: str | None
     detail: str
 
 
-class OfAgent(_Model):
-    """What one agent came to.
+class AgentResult(_Model):
+    """The result of one agent. None means that this part is not compared.
 
-    chain: the names of its blocks, the oldest first; top: its top chain hash; deviates: the handler in which it first
-    did other than the algorithms say, "" if that is none of the protocol's. Of a record: what a core does otherwise.
-    None where nothing of that is compared.
+    `chain` has the names of its blocks, oldest first, and `top` its top chain hash. `deviates` is the handler of its
+    first deviation, "" if that is no handler of the protocol. `differences` are those from its record.
     """
 
     chain: list[str] | None = None
     top: str | None = None
     deviates: str | None = None
-    differences: list[Difference] | None = None
+    differences: list[RecordDifference] | None = None
 
 
 class Outcome(_Model):
-    """`crashed` is where the code under test raised an exception that ended all of it."""
+    """The outcome of playing a subject once.
+
+    `crashed` is the place of the exception in the code under test that ended it.
+    """
 
     schema_: Literal["ucp-outcome/1"] = "ucp-outcome/1"
     subject: str
-    agents: dict[int, OfAgent] = {}
+    agents: dict[int, AgentResult] = {}
     verdicts: dict[str, str] = {}
     crashed: str | None = None
 
     def as_recorded(self) -> "Outcome":
-        """Return the outcome of a core that does exactly what the records contain."""
-        agents = {agent: OfAgent(differences=[]) for agent in self.agents}
+        """Return the outcome of a core without any difference from the records."""
+        agents = {agent: AgentResult(differences=[]) for agent in self.agents}
         return self.model_copy(update={"agents": agents, "crashed": None})
 
     @property
     def sentence(self) -> str:
-        """In a line."""
+        """The outcome in one line."""
         if self.crashed:
             return f"it crashes: {self.crashed}"
         bad = [key for key, verdict in self.verdicts.items() if kind_of(verdict) == "bad"]
-        wrong = [f"agent {agent} in {of.deviates or 'no handler'}" for agent, of in self.agents.items() if of.deviates]
-        chains = {of.top: of.chain for of in self.agents.values() if of.chain is not None}
-        parts = [f"{len(chains)} distinct chain{'s' if len(chains) != 1 else ''}"] if chains else []
-        for agent, of in self.agents.items():
-            if of.differences:
-                parts.append(f"agent {agent}: {len(of.differences)} differences, the first at line {_first(of)}")
-            elif of.differences is not None:
-                parts.append(f"agent {agent}: as recorded")
-        return "; ".join([*parts, *(BAD_IN_WORDS.get(key, key) for key in bad), *wrong]) or "nothing differs"
+        wrong = [
+            f"agent {agent} in {result.deviates or 'no handler'}"
+            for agent, result in self.agents.items()
+            if result.deviates
+        ]
+        chains = {result.top: result.chain for result in self.agents.values() if result.chain is not None}
+        phrases = [f"{len(chains)} distinct chain{'s' if len(chains) != 1 else ''}"] if chains else []
+        for agent, result in self.agents.items():
+            if result.differences:
+                phrases.append(
+                    f"agent {agent}: {len(result.differences)} differences, the first at line {_first(result)}"
+                )
+            elif result.differences is not None:
+                phrases.append(f"agent {agent}: as recorded")
+        return "; ".join([*phrases, *(BAD_IN_WORDS.get(key, key) for key in bad), *wrong]) or "nothing differs"
 
 
-def _first(of: OfAgent) -> str:
-    first = (of.differences or [])[0]
+def _first(result: AgentResult) -> str:
+    first = (result.differences or [])[0]
     return f"{first.line}{f', in {first.handler}' if first.handler else ''}"
 
 
-def of_run(subject: str, result: Result, exports: dict[int, Export], *, exact: bool) -> Outcome:
-    """Of a run that has been judged; where chance plays a part chains and what depends on the moment are left out."""
+def outcome_of_run(subject: str, result: Result, exports: dict[int, Export], *, exact: bool) -> Outcome:
+    """Return the outcome of a judged run.
+
+    If the run is not `exact`, because its processes depend on timing, chains and timing-dependent judgements are left
+    out.
+    """
     names = name_blocks(exports)
     first: dict[int, str] = {}
     for finding in result.beside["steps"].evidence:
@@ -94,14 +104,16 @@ def of_run(subject: str, result: Result, exports: dict[int, Export], *, exact: b
     for agent, export in sorted(exports.items()):
         chain = [names.get(block, block[:12]) for block in export.chain_of_block_hashes] if exact else None
         top = export.top_chain_hash if exact else None
-        agents[agent] = OfAgent(chain=chain, top=top, deviates=first.get(agent))
+        agents[agent] = AgentResult(chain=chain, top=top, deviates=first.get(agent))
     judged = result.judgements.items()
-    verdicts: dict[str, str] = {key: judgement.verdict for key, judgement in judged if exact or key not in OF_CHANCE}
+    verdicts: dict[str, str] = {
+        key: judgement.verdict for key, judgement in judged if exact or key not in TIMING_DEPENDENT
+    }
     return Outcome(subject=subject, agents=agents, verdicts=verdicts)
 
 
 def differences(before: Outcome, after: Outcome) -> list[str]:
-    """A sentence for each thing in which they differ; none if they are the same."""
+    """Return a sentence for each difference between two outcomes."""
     return list(_differences(before, after))
 
 
@@ -114,16 +126,16 @@ def _differences(before: Outcome, after: Outcome) -> Iterator[str]:
             what = f"characteristic {key}" if key.isdecimal() else key
             yield f"{what}: {now or 'not judged'}, was {was or 'not judged'}"
     for agent in sorted({*before.agents, *after.agents}):
-        was_of, now_of = before.agents.get(agent, OfAgent()), after.agents.get(agent, OfAgent())
-        yield from (f"agent {agent}: {words}" for words in _of_agent(was_of, now_of))
+        was_result, now_result = before.agents.get(agent, AgentResult()), after.agents.get(agent, AgentResult())
+        yield from (f"agent {agent}: {labels}" for labels in _agent_differences(was_result, now_result))
 
 
-def _of_agent(was: OfAgent, now: OfAgent) -> Iterator[str]:
+def _agent_differences(was: AgentResult, now: AgentResult) -> Iterator[str]:
     if was.deviates != now.deviates:
-        words = {None: "nowhere", "": "in no known handler"}
+        labels = {None: "nowhere", "": "in no known handler"}
         yield (
-            f"its first deviation is {words.get(now.deviates, f'in {now.deviates}')}, was "
-            f"{words.get(was.deviates, f'in {was.deviates}')}"
+            f"its first deviation is {labels.get(now.deviates, f'in {now.deviates}')}, was "
+            f"{labels.get(was.deviates, f'in {was.deviates}')}"
         )
     if was.top != now.top:
         old, new = was.chain or [], now.chain or []
@@ -151,7 +163,7 @@ def _at(chain: list[str], place: int) -> str:
 
 
 def read(path: Path) -> Outcome:
-    """An outcome that was kept. Raises RunDirectoryError."""
+    """Read an outcome that was saved before. Raises RunDirectoryError."""
     try:
         if path.stat().st_size > MAX_OUTCOME_BYTES:
             raise RunDirectoryError(f"{path}: larger than {MAX_OUTCOME_BYTES} bytes, which is too large for an outcome")
@@ -167,7 +179,7 @@ YAML = (".yaml", ".yml")
 
 @dataclass(frozen=True)
 class Subject:
-    """`scenario` is None of records, which are in `path`; `agent` is whose record is meant, None for all."""
+    """The subject of a bisection. `scenario` is None for records, which are in `path`. `agent` selects one record."""
 
     path: Path
     scenario: Scenario | None
@@ -184,9 +196,10 @@ class Subject:
 
 
 def subject_of(path: Path, seed: int | None, agent: int | None) -> Subject:
-    """A YAML file, or a name of the library, is a scenario; so is a run directory of virtual time; all else is records.
+    """Return the subject at `path`.
 
-    Raises HarnessError.
+    A YAML file, a library name, or a run directory of virtual time is a scenario. Every other path is a record. Raises
+    HarnessError.
     """
     path = load.find(path)
     if path.suffix in YAML or (path.is_file() and _is_scenario(path)):
@@ -209,7 +222,7 @@ def _is_scenario(path: Path) -> bool:
 
 
 def _played(path: Path) -> tuple[Scenario, int] | None:
-    """Scenario and seed of a run that plays the same again."""
+    """Return scenario and seed of a run, if playing them gives the same run again."""
     record = RunArchive(path).record
     if record.backend != "sim" or record.scenario is None or record.seed is None:
         return None

@@ -1,1 +1,1 @@
-"""Before and after a mission: what every vehicle is given, and what all of them brought back, as one record."""
+"""Before and after a mission: the mission files of all vehicles, and their exports merged into one record."""

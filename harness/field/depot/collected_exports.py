@@ -1,8 +1,8 @@
-"""Reads the chain exports that came home, whatever has become of them: all that is usable of each is used.
+"""Read the chain exports of a mission in any condition, and use every undamaged part.
 
-An export that was cut off is read up to there, and of one that was edited or damaged the parts that are whole. A block
-is what it hashes to (eq. 3.1), not what the file says that it hashes to; where the two differ it is told. Blocks that
-many vehicles hold are kept once.
+A truncated export is read up to its end, and an edited or damaged one without its damaged parts. The hash of a block is
+computed from its content (eq. 3.1). If the file has another hash, the difference is reported. Vehicles that hold the
+same block share one object for it.
 """
 
 import base64
@@ -32,9 +32,9 @@ from harness.archive.record_file import validate_leniently
 from harness.archive.traces import read_trace
 from harness.archive.vocabulary import unknown_names
 from harness.errors import ExportError
-from harness.field.depot.mission_comparison import INCEPTION, ROSTER, Carried, UnreadableFileError
-from harness.field.depot.mission_comparison import read as read_carried
-from harness.field.ingest import LeftOut
+from harness.field.depot.mission_comparison import INCEPTION, ROSTER, ComparedFile, UnreadableFileError
+from harness.field.depot.mission_comparison import read as read_compared_file
+from harness.field.ingest import Omission
 from harness.field.ingest._file_search import files_of
 from harness.gc_pause import gc_paused
 from harness.report.logbook.book import logged_telemetry
@@ -42,18 +42,17 @@ from ucp.block import Block, InceptionBlock, next_chain_hash
 from ucp.export import SCHEMA
 
 HASH_DIGITS = 12
-NAMED_AT_MOST = 5
+MAX_NAMED = 5
 BEGINNING_BYTES = 4096
 _FORMAT = SCHEMA.partition("/")[0].encode()
-AGAIN = "export it again if you can"
+EXPORT_AGAIN = "export it again if you can"
 
 
 @dataclass(frozen=True)
-class Brought:
-    """An export, its hashes made true, and the file that it was in.
+class ReadExport:
+    """An export with correct hashes, and its file.
 
-    `problems` are sentences on what is wrong with it. `claims` has of the blocks that are not what the file says which
-    hash it gives them: the true one, and the claimed.
+    `problems` has a sentence for each error. `claims` maps the true hash of each wrong block to the hash in the file.
     """
 
     path: Path
@@ -62,37 +61,36 @@ class Brought:
     claims: dict[str, str]
 
     def blocks(self) -> set[str]:
-        """The hashes of all blocks that it has."""
+        """Return the hashes of all blocks in the export."""
         return {block.block_hash for block in self.export.blocks()}
 
 
 @dataclass
-class CameHome:
-    """The exports of one mission: of each agent the latest, and those before.
+class CollectedExports:
+    """The exports of one mission: the latest of each agent, and the earlier ones.
 
-    `left_out` are sentences on files that are not used, and `remarks` on what must be known of those that are, without
-    being wrong.
+    `left_out` has a sentence for each unused file, and `remarks` has further facts about the used ones.
     """
 
-    latest: dict[int, Brought]
-    earlier: list[Brought]
+    latest: dict[int, ReadExport]
+    earlier: list[ReadExport]
     left_out: list[str]
     remarks: list[str]
     roster: set[int] = field(default_factory=set)
-    """Agents that mission files, traces, a manifest or a run's record beside the exports name."""
+    """Agents that other files name: mission files, traces, a manifest, or the record of the run."""
     traced: dict[int, list[str]] = field(default_factory=dict)
-    """Hashes of the blocks that agents without an export completed, by their traces."""
+    """Hashes of the blocks that agents without an export completed, according to their traces."""
     telemetry: bool = True
-    """Whether events are those of vehicles, as far as anything says otherwise."""
+    """True if events come from vehicles, unless a file contradicts that."""
 
     @property
-    def brought(self) -> list[Brought]:
+    def read_exports(self) -> list[ReadExport]:
         return [*self.latest.values(), *self.earlier]
 
     @property
     def exports(self) -> dict[int, Export]:
-        """The latest of each agent."""
-        return {agent_id: brought.export for agent_id, brought in self.latest.items()}
+        """The latest export of each agent."""
+        return {agent_id: read_export.export for agent_id, read_export in self.latest.items()}
 
     @property
     def inception(self) -> ExportedInception:
@@ -100,98 +98,102 @@ class CameHome:
 
     @property
     def problems(self) -> list[str]:
-        return [problem for brought in self.brought for problem in brought.problems]
+        return [problem for read_export in self.read_exports for problem in read_export.problems]
 
     @property
     def claims(self) -> dict[str, str]:
-        """Of the blocks that are nowhere what a file says: the true hash, and the claimed one.
+        """The true hash of each wrong block, with the hash in the file.
 
-        A block that another export has under its own hash, or that its agent completed, is good.
+        A block is not wrong if another export has it under its true hash, or if its agent completed it.
         """
-        claims = {true: claimed for brought in self.brought for true, claimed in brought.claims.items()}
-        for brought in self.brought if claims else ():
-            for good in {*brought.export.completed, *(brought.blocks() - brought.claims.keys())}:
+        claims = {true: claimed for read_export in self.read_exports for true, claimed in read_export.claims.items()}
+        for read_export in self.read_exports if claims else ():
+            for good in {*read_export.export.completed, *(read_export.blocks() - read_export.claims.keys())}:
                 claims.pop(good, None)
         return claims
 
 
 @gc_paused()
-def came_home(paths: Iterable[Path]) -> CameHome:
-    """What the files, and those in directories, hold of the mission that most of them are of.
+def collect_exports(paths: Iterable[Path]) -> CollectedExports:
+    """Return the exports of the largest mission in files and directories.
 
-    Raises FieldError if a path does not exist, and ExportError if nothing in them is usable.
+    Raises FieldError if a path does not exist, and ExportError if no export is usable.
     """
-    reader, brought, left_out = _Reader(), list[Brought](), list[str]()
-    passed_over, beside = list[LeftOut](), list[Carried]()
+    reader, read_exports, left_out = _Reader(), list[ReadExport](), list[str]()
+    skipped, context_files = list[Omission](), list[ComparedFile]()
     paths = list(paths)
-    for path in files_of(paths, passed_over):
-        named = path in paths or path.name.endswith(SUFFIX)
+    for path in files_of(paths, skipped):
+        named_by_user = path in paths or path.name.endswith(SUFFIX)
         try:
-            brought.append(reader.read(path, named=named))
+            read_exports.append(reader.read(path, named_by_user=named_by_user))
         except NotAnExportError as error:
             try:
-                beside.append(read_carried(path))
+                context_files.append(read_compared_file(path))
             except UnreadableFileError:
-                left_out += [str(error)] if named else []
+                left_out += [str(error)] if named_by_user else []
         except ExportError as error:
             left_out.append(str(error))
-    if not brought:
+    if not read_exports:
         why = left_out[0] if left_out else "no file contains a chain export"
         more = f" (and {len(left_out) - 1} files more)" if len(left_out) > 1 else ""
         raise ExportError(f"none of these files is usable: {why}{more}")
-    mission = _largest_mission(brought)
-    left_out += _of_other_missions(brought, mission)
-    home = _by_agent([each for each in brought if each.export.inception.block_hash == mission], left_out)
-    home.remarks += [each.sentence for each in passed_over]
-    _look_beside(home, [each for each in beside if each.shared[INCEPTION].value == mission])
-    return home
+    mission = _largest_mission(read_exports)
+    left_out += _other_missions(read_exports, mission)
+    collected = _by_agent([each for each in read_exports if each.export.inception.block_hash == mission], left_out)
+    collected.remarks += [each.sentence for each in skipped]
+    _add_context(collected, [each for each in context_files if each.shared[INCEPTION].value == mission])
+    return collected
 
 
-def _look_beside(home: CameHome, carried: Iterable[Carried]) -> None:
-    """Who flew, and what their events are, as other files of the mission say it."""
-    for each in carried:
-        if each.kind == "trace" and each.agent_id is not None and each.agent_id not in home.latest:
+def _add_context(collected: CollectedExports, compared_files: Iterable[ComparedFile]) -> None:
+    """Add the roster, and the kind of events, from other files of the mission."""
+    for each in compared_files:
+        if each.kind == "trace" and each.agent_id is not None and each.agent_id not in collected.latest:
             trace = read_trace(each.path, skim=True)
-            home.traced.setdefault(each.agent_id, []).extend(trace.completed() if trace else ())
+            collected.traced.setdefault(each.agent_id, []).extend(trace.completed() if trace else ())
             if unknown := unknown_names(trace.runs if trace else ()).get("operation"):
-                home.remarks.append(
+                collected.remarks.append(
                     f"{each.path}: {unknown}, so the completed blocks of agent {each.agent_id} are unknown"
                 )
         if ROSTER in each.shared:
-            home.roster.update(each.shared[ROSTER].value)  # type: ignore[arg-type]
+            collected.roster.update(each.shared[ROSTER].value)  # type: ignore[arg-type]
         if each.mission is not None and each.mission.events.source == "random":
-            home.telemetry = False
-    around = (directory for brought in home.brought for directory in (brought.path.parent, brought.path.parent.parent))
-    run = next((directory for directory in dict.fromkeys(around) if (directory / RUN_FILE).is_file()), None)
+            collected.telemetry = False
+    directories = (
+        directory
+        for read_export in collected.read_exports
+        for directory in (read_export.path.parent, read_export.path.parent.parent)
+    )
+    run = next((directory for directory in dict.fromkeys(directories) if (directory / RUN_FILE).is_file()), None)
     if run is not None:
         record = RunArchive(run).record
-        home.roster.update(record.known_agents)
-        home.telemetry = logged_telemetry(record)
+        collected.roster.update(record.known_agents)
+        collected.telemetry = logged_telemetry(record)
 
 
 class NotAnExportError(ExportError):
-    """A file of something else."""
+    """The file has another format."""
 
 
-def _largest_mission(brought: Iterable[Brought]) -> str:
-    """The inception block of most agents; of several that with more blocks, else the first."""
+def _largest_mission(read_exports: Iterable[ReadExport]) -> str:
+    """Return the inception block of the mission with the most agents, then the most blocks."""
     agents: dict[str, set[int]] = {}
     blocks: Counter[str] = Counter()
-    for each in brought:
+    for each in read_exports:
         mission = each.export.inception.block_hash
         agents.setdefault(mission, set()).add(each.export.agent_id)
         blocks[mission] += len(each.export.chain)
     return max(agents, key=lambda mission: (len(agents[mission]), blocks[mission]))
 
 
-def _of_other_missions(brought: Iterable[Brought], mission: str) -> Iterator[str]:
+def _other_missions(read_exports: Iterable[ReadExport], mission: str) -> Iterator[str]:
     others: dict[str, list[Path]] = {}
-    for each in brought:
+    for each in read_exports:
         if each.export.inception.block_hash != mission:
             others.setdefault(each.export.inception.block_hash, []).append(each.path)
     for other, files in others.items():
-        names = ", ".join(map(str, files[:NAMED_AT_MOST]))
-        more = f" and {len(files) - NAMED_AT_MOST} more" if len(files) > NAMED_AT_MOST else ""
+        names = ", ".join(map(str, files[:MAX_NAMED]))
+        more = f" and {len(files) - MAX_NAMED} more" if len(files) > MAX_NAMED else ""
         are = "are" if len(files) > 1 else "is"
         yield (
             f"{names}{more}: {are} of another mission (inception block {other[:HASH_DIGITS]}, not "
@@ -199,35 +201,35 @@ def _of_other_missions(brought: Iterable[Brought], mission: str) -> Iterator[str
         )
 
 
-def _by_agent(brought: Iterable[Brought], left_out: list[str]) -> CameHome:
-    """Of several exports of an agent the latest is what it holds; what the others hold besides came home as well."""
-    home = CameHome({}, [], left_out, [])
-    for each in brought:
+def _by_agent(read_exports: Iterable[ReadExport], left_out: list[str]) -> CollectedExports:
+    """Group the exports by agent. The latest export has the current state. Earlier ones may contain further blocks."""
+    collected = CollectedExports({}, [], left_out, [])
+    for each in read_exports:
         agent_id = each.export.agent_id
-        other = home.latest.get(agent_id)
+        other = collected.latest.get(agent_id)
         if other is None:
-            home.latest[agent_id] = each
+            collected.latest[agent_id] = each
             continue
         if other.export == each.export:
-            home.remarks.append(f"{each.path}: the same export as {other.path}, counted once")
+            collected.remarks.append(f"{each.path}: the same export as {other.path}, counted once")
             continue
         age = each.export.exported_at_us, len(each.export.completed), len(each.export.chain)
         its_age = other.export.exported_at_us, len(other.export.completed), len(other.export.chain)
-        earlier, home.latest[agent_id] = (other, each) if age >= its_age else (each, other)
-        home.earlier.append(earlier)
-        home.remarks.append(
-            f"{earlier.path}: agent {agent_id} exported its chain again later, in {home.latest[agent_id].path}: the "
-            "later export is current; the earlier one is recorded as well"
+        earlier, collected.latest[agent_id] = (other, each) if age >= its_age else (each, other)
+        collected.earlier.append(earlier)
+        collected.remarks.append(
+            f"{earlier.path}: agent {agent_id} exported its chain again later, in {collected.latest[agent_id].path}: "
+            "the later export is current; the earlier one is recorded as well"
         )
-    home.latest = dict(sorted(home.latest.items()))
-    return home
+    collected.latest = dict(sorted(collected.latest.items()))
+    return collected
 
 
 # A file
 
 
-class _Damaged(Export):
-    """What can be read of an export by itself."""
+class _PartialExport(Export):
+    """An export in which every key has a default."""
 
     agent_id: AgentId | None = None  # type: ignore[assignment]
     exported_at_us: Annotated[int, Field(ge=0, strict=True)] = 0
@@ -242,23 +244,26 @@ class _Damaged(Export):
 
 
 class _Reader:
-    """Reads exports one after another. What they share is made once."""
+    """A reader of exports. Equal blocks share one object."""
 
     def __init__(self) -> None:
         self._hashes: dict[tuple[int, int, str], str] = {}
         self._blocks: dict[tuple[str, str | None], ExportedBlock] = {}
 
-    def read(self, path: Path, *, named: bool) -> Brought:
-        """Raises ExportError: why nothing of it can be used, or NotAnExportError for a file of something else."""
-        data = _content(path, named)
+    def read(self, path: Path, *, named_by_user: bool) -> ReadExport:
+        """Read an export.
+
+        Raises NotAnExportError for a file of another format, and ExportError if no part is usable.
+        """
+        data = _content(path, named_by_user)
         problems: list[str] = []
         try:
             export = Export.model_validate_json(data)
         except ValidationError:
-            export = _what_is_whole(path, data, problems)
-        return self._made_true(path, export, problems)
+            export = _recover(path, data, problems)
+        return self._with_true_hashes(path, export, problems)
 
-    def _made_true(self, path: Path, export: Export, problems: list[str]) -> Brought:
+    def _with_true_hashes(self, path: Path, export: Export, problems: list[str]) -> ReadExport:
         inception = InceptionBlock(base64.b64decode(export.inception.block_data))
         true = ExportedInception(
             block_data=export.inception.block_data,
@@ -282,27 +287,32 @@ class _Reader:
             problems.append(
                 f"{path}: the chain hash at block {broken_at} of its chain does not match the blocks up to it"
             )
-        aside = []
+        other_places = []
         for place, blocks in (
             ("its deque", export.blocks_to_be_committed),
             ("its reconcile stack", export.reconcile_stack),
         ):
-            made = []
+            true_blocks = []
             for position, block in enumerate(blocks, 1):
                 block_hash = self._hash(block)
                 if block_hash != block.block_hash:
                     claims[block_hash] = block.block_hash
                     problems.append(_edited(path, f"block {position} of {place}", block.block_hash))
-                made.append(self._block(block, block_hash, None))
-            aside.append(made)
-        times = Counter(block.block_hash for blocks in (chain, *aside) for block in blocks)
+                true_blocks.append(self._block(block, block_hash, None))
+            other_places.append(true_blocks)
+        times = Counter(block.block_hash for blocks in (chain, *other_places) for block in blocks)
         problems += [
             f"{path}: it holds block {block_hash[:HASH_DIGITS]} {count} times"
             for block_hash, count in times.items()
             if count > 1
         ]
-        parts = {"inception": true, "chain": chain, "blocks_to_be_committed": aside[0], "reconcile_stack": aside[1]}
-        return Brought(path, export.model_copy(update=parts), problems, claims)
+        parts = {
+            "inception": true,
+            "chain": chain,
+            "blocks_to_be_committed": other_places[0],
+            "reconcile_stack": other_places[1],
+        }
+        return ReadExport(path, export.model_copy(update=parts), problems, claims)
 
     def _hash(self, block: ExportedBlock) -> str:
         content = block.agent_id, block.timestamp_us, block.event_data
@@ -314,23 +324,23 @@ class _Reader:
 
     def _block(self, block: ExportedBlock, block_hash: str, chain_hash: str | None) -> ExportedBlock:
         key = block_hash, chain_hash
-        kept = self._blocks.get(key)
-        if kept is None:
+        shared = self._blocks.get(key)
+        if shared is None:
             if (block.block_hash, block.chain_hash) != key:
                 block = block.model_copy(update={"block_hash": block_hash, "chain_hash": chain_hash})
-            kept = self._blocks[key] = block
-        return kept
+            shared = self._blocks[key] = block
+        return shared
 
 
 def _edited(path: Path, which: str, claimed: str) -> str:
     return f"{path}: {which} does not match its hash {claimed[:HASH_DIGITS]}: it was edited or damaged"
 
 
-def _content(path: Path, named: bool) -> bytes:
-    """What is in a file, if it was named, is called as exports are, or begins as one."""
+def _content(path: Path, named_by_user: bool) -> bytes:
+    """Return the content of a file that the user named, or that looks like an export."""
     try:
         with BoundedFile(path, MAX_EXPORT_BYTES) as file:
-            if not named and path.suffix != ".json" and _FORMAT not in file.peek(BEGINNING_BYTES):
+            if not named_by_user and path.suffix != ".json" and _FORMAT not in file.peek(BEGINNING_BYTES):
                 raise NotAnExportError(f"{path}: not a chain export")
             data = file.read()
             if file.problem and len(data) >= MAX_EXPORT_BYTES:
@@ -340,8 +350,8 @@ def _content(path: Path, named: bool) -> bytes:
         raise ExportError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _what_is_whole(path: Path, data: bytes, problems: list[str]) -> Export:
-    """The parts of a damaged export that are whole; what is wrong with the others is told in `problems`."""
+def _recover(path: Path, data: bytes, problems: list[str]) -> Export:
+    """Return the undamaged parts of an export. `problems` gets a sentence for each error."""
     if _FORMAT not in data:
         raise NotAnExportError(f"{path}: not a chain export")
     text = data.decode("utf-8", errors="replace")
@@ -349,19 +359,21 @@ def _what_is_whole(path: Path, data: bytes, problems: list[str]) -> Export:
         document = json.loads(text, strict=False)
     except (ValueError, RecursionError) as error:
         damage = error.pos if isinstance(error, json.JSONDecodeError) else 0
-        document = _up_to(text[:damage])
+        document = _parse_prefix(text[:damage])
         if isinstance(document, dict):
-            after = [*_whole_blocks(text[damage:])]
+            after = [*_intact_blocks(text[damage:])]
             before = document.get("chain")
             document["chain"] = [*(before if isinstance(before, list) else ()), *after]
-        problems.append(f"{path}: cut off or damaged at {_place(text, damage)}: its undamaged part is used; {AGAIN}")
+        problems.append(
+            f"{path}: cut off or damaged at {_place(text, damage)}: its undamaged part is used; {EXPORT_AGAIN}"
+        )
     if not isinstance(document, dict):
         raise ExportError(f"{path}: no part of it is undamaged")
     if document.get("schema") != SCHEMA:
-        said = str(document.get("schema"))[:40]
-        raise ExportError(f"{path}: its schema is {said!r}, and this version reads {SCHEMA!r}")
+        schema = str(document.get("schema"))[:40]
+        raise ExportError(f"{path}: its schema is {schema!r}, and this version reads {SCHEMA!r}")
     try:
-        read, invalid_parts = validate_leniently(_Damaged, document)
+        read, invalid_parts = validate_leniently(_PartialExport, document)
     except ValueError as error:
         raise ExportError(f"{path}: {error}") from None
     if not problems:
@@ -376,31 +388,31 @@ def _what_is_whole(path: Path, data: bytes, problems: list[str]) -> Export:
 
 
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.|\\\Z)*(?:"|\Z)|[\[\]{},]', re.DOTALL)
-"""A string that the text breaks off in goes to its end, whatever brackets are in it."""
+"""A JSON string or bracket. A truncated string extends to the end of the text, even if it contains brackets."""
 _FLAT_OBJECT = re.compile(r"\{[^{}]*\}")
 
 
-def _up_to(text: str) -> Any:
-    """The JSON value of which a text is the beginning, with all that is whole in it; None if there is nothing."""
+def _parse_prefix(text: str) -> Any:
+    """Return the complete parts of a truncated JSON value. None if there are none."""
     closing: list[str] = []
-    whole, after = 0, ""
+    complete_end, after = 0, ""
     for token in _TOKEN.finditer(text):
         match token[0]:
             case "{" | "[":
                 closing.append("}" if token[0] == "{" else "]")
             case "}" | "]":
                 closing.pop()
-                whole, after = token.end(), "".join(reversed(closing))
+                complete_end, after = token.end(), "".join(reversed(closing))
             case ",":
-                whole, after = token.start(), "".join(reversed(closing))
+                complete_end, after = token.start(), "".join(reversed(closing))
     try:
-        return json.loads(text[:whole] + after, strict=False)
+        return json.loads(text[:complete_end] + after, strict=False)
     except (ValueError, RecursionError):
         return None
 
 
-def _whole_blocks(text: str) -> Iterator[Any]:
-    """The blocks that stand in a text, whatever stands around them, and are what they hash to."""
+def _intact_blocks(text: str) -> Iterator[Any]:
+    """Yield each block in a text whose hash is correct, whatever surrounds it."""
     for candidate in _FLAT_OBJECT.finditer(text):
         try:
             block = ExportedBlock.model_validate_json(candidate[0])
@@ -414,6 +426,6 @@ def _place(text: str, position: int) -> str:
     return f"line {text.count(chr(10), 0, position) + 1} of {text.count(chr(10)) + 1}"
 
 
-def all_blocks(brought: Iterable[Brought]) -> dict[str, ExportedBlock]:
-    """Every block that anybody holds, by hash."""
-    return {block.block_hash: block for each in brought for block in each.export.blocks()}
+def all_blocks(read_exports: Iterable[ReadExport]) -> dict[str, ExportedBlock]:
+    """Return every block in any export, by hash."""
+    return {block.block_hash: block for each in read_exports for block in each.export.blocks()}

@@ -1,9 +1,8 @@
-"""One ordered record of all that came home: each block once, with where it is held, and what is missing.
+"""Merge the exports of a mission into one ordered record: each block once, its holders, and the missing blocks.
 
-Blocks stand in the order of `harness.field.depot.record_lines`. A block that an agent was building when it exported
-comes after
-them, unless a completed block begins with the same events: then it is that block, on its way. So every event of every
-block in any chain, deque, reconcile stack or current block is on record exactly once.
+Blocks are in the order of `harness.field.depot.record_lines`. The current block of an agent at its export comes after
+them, unless a completed block begins with the same events. In that case both are the same block at different times.
+Therefore each event of each chain, deque, reconcile stack or current block occurs exactly once.
 """
 
 import base64
@@ -14,16 +13,16 @@ from typing import TYPE_CHECKING
 
 from harness.archive.event_data import EventData, SealedError
 from harness.archive.exports import Export, ExportedBlock, name_blocks
-from harness.field.depot.collected_exports import CameHome, all_blocks
+from harness.field.depot.collected_exports import CollectedExports, all_blocks
 from harness.field.depot.record_lines import (
     Block,
     ExportUsed,
     Fork,
+    ForkBranch,
     Header,
-    Held,
-    Lost,
+    Holding,
+    MissingItem,
     Place,
-    Way,
     mutual_chain,
     ordered,
 )
@@ -40,8 +39,8 @@ _HEADER = struct_of(EVENT_FIELDS)
 
 
 @dataclass(frozen=True)
-class BlockOnRecord:
-    """A block as the record has it, with the event data of which its events are made when somebody asks."""
+class RecordedBlock:
+    """A block of the record, with the event data from which its events are decoded on demand."""
 
     line: Block
     event_data: bytes
@@ -56,43 +55,46 @@ class BlockOnRecord:
 
 @dataclass
 class Consolidation:
-    """What came home as one record; `names` are those of all blocks, by hash."""
+    """The merged record. `names` has the names of all blocks by hash."""
 
-    home: CameHome
+    collected: CollectedExports
     header: Header
     forks: list[Fork]
-    blocks: list[BlockOnRecord]
-    lost: list[Lost]
+    blocks: list[RecordedBlock]
+    lost: list[MissingItem]
     names: dict[str, str]
 
     @property
-    def lost_blocks(self) -> list[Lost]:
+    def lost_blocks(self) -> list[MissingItem]:
         return [lost for lost in self.lost if lost.block is not None]
 
     @property
-    def missing(self) -> list[Lost]:
-        """The vehicles that did not come home."""
+    def missing(self) -> list[MissingItem]:
+        """The vehicles without an export."""
         return [lost for lost in self.lost if lost.block is None]
 
     @property
-    def unfinished(self) -> list[BlockOnRecord]:
-        """What was being built."""
+    def unfinished(self) -> list[RecordedBlock]:
+        """The blocks that agents had not completed at their export."""
         return [block for block in self.blocks if block.line.block_hash is None]
 
 
 @gc_paused()
-def consolidate(home: CameHome, depot: "Depot | None" = None) -> Consolidation:
-    """The record of what came home; `depot` opens what is sealed. Raises ExportError if that is nothing here."""
-    event_data = EventData.of(home.exports.values(), depot)
-    blocks = all_blocks(home.brought)
-    chains = {agent_id: export.chain_of_block_hashes for agent_id, export in home.exports.items()}
-    names = _names(home)
+def consolidate(collected: CollectedExports, depot: "Depot | None" = None) -> Consolidation:
+    """Merge exports into one record.
+
+    `depot` decrypts event data. Raises ExportError if its key does not fit the mission.
+    """
+    event_data = EventData.of(collected.exports.values(), depot)
+    blocks = all_blocks(collected.read_exports)
+    chains = {agent_id: export.chain_of_block_hashes for agent_id, export in collected.exports.items()}
+    names = _names(collected)
     mutual = set(mutual_chain(chains.values()))
-    held, claims = _held(home), home.claims
-    on_record = []
+    holdings, claims = _holdings(collected), collected.claims
+    recorded_blocks = []
     for number, block_hash in enumerate(ordered(blocks, [*chains.values()]), 1):
         block = blocks[block_hash]
-        data, sealed = _opened(block, event_data)
+        data, sealed = _event_data(block, event_data)
         events = [] if sealed else events_in(data)
         line = Block(
             number=number,
@@ -102,37 +104,41 @@ def consolidate(home: CameHome, depot: "Depot | None" = None) -> Consolidation:
             block_hash=block_hash,
             events=len(events),
             mutual=block_hash in mutual,
-            held=held[block_hash],
+            held=holdings[block_hash],
             claimed_hash=claims.get(block_hash),
             unreadable=_unreadable(data, events),
             sealed=sealed,
         )
-        on_record.append(BlockOnRecord(line, b"" if sealed else data))
-    _add_unfinished(on_record, home)
-    made = Counter(block.agent_id for block in blocks.values())
-    flown = sorted({*home.roster, *made, *(brought.export.agent_id for brought in home.brought)})
-    absent = [agent_id for agent_id in flown if agent_id not in home.latest]
-    lost = _lost_blocks(home, blocks, names, absent)
+        recorded_blocks.append(RecordedBlock(line, b"" if sealed else data))
+    _add_unfinished(recorded_blocks, collected)
+    completed_by = Counter(block.agent_id for block in blocks.values())
+    roster = sorted(
+        {*collected.roster, *completed_by, *(read_export.export.agent_id for read_export in collected.read_exports)}
+    )
+    without_export = [agent_id for agent_id in roster if agent_id not in collected.latest]
+    lost = _lost_blocks(collected, blocks, names, without_export)
     return Consolidation(
-        home,
-        _header(home, flown, on_record, len(mutual), len(lost)),
+        collected,
+        _header(collected, roster, recorded_blocks, len(mutual), len(lost)),
         _forks(chains, names),
-        on_record,
-        [*lost, *(_missing(agent_id, made[agent_id]) for agent_id in absent)],
+        recorded_blocks,
+        [*lost, *(_missing(agent_id, completed_by[agent_id]) for agent_id in without_export)],
         names,
     )
 
 
-def _header(home: CameHome, flown: list[int], blocks: list[BlockOnRecord], mutual: int, lost: int) -> Header:
+def _header(
+    collected: CollectedExports, roster: list[int], blocks: list[RecordedBlock], mutual: int, lost: int
+) -> Header:
     return Header(
-        inception=home.inception,
-        roster=flown,
+        inception=collected.inception,
+        roster=roster,
         exports=[
             ExportUsed(
                 agent_id=export.agent_id,
-                file=_writable(str(brought.path)),
+                file=_without_surrogates(str(read_export.path)),
                 exported_at_us=export.exported_at_us,
-                latest=home.latest[export.agent_id] is brought,
+                latest=collected.latest[export.agent_id] is read_export,
                 chain=len(export.chain),
                 deque=len(export.blocks_to_be_committed),
                 stack=len(export.reconcile_stack),
@@ -141,28 +147,28 @@ def _header(home: CameHome, flown: list[int], blocks: list[BlockOnRecord], mutua
                 reconcile_in_progress=export.reconcile_in_progress,
                 top_chain_hash=export.top_chain_hash,
             )
-            for brought in home.brought
-            for export in (brought.export,)
+            for read_export in collected.read_exports
+            for export in (read_export.export,)
         ],
         blocks=len(blocks),
         events=sum(block.line.events for block in blocks),
         mutual_chain=mutual,
-        longest_chain=max(len(export.chain) for export in home.exports.values()),
-        distinct_chains=len({export.top_chain_hash for export in home.exports.values()}),
+        longest_chain=max(len(export.chain) for export in collected.exports.values()),
+        distinct_chains=len({export.top_chain_hash for export in collected.exports.values()}),
         lost_blocks=lost,
-        problems=[*map(_writable, home.problems)],
-        left_out=[*map(_writable, home.left_out)],
-        remarks=[*map(_writable, home.remarks)],
+        problems=[*map(_without_surrogates, collected.problems)],
+        left_out=[*map(_without_surrogates, collected.left_out)],
+        remarks=[*map(_without_surrogates, collected.remarks)],
     )
 
 
-def _writable(text: str) -> str:
-    """A file's name may have bytes that are no text: question marks instead."""
+def _without_surrogates(text: str) -> str:
+    """Return a text in which bytes of a file name that are no text are question marks."""
     return text.encode(errors="replace").decode()
 
 
-def _opened(block: ExportedBlock, event_data: EventData) -> tuple[bytes, bool]:
-    """What it holds, and whether that is sealed and nobody here opens it."""
+def _event_data(block: ExportedBlock, event_data: EventData) -> tuple[bytes, bool]:
+    """Return the event data of a block, and whether it is still sealed."""
     try:
         return event_data.of_block(block), False
     except SealedError:
@@ -170,7 +176,9 @@ def _opened(block: ExportedBlock, event_data: EventData) -> tuple[bytes, bool]:
 
 
 def events_in(event_data: bytes) -> list[tuple[int, int, int, int]]:
-    """The events that data begins with: timestamp, event ID, and where the data of each begins and ends."""
+    """Return the events at the beginning of the data: timestamp, event ID, and the start and end of each event's
+    data.
+    """
     events, offset = [], 0
     last_header = len(event_data) - EVENT_HEADER_BYTES
     while offset <= last_header:
@@ -187,12 +195,12 @@ def _unreadable(event_data: bytes, events: Sequence[tuple[int, int, int, int]]) 
     return base64.b64encode(event_data[events[-1][3] if events else 0 :]).decode("ascii")
 
 
-def _names(home: CameHome) -> dict[str, str]:
-    """What people call the blocks. One that was edited has no ordinal of its own."""
-    claims = home.claims
+def _names(collected: CollectedExports) -> dict[str, str]:
+    """Return the names of the blocks. An edited block has no ordinal."""
+    claims = collected.claims
     exports: dict[int, Export] = {}
-    for agent_id, export in home.exports.items():
-        earlier = [each.export for each in home.earlier if each.export.agent_id == agent_id]
+    for agent_id, export in collected.exports.items():
+        earlier = [each.export for each in collected.earlier if each.export.agent_id == agent_id]
         exports[agent_id] = export.model_copy(
             update={
                 "completed": list(dict.fromkeys(block for each in (*earlier, export) for block in each.completed)),
@@ -203,7 +211,7 @@ def _names(home: CameHome) -> dict[str, str]:
                 "reconcile_stack": [],
             }
         )
-    for agent_id, completed in home.traced.items():
+    for agent_id, completed in collected.traced.items():
         exports[agent_id] = Export.model_construct(
             agent_id=agent_id, completed=completed, chain=[], blocks_to_be_committed=[], reconcile_stack=[]
         )
@@ -212,48 +220,50 @@ def _names(home: CameHome) -> dict[str, str]:
     return {**edited, **names}
 
 
-def _held(home: CameHome) -> dict[str, list[Held]]:
-    """Where each block is held, by hash."""
+def _holdings(collected: CollectedExports) -> dict[str, list[Holding]]:
+    """Return the holders of each block, by hash."""
     where: dict[str, dict[tuple[Place, int | None, str | None], list[int]]] = defaultdict(lambda: defaultdict(list))
-    for agent_id, export in home.exports.items():
+    for agent_id, export in collected.exports.items():
         for position, block in enumerate(export.chain, 1):
             where[block.block_hash]["chain", position, block.chain_hash].append(agent_id)
         for position, block in enumerate(export.blocks_to_be_committed, 1):
             where[block.block_hash]["deque", position, None].append(agent_id)
         for position, block in enumerate(export.reconcile_stack, 1):
             where[block.block_hash]["stack", position, None].append(agent_id)
-    for brought in home.earlier:
-        for block_hash in brought.blocks():
+    for read_export in collected.earlier:
+        for block_hash in read_export.blocks():
             agents = where[block_hash]["earlier export", None, None]
-            if brought.export.agent_id not in agents:
-                agents.append(brought.export.agent_id)
+            if read_export.export.agent_id not in agents:
+                agents.append(read_export.export.agent_id)
     return {
         block_hash: [
-            Held(place=place, position=position, chain_hash=chain_hash, agents=sorted(agents))
+            Holding(place=place, position=position, chain_hash=chain_hash, agents=sorted(agents))
             for (place, position, chain_hash), agents in places.items()
         ]
         for block_hash, places in where.items()
     }
 
 
-def _add_unfinished(on_record: list[BlockOnRecord], home: CameHome) -> None:
-    """What agents were building: blocks of their own, or the beginning of some that are on record."""
+def _add_unfinished(recorded_blocks: list[RecordedBlock], collected: CollectedExports) -> None:
+    """Add the current blocks of agents: as separate blocks, or as holders of a block that begins with the same
+    events.
+    """
     building = [
         (base64.b64decode(export.current_block.event_data), export)
-        for export in (brought.export for brought in home.brought)
+        for export in (read_export.export for read_export in collected.read_exports)
         if export.current_block.event_data
     ]
     builders = {export.agent_id for _, export in building}
-    own = [block for block in on_record if block.line.agent_id in builders]
+    own_blocks = [block for block in recorded_blocks if block.line.agent_id in builders]
     for data, export in sorted(building, key=lambda each: (-len(each[0]), each[1].agent_id)):
         agent_id = export.agent_id
-        whole = next(
-            (each for each in own if each.line.agent_id == agent_id and each.event_data.startswith(data)), None
+        matching_block = next(
+            (each for each in own_blocks if each.line.agent_id == agent_id and each.event_data.startswith(data)), None
         )
-        if whole is None:
+        if matching_block is None:
             events = events_in(data)
             line = Block(
-                number=len(on_record) + 1,
+                number=len(recorded_blocks) + 1,
                 name=f"{agent_id}.{UNFINISHED}",
                 agent_id=agent_id,
                 timestamp_us=events[-1][0] if events else export.exported_at_us,
@@ -263,74 +273,84 @@ def _add_unfinished(on_record: list[BlockOnRecord], home: CameHome) -> None:
                 held=[],
                 unreadable=_unreadable(data, events),
             )
-            whole = BlockOnRecord(line, data)
-            on_record.append(whole)
-            own.append(whole)
-        holding = Held(place="current block", position=None, chain_hash=None, agents=[agent_id])
-        if holding not in whole.line.held:
-            whole.line.held.append(holding)
+            matching_block = RecordedBlock(line, data)
+            recorded_blocks.append(matching_block)
+            own_blocks.append(matching_block)
+        holding = Holding(place="current block", position=None, chain_hash=None, agents=[agent_id])
+        if holding not in matching_block.line.held:
+            matching_block.line.held.append(holding)
 
 
 def _forks(chains: Mapping[int, Sequence[str]], names: Mapping[str, str]) -> list[Fork]:
-    """Where chains part, the lowest first."""
+    """Return the places at which chains fork, the lowest first."""
     forks = []
-    together = [(0, sorted(chains))]
-    while together:
-        height, agents = together.pop()
-        ways: dict[str | None, list[int]] = {}
+    to_split = [(0, sorted(chains))]
+    while to_split:
+        height, agents = to_split.pop()
+        branches: dict[str | None, list[int]] = {}
         while True:
-            ways = {}
+            branches = {}
             for agent_id in agents:
                 chain = chains[agent_id]
-                ways.setdefault(chain[height] if height < len(chain) else None, []).append(agent_id)
-            if len(ways) > 1 or None in ways:
+                branches.setdefault(chain[height] if height < len(chain) else None, []).append(agent_id)
+            if len(branches) > 1 or None in branches:
                 break
             height += 1
-        if len(ways) == 1:
+        if len(branches) == 1:
             continue
         last = chains[agents[0]][height - 1] if height else None
-        going = [Way(agents=way, next=names[block] if block else None, next_hash=block) for block, way in ways.items()]
-        forks.append(Fork(height=height, after=names[last] if last else None, after_hash=last, ways=going))
-        together += [(height + 1, way) for block, way in ways.items() if block is not None and len(way) > 1]
+        fork_branches = [
+            ForkBranch(agents=branch_agents, next=names[block] if block else None, next_hash=block)
+            for block, branch_agents in branches.items()
+        ]
+        forks.append(Fork(height=height, after=names[last] if last else None, after_hash=last, ways=fork_branches))
+        to_split += [
+            (height + 1, branch_agents)
+            for block, branch_agents in branches.items()
+            if block is not None and len(branch_agents) > 1
+        ]
     return sorted(forks, key=lambda fork: (fork.height, fork.ways[0].agents))
 
 
 def _lost_blocks(
-    home: CameHome, blocks: Mapping[str, ExportedBlock], names: Mapping[str, str], absent: Sequence[int]
-) -> list[Lost]:
-    """Blocks that their agents say to have completed, and that are nowhere."""
-    lost: dict[str, Lost] = {}
-    edited = {*home.claims.values()}
-    for brought in home.brought:
-        agent_id = brought.export.agent_id
-        for block_hash in brought.export.completed:
+    collected: CollectedExports,
+    blocks: Mapping[str, ExportedBlock],
+    names: Mapping[str, str],
+    without_export: Sequence[int],
+) -> list[MissingItem]:
+    """Return the blocks that their agents completed, but no export contains."""
+    lost: dict[str, MissingItem] = {}
+    edited = {*collected.claims.values()}
+    for read_export in collected.read_exports:
+        agent_id = read_export.export.agent_id
+        for block_hash in read_export.export.completed:
             if block_hash in blocks or block_hash in lost:
                 continue
             why = f"agent {agent_id} completed it, but its export does not contain it"
-            if absent:
-                why += f"; vehicles without an export may have it: {', '.join(ranges([*absent]))}"
+            if without_export:
+                why += f"; vehicles without an export may have it: {', '.join(ranges([*without_export]))}"
             if block_hash in edited:
                 why += "; a file has other data under its hash"
-            lost[block_hash] = Lost(
+            lost[block_hash] = MissingItem(
                 agent_id=agent_id,
                 block=names[block_hash],
                 block_hash=block_hash,
-                agents=[*absent] or [agent_id],
+                agents=[*without_export] or [agent_id],
                 why=why,
             )
-    for agent_id, completed in home.traced.items():
+    for agent_id, completed in collected.traced.items():
         for block_hash in completed:
             if block_hash not in blocks:
                 why = f"agent {agent_id} completed it according to its trace, but no export contains it"
-                lost[block_hash] = Lost(
+                lost[block_hash] = MissingItem(
                     agent_id=agent_id, block=names[block_hash], block_hash=block_hash, agents=[agent_id], why=why
                 )
     return [*lost.values()]
 
 
-def _missing(agent_id: int, blocks: int) -> Lost:
+def _missing(agent_id: int, blocks: int) -> MissingItem:
     others = {0: "no export has blocks of it", 1: "other exports have 1 block of it"}.get(
         blocks, f"other exports have {blocks} of its blocks"
     )
     why = f"vehicle {agent_id} has no export: {others}; its other logged events are missing"
-    return Lost(agent_id=agent_id, agents=[agent_id], why=why)
+    return MissingItem(agent_id=agent_id, agents=[agent_id], why=why)

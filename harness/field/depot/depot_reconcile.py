@@ -1,10 +1,10 @@
-"""The final reconcile of what came home, by the protocol, without vehicles (Section 5.1).
+"""Reconcile the exports of a mission by the protocol, without vehicles (Section 5.1).
 
-What each export holds is put into an agent, as after a brown-out (`Agent.boot`), on an air that loses nothing, in
-virtual time. One agent after another reconciles, until a round changes no chain, as at the end of a run; then each is
-given the blocks that it had still to commit, and proposes them to all. An edited block is given to nobody. What was
-only in an agent's earlier export goes back on top of its chain, as what is on its reconcile stack does. The block that
-it was building stays as it was: no events come any more.
+Each export is put into an agent, as after a brown-out (`Agent.boot`). The agents run in virtual time on a network
+without loss. One agent after another reconciles, until a round changes no chain, as at the end of a run. Then each
+agent receives the blocks in its deque and proposes them. Edited blocks are left out. Blocks that only an earlier export
+of an agent contains are put on its reconcile stack, and so return to the top of its chain. Current blocks stay as they
+are, because no further events occur.
 """
 
 import base64
@@ -15,9 +15,9 @@ from typing import Any
 
 from harness.archive.exports import SUFFIX, Export, ExportedBlock, ExportMaker
 from harness.errors import MachineError
-from harness.field.depot.collected_exports import CameHome
+from harness.field.depot.collected_exports import CollectedExports
 from harness.field.depot.consolidation import Consolidation
-from harness.field.depot.record_lines import Reconciled, Vehicle
+from harness.field.depot.record_lines import ReconcileResult, Vehicle
 from harness.play.mission import reconcile_finally
 from harness.play.simulation.restored import Restored
 from harness.play.simulation.simulation import Simulation
@@ -31,48 +31,52 @@ from ucp.clock import MICROSECONDS
 from ucp.store import StoredState
 
 LIMIT_S = 1e7
-"""Virtual seconds for agents to become idle: a block that is popped takes five."""
+"""Time limit for the agents to become idle, in virtual seconds. A block that is popped takes five seconds."""
 
 
 @dataclass(frozen=True)
 class Reconciliation:
-    """The exports after the reconcile, by agent, and what the record says of it."""
+    """The exports after the reconcile, by agent, and the line for the record."""
 
     exports: dict[int, Export]
-    line: Reconciled
+    line: ReconcileResult
 
 
-def reconcile(record: Consolidation, say: Callable[[str], None] = lambda words: None) -> Reconciliation:
-    """Reconcile the exports of a record with each other. `say` is told again and again how far it is."""
-    home = record.home
-    stored = _stored(home)
+def reconcile(record: Consolidation, report_progress: Callable[[str], None] = lambda words: None) -> Reconciliation:
+    """Reconcile the exports of a record with each other. `report_progress` receives texts on the progress."""
+    collected = record.collected
+    stored = _stored(collected)
 
-    async def breathe(simulation: Simulation) -> None:
+    async def show_progress(simulation: Simulation) -> None:
         tops = await simulation.top_chain_hashes()
-        say(f"reconciling, {simulation.now():.0f} s in virtual time: {len({*tops.values()})} distinct chains")
-
-    swarm = Restored(_scenario(record), stored, InMemory(tracing=False), breathe=breathe)
-    rounds = without_waiting(_put_together(swarm, [agent_id for agent_id, held in stored.items() if held.deque]))
-    swarm.end()
-    at_us = max(export.exported_at_us for export in home.exports.values()) + round(swarm.now() * MICROSECONDS)
-    maker, signatures = ExportMaker(), _signatures(home)
-    exports = {
-        life.agent.agent_id: maker.export(life.state, at_us, signatures).model_copy(
-            update={"current_block": home.exports[life.agent.agent_id].current_block}
+        report_progress(
+            f"reconciling, {simulation.now():.0f} s in virtual time: {len({*tops.values()})} distinct chains"
         )
-        for life in swarm.living()
-        if life.state is not None
+
+    swarm = Restored(_scenario(record), stored, InMemory(tracing=False), breathe=show_progress)
+    rounds = without_waiting(_play(swarm, [agent_id for agent_id, state in stored.items() if state.deque]))
+    swarm.end()
+    exported_at_us = max(export.exported_at_us for export in collected.exports.values()) + round(
+        swarm.now() * MICROSECONDS
+    )
+    maker, signatures = ExportMaker(), _signatures(collected)
+    exports = {
+        incarnation.agent.agent_id: maker.export(incarnation.state, exported_at_us, signatures).model_copy(
+            update={"current_block": collected.exports[incarnation.agent.agent_id].current_block}
+        )
+        for incarnation in swarm.living()
+        if incarnation.state is not None
     }
     return Reconciliation(exports, _line(record, exports, rounds))
 
 
-async def _put_together(swarm: Restored, with_deques: Iterable[int]) -> int:
-    """How many rounds it took, each of which lets every agent reconcile once."""
+async def _play(swarm: Restored, agents_with_deque: Iterable[int]) -> int:
+    """Play the reconcile. Returns the number of rounds, in each of which every agent reconciles once."""
     first, *_ = timeline_of(swarm.scenario)
     await swarm.begin(first)
     await swarm.until_idle(LIMIT_S)
     rounds = await _reconcile(swarm)
-    for agent_id in with_deques:
+    for agent_id in agents_with_deque:
         await swarm.give_deque(agent_id)
         await swarm.until_idle(LIMIT_S)
     if len({*(await swarm.top_chain_hashes()).values()}) > 1:
@@ -82,12 +86,12 @@ async def _put_together(swarm: Restored, with_deques: Iterable[int]) -> int:
 
 async def _reconcile(swarm: Restored) -> int:
     await reconcile_finally(swarm, LIMIT_S)
-    done = swarm.played.final_reconcile
-    return 0 if done is None else done.rounds
+    final_reconcile = swarm.played.final_reconcile
+    return 0 if final_reconcile is None else final_reconcile.rounds
 
 
 def write(reconciliation: Reconciliation, directory: Path) -> None:
-    """Write the exports. Raises MachineError if the disk refuses."""
+    """Write the exports. Raises MachineError if that is not possible."""
     try:
         for agent_id, export in reconciliation.exports.items():
             write_json_atomically(directory / f"{agent_id}{SUFFIX}", export.model_dump(mode="json", by_alias=True))
@@ -96,65 +100,66 @@ def write(reconciliation: Reconciliation, directory: Path) -> None:
 
 
 def _scenario(record: Consolidation) -> Scenario:
-    """A mission in which nothing happens any more."""
-    asked: dict[str, Any] = {
+    """Return a mission without events and faults."""
+    document: dict[str, Any] = {
         "name": "final reconcile",
         "agents": list(record.header.roster),
         "initial_data": record.header.inception.block_data,
         "events": {"source": "scripted"},
         "vehicles": {"kind": "none"},
     }
-    return parse(asked)
+    return parse(document)
 
 
-def _signatures(home: CameHome) -> dict[bytes, bytes]:
-    """Those of the blocks' makers that came home, by block hash; each is as good as it was."""
+def _signatures(collected: CollectedExports) -> dict[bytes, bytes]:
+    """Return the signatures in the exports, by block hash. They are not verified here."""
     return {
         bytes.fromhex(block.block_hash): base64.b64decode(block.signature)
-        for brought in home.brought
-        for block in brought.export.blocks()
+        for read_export in collected.read_exports
+        for block in read_export.export.blocks()
         if block.signature is not None
     }
 
 
-def _stored(home: CameHome) -> dict[int, StoredState]:
-    """What each agent boots with: every block once, and none that was edited."""
-    claims, made = home.claims, dict[str, Block]()
+def _stored(collected: CollectedExports) -> dict[int, StoredState]:
+    """Return the state that each agent boots with: every block once, without edited blocks."""
+    claims, shared_blocks = collected.claims, dict[str, Block]()
     stored = {}
-    held_by_anybody = {block.block_hash for export in home.exports.values() for block in export.blocks()}
-    for agent_id, export in home.exports.items():
-        given = set(claims)
+    held_anywhere = {block.block_hash for export in collected.exports.values() for block in export.blocks()}
+    for agent_id, export in collected.exports.items():
+        seen = set(claims)
 
-        def take(blocks: list[ExportedBlock], given: set[str] = given) -> list[Block]:
-            taken = []
+        def unseen(blocks: list[ExportedBlock], seen: set[str] = seen) -> list[Block]:
+            unseen_blocks = []
             for block in blocks:
-                if block.block_hash not in given:
-                    given.add(block.block_hash)
-                    taken.append(_block(block, made))
-            return taken
+                if block.block_hash not in seen:
+                    seen.add(block.block_hash)
+                    unseen_blocks.append(_block(block, shared_blocks))
+            return unseen_blocks
 
-        chain, deque = take(export.chain), take(export.blocks_to_be_committed)
-        stack = take(export.reconcile_stack)
-        for brought in home.earlier:
-            if brought.export.agent_id == agent_id:
-                only_there = [block for block in brought.export.blocks() if block.block_hash not in held_by_anybody]
-                stack = [*reversed(take(only_there)), *stack]
-                held_by_anybody |= {block.block_hash for block in only_there}
+        chain, deque = unseen(export.chain), unseen(export.blocks_to_be_committed)
+        stack = unseen(export.reconcile_stack)
+        for read_export in collected.earlier:
+            if read_export.export.agent_id == agent_id:
+                only_there = [block for block in read_export.export.blocks() if block.block_hash not in held_anywhere]
+                stack = [*reversed(unseen(only_there)), *stack]
+                held_anywhere |= {block.block_hash for block in only_there}
         completed = [bytes.fromhex(block_hash) for block_hash in export.completed]
         stored[agent_id] = StoredState(completed, chain, deque, stack)
     return stored
 
 
-def _block(block: ExportedBlock, made: dict[str, Block]) -> Block:
-    if block.block_hash not in made:
-        made[block.block_hash] = Block(block.agent_id, block.timestamp_us, base64.b64decode(block.event_data))
-    return made[block.block_hash]
+def _block(block: ExportedBlock, shared_blocks: dict[str, Block]) -> Block:
+    if block.block_hash not in shared_blocks:
+        shared_blocks[block.block_hash] = Block(block.agent_id, block.timestamp_us, base64.b64decode(block.event_data))
+    return shared_blocks[block.block_hash]
 
 
-def _line(record: Consolidation, exports: Mapping[int, Export], rounds: int) -> Reconciled:
+def _line(record: Consolidation, exports: Mapping[int, Export], rounds: int) -> ReconcileResult:
     names = record.names
     before = {
-        agent_id: {block.block_hash for block in export.blocks()} for agent_id, export in record.home.exports.items()
+        agent_id: {block.block_hash for block in export.blocks()}
+        for agent_id, export in record.collected.exports.items()
     }
     chains = {export.chain_of_block_hashes for export in exports.values()}
     uniform = len(chains) == 1
@@ -166,7 +171,7 @@ def _line(record: Consolidation, exports: Mapping[int, Export], rounds: int) -> 
             continue
         why = "it was edited or damaged" if line.claimed_hash else "some chains lack it"
         left_out.append(f"{line.name}: {why}")
-    return Reconciled(
+    return ReconcileResult(
         uniform=uniform,
         rounds=rounds,
         vehicles=[

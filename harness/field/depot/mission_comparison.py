@@ -1,8 +1,8 @@
-"""Does every vehicle carry the same mission? What is on the vehicles is compared, file by file and key by key.
+"""Compare the files of all vehicles, key by key, to find out whether they belong to one mission.
 
-Mission files must agree in all that a swarm has to share, and differ in what each vehicle has for itself. A manifest
-says what they should agree on; without one it is what most of them say. Chain exports and traces that lie beside them
-must be of the same inception block and roster. A file that cannot be read is a difference, too.
+Mission files must agree in all values that a swarm shares, and must differ in the values that are unique per vehicle. A
+manifest has the expected values. Without one, the most frequent values are expected. Chain exports and traces in the
+same directory must have the same inception block and roster. An unreadable file counts as a difference.
 """
 
 import base64
@@ -37,12 +37,12 @@ _EXPECTED = (MISSION_SUFFIX, EXPORT_SUFFIX, TRACE_SUFFIX)
 
 
 class UnreadableFileError(HarnessError):
-    """A file that is none of those that can be compared, or is damaged."""
+    """The file has no comparable format, or is damaged."""
 
 
 @dataclass(frozen=True)
-class Shared:
-    """What a file says of what all must share: `key` is what the value is called in this file."""
+class SharedValue:
+    """A value that all files must share. `key` is its key in this file."""
 
     key: str
     value: Hashable
@@ -50,19 +50,19 @@ class Shared:
 
 
 @dataclass
-class Carried:
-    """A file that a vehicle carries, or that belongs to a mission."""
+class ComparedFile:
+    """A file of a vehicle, or of the mission."""
 
     path: Path
     kind: Kind
     agent_id: int | None
-    shared: dict[str, Shared]
+    shared: dict[str, SharedValue]
     mission: Mission | None = None
 
 
 @dataclass(frozen=True)
-class Difference:
-    """`file` is None where no file is to blame, but one that is not there; `key` where it is the whole file."""
+class MissionDifference:
+    """A difference. `file` is None if a file is missing. `key` is None if the whole file is wrong."""
 
     file: Path | None
     key: str | None
@@ -74,25 +74,25 @@ class Difference:
 
 @dataclass
 class Comparison:
-    """What was compared, and what differs."""
+    """The compared files, and their differences."""
 
-    carried: list[Carried]
-    differences: list[Difference]
+    files: list[ComparedFile]
+    differences: list[MissionDifference]
 
     @property
     def verdict(self) -> Literal["same", "differ", "nothing usable"]:
-        if not self.carried:
+        if not self.files:
             return "nothing usable"
         return "differ" if self.differences else "same"
 
     def in_words(self) -> str:
-        """What is the same in all files, if it is."""
-        kinds = Counter(carried.kind for carried in self.carried)
+        """Return a sentence with the values that all files share."""
+        kinds = Counter(file.kind for file in self.files)
         counted = ", ".join(f"{count} {kind}{'s' if count > 1 else ''}" for kind, count in kinds.items())
-        known = {name: said.shown for carried in self.carried for name, said in carried.shared.items()}
+        known = {name: shared.shown for file in self.files for name, shared in file.shared.items()}
         what = ", ".join(f"{name} {known[name]}" for name in (INCEPTION, ROSTER, FINGERPRINT) if name in known)
-        alike = "are of one mission" if len(self.carried) > 1 else "is of a mission"
-        sentence = f"{counted} {alike}: {what}"
+        equal_files = "are of one mission" if len(self.files) > 1 else "is of a mission"
+        sentence = f"{counted} {equal_files}: {what}"
         if not kinds["mission file"]:
             sentence += "; without a mission file, settings, network and seeds were not compared"
         return sentence
@@ -100,51 +100,57 @@ class Comparison:
     def to_json(self) -> dict[str, Any]:
         return {
             "verdict": self.verdict,
-            "files": [
-                {"file": str(carried.path), "kind": carried.kind, "agent_id": carried.agent_id}
-                for carried in self.carried
-            ],
-            "shared": {name: said.shown for carried in reversed(self.carried) for name, said in carried.shared.items()}
+            "files": [{"file": str(file.path), "kind": file.kind, "agent_id": file.agent_id} for file in self.files],
+            "shared": {name: shared.shown for file in reversed(self.files) for name, shared in file.shared.items()}
             if self.verdict == "same"
             else {},
             "differences": [
-                {"file": None if gap.file is None else str(gap.file), "key": gap.key, "sentence": gap.sentence}
-                for gap in self.differences
+                {
+                    "file": None if difference.file is None else str(difference.file),
+                    "key": difference.key,
+                    "sentence": difference.sentence,
+                }
+                for difference in self.differences
             ],
         }
 
 
 def compare(paths: Iterable[Path]) -> Comparison:
-    """Compare files, and those in directories. Raises RunDirectoryError if a path does not exist, or holds none."""
+    """Compare files, and the files in directories.
+
+    Raises RunDirectoryError if a path does not exist, or a directory has no files to compare.
+    """
     comparison = Comparison([], [])
     for path, named in _files(paths):
         try:
-            comparison.carried.append(read(path))
+            comparison.files.append(read(path))
         except UnreadableFileError as error:
-            begun = path.name.endswith(TRACE_SUFFIX) and not path.stat().st_size  # and not a line of it is there yet
-            if named or (path.name.endswith(_EXPECTED) and not begun) or path.name == FILE:
-                comparison.differences.append(Difference(path, None, f"{path}: {error}"))
-    comparison.differences += differences(comparison.carried)
+            is_empty = path.name.endswith(TRACE_SUFFIX) and not path.stat().st_size  # no line is written yet
+            if named or (path.name.endswith(_EXPECTED) and not is_empty) or path.name == FILE:
+                comparison.differences.append(MissionDifference(path, None, f"{path}: {error}"))
+    comparison.differences += differences(comparison.files)
     return comparison
 
 
-def differences(carried: Sequence[Carried]) -> list[Difference]:
-    """Whatever keeps these files from being of one mission."""
-    found = [*_unlike(carried), *_not_distinct(carried), *_off_the_roster(carried)]
-    for file in carried:
+def differences(files: Sequence[ComparedFile]) -> list[MissionDifference]:
+    """Return all differences that show that the files do not belong to one mission."""
+    found = [*_deviating_values(files), *_duplicate_values(files), *_roster_differences(files)]
+    for file in files:
         if file.mission is not None:
             found += [
-                Difference(file.path, f"quirks.{name}", f"{file.path}: `quirks.{name}` asks for a mistake: set it to 0")
+                MissionDifference(
+                    file.path, f"quirks.{name}", f"{file.path}: `quirks.{name}` asks for a mistake: set it to 0"
+                )
                 for name in in_force(file.mission.quirks)
             ]
     return found
 
 
-# What is in the files
+# Reading files
 
 
-def read(path: Path) -> Carried:
-    """What a file says of its mission. Raises UnreadableFileError: why, without the file's name."""
+def read(path: Path) -> ComparedFile:
+    """Read a file. Raises UnreadableFileError with the reason, without the name of the file."""
     document = _beginning(path)
     schema = document.get("schema")
     try:
@@ -167,7 +173,7 @@ def read(path: Path) -> Carried:
 
 
 def _beginning(path: Path) -> dict[str, Any]:
-    """The JSON object that a file is, or begins with."""
+    """Return the JSON object in the file, or in its first line."""
     try:
         with path.open("rb") as file:
             first = file.readline(MAX_LINE_BYTES)
@@ -186,34 +192,36 @@ def _beginning(path: Path) -> dict[str, Any]:
     return document
 
 
-def _of_mission(path: Path, mission: Mission) -> Carried:
+def _of_mission(path: Path, mission: Mission) -> ComparedFile:
     shared = {
         INCEPTION: _inception("initial_data", mission.initial_data),
         ROSTER: _roster(mission.roster),
         FINGERPRINT: _fingerprint("settings", fingerprint(mission.settings)),
     }
     for name, value in dataclasses.asdict(mission.settings).items():
-        shared[f"setting {name}"] = Shared(f"settings.{name}", value, _shown(value))
+        shared[f"setting {name}"] = SharedValue(f"settings.{name}", value, _shown(value))
     for name, value in (
         ("broadcast address", mission.network.broadcast),
         ("port", mission.network.port),
     ):
-        shared[name] = Shared(f"network.{name.split()[0]}", value, _shown(value))
+        shared[name] = SharedValue(f"network.{name.split()[0]}", value, _shown(value))
     for name, value in (("speedup", mission.speedup), ("epoch_us", mission.epoch_us)):
-        shared[name] = Shared(name, value, _shown(value))
-    return Carried(path, "mission file", mission.agent_id, shared, mission)
+        shared[name] = SharedValue(name, value, _shown(value))
+    return ComparedFile(path, "mission file", mission.agent_id, shared, mission)
 
 
-def _of_export(path: Path) -> Carried:
+def _of_export(path: Path) -> ComparedFile:
     export = read_export(path)
     initial_data = base64.b64decode(export.inception.block_data)
     inception = InceptionBlock(initial_data)
     if inception.block_hash.hex() != export.inception.block_hash:
         raise UnreadableFileError("`inception.block_hash` does not match `inception.block_data`: it was edited")
-    return Carried(path, "chain export", export.agent_id, {INCEPTION: _inception("inception.block_data", initial_data)})
+    return ComparedFile(
+        path, "chain export", export.agent_id, {INCEPTION: _inception("inception.block_data", initial_data)}
+    )
 
 
-def _of_trace(path: Path, document: dict[str, Any]) -> Carried:
+def _of_trace(path: Path, document: dict[str, Any]) -> ComparedFile:
     header = HEADER.validate_python(document)
     if header.initial_data is None:
         raise UnreadableFileError("a trace of version 1 has no `initial_data`, so its mission is unknown")
@@ -221,7 +229,7 @@ def _of_trace(path: Path, document: dict[str, Any]) -> Carried:
         initial_data = base64.b64decode(header.initial_data, validate=True)
     except ValueError:
         raise UnreadableFileError("`initial_data` is not base64") from None
-    return Carried(
+    return ComparedFile(
         path,
         "trace",
         header.agent_id,
@@ -229,35 +237,35 @@ def _of_trace(path: Path, document: dict[str, Any]) -> Carried:
     )
 
 
-def _of_manifest(path: Path, document: dict[str, Any]) -> Carried:
+def _of_manifest(path: Path, document: dict[str, Any]) -> ComparedFile:
     manifest = Manifest.model_validate(document)
     block_hash = manifest.inception.block_hash
-    return Carried(
+    return ComparedFile(
         path,
         "manifest",
         None,
         {
-            INCEPTION: Shared("inception.block_hash", block_hash, block_hash[:HASH_DIGITS]),
+            INCEPTION: SharedValue("inception.block_hash", block_hash, block_hash[:HASH_DIGITS]),
             ROSTER: _roster(manifest.roster),
             FINGERPRINT: _fingerprint("settings_sha256", manifest.settings_sha256),
-            "broadcast address": Shared("broadcast", manifest.broadcast, _shown(manifest.broadcast)),
-            "port": Shared("port", manifest.port, _shown(manifest.port)),
+            "broadcast address": SharedValue("broadcast", manifest.broadcast, _shown(manifest.broadcast)),
+            "port": SharedValue("port", manifest.port, _shown(manifest.port)),
         },
     )
 
 
-def _inception(key: str, initial_data: bytes) -> Shared:
+def _inception(key: str, initial_data: bytes) -> SharedValue:
     block_hash = InceptionBlock(initial_data).block_hash.hex()
-    return Shared(key, block_hash, block_hash[:HASH_DIGITS])
+    return SharedValue(key, block_hash, block_hash[:HASH_DIGITS])
 
 
-def _roster(roster: Iterable[int]) -> Shared:
+def _roster(roster: Iterable[int]) -> SharedValue:
     members = sorted(roster)
-    return Shared("roster", tuple(members), ", ".join(ranges(members)))
+    return SharedValue("roster", tuple(members), ", ".join(ranges(members)))
 
 
-def _fingerprint(key: str, sha256: str) -> Shared:
-    return Shared(key, sha256, sha256[:HASH_DIGITS])
+def _fingerprint(key: str, sha256: str) -> SharedValue:
+    return SharedValue(key, sha256, sha256[:HASH_DIGITS])
 
 
 def _shown(value: Any) -> str:
@@ -265,47 +273,51 @@ def _shown(value: Any) -> str:
     return text if len(text) <= MAX_VALUE else f"{text[:MAX_VALUE]}…"
 
 
-# What differs
+# Differences
 
 
-def _unlike(carried: Sequence[Carried]) -> Iterator[Difference]:
-    """Files that say otherwise than the manifest, or than most."""
-    names = dict.fromkeys(name for file in carried for name in file.shared)
+def _deviating_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
+    """Yield the values that differ from those of the manifest, or of most files."""
+    names = dict.fromkeys(name for file in files for name in file.shared)
     for name in names:
-        saying = [file for file in carried if name in file.shared]
-        manifest = next((file for file in saying if file.kind == "manifest"), None)
-        counts = Counter(file.shared[name].value for file in saying)
-        wanted = manifest.shared[name].value if manifest else counts.most_common(1)[0][0]
-        alike = [file for file in saying if file.shared[name].value == wanted]
-        for file in saying:
-            said = file.shared[name]
-            if said.value == wanted or (name == FINGERPRINT and _told_by_key(file, alike)):
+        files_with_value = [file for file in files if name in file.shared]
+        manifest = next((file for file in files_with_value if file.kind == "manifest"), None)
+        counts = Counter(file.shared[name].value for file in files_with_value)
+        expected = manifest.shared[name].value if manifest else counts.most_common(1)[0][0]
+        equal_files = [file for file in files_with_value if file.shared[name].value == expected]
+        for file in files_with_value:
+            shared = file.shared[name]
+            if shared.value == expected or (name == FINGERPRINT and _has_settings_to_compare(file, equal_files)):
                 continue
-            where = manifest.path if manifest else alike[0].path
-            others = f" and {len(alike) - 1} other{'s' if len(alike) > 2 else ''}" if len(alike) > 1 else ""
-            what = f"`{said.key}`" if name not in (INCEPTION, FINGERPRINT) else f"`{said.key}` ({name})"
-            yield Difference(
+            where = manifest.path if manifest else equal_files[0].path
+            others = (
+                f" and {len(equal_files) - 1} other{'s' if len(equal_files) > 2 else ''}"
+                if len(equal_files) > 1
+                else ""
+            )
+            what = f"`{shared.key}`" if name not in (INCEPTION, FINGERPRINT) else f"`{shared.key}` ({name})"
+            yield MissionDifference(
                 file.path,
-                said.key,
-                f"{file.path}: {what} is {said.shown}, and {alike[0].shared[name].shown} in {where}{others}",
+                shared.key,
+                f"{file.path}: {what} is {shared.shown}, and {equal_files[0].shared[name].shown} in {where}{others}",
             )
 
 
-def _told_by_key(file: Carried, others: Sequence[Carried]) -> bool:
-    """Whether another mission file's settings say which of them differ."""
+def _has_settings_to_compare(file: ComparedFile, others: Sequence[ComparedFile]) -> bool:
+    """Return whether the single settings are compared, too, so that the fingerprint needs no sentence of its own."""
     return file.mission is not None and any(other.mission is not None for other in others)
 
 
-def _not_distinct(carried: Sequence[Carried]) -> Iterator[Difference]:
-    """Mission files that have alike what every vehicle has for itself."""
+def _duplicate_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
+    """Yield the values that several mission files share, but that must be unique per vehicle."""
     for key in ("agent_id", "network.address", "seed"):
-        first: dict[Hashable, Carried] = {}
-        for file in carried:
+        first: dict[Hashable, ComparedFile] = {}
+        for file in files:
             if file.mission is None:
                 continue
             value: Hashable = file.mission.network.address if key == "network.address" else getattr(file.mission, key)
             if value in first:
-                yield Difference(
+                yield MissionDifference(
                     file.path,
                     key,
                     f"{file.path}: `{key}` is {_shown(value)}, as in {first[value].path}, but must be "
@@ -314,9 +326,9 @@ def _not_distinct(carried: Sequence[Carried]) -> Iterator[Difference]:
             first.setdefault(value, file)
 
 
-def _off_the_roster(carried: Sequence[Carried]) -> Iterator[Difference]:
-    """Vehicles of the roster without a mission file, and files of vehicles that are not on it."""
-    rosters = [file for file in carried if ROSTER in file.shared and file.kind in ("manifest", "mission file")]
+def _roster_differences(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
+    """Yield the agents on the roster without a mission file, and the files of agents that are not on it."""
+    rosters = [file for file in files if ROSTER in file.shared and file.kind in ("manifest", "mission file")]
     if not rosters:
         return
     by_count = Counter(file.shared[ROSTER].value for file in rosters)
@@ -324,32 +336,36 @@ def _off_the_roster(carried: Sequence[Carried]) -> Iterator[Difference]:
     roster: Any = manifest.shared[ROSTER].value if manifest else by_count.most_common(1)[0][0]
     for member, count in Counter(roster).items():
         if count > 1:
-            yield Difference(rosters[0].path, "roster", f"{rosters[0].path}: `roster` names agent {member} twice")
-    with_file = {file.agent_id for file in carried if file.kind == "mission file"}
+            yield MissionDifference(
+                rosters[0].path, "roster", f"{rosters[0].path}: `roster` names agent {member} twice"
+            )
+    with_file = {file.agent_id for file in files if file.kind == "mission file"}
     for member in dict.fromkeys(roster):
         if member not in with_file:
-            yield Difference(None, "roster", f"agent {member} is on the `roster`, but its mission file is missing")
-    for file in carried:
+            yield MissionDifference(
+                None, "roster", f"agent {member} is on the `roster`, but its mission file is missing"
+            )
+    for file in files:
         if file.agent_id is not None and file.agent_id not in roster:
-            yield Difference(
+            yield MissionDifference(
                 file.path,
                 "agent_id",
                 f"{file.path}: `agent_id` {file.agent_id} is not on the roster of the other files",
             )
 
 
-# Which files
+# Finding files
 
 
 def _files(paths: Iterable[Path]) -> list[tuple[Path, bool]]:
-    """The files, each once, and whether it was named itself."""
+    """Return the files, each once, and whether the user named the file itself."""
     files: dict[Path, tuple[Path, bool]] = {}
     for path in paths:
         if path.is_dir():
-            inside = _in_directory(path)
-            if not inside:
+            found_files = _in_directory(path)
+            if not found_files:
                 raise RunDirectoryError(f"{path}: holds no *{MISSION_SUFFIX} and no other files to compare")
-            for file in inside:
+            for file in found_files:
                 files.setdefault(file.resolve(), (file, False))
         elif path.exists():
             files[path.resolve()] = path, True
@@ -359,10 +375,10 @@ def _files(paths: Iterable[Path]) -> list[tuple[Path, bool]]:
 
 
 def _in_directory(directory: Path) -> list[Path]:
-    """The JSON files in a directory or a run's; if there are none, those one level deeper, a directory per vehicle."""
-    here = agents_directory(directory)
+    """Return the JSON files in a directory. If there are none, return those in its subdirectories, one per vehicle."""
+    agents_folder = agents_directory(directory)
     for pattern in ("*.json*", "*/*.json*"):
-        files = [path for path in here.glob(pattern) if path.is_file() and path.suffix in (".json", ".jsonl")]
+        files = [path for path in agents_folder.glob(pattern) if path.is_file() and path.suffix in (".json", ".jsonl")]
         if files:
             return sorted(files, key=lambda path: (path.parent, len(path.name), path.name))
     return []

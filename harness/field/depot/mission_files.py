@@ -1,8 +1,9 @@
 """The mission files of a roster, and their manifest (`ucp-mission-manifest/1`).
 
-They are what a run gives its agents (`harness.play.process.agent_mission`), but for what a flight has otherwise: time
-passes as it does, no mistake is asked for, every vehicle has an address of its own choosing, and keeps a store, so that
-a brown-out loses nothing. Each is read by the agent's own reader before it is written.
+They equal the files that a run gives to its agents (`harness.play.process.agent_mission`), with some differences for
+real flights. Time has no speedup, and there are no quirks. Each vehicle has an address of the user's network. Each
+agent keeps a store, so that a brown-out loses no data. Each file is parsed by the agent's own parser before it is
+written.
 """
 
 import hashlib
@@ -31,7 +32,7 @@ from ucp.settings import Settings
 
 FILE = "manifest.json"
 EXACT = 2**53
-"""Whole numbers up to here are floats as well."""
+"""Integers up to this number are exact as floats."""
 
 
 class ManifestInception(BaseModel):
@@ -68,27 +69,29 @@ class Manifest(BaseModel):
 
 
 def fingerprint(settings: Settings) -> str:
-    """SHA-256 of the settings as JSON: keys in order, no spaces, and 10 written as 10.0 is."""
-    known = {
+    """Return the SHA-256 hash of the settings as JSON, with sorted keys, without spaces, and with integers as
+    floats.
+    """
+    values = {
         name: float(value) if type(value) is int and value < EXACT else value for name, value in settings.told().items()
     }
-    return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 SUFFIX = ".mission.json"
 
 
 class MissionFileError(HarnessError):
-    """What was asked for makes no mission that an agent reads."""
+    """The requested mission is not one that an agent accepts."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A mission before it is written. `settings` and `events` are laid over the scenario's, key by key.
+    """The plan of a mission before it is written. `settings` and `events` override the scenario's values, key by key.
 
-    A vehicle's address is its place in `subnet`, its ID counted from the first, or what `addresses` says; without a
-    subnet it is that of a run's network (`netem.addresses`). `broadcast` goes with it if it is None.
-    `secured`: each vehicle has its bundle of keys beside its mission file.
+    The address of a vehicle is given in `addresses`, or is the address in `subnet` with its ID as the number. Without a
+    subnet, the address is that of a run (`netem.addresses`). The broadcast address follows from the subnet unless it is
+    given. If `secured`, each vehicle has a bundle of keys in the directory of its mission file.
     """
 
     scenario: Scenario
@@ -102,22 +105,22 @@ class Plan:
     secured: bool = False
 
     def documents(self) -> dict[int, dict[str, Any]]:
-        """The mission file of each agent. Raises MissionFileError."""
+        """Return the mission file of each agent. Raises MissionFileError."""
         if len(self.initial_data) > MAX_INITIAL_DATA_BYTES:
             raise MissionFileError(
                 f"the initial data is {len(self.initial_data)} bytes: the maximum is {MAX_INITIAL_DATA_BYTES}"
             )
-        strangers = sorted(self.addresses.keys() - {*self.scenario.roster})
-        if strangers:
-            raise MissionFileError(f"`--address` names vehicle {strangers[0]}, which is not on the roster")
+        unknown_ids = sorted(self.addresses.keys() - {*self.scenario.roster})
+        if unknown_ids:
+            raise MissionFileError(f"`--address` names vehicle {unknown_ids[0]}, which is not on the roster")
         documents = {agent_id: self._document(agent_id) for agent_id in self.scenario.roster}
         vehicles: dict[str, int] = {}
         for agent_id, document in documents.items():
-            its_address = document["network"]["address"]
-            other = vehicles.setdefault(its_address, agent_id)
+            vehicle_address = document["network"]["address"]
+            other = vehicles.setdefault(vehicle_address, agent_id)
             if other != agent_id:
                 raise MissionFileError(
-                    f"vehicles {other} and {agent_id} have the same address {its_address}: choose "
+                    f"vehicles {other} and {agent_id} have the same address {vehicle_address}: choose "
                     "another `--address` for one of them"
                 )
         return documents
@@ -162,15 +165,15 @@ class Plan:
 
 
 def write(plan: Plan, directory: Path, *, overwrite: bool = False) -> list[Path]:
-    """Write the mission files and the manifest; which files those are, the manifest last.
+    """Write the mission files and the manifest. Returns their paths, the manifest last.
 
-    Raises MissionFileError, RunDirectoryError if a file is there already and may not be overwritten, or if the
-    directory has mission files of others, and MachineError if the disk refuses.
+    Raises MissionFileError, or MachineError on a disk error. Raises RunDirectoryError if a file exists and `overwrite`
+    is false, or if the directory has other mission files.
     """
     documents = {f"{agent_id}{SUFFIX}": document for agent_id, document in plan.documents().items()}
     missions = {name: parse_mission(document) for name, document in documents.items()}
     files = {**documents, FILE: manifest(plan.scenario.name, missions).to_json()}
-    _refuse(directory, list(files), overwrite)
+    _check_overwrite(directory, list(files), overwrite)
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for name, document in files.items():
@@ -181,7 +184,7 @@ def write(plan: Plan, directory: Path, *, overwrite: bool = False) -> list[Path]
 
 
 def manifest(name: str, missions: Mapping[str, Mission]) -> Manifest:
-    """What these mission files, by their names, have in common; there is one at least."""
+    """Return the manifest of these mission files, at least one, by file name."""
     first = next(iter(missions.values()))
     return Manifest(
         name=name,
@@ -194,10 +197,12 @@ def manifest(name: str, missions: Mapping[str, Mission]) -> Manifest:
     )
 
 
-def _refuse(directory: Path, names: Sequence[str], overwrite: bool) -> None:
-    there = [name for name in names if (directory / name).exists()]
-    if there and not overwrite:
-        raise RunDirectoryError(f"{directory / there[0]} exists: choose another --out, or replace it with --overwrite")
+def _check_overwrite(directory: Path, names: Sequence[str], overwrite: bool) -> None:
+    existing = [name for name in names if (directory / name).exists()]
+    if existing and not overwrite:
+        raise RunDirectoryError(
+            f"{directory / existing[0]} exists: choose another --out, or replace it with --overwrite"
+        )
     stale = sorted(path.name for path in directory.glob(f"*{SUFFIX}") if path.name not in names)
     if stale:
         raise RunDirectoryError(

@@ -1,19 +1,19 @@
 """The lines of a consolidated record (`ucp-consolidated/1`), and the order of its blocks.
 
-    header      first, once: the mission, whose exports came home, how much there is
-    fork        where chains part, the lowest first
+    header      first, once: the mission, its exports, and totals
+    fork        a place at which chains fork, the lowest first
     block       in the order of the record, each followed by its events
-    event       every logged event, exactly once
-    lost        a completed block, or a vehicle, that did not come home
-    reconciled  last, if it was asked for: what a final reconcile of the exports made of them
+    event       each logged event, exactly once
+    lost        a completed block, or a vehicle, that is in no export
+    reconciled  last, if requested: the result of a final reconcile of the exports
 
-Data is in base64, hashes in lower-case hex, times in microseconds as blocks have them. From the events of a block, and
-what of it is unreadable, its data is made again byte by byte, and so its hash.
+Data is in base64, hashes are in lower-case hex, and times are in microseconds, as in blocks. The data of a block, and
+so its hash, can be computed again from its events and its unreadable part.
 
-First comes the mutual chain, as all agents have it. After it a block comes later than the blocks below it in every
-chain, as long as the chains agree; among those that may come next, the one with the earliest timestamp does, then that
-of the lowest agent ID. Where chains contradict each other, so that blocks would have to come before themselves, these
-blocks stand together in order of time. The same exports give the same order.
+The mutual chain comes first, in the order that all agents share. Each other block comes after its predecessors in all
+chains, as long as the chains do not contradict each other. Of several possible next blocks, the one with the earliest
+timestamp comes first, then the one with the lowest agent ID. If chains contradict each other about the order of some
+blocks, these blocks stand together in order of time. Therefore equal exports give an equal order.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,11 +34,11 @@ Place = Literal["chain", "deque", "stack", "current block", "earlier export"]
 HELD_NOW: tuple[Place, ...] = ("chain", "deque", "stack")
 
 
-class Line(BaseModel):
+class RecordLine(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
-class ExportUsed(Line):
+class ExportUsed(RecordLine):
     """An export and the numbers of blocks in it. Of several exports of one agent, `latest` marks the current one."""
 
     agent_id: AgentId
@@ -54,7 +54,7 @@ class ExportUsed(Line):
     top_chain_hash: Hash
 
 
-class Header(Line):
+class Header(RecordLine):
     """The first line: the mission, its exports, and totals. `roster` has the IDs of all agents known to have flown.
 
     `problems` has a sentence for each error in an export, `left_out` for each unused file, and `remarks` for other
@@ -77,7 +77,7 @@ class Header(Line):
     remarks: list[str]
 
 
-class Way(Line):
+class ForkBranch(RecordLine):
     """Agents whose chains continue with the same block, `next`. It is null if their chains end."""
 
     agents: list[AgentId]
@@ -85,7 +85,7 @@ class Way(Line):
     next_hash: Hash | None
 
 
-class Fork(Line):
+class Fork(RecordLine):
     """A fork: chains differ after `height` common blocks. `after` is the last common block, null for the inception
     block."""
 
@@ -93,10 +93,10 @@ class Fork(Line):
     height: Count
     after: str | None
     after_hash: Hash | None
-    ways: list[Way]
+    ways: list[ForkBranch]
 
 
-class Held(Line):
+class Holding(RecordLine):
     """A place of a block, and the agents that hold it there. `position` counts from 1: in a chain from the inception
     block, in a deque from the front, in a stack from the bottom.
 
@@ -110,7 +110,7 @@ class Held(Line):
     agents: list[AgentId]
 
 
-class Block(Line):
+class Block(RecordLine):
     """A block. `number` counts the blocks of the record from 1. `block_hash` is null for an incomplete block.
 
     `mutual` is true if all chains share the block. `claimed_hash` is the wrong hash in a file that was edited or
@@ -126,7 +126,7 @@ class Block(Line):
     block_hash: Hash | None
     events: Count
     mutual: bool
-    held: list[Held]
+    held: list[Holding]
     claimed_hash: Hash | None = None
     unreadable: Base64 = ""
     sealed: Annotated[bool, Field(exclude_if=not_)] = False
@@ -137,7 +137,7 @@ class Block(Line):
         return sorted({agent for held in self.held if held.place in HELD_NOW for agent in held.agents})
 
 
-class Event(Line):
+class Event(RecordLine):
     """One event: number `index`, from 0, in the block with the number `block`."""
 
     line: Literal["event"] = "event"
@@ -149,7 +149,7 @@ class Event(Line):
     data: Base64
 
 
-class Lost(Line):
+class MissingItem(RecordLine):
     """A missing block of `agent_id`, or the missing vehicle itself if `block` is null. `agents` are the missing
     vehicles that may have the block, or `agent_id` alone."""
 
@@ -161,7 +161,7 @@ class Lost(Line):
     why: str
 
 
-class Vehicle(Line):
+class Vehicle(RecordLine):
     """A vehicle after the reconcile. `gained` has the names of the blocks that it did not have before."""
 
     agent_id: AgentId
@@ -170,7 +170,7 @@ class Vehicle(Line):
     gained: list[str]
 
 
-class Reconciled(Line):
+class ReconcileResult(RecordLine):
     """The last line: the result of a final reconcile of the exports. `chain` has the hashes of the uniform chain,
     oldest first. It is empty if the chains are not uniform.
 
@@ -186,13 +186,13 @@ class Reconciled(Line):
 
 
 class ConsolidatedLine(
-    RootModel[Annotated[Header | Fork | Block | Event | Lost | Reconciled, Field(discriminator="line")]]
+    RootModel[Annotated[Header | Fork | Block | Event | MissingItem | ReconcileResult, Field(discriminator="line")]]
 ):
     """One line of a `ucp-consolidated/1` record."""
 
 
 def mutual_chain(chains: Iterable[Sequence[str]]) -> Sequence[str]:
-    """What all chains begin with."""
+    """Return the longest common prefix of the chains."""
     first, *others = chains
     length = len(first)
     for other in others:
@@ -203,17 +203,22 @@ def mutual_chain(chains: Iterable[Sequence[str]]) -> Sequence[str]:
 
 
 def ordered(blocks: Mapping[str, ExportedBlock], chains: Sequence[Sequence[str]]) -> list[str]:
-    """The hashes of `blocks`, which are all that the chains hold, and perhaps others. There is a chain at least."""
+    """Return the hashes of `blocks` in the order of the record.
+
+    `blocks` includes all blocks of the chains. There is at least one chain.
+    """
     mutual = mutual_chain(chains)
     first = set(mutual)
     after: dict[str, set[str]] = {block_hash: set() for block_hash in blocks if block_hash not in first}
-    tails = [chain[len(mutual) :] for chain in dict.fromkeys(map(tuple, chains))]
-    for tail in tails:
+    remainders = [chain[len(mutual) :] for chain in dict.fromkeys(map(tuple, chains))]
+    for tail in remainders:
         for below, above in pairwise(tail):
             if below != above and below in after and above in after:
                 after[below].add(above)
-    apart = sum(map(len, tails)) == len(set().union(*tails))  # then no two of them can contradict each other
-    component = {block_hash: number for number, block_hash in enumerate(after)} if apart else _components(after)
+    disjoint = sum(map(len, remainders)) == len(
+        set().union(*remainders)
+    )  # disjoint chains cannot contradict each other
+    component = {block_hash: number for number, block_hash in enumerate(after)} if disjoint else _components(after)
     members: dict[int, list[str]] = {}
     for block_hash, number in component.items():
         members.setdefault(number, []).append(block_hash)
@@ -221,29 +226,32 @@ def ordered(blocks: Mapping[str, ExportedBlock], chains: Sequence[Sequence[str]]
     def age(block_hash: str) -> tuple[int, int, str]:
         return blocks[block_hash].timestamp_us, blocks[block_hash].agent_id, block_hash
 
-    waits_for = dict.fromkeys(members, 0)
-    leads_to: dict[int, set[int]] = {number: set() for number in members}
+    predecessor_counts = dict.fromkeys(members, 0)
+    successors: dict[int, set[int]] = {number: set() for number in members}
     for below, above in ((below, each) for below, others in after.items() for each in others):
-        if component[below] != component[above] and component[above] not in leads_to[component[below]]:
-            leads_to[component[below]].add(component[above])
-            waits_for[component[above]] += 1
-    for together in members.values():
-        together.sort(key=age)
-    free = [(age(members[number][0]), number) for number, count in waits_for.items() if not count]
-    heapify(free)
+        if component[below] != component[above] and component[above] not in successors[component[below]]:
+            successors[component[below]].add(component[above])
+            predecessor_counts[component[above]] += 1
+    for members_in_order in members.values():
+        members_in_order.sort(key=age)
+    ready = [(age(members[number][0]), number) for number, count in predecessor_counts.items() if not count]
+    heapify(ready)
     order = list(dict.fromkeys(mutual))
-    while free:
-        _, number = heappop(free)
+    while ready:
+        _, number = heappop(ready)
         order += members[number]
-        for later in leads_to[number]:
-            waits_for[later] -= 1
-            if not waits_for[later]:
-                heappush(free, (age(members[later][0]), later))
+        for later in successors[number]:
+            predecessor_counts[later] -= 1
+            if not predecessor_counts[later]:
+                heappush(ready, (age(members[later][0]), later))
     return order
 
 
 def _components(after: Mapping[str, set[str]]) -> dict[str, int]:
-    """The strongly connected component that each is in (Tarjan, 1972), without recursion, for chains are long."""
+    """Return the strongly connected component of each block (Tarjan, 1972).
+
+    Long chains would exceed the recursion limit, so the function is iterative.
+    """
     index: dict[str, int] = {}
     lowest: dict[str, int] = {}
     component: dict[str, int] = {}

@@ -1,10 +1,10 @@
-"""The files of a flight, as they came home: whose they are, of which flight, and what of them can be used.
+"""Ingest the files of a flight: find out the agent, the flight and the usable part of each file.
 
-Field data is broken: lines are cut, two flights are in one file, a file is there twice, others' files lie beside.
-Everything usable is used, and whatever is left out is named.
+Field data is often broken. Lines are truncated, two flights are in one file, a file exists twice, and unrelated files
+lie in the same directory. Ingesting uses everything usable, and reports everything that it leaves out.
 """
 
-from harness.field.ingest._ingest import Flight, Homecoming, LeftOut, Remark
-from harness.field.ingest._sorting import sort_out
+from harness.field.ingest._ingest import Flight, IngestResult, Omission, Remark
+from harness.field.ingest._sorting import ingest_files
 
-__all__ = ["Flight", "Homecoming", "LeftOut", "Remark", "sort_out"]
+__all__ = ["Flight", "IngestResult", "Omission", "Remark", "ingest_files"]

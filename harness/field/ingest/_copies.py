@@ -1,112 +1,140 @@
-"""The same life of an agent in several files: what is lost of one copy may be left of another."""
+"""Combine several files of the same incarnation of an agent. One copy may contain the lines that another has lost."""
 
 from collections.abc import Iterator
 
-from harness.field.ingest._file_search import is_of_a_life
-from harness.field.ingest._ingest import LeftOut
-from harness.field.ingest._trace_incarnations import Life, jumps_in
+from harness.field.ingest._file_search import is_incarnation_copy
+from harness.field.ingest._ingest import Omission
+from harness.field.ingest._trace_incarnations import TraceIncarnation, jumps_in
 from ucp.trace import HandlerRun
 
 
-def told_apart(lives: list[Life], left_out: list[LeftOut]) -> Iterator[list[Life]]:
-    """The lives of one agent under one header: those that follow each other are of one flight, each once."""
-    flights: list[list[Life]] = []
-    for life in sorted(lives, key=_worth, reverse=True):
-        twin = next((other for flight in flights for other in flight if _is_copy(life, other)), None)
-        if twin is not None:
-            taken = _mend(twin, life) if life.runs else 0
-            if taken or ((life.runs or life.path != twin.path) and not is_of_a_life(life.path)):
-                left_out.append(LeftOut(life.path, _of_copy(life, twin, taken), life.first_line, life.counts))
+def split_into_flights(
+    incarnations: list[TraceIncarnation], left_out: list[Omission]
+) -> Iterator[list[TraceIncarnation]]:
+    """Yield groups of incarnations of one agent with the same header. Each group belongs to one flight.
+
+    Successive incarnations belong to the same flight, overlapping ones to different flights. Copies are combined into
+    one.
+    """
+    flights: list[list[TraceIncarnation]] = []
+    for incarnation in sorted(incarnations, key=_quality, reverse=True):
+        other_copy = next((other for flight in flights for other in flight if _is_copy(incarnation, other)), None)
+        if other_copy is not None:
+            added_runs = _fill_gaps(other_copy, incarnation) if incarnation.runs else 0
+            if added_runs or (
+                (incarnation.runs or incarnation.path != other_copy.path) and not is_incarnation_copy(incarnation.path)
+            ):
+                left_out.append(
+                    Omission(
+                        incarnation.path,
+                        _describe_copy(incarnation, other_copy, added_runs),
+                        incarnation.first_line,
+                        incarnation.counts,
+                    )
+                )
             continue
-        room = next((flight for flight in flights if not any(_overlap(life, other) for other in flight)), None)
-        if room is None:
-            flights.append([life])
+        fitting_flight = next(
+            (flight for flight in flights if not any(_overlap(incarnation, other) for other in flight)), None
+        )
+        if fitting_flight is None:
+            flights.append([incarnation])
         else:
-            room.append(life)
-    order = {id(life): number for number, life in enumerate(lives)}
+            fitting_flight.append(incarnation)
+    order = {id(incarnation): number for number, incarnation in enumerate(incarnations)}
     for flight in flights:
-        if len({life.path for life in flight}) > 1:
-            flight.sort(key=lambda life: (life.runs[0].t if life.runs else 0.0, order[id(life)]))
+        if len({incarnation.path for incarnation in flight}) > 1:
+            flight.sort(
+                key=lambda incarnation: (incarnation.runs[0].t if incarnation.runs else 0.0, order[id(incarnation)])
+            )
         else:
-            flight.sort(key=lambda life: order[id(life)])
+            flight.sort(key=lambda incarnation: order[id(incarnation)])
         yield flight
 
 
-def _worth(life: Life) -> tuple[bool, int, int]:
-    """Of two copies the one to go by is in order, then longer, then whole."""
-    return not life.jumps, len(life.runs), -len(life.gaps)
+def _quality(incarnation: TraceIncarnation) -> tuple[bool, int, int]:
+    """Return a sort key for copies.
+
+    Copies without clock jumps are best, then longer ones, then those with fewer gaps.
+    """
+    return not incarnation.jumps, len(incarnation.runs), -len(incarnation.gaps)
 
 
 def _key(run: HandlerRun) -> tuple[object, ...]:
-    """What tells one handler run of a life from all others."""
+    """Return a key that identifies a handler run within an incarnation."""
     return round(run.t, 3), run.handler, run.trigger, run.branch, run.state.chain, run.state.top
 
 
-def _is_copy(life: Life, other: Life) -> bool:
-    """Whether most of `life` is in the other, too."""
-    if not life.runs:
-        return not other.runs and life.path != other.path
-    if life.runs == other.runs[: len(life.runs)]:
+def _is_copy(incarnation: TraceIncarnation, other: TraceIncarnation) -> bool:
+    """Return whether most handler runs of `incarnation` are also in `other`."""
+    if not incarnation.runs:
+        return not other.runs and incarnation.path != other.path
+    if incarnation.runs == other.runs[: len(incarnation.runs)]:
         return True
-    if not _overlap(life, other, anywhere=True):
+    if not _overlap(incarnation, other, anywhere=True):
         return False
     known = set(map(_key, other.runs))
-    return 2 * sum(_key(run) in known for run in life.runs) > min(len(life.runs), len(other.runs))
+    return 2 * sum(_key(run) in known for run in incarnation.runs) > min(len(incarnation.runs), len(other.runs))
 
 
-def _overlap(life: Life, other: Life, *, anywhere: bool = False) -> bool:
-    """Whether both cannot be lives of one agent on one flight: neither ended before the other began.
+def _overlap(incarnation: TraceIncarnation, other: TraceIncarnation, *, anywhere: bool = False) -> bool:
+    """Return whether the times of two incarnations overlap, so that they cannot belong to the same flight.
 
-    In one file, unless `anywhere` counts, a life ends where the next begins, whatever its clock says.
+    Incarnations in the same file follow each other, whatever their times are. With `anywhere` this does not count.
     """
-    if (life.path == other.path and not anywhere) or not life.runs or not other.runs:
+    if (incarnation.path == other.path and not anywhere) or not incarnation.runs or not other.runs:
         return False
-    return life.runs[0].t < other.runs[-1].t and other.runs[0].t < life.runs[-1].t
+    return incarnation.runs[0].t < other.runs[-1].t and other.runs[0].t < incarnation.runs[-1].t
 
 
-def _mend(life: Life, copy: Life) -> int:
-    """Put what `life` has lost, and `copy` has not, where it was; how many handler runs that are."""
+def _fill_gaps(incarnation: TraceIncarnation, copy: TraceIncarnation) -> int:
+    """Insert the handler runs that `incarnation` lacks and `copy` has. Returns the number of inserted runs."""
     where = {_key(run): position for position, run in enumerate(copy.runs)}
     broken = {gap.position for gap in copy.gaps}
-    taken = 0
-    for gap in reversed(life.gaps):
+    added_runs = 0
+    for gap in reversed(incarnation.gaps):
         position = gap.position
-        before = where.get(_key(life.runs[position - 1])) if position else -1
-        after = where.get(_key(life.runs[position])) if position < len(life.runs) else None
+        before = where.get(_key(incarnation.runs[position - 1])) if position else -1
+        after = where.get(_key(incarnation.runs[position])) if position < len(incarnation.runs) else None
         if before is None or after is None or broken & {*range(before + 1, after + 1)} or before >= after:
             continue
-        life.gaps.remove(gap)
-        taken += _insert(life, position, copy, before + 1, after)
-    last = where.get(_key(life.runs[-1])) if life.runs else None
+        incarnation.gaps.remove(gap)
+        added_runs += _insert(incarnation, position, copy, before + 1, after)
+    last = where.get(_key(incarnation.runs[-1])) if incarnation.runs else None
     if last is not None and last + 1 < len(copy.runs):
-        at = len(life.runs)
-        taken += _insert(life, at, copy, last + 1, len(copy.runs))
+        at = len(incarnation.runs)
+        added_runs += _insert(incarnation, at, copy, last + 1, len(copy.runs))
         behind = [gap._replace(position=gap.position - last - 1 + at) for gap in copy.gaps if gap.position > last]
-        life.gaps = [gap for gap in life.gaps if gap.position < at] + behind
-        life.cut_off = copy.cut_off
-    if taken:
-        life.jumps = jumps_in(life.runs)
-    return taken
+        incarnation.gaps = [gap for gap in incarnation.gaps if gap.position < at] + behind
+        incarnation.cut_off = copy.cut_off
+    if added_runs:
+        incarnation.jumps = jumps_in(incarnation.runs)
+    return added_runs
 
 
-def _insert(life: Life, position: int, copy: Life, start: int, end: int) -> int:
+def _insert(incarnation: TraceIncarnation, position: int, copy: TraceIncarnation, start: int, end: int) -> int:
     count = end - start
-    life.runs[position:position] = copy.runs[start:end]
-    life.run_lines[position:position] = copy.run_lines[start:end]
-    life.gaps = [gap._replace(position=gap.position + count * (gap.position > position)) for gap in life.gaps]
-    beside = [aside for at, aside in life.asides if at == position]
-    asides = [((at + count * (at > position), aside), line) for (at, aside), line in life.numbered_asides()]
+    incarnation.runs[position:position] = copy.runs[start:end]
+    incarnation.run_lines[position:position] = copy.run_lines[start:end]
+    incarnation.gaps = [
+        gap._replace(position=gap.position + count * (gap.position > position)) for gap in incarnation.gaps
+    ]
+    asides_here = [aside for at, aside in incarnation.asides if at == position]
+    asides = [((at + count * (at > position), aside), line) for (at, aside), line in incarnation.numbered_asides()]
     asides += [
         ((at - start + position, aside), line)
         for (at, aside), line in copy.numbered_asides()
-        if start <= at <= end and aside not in beside
+        if start <= at <= end and aside not in asides_here
     ]
     asides.sort(key=lambda numbered: numbered[0][0])
-    life.asides, life.aside_lines = [aside for aside, _ in asides], [line for _, line in asides]
+    incarnation.asides, incarnation.aside_lines = [aside for aside, _ in asides], [line for _, line in asides]
     return count
 
 
-def _of_copy(life: Life, twin: Life, taken: int) -> str:
-    where = "also in this file" if life.path == twin.path else f"in {twin.path}"
-    used = f"{taken} handler runs that are lost there are read from here" if taken else "the lines there are used"
-    return f"the records from here on are {where}, from {twin.counts} {twin.first_line} on; {used}"
+def _describe_copy(incarnation: TraceIncarnation, other_copy: TraceIncarnation, added_runs: int) -> str:
+    where = "also in this file" if incarnation.path == other_copy.path else f"in {other_copy.path}"
+    used = (
+        f"{added_runs} handler runs that are lost there are read from here"
+        if added_runs
+        else "the lines there are used"
+    )
+    return f"the records from here on are {where}, from {other_copy.counts} {other_copy.first_line} on; {used}"

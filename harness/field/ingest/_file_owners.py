@@ -1,4 +1,4 @@
-"""Owners of files without a name: the mission of a capture, and the flight of a set of public keys."""
+"""Find the owner of files that do not name it: the mission of a capture, and the flight of public keys."""
 
 import base64
 from collections.abc import Iterator, Sequence
@@ -8,66 +8,74 @@ from typing import TYPE_CHECKING
 
 from harness.archive.exports import ExportedBlock
 from harness.archive.packets.capture_reader import Capture, Datagram
-from harness.field.ingest._ingest import Flight, LeftOut
+from harness.field.ingest._ingest import Flight, Omission
 from ucp.block import Block
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
     from ucp.secure.opening import Opener
 
-ENOUGH_FRAMES = 5000
+MAX_FRAMES_READ = 5000
 
 
 @dataclass(frozen=True)
-class Glance:
-    """`hashes` are of blocks and chains that its datagrams name, in hex."""
+class CaptureSummary:
+    """The facts about a capture that identify its flight.
+
+    `hashes` are the block and chain hashes in its datagrams, in hex.
+    """
 
     path: Path
     vehicle: int | None
     epoch_us: int | None
     hashes: frozenset[str]
     source: Path
-    """The file that it is, or was made from."""
+    """The original file. It differs from `path` if an import made the capture."""
 
 
-def glance(path: Path, left_out: list[LeftOut], opener: "Opener | None" = None) -> Glance | None:
-    """None if there is no UCP datagram at its beginning; `opener` opens what is sealed.
+def summarise_capture(path: Path, left_out: list[Omission], opener: "Opener | None" = None) -> CaptureSummary | None:
+    """Read the beginning of a capture. Returns None if it contains no UCP datagram. `opener` decrypts sealed datagrams.
 
-    Raises CaptureError if it cannot be read.
+    Raises CaptureError if the file cannot be read.
     """
     capture, datagrams = Capture(0, path), dict[bytes, Datagram]()
-    capture.read(datagrams, ENOUGH_FRAMES, opener=opener)
-    left_out += [LeftOut(path, problem.removeprefix(f"{path}: ")) for problem in capture.problems]
+    capture.read(datagrams, MAX_FRAMES_READ, opener=opener)
+    left_out += [Omission(path, problem.removeprefix(f"{path}: ")) for problem in capture.problems]
     if not datagrams:
         what = "no frame" if not capture.frames else f"none of its first {capture.frames} frames is a UCP datagram"
-        left_out.append(LeftOut(path, f"a capture, but it has {what}" if not capture.frames else what))
+        left_out.append(Omission(path, f"a capture, but it has {what}" if not capture.frames else what))
         return None
-    named = (name for each in datagrams.values() for name in (each.summary.block_hash, each.summary.chain_hash))
-    hashes = frozenset(name.hex() for name in named if name is not None)
-    return Glance(path, capture.vehicle, capture.comment.epoch_us if capture.comment else None, hashes, path)
+    mentioned = (name for each in datagrams.values() for name in (each.summary.block_hash, each.summary.chain_hash))
+    hashes = frozenset(name.hex() for name in mentioned if name is not None)
+    return CaptureSummary(path, capture.vehicle, capture.comment.epoch_us if capture.comment else None, hashes, path)
 
 
 PUBLIC_SCHEMA = '"ucp-keys/1"'
-"""What a file of public keys has in it."""
+"""A text that each file of public keys contains."""
 
 
-def read_public_keys(path: Path, left_out: list[LeftOut]) -> "PublicKeys | None":
-    """Those in a file; None if they cannot be used, which is told in `left_out`. Raises OSError."""
+def read_public_keys(path: Path, left_out: list[Omission]) -> "PublicKeys | None":
+    """Return the public keys in a file. None if they are unusable. `left_out` then has the reason. Raises OSError."""
     try:
         from ucp.secure.bundle import load_public
         from ucp.secure.keyfile import KeyFileError
     except ModuleNotFoundError:
-        left_out.append(LeftOut(path, "public keys, which need the package cryptography (extra `secure`)"))
+        left_out.append(Omission(path, "public keys, which need the package cryptography (extra `secure`)"))
         return None
     try:
         return load_public(path)
     except KeyFileError as error:
-        left_out.append(LeftOut(path, f"public keys, but {str(error).removeprefix(f'{path}: ')}"))
+        left_out.append(Omission(path, f"public keys, but {str(error).removeprefix(f'{path}: ')}"))
         return None
 
 
-def give_keys(flights: Sequence[Flight], found: Sequence[tuple[Path, "PublicKeys"]], left_out: list[LeftOut]) -> None:
-    """Each flight gets those that a block of its exports is signed with; if any block is, others are `left_out`."""
+def assign_keys(
+    flights: Sequence[Flight], found: Sequence[tuple[Path, "PublicKeys"]], left_out: list[Omission]
+) -> None:
+    """Assign to each flight the public keys that verify a signature in its exports.
+
+    If any block is signed, unused keys belong to another mission and are left out.
+    """
     signed = {id(flight): [*_signed(flight)] for flight in flights} if found else {}
     unused = dict(found)
     for flight in flights:
@@ -77,7 +85,7 @@ def give_keys(flights: Sequence[Flight], found: Sequence[tuple[Path, "PublicKeys
                 unused.pop(path, None)
                 break
     if any(signed.values()):
-        left_out += [LeftOut(path, "public keys of another mission, which sign no block here") for path in unused]
+        left_out += [Omission(path, "public keys of another mission, which sign no block here") for path in unused]
 
 
 def _signed(flight: Flight) -> Iterator[ExportedBlock]:
@@ -86,7 +94,7 @@ def _signed(flight: Flight) -> Iterator[ExportedBlock]:
 
 
 def _has_signed(keys: "PublicKeys", block: ExportedBlock) -> bool:
-    """Whether the vehicle that the block names has signed it in this mission."""
+    """Return whether the signature of a block is valid under these keys."""
     from ucp.secure.block_signature import claim_of_block
     from ucp.secure.crypto_suite import verify
 

@@ -1,4 +1,7 @@
-"""Which files there are: those that are named, and those in directories, each once; no fifo, device or loop."""
+"""Find the files to ingest: the given files, and the files in given directories, each once.
+
+FIFOs, devices and loops of links are left out.
+"""
 
 import filecmp
 import os
@@ -8,83 +11,91 @@ from pathlib import Path
 
 from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE
 from harness.errors import FieldError
-from harness.field.ingest._ingest import LeftOut
+from harness.field.ingest._ingest import Omission
 
 _IMPORT_FILE = "import.json"
 MAX_FILES = 10_000
 MAX_DEPTH = 16
-_BY_THE_HARNESS = {
+_HARNESS_FILES = {
     *(RUN_FILE, BEFORE_FINAL_RECONCILE, "vehicles", "network.jsonl", "tracks.jsonl", "rogue.jsonl"),
     *("report.html", "report.md", "junit.xml", "chains.svg"),
 }
-"""What the harness itself writes into a run directory: no agent left it."""
-_NO_RECORD = re.compile(r"(\d+|capture|lab|rogue)\.(log|mission\.json|control|store)")
-"""What else is in a run directory, and is no record of an agent."""
-_LIFE = re.compile(r"\d+-\d+")
+"""Files in a run directory that the harness wrote, as opposed to agents."""
+_OTHER_RUN_FILES = re.compile(r"(\d+|capture|lab|rogue)\.(log|mission\.json|control|store)")
+"""Other files in a run directory that are no records of an agent."""
+_INCARNATION_DIRECTORY = re.compile(r"\d+-\d+")
 
 
-def files_of(paths: Iterable[Path], left_out: list[LeftOut]) -> list[Path]:
-    """The regular files in `paths`, each once. Raises FieldError if a path that is named does not exist."""
+def files_of(paths: Iterable[Path], left_out: list[Omission]) -> list[Path]:
+    """Return the regular files in `paths`, each once. Raises FieldError if a path does not exist."""
     files: dict[Path, Path] = {}
-    of_size: dict[int, list[Path]] = {}
+    by_size: dict[int, list[Path]] = {}
     for path in paths:
         if not os.path.lexists(path):
             raise FieldError(f"{path}: does not exist; give files of a flight, or directories of such files")
         for file in _walk(path, left_out, named=True):
             if len(files) == MAX_FILES:
                 left_out.append(
-                    LeftOut(file, f"it and all later files are not read, because at most {MAX_FILES} files are read")
+                    Omission(file, f"it and all later files are not read, because at most {MAX_FILES} files are read")
                 )
                 return [*files.values()]
             try:
                 real, size = file.resolve(strict=True), file.stat().st_size
                 if real in files:
                     continue
-                twins = (other for other in of_size.get(size, ()) if size and filecmp.cmp(other, file, shallow=False))
-                twin = next(twins, None)
+                equal_files = (
+                    other for other in by_size.get(size, ()) if size and filecmp.cmp(other, file, shallow=False)
+                )
+                equal_file = next(equal_files, None)
             except (OSError, RuntimeError) as error:
                 why = getattr(error, "strerror", None) or "its links form a loop"
-                left_out.append(LeftOut(file, f"it cannot be read: {why}"))
+                left_out.append(Omission(file, f"it cannot be read: {why}"))
                 continue
-            if twin is not None and is_of_a_life(file):
+            if equal_file is not None and is_incarnation_copy(file):
                 continue
-            if twin is not None:
-                left_out.append(LeftOut(file, f"its content equals {twin}"))
+            if equal_file is not None:
+                left_out.append(Omission(file, f"its content equals {equal_file}"))
                 continue
             files[real] = file
-            of_size.setdefault(size, []).append(file)
+            by_size.setdefault(size, []).append(file)
     return [*files.values()]
 
 
-def is_of_a_life(path: Path) -> bool:
-    """Whether a run put it aside for one life of an agent: it is among those of all lives, too, as a rule."""
-    return path.parent.parent.name == "agents" and _LIFE.fullmatch(path.parent.name) is not None
+def is_incarnation_copy(path: Path) -> bool:
+    """Return whether a run kept this file for one incarnation.
+
+    The files of the agent usually contain the same records.
+    """
+    return path.parent.parent.name == "agents" and _INCARNATION_DIRECTORY.fullmatch(path.parent.name) is not None
 
 
 def _walk(
-    path: Path, left_out: list[LeftOut], *, named: bool = False, depth: int = 0, of_run: bool = False
+    path: Path, left_out: list[Omission], *, named: bool = False, depth: int = 0, in_run: bool = False
 ) -> Iterator[Path]:
-    """Links that were not named themselves are not followed: what they lead to is here by itself, or not meant."""
+    """Yield the files in a path.
+
+    Links inside a directory are not followed, because their targets are often unrelated.
+    """
     try:
         if path.is_symlink() and not named:
-            left_out.append(LeftOut(path, "it is a link; name its target if the target belongs to the flight"))
+            left_out.append(Omission(path, "it is a link; name its target if the target belongs to the flight"))
         elif path.is_dir():
             if depth > MAX_DEPTH:
-                left_out.append(LeftOut(path, f"it is below more than {MAX_DEPTH} directories"))
+                left_out.append(Omission(path, f"it is below more than {MAX_DEPTH} directories"))
                 return
-            of_run = of_run or (path / RUN_FILE).is_file()
-            not_here = _BY_THE_HARNESS if of_run else {_IMPORT_FILE}
+            in_run = in_run or (path / RUN_FILE).is_file()
+            ignored = _HARNESS_FILES if in_run else {_IMPORT_FILE}
             for inner in sorted(path.iterdir(), key=_files_first):
-                if inner.name not in not_here and not (of_run and _NO_RECORD.fullmatch(inner.name)):
-                    yield from _walk(inner, left_out, depth=depth + 1, of_run=of_run)
+                if inner.name not in ignored and not (in_run and _OTHER_RUN_FILES.fullmatch(inner.name)):
+                    yield from _walk(inner, left_out, depth=depth + 1, in_run=in_run)
         elif path.is_file():
             yield path
         else:
-            left_out.append(LeftOut(path, "it is not a regular file, but a FIFO, a socket, a device or a broken link"))
+            left_out.append(Omission(path, "it is not a regular file, but a FIFO, a socket, a device or a broken link"))
     except OSError as error:
-        left_out.append(LeftOut(path, f"it cannot be read: {error.strerror}"))
+        left_out.append(Omission(path, f"it cannot be read: {error.strerror}"))
 
 
 def _files_first(path: Path) -> tuple[bool, int, str]:
-    """And 9 before 10."""
+    """Return a sort key: files before directories, and 9 before 10."""
     return path.is_dir(), len(path.name), path.name

@@ -1,7 +1,8 @@
-"""Puts together what is of one flight: the same mission, on the same clock, every agent once.
+"""Group records by flight. The agents of one flight have the same mission and time, and each occurs once.
 
-A mission is its roster and what its inception block says (BD_0). Of one mission there may be several flights, each with
-its own second 0. Exports and captures do not say which: they go where the blocks are that they name.
+A mission is identified by its roster and its inception data (BD_0). One mission may have several flights, each with its
+own mission second 0. Exports and captures do not contain the flight. They are assigned to the flight that shares the
+most blocks with them.
 """
 
 import base64
@@ -16,16 +17,16 @@ from typing import NamedTuple
 
 from harness.archive.exports import Export
 from harness.archive.traces import Header, Trace
-from harness.field.ingest._copies import told_apart
-from harness.field.ingest._file_owners import Glance
-from harness.field.ingest._ingest import Flight, LeftOut, Remark
-from harness.field.ingest._trace_incarnations import Life
+from harness.field.ingest._copies import split_into_flights
+from harness.field.ingest._file_owners import CaptureSummary
+from harness.field.ingest._ingest import Flight, Omission, Remark
+from harness.field.ingest._trace_incarnations import TraceIncarnation
 from ucp.block import InceptionBlock
 from ucp.events import LoggableEvent
 
 
 class _Mission(NamedTuple):
-    """As a header says it: BD_0 in base64, if it does, and mission second 0."""
+    """The mission in a header: BD_0 in base64 if present, the roster, and mission second 0."""
 
     initial_data: str | None
     roster: tuple[int, ...]
@@ -33,11 +34,11 @@ class _Mission(NamedTuple):
 
 
 @dataclass
-class _Gathering:
-    """A flight while it is put together. `hashes` are of its blocks and chains, in hex."""
+class _FlightRecords:
+    """The records of one flight so far. `hashes` are the hashes of its blocks and chains, in hex."""
 
     mission: _Mission
-    lives: dict[int, list[Life]] = field(default_factory=lambda: defaultdict(list))
+    incarnations: dict[int, list[TraceIncarnation]] = field(default_factory=lambda: defaultdict(list))
     exports: dict[int, tuple[Path, Export]] = field(default_factory=dict)
     captures: dict[int, Path] = field(default_factory=dict)
     more_captures: list[Path] = field(default_factory=list)
@@ -45,73 +46,85 @@ class _Gathering:
     hashes: set[str] = field(default_factory=set)
     directories: set[Path] = field(default_factory=set)
 
-    def add(self, life: Life, agent_id: int) -> None:
-        self.lives[agent_id].append(life)
-        self.directories.add(life.path.parent)
-        self.hashes |= _hashes_of(life)
+    def add(self, incarnation: TraceIncarnation, agent_id: int) -> None:
+        self.incarnations[agent_id].append(incarnation)
+        self.directories.add(incarnation.path.parent)
+        self.hashes |= _hashes_of(incarnation)
 
     @property
     def runs(self) -> int:
-        return sum(len(life.runs) for lives in self.lives.values() for life in lives)
+        return sum(len(incarnation.runs) for incarnations in self.incarnations.values() for incarnation in incarnations)
 
     @property
     def size(self) -> tuple[int, int]:
-        return len(self.lives) + len(self.exports) + len(self.captures) + len(self.logged), self.runs
+        return len(self.incarnations) + len(self.exports) + len(self.captures) + len(self.logged), self.runs
 
     @cached_property
-    def spans(self) -> tuple[float, float]:
-        """From when to when its handlers ran, in the seconds of its blocks' timestamps."""
-        times = [run.t for lives in self.lives.values() for life in lives for run in life.runs]
-        begins = (self.mission.epoch_us or 0) / 1e6
-        return begins + min(times, default=0.0), begins + max(times, default=0.0)
+    def time_span(self) -> tuple[float, float]:
+        """The times of the first and the last handler run, in seconds of the blocks' timestamps."""
+        times = [
+            run.t
+            for incarnations in self.incarnations.values()
+            for incarnation in incarnations
+            for run in incarnation.runs
+        ]
+        start_s = (self.mission.epoch_us or 0) / 1e6
+        return start_s + min(times, default=0.0), start_s + max(times, default=0.0)
 
 
-def put_together(
-    lives: Iterable[Life],
+def group_by_flight(
+    incarnations: Iterable[TraceIncarnation],
     exports: Iterable[tuple[Path, Export]],
-    captures: Iterable[Glance],
+    captures: Iterable[CaptureSummary],
     logged: Iterable[tuple[Path, int, LoggableEvent]],
-    left_out: list[LeftOut],
+    left_out: list[Omission],
     remarks: list[Remark],
 ) -> list[Flight]:
-    """The flights, the one with the most in it first."""
-    gatherings, headless = _by_mission(lives, left_out)
+    """Return the flights, the one with the most records first."""
+    groups, without_header = _by_mission(incarnations, left_out)
     for path, export in exports:
-        _add_export(gatherings, path, export, left_out)
-    for life in headless:
-        _add_headless(gatherings, life, left_out, remarks)
+        _add_export(groups, path, export, left_out)
+    for incarnation in without_header:
+        _add_without_header(groups, incarnation, left_out, remarks)
     for capture in captures:
-        _add_capture(gatherings, capture)
+        _add_capture(groups, capture)
     for path, agent_id, event in logged:
-        _add_logged(gatherings, path, agent_id, event)
-    gatherings.sort(key=lambda gathering: gathering.size, reverse=True)
-    return [_flight(gathering, remarks) for gathering in gatherings]
+        _add_logged(groups, path, agent_id, event)
+    groups.sort(key=lambda records: records.size, reverse=True)
+    return [_flight(records, remarks) for records in groups]
 
 
 # Traces
 
 
-def _by_mission(lives: Iterable[Life], left_out: list[LeftOut]) -> tuple[list[_Gathering], list[Life]]:
-    """What is of each mission and second 0, and the lives of which the header is lost."""
-    by_header: dict[tuple[_Mission, int], list[Life]] = defaultdict(list)
-    headless: list[Life] = []
-    last: Life | None = None
-    for life in lives:
-        if life.header is None and last is not None and last.path == life.path and last.agent_id == life.agent_id:
-            life.header = last.header  # an agent that was restarted, and only the line that says so is damaged
-        if life.header is None:
-            headless.append(life)
-        elif life.header.agent_id not in life.header.roster:
-            why = f"agent {life.header.agent_id} is not on the roster in its own trace"
-            left_out.append(LeftOut(life.path, why, life.first_line, life.counts))
+def _by_mission(
+    incarnations: Iterable[TraceIncarnation], left_out: list[Omission]
+) -> tuple[list[_FlightRecords], list[TraceIncarnation]]:
+    """Return the records of each mission and mission second 0, and the incarnations without a header."""
+    by_header: dict[tuple[_Mission, int], list[TraceIncarnation]] = defaultdict(list)
+    without_header: list[TraceIncarnation] = []
+    last: TraceIncarnation | None = None
+    for incarnation in incarnations:
+        if (
+            incarnation.header is None
+            and last is not None
+            and last.path == incarnation.path
+            and last.agent_id == incarnation.agent_id
+        ):
+            incarnation.header = last.header  # a restarted agent whose header line is damaged
+        if incarnation.header is None:
+            without_header.append(incarnation)
+        elif incarnation.header.agent_id not in incarnation.header.roster:
+            why = f"agent {incarnation.header.agent_id} is not on the roster in its own trace"
+            left_out.append(Omission(incarnation.path, why, incarnation.first_line, incarnation.counts))
         else:
-            by_header[_mission_of(life.header), life.header.agent_id].append(life)
-        last = life
-    gatherings: dict[_Mission, list[_Gathering]] = defaultdict(list)
+            by_header[_mission_of(incarnation.header), incarnation.header.agent_id].append(incarnation)
+        last = incarnation
+    groups: dict[_Mission, list[_FlightRecords]] = defaultdict(list)
     for (mission, agent_id), of_agent in by_header.items():
-        _place(gatherings[mission], mission, agent_id, [*told_apart(of_agent, left_out)])
-    separate = [gathering for of_mission in gatherings.values() for gathering in of_mission]
-    return _merged(separate), headless
+        _assign_to_flights(groups[mission], mission, agent_id, [*split_into_flights(of_agent, left_out)])
+    separate = [records for of_mission in groups.values() for records in of_mission]
+    return _merged(separate), without_header
 
 
 def _mission_of(header: Header) -> _Mission:
@@ -121,119 +134,140 @@ def _mission_of(header: Header) -> _Mission:
     return _Mission(header.initial_data, tuple(sorted(set(header.roster))), epoch)
 
 
-def _place(gatherings: list[_Gathering], mission: _Mission, agent_id: int, flights: list[list[Life]]) -> None:
-    """An agent's flights go where the others' files are beside its own, of flights that nothing else tells apart."""
+def _assign_to_flights(
+    groups: list[_FlightRecords], mission: _Mission, agent_id: int, flights: list[list[TraceIncarnation]]
+) -> None:
+    """Assign the flights of one agent to the flights of the others, by the number of shared directories.
 
-    def beside(flown: list[Life], gathering: _Gathering) -> int:
-        return len(gathering.directories & {life.path.parent for life in flown})
+    This is only a guess, for flights that nothing else distinguishes.
+    """
 
-    flights.sort(key=lambda flown: max((beside(flown, each) for each in gatherings), default=0), reverse=True)
-    for flown in flights:
-        free = [gathering for gathering in gatherings if agent_id not in gathering.lives]
-        best = max(free, key=lambda gathering: beside(flown, gathering), default=None)
+    def shared_directories(flight_incarnations: list[TraceIncarnation], records: _FlightRecords) -> int:
+        return len(records.directories & {incarnation.path.parent for incarnation in flight_incarnations})
+
+    flights.sort(
+        key=lambda flight_incarnations: max(
+            (shared_directories(flight_incarnations, each) for each in groups), default=0
+        ),
+        reverse=True,
+    )
+    for flight_incarnations in flights:
+        free = [records for records in groups if agent_id not in records.incarnations]
+        best = max(free, key=lambda records: shared_directories(flight_incarnations, records), default=None)
         if best is None:
-            best = _Gathering(mission)
-            gatherings.append(best)
-        for life in flown:
-            best.add(life, agent_id)
+            best = _FlightRecords(mission)
+            groups.append(best)
+        for incarnation in flight_incarnations:
+            best.add(incarnation, agent_id)
 
 
-def _merged(gatherings: list[_Gathering]) -> list[_Gathering]:
-    """Agents with a second 0 of their own, or that do not say BD_0, join the others if those lack them."""
-    merged: list[_Gathering] = []
-    for gathering in sorted(gatherings, key=lambda each: each.size, reverse=True):
-        host = next((other for other in merged if _same_flight(gathering, other)), None)
+def _merged(groups: list[_FlightRecords]) -> list[_FlightRecords]:
+    """Merge groups of records that belong to the same flight.
+
+    Their headers may differ in mission second 0, or lack BD_0.
+    """
+    merged: list[_FlightRecords] = []
+    for records in sorted(groups, key=lambda each: each.size, reverse=True):
+        host = next((other for other in merged if _same_flight(records, other)), None)
         if host is None:
-            merged.append(gathering)
+            merged.append(records)
             continue
-        for agent_id, lives in gathering.lives.items():
-            host.lives[agent_id] = lives
-        host.hashes |= gathering.hashes
+        for agent_id, incarnations in records.incarnations.items():
+            host.incarnations[agent_id] = incarnations
+        host.hashes |= records.hashes
         host.__dict__.pop("spans", None)
-        host.directories |= gathering.directories
+        host.directories |= records.directories
         if host.mission.initial_data is None or host.mission.epoch_us is None:
             host.mission = host.mission._replace(
-                initial_data=host.mission.initial_data or gathering.mission.initial_data,
-                epoch_us=gathering.mission.epoch_us if host.mission.epoch_us is None else host.mission.epoch_us,
+                initial_data=host.mission.initial_data or records.mission.initial_data,
+                epoch_us=records.mission.epoch_us if host.mission.epoch_us is None else host.mission.epoch_us,
             )
     return merged
 
 
-def _same_flight(gathering: _Gathering, other: _Gathering) -> bool:
-    mine, its = gathering.mission, other.mission
-    if gathering.lives.keys() & other.lives.keys():
+def _same_flight(records: _FlightRecords, other: _FlightRecords) -> bool:
+    own_mission, other_mission = records.mission, other.mission
+    if records.incarnations.keys() & other.incarnations.keys():
         return False
-    if gathering.hashes & other.hashes:
-        return True  # whatever a damaged header says
-    if mine.roster != its.roster:
+    if records.hashes & other.hashes:
+        return True  # shared hashes prove it, even if a header is damaged
+    if own_mission.roster != other_mission.roster:
         return False
-    if mine.initial_data != its.initial_data and None not in (mine.initial_data, its.initial_data):
+    if own_mission.initial_data != other_mission.initial_data and None not in (
+        own_mission.initial_data,
+        other_mission.initial_data,
+    ):
         return False
-    if None in (mine.epoch_us, its.epoch_us):
+    if None in (own_mission.epoch_us, other_mission.epoch_us):
         return True
-    (begins, ends), (its_begins, its_ends) = gathering.spans, other.spans
-    return begins <= its_ends and its_begins <= ends
+    (start_s, end_s), (other_start_s, other_end_s) = records.time_span, other.time_span
+    return start_s <= other_end_s and other_start_s <= end_s
 
 
-def _hashes_of(life: Life) -> set[str]:
-    hashes = {block for run in life.runs for _, block in run.changes}
-    hashes.update(run.state.top for run in life.runs if run.state.chain)  # the inception block is that of every flight
+def _hashes_of(incarnation: TraceIncarnation) -> set[str]:
+    hashes = {block for run in incarnation.runs for _, block in run.changes}
+    hashes.update(run.state.top for run in incarnation.runs if run.state.chain)  # all flights share the inception block
     return hashes
 
 
-def _add_headless(gatherings: list[_Gathering], life: Life, left_out: list[LeftOut], remarks: list[Remark]) -> None:
-    """A life whose header is lost is under that of the others of its flight, whose mission it shares."""
-    agent_id, hashes = life.agent_id, _hashes_of(life)
-    if agent_id is None or not life.runs:
-        left_out.append(LeftOut(life.path, "its header is lost, so its agent is unknown"))
+def _add_without_header(
+    groups: list[_FlightRecords], incarnation: TraceIncarnation, left_out: list[Omission], remarks: list[Remark]
+) -> None:
+    """Add an incarnation without a header. It gets the header of the flight with the most shared hashes."""
+    agent_id, hashes = incarnation.agent_id, _hashes_of(incarnation)
+    if agent_id is None or not incarnation.runs:
+        left_out.append(Omission(incarnation.path, "its header is lost, so its agent is unknown"))
         return
-    able = [gathering for gathering in gatherings if agent_id in gathering.mission.roster and gathering.lives]
-    likeliest = max(
-        able,
-        key=lambda each: (len(each.hashes & hashes), life.path.parent in each.directories, each.size),
+    candidates = [records for records in groups if agent_id in records.mission.roster and records.incarnations]
+    best = max(
+        candidates,
+        key=lambda each: (len(each.hashes & hashes), incarnation.path.parent in each.directories, each.size),
         default=None,
     )
-    if likeliest is None or not (likeliest.hashes & hashes or life.path.parent in likeliest.directories):
+    if best is None or not (best.hashes & hashes or incarnation.path.parent in best.directories):
         why = f"its header is lost, and no other trace belongs to a mission of agent {agent_id}"
-        left_out.append(LeftOut(life.path, why))
+        left_out.append(Omission(incarnation.path, why))
         return
-    own = likeliest.lives.get(agent_id, [])
-    lender = next(iter(own or next(iter(likeliest.lives.values()))))
-    assert lender.header is not None
-    clock = lender.header.clock
-    if not own:
+    own_incarnations = best.incarnations.get(agent_id, [])
+    header_owner = next(iter(own_incarnations or next(iter(best.incarnations.values()))))
+    assert header_owner.header is not None
+    clock = header_owner.header.clock
+    if not own_incarnations:
         clock = {key: clock[key] for key in ("epoch_us", "speedup") if key in clock}
-    life.header = lender.header.model_copy(update={"agent_id": agent_id, "clock": clock})
-    kept = next(told_apart([*own, life], left_out))
-    if life in kept:
-        whose = "another of its files" if own else f"the trace of agent {lender.header.agent_id}"
+    incarnation.header = header_owner.header.model_copy(update={"agent_id": agent_id, "clock": clock})
+    kept = next(split_into_flights([*own_incarnations, incarnation], left_out))
+    if incarnation in kept:
+        header_source = (
+            "another of its files" if own_incarnations else f"the trace of agent {header_owner.header.agent_id}"
+        )
         remarks.append(
             Remark(
-                life.path, f"its header is lost; it is read as a trace of agent {agent_id}, with the header of {whose}"
+                incarnation.path,
+                f"its header is lost; it is read as a trace of agent {agent_id}, with the header of {header_source}",
             )
         )
-    likeliest.lives[agent_id] = kept
-    likeliest.hashes |= hashes
+    best.incarnations[agent_id] = kept
+    best.hashes |= hashes
 
 
 # Exports and captures
 
 
-def _add_export(gatherings: list[_Gathering], path: Path, export: Export, left_out: list[LeftOut]) -> None:
+def _add_export(groups: list[_FlightRecords], path: Path, export: Export, left_out: list[Omission]) -> None:
     agent_id, inception = export.agent_id, export.inception
     hashes = {block.block_hash for block in export.blocks()} | {*export.completed}
     of_mission = [
-        gathering
-        for gathering in gatherings
-        if gathering.mission.initial_data in (None, inception.block_data)
-        and (not gathering.exports or _inception(gathering) == inception.block_hash)
+        records
+        for records in groups
+        if records.mission.initial_data in (None, inception.block_data)
+        and (not records.exports or _inception(records) == inception.block_hash)
     ]
-    able = [each for each in of_mission if not each.mission.roster or agent_id in each.mission.roster]
-    if of_mission and not able:
-        left_out.append(LeftOut(path, f"agent {agent_id} is not on the roster of its mission"))
+    candidates = [each for each in of_mission if not each.mission.roster or agent_id in each.mission.roster]
+    if of_mission and not candidates:
+        left_out.append(Omission(path, f"agent {agent_id} is not on the roster of its mission"))
         return
-    likeliest = max(
-        able,
+    best = max(
+        candidates,
         key=lambda each: (
             len(each.hashes & hashes),
             path.parent in each.directories,
@@ -242,50 +276,52 @@ def _add_export(gatherings: list[_Gathering], path: Path, export: Export, left_o
         ),
         default=None,
     )
-    if likeliest is not None and likeliest.mission.initial_data is None and not likeliest.hashes & hashes:
-        likeliest = None if likeliest.hashes and hashes else likeliest
-    if likeliest is None:
-        likeliest = _Gathering(_Mission(inception.block_data, (), None))
-        gatherings.append(likeliest)
-    likeliest.hashes |= hashes | {block.chain_hash for block in export.chain if block.chain_hash}
-    likeliest.directories.add(path.parent)
-    likeliest.mission = likeliest.mission._replace(initial_data=inception.block_data)
-    other = likeliest.exports.get(agent_id)
+    if best is not None and best.mission.initial_data is None and not best.hashes & hashes:
+        best = None if best.hashes and hashes else best
+    if best is None:
+        best = _FlightRecords(_Mission(inception.block_data, (), None))
+        groups.append(best)
+    best.hashes |= hashes | {block.chain_hash for block in export.chain if block.chain_hash}
+    best.directories.add(path.parent)
+    best.mission = best.mission._replace(initial_data=inception.block_data)
+    other = best.exports.get(agent_id)
     if other is None:
-        likeliest.exports[agent_id] = path, export
+        best.exports[agent_id] = path, export
         return
     if other[1] == export:
-        left_out.append(LeftOut(path, f"it is the same export as {other[0]}"))
+        left_out.append(Omission(path, f"it is the same export as {other[0]}"))
         return
     earlier, later = sorted((other, (path, export)), key=lambda each: each[1].exported_at_us)
-    likeliest.exports[agent_id] = later
-    left_out.append(LeftOut(earlier[0], f"agent {agent_id} exported its chain again, later: {later[0]} is used"))
+    best.exports[agent_id] = later
+    left_out.append(Omission(earlier[0], f"agent {agent_id} exported its chain again, later: {later[0]} is used"))
 
 
-def _inception(gathering: _Gathering) -> str:
-    return next(iter(gathering.exports.values()))[1].inception.block_hash
+def _inception(records: _FlightRecords) -> str:
+    return next(iter(records.exports.values()))[1].inception.block_hash
 
 
-def _inception_chain_hash(gathering: _Gathering) -> str | None:
-    """CH_0 (eq. 3.4), which every flight of the mission has."""
-    data = _decoded(gathering.mission.initial_data)
+def _inception_chain_hash(records: _FlightRecords) -> str | None:
+    """Return CH_0 (eq. 3.4), which all flights of the mission share."""
+    data = _decoded(records.mission.initial_data)
     return None if data is None else InceptionBlock(data).chain_hash.hex()
 
 
-def _add_capture(gatherings: list[_Gathering], capture: Glance) -> None:
-    of_inceptions = {_inception_chain_hash(gathering) for gathering in gatherings}
+def _add_capture(groups: list[_FlightRecords], capture: CaptureSummary) -> None:
+    inception_hashes = {_inception_chain_hash(records) for records in groups}
 
-    def shared(gathering: _Gathering) -> int:
-        return len((gathering.hashes & capture.hashes) - of_inceptions)
+    def shared_hashes(records: _FlightRecords) -> int:
+        return len((records.hashes & capture.hashes) - inception_hashes)
 
-    def same_mission(gathering: _Gathering) -> bool:
-        return _inception_chain_hash(gathering) in capture.hashes
+    def same_mission(records: _FlightRecords) -> bool:
+        return _inception_chain_hash(records) in capture.hashes
 
-    able = [each for each in gatherings if shared(each) or same_mission(each) or not each.hashes or not capture.hashes]
-    likeliest = max(
-        able,
+    candidates = [
+        each for each in groups if shared_hashes(each) or same_mission(each) or not each.hashes or not capture.hashes
+    ]
+    best = max(
+        candidates,
         key=lambda each: (
-            shared(each),
+            shared_hashes(each),
             same_mission(each),
             capture.epoch_us is not None and capture.epoch_us == each.mission.epoch_us,
             capture.source.parent in each.directories,
@@ -293,83 +329,86 @@ def _add_capture(gatherings: list[_Gathering], capture: Glance) -> None:
         ),
         default=None,
     )
-    if likeliest is None:
-        likeliest = _Gathering(_Mission(None, (), capture.epoch_us))
-        gatherings.append(likeliest)
-    likeliest.hashes |= capture.hashes
-    likeliest.directories.add(capture.source.parent)
-    if likeliest.mission.epoch_us is None:
-        likeliest.mission = likeliest.mission._replace(epoch_us=capture.epoch_us)
-    if capture.vehicle is None or capture.vehicle in likeliest.captures:
-        likeliest.more_captures.append(capture.path)
+    if best is None:
+        best = _FlightRecords(_Mission(None, (), capture.epoch_us))
+        groups.append(best)
+    best.hashes |= capture.hashes
+    best.directories.add(capture.source.parent)
+    if best.mission.epoch_us is None:
+        best.mission = best.mission._replace(epoch_us=capture.epoch_us)
+    if capture.vehicle is None or capture.vehicle in best.captures:
+        best.more_captures.append(capture.path)
     else:
-        likeliest.captures[capture.vehicle] = capture.path
+        best.captures[capture.vehicle] = capture.path
 
 
-def _add_logged(gatherings: list[_Gathering], path: Path, agent_id: int, event: LoggableEvent) -> None:
-    """An event is of the flight that was under way then, else of the one whose files lie beside."""
+def _add_logged(groups: list[_FlightRecords], path: Path, agent_id: int, event: LoggableEvent) -> None:
+    """Assign an event to the flight in progress at its time, else to the flight with files in the same directory."""
 
-    def under_way(gathering: _Gathering) -> bool:
-        begins, ends = gathering.spans
-        return begins <= event.timestamp_us / 1e6 <= ends
+    def under_way(records: _FlightRecords) -> bool:
+        start_s, end_s = records.time_span
+        return start_s <= event.timestamp_us / 1e6 <= end_s
 
-    able = [each for each in gatherings if not each.mission.roster or agent_id in each.mission.roster]
-    likeliest = max(able, key=lambda each: (under_way(each), path.parent in each.directories, each.size), default=None)
-    if likeliest is None:
-        likeliest = _Gathering(_Mission(None, (), None))
-        gatherings.append(likeliest)
-    likeliest.logged[agent_id].append(event)
-
-
-# What comes out
+    candidates = [each for each in groups if not each.mission.roster or agent_id in each.mission.roster]
+    best = max(candidates, key=lambda each: (under_way(each), path.parent in each.directories, each.size), default=None)
+    if best is None:
+        best = _FlightRecords(_Mission(None, (), None))
+        groups.append(best)
+    best.logged[agent_id].append(event)
 
 
-def _flight(gathering: _Gathering, remarks: list[Remark]) -> Flight:
-    traces = {agent_id: _trace(lives) for agent_id, lives in sorted(gathering.lives.items())}
+# Results
+
+
+def _flight(records: _FlightRecords, remarks: list[Remark]) -> Flight:
+    traces = {agent_id: _trace(incarnations) for agent_id, incarnations in sorted(records.incarnations.items())}
     for agent_id, trace in traces.items():
-        remarks += _clock_remarks(agent_id, gathering.lives[agent_id], trace)
+        remarks += _clock_remarks(agent_id, records.incarnations[agent_id], trace)
     return Flight(
-        _decoded(gathering.mission.initial_data),
+        _decoded(records.mission.initial_data),
         traces,
-        {agent_id: export for agent_id, (_, export) in sorted(gathering.exports.items())},
-        dict(sorted(gathering.captures.items())),
-        gathering.mission.roster,
-        gathering.mission.epoch_us,
-        gathering.more_captures,
-        {agent_id: sorted(events, key=attrgetter("timestamp_us")) for agent_id, events in gathering.logged.items()},
-        {agent_id: list(dict.fromkeys(life.path for life in lives)) for agent_id, lives in gathering.lives.items()},
+        {agent_id: export for agent_id, (_, export) in sorted(records.exports.items())},
+        dict(sorted(records.captures.items())),
+        records.mission.roster,
+        records.mission.epoch_us,
+        records.more_captures,
+        {agent_id: sorted(events, key=attrgetter("timestamp_us")) for agent_id, events in records.logged.items()},
+        {
+            agent_id: list(dict.fromkeys(incarnation.path for incarnation in incarnations))
+            for agent_id, incarnations in records.incarnations.items()
+        },
     )
 
 
-def _trace(lives: list[Life]) -> Trace:
-    header = lives[0].header
+def _trace(incarnations: list[TraceIncarnation]) -> Trace:
+    header = incarnations[0].header
     assert header is not None
     trace, run_lines, aside_lines = Trace(header), list[int](), list[int]()
-    for number, life in enumerate(lives):
-        begun = len(trace.runs)
+    for number, incarnation in enumerate(incarnations):
+        first_position = len(trace.runs)
         if number:
-            trace.starts.append(begun)
-        trace.runs += life.runs
-        trace.asides += [(begun + position, aside) for position, aside in life.asides]
-        trace.gaps += [gap._replace(position=begun + gap.position) for gap in life.gaps]
-        trace.jumps += [begun + position for position in life.jumps]
-        run_lines += life.run_lines
-        aside_lines += life.aside_lines
+            trace.starts.append(first_position)
+        trace.runs += incarnation.runs
+        trace.asides += [(first_position + position, aside) for position, aside in incarnation.asides]
+        trace.gaps += [gap._replace(position=first_position + gap.position) for gap in incarnation.gaps]
+        trace.jumps += [first_position + position for position in incarnation.jumps]
+        run_lines += incarnation.run_lines
+        aside_lines += incarnation.aside_lines
     trace.lines = run_lines, aside_lines
-    trace.cut_off = lives[-1].cut_off
+    trace.cut_off = incarnations[-1].cut_off
     return trace
 
 
-def _clock_remarks(agent_id: int, lives: list[Life], trace: Trace) -> Iterator[Remark]:
-    jumps = [(life, position) for life in lives for position in life.jumps]
-    for life, position in jumps[:1]:
-        before, after = life.runs[position - 1].t, life.runs[position].t
+def _clock_remarks(agent_id: int, incarnations: list[TraceIncarnation], trace: Trace) -> Iterator[Remark]:
+    jumps = [(incarnation, position) for incarnation in incarnations for position in incarnation.jumps]
+    for incarnation, position in jumps[:1]:
+        before, after = incarnation.runs[position - 1].t, incarnation.runs[position].t
         more = f", and {len(jumps) - 1} more times" if len(jumps) > 1 else ""
         yield Remark(
-            life.path,
+            incarnation.path,
             f"the clock of agent {agent_id} jumps from {before:.3f} s to {after:.3f} s here{more}",
-            life.run_lines[position],
-            life.counts,
+            incarnation.run_lines[position],
+            incarnation.counts,
         )
 
 

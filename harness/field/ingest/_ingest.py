@@ -1,4 +1,4 @@
-"""What came home, sorted."""
+"""The result of ingesting files: flights, and remarks on the files."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -16,51 +16,52 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Remark:
-    """Something true of a file, or of a line of it: a sentence's end, as "it is not of this mission"."""
+    """A remark on a file, or on a line of it. `why` completes a sentence, as in "it is not of this mission"."""
 
     path: Path
     why: str
     line: int | None = None
-    """Counting from 1; None for the whole file."""
+    """Number of the line, from 1. None for the whole file."""
     counts: str = "line"
-    """What `line` counts: of a bag its messages."""
+    """The unit of `line`, for example "message" in a ROS bag."""
 
     @property
     def sentence(self) -> str:
         where = f"{self.path}" if self.line is None else f"{self.path}, {self.counts} {self.line}"
-        return "".join(letter if letter.isprintable() else "?" for letter in f"{where}: {self.why}")
+        return "".join(character if character.isprintable() else "?" for character in f"{where}: {self.why}")
 
 
 @dataclass(frozen=True)
-class LeftOut(Remark):
-    """A file, or lines of it, that is not used, and why."""
+class Omission(Remark):
+    """A file, or a part of it, that is not used, with the reason."""
 
 
 @dataclass
 class Flight:
-    """What is left of one mission of one swarm, by agent ID."""
+    """The records of one flight of a swarm, by agent ID."""
 
     initial_data: bytes | None
-    """BD_0 of the mission, if any file says it."""
+    """BD_0 of the mission. None if no file contains it."""
     traces: dict[int, Trace] = field(default_factory=dict)
     exports: dict[int, Export] = field(default_factory=dict)
     captures: dict[int, Path] = field(default_factory=dict)
     roster: tuple[int, ...] = ()
-    """As the traces say it; empty if there is none."""
+    """The roster in the traces. Empty without traces."""
     epoch_us: int | None = None
-    """Mission second 0 in microseconds since the Unix epoch, if any trace or capture says it."""
+    """Mission second 0 in microseconds since the Unix epoch. None if no trace or capture contains it."""
     more_captures: list[Path] = field(default_factory=list)
-    """Further captures of the same vehicles, and those of points that only listened."""
+    """Further captures of the same vehicles, and captures of observation points without a vehicle."""
     logged: dict[int, list[LoggableEvent]] = field(default_factory=dict)
-    """Events that an agent was given, as somebody beside it took them down: its own trace has them anyway."""
+    """Events for the agents to log, recorded by a separate recorder. The trace of an agent contains its events in
+    any case."""
     sources: dict[int, list[Path]] = field(default_factory=dict)
-    """The files that the trace of an agent was read from."""
+    """The files that the trace of each agent was read from."""
     public_keys: "PublicKeys | None" = None
-    """Of a secured mission, if they came along."""
+    """The public keys of a secured mission. None if no file contains them."""
 
     @property
     def agents(self) -> list[int]:
-        """All that left anything, the lowest ID first."""
+        """The IDs of all agents with any record, ascending."""
         return sorted({*self.traces, *self.exports, *self.captures, *self.logged})
 
     @property
@@ -69,18 +70,18 @@ class Flight:
 
 
 @dataclass
-class Homecoming:
-    """The flights that are in the files, the one with the most in it first, and what is left out.
+class IngestResult:
+    """The flights in some files, the one with the most records first, and the omitted files.
 
-    `remarks` are of what is used all the same: a clock that was set, a header that another agent's trace had to lend.
+    `remarks` concern files that are used, for example a changed clock or a header taken from another agent's trace.
     """
 
     flights: list[Flight]
-    left_out: list[LeftOut]
+    left_out: list[Omission]
     remarks: list[Remark] = field(default_factory=list)
 
     def largest(self) -> Flight:
-        """The flight with the most in it. Raises FieldError if nothing can be used."""
+        """Return the flight with the most records. Raises FieldError if nothing is usable."""
         if not self.flights:
             why = f": {self.left_out[0].sentence}" if self.left_out else ""
             error = FieldError(f"none of these files is a usable trace, chain export or capture{why}")
@@ -89,7 +90,7 @@ class Homecoming:
         return self.flights[0]
 
     def sentences(self) -> Iterator[str]:
-        """What is left out, what must be known of the rest, and what the other flights are: for people."""
+        """Yield sentences for the user: omissions, remarks, and the further flights."""
         yield from (left_out.sentence for left_out in self.left_out)
         yield from (remark.sentence for remark in self.remarks)
         for flight in self.flights[1:]:

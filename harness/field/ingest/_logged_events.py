@@ -1,4 +1,4 @@
-"""Events that an agent was given to log, as somebody beside it took them down: `ucp-events/1`, a line of JSON for each.
+"""Events for agents to log, recorded by a separate recorder: `ucp-events/1`, one JSON object per line.
 
 {"schema": "ucp-events/1", "agent_id": 7, "time_us": 1790000000000000, "event_id": 3, "data": "<base64>"}
 """
@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from harness.archive.bounded_file import BoundedFile
 from harness.archive.exports import AgentId, Base64
 from harness.archive.traces import MAX_LINE_BYTES
-from harness.field.ingest._ingest import LeftOut
+from harness.field.ingest._ingest import Omission
 from ucp.events import LoggableEvent
 
 SCHEMA: Literal["ucp-events/1"] = "ucp-events/1"
@@ -21,7 +21,7 @@ MAX_EVENTS = 1_000_000
 
 
 class EventLine(BaseModel):
-    """One event; `time_us` is in microseconds since the Unix epoch."""
+    """One event. `time_us` is in microseconds since the Unix epoch."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -44,8 +44,8 @@ class EventLine(BaseModel):
         return self.model_dump_json(by_alias=True) + "\n"
 
 
-def read_logged(path: Path, left_out: list[LeftOut]) -> list[tuple[int, LoggableEvent]]:
-    """The events of a file, each with its agent; none if it is of another kind. Raises OSError."""
+def read_logged(path: Path, left_out: list[Omission]) -> list[tuple[int, LoggableEvent]]:
+    """Return the events in a file, each with its agent. Empty if the file has another format. Raises OSError."""
     events: list[tuple[int, LoggableEvent]] = []
     damaged: list[int] = []
     with BoundedFile(path) as file:
@@ -60,8 +60,8 @@ def read_logged(path: Path, left_out: list[LeftOut]) -> list[tuple[int, Loggable
             except ValidationError:
                 damaged.append(number)
         if file.problem:
-            left_out.append(LeftOut(path, file.problem))
+            left_out.append(Omission(path, file.problem))
     if damaged:
         more = f", and {len(damaged) - 1} more lines are" if len(damaged) > 1 else ""
-        left_out.append(LeftOut(path, f"it is damaged{more}", damaged[0]))
+        left_out.append(Omission(path, f"it is damaged{more}", damaged[0]))
     return events

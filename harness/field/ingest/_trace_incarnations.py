@@ -1,6 +1,7 @@
-"""Reads traces from the field, life by life: whatever stands between damaged lines is used.
+"""Read traces from the field, incarnation by incarnation. The lines between damaged lines are used.
 
-A life begins with a header line. A file may hold lives of several agents and missions, and begin in the midst of one.
+A header line begins an incarnation. A file may contain incarnations of several agents and missions, and may begin
+within one.
 """
 
 import base64
@@ -14,43 +15,44 @@ from pathlib import Path
 from harness.archive.bounded_file import BoundedFile
 from harness.archive.history import LATEST_S
 from harness.archive.traces import MAX_LINE_BYTES, Gap, Header, parse_gap, parse_line
-from harness.field.ingest._ingest import LeftOut
+from harness.field.ingest._ingest import Omission
 from ucp.messages import HEADER as DATAGRAM_HEADER
 from ucp.messages import MAGIC
 from ucp.trace import Commanded, Dropped, Entry, HandlerRun
 
 MAX_TRACE_BYTES = 256 * 1024 * 1024
-"""Of a larger file the beginning is read."""
-MAX_LIVES = 1000
-MAX_LOST = 1_000_000
+"""Only the beginning of a larger file is read."""
+MAX_INCARNATIONS = 1000
+MAX_DAMAGED = 1_000_000
 MAX_PLACES = 1000
-"""Damaged places that are kept apart."""
+"""Maximum number of damaged places that are listed separately."""
 MAX_RUNS = 1_000_000
-"""Of one file. Of 20 agents that hear everything, each has about a tenth of it in 2 hours."""
-NOTHING_WITHIN_BYTES, NOTHING_WITHIN_LINES = 8 * 1024 * 1024, 100_000
-"""A file that holds no line of a trace so far is none."""
+"""Maximum number of handler runs in a file. In a swarm of 20 agents without loss, an agent has about a tenth of it
+in 2 hours."""
+MAX_BYTES_BEFORE_TRACE, MAX_LINES_BEFORE_TRACE = 8 * 1024 * 1024, 100_000
+"""A file is no trace if it has no line of a trace within these limits."""
 ROUNDING_S = 2e-3
-"""How far time may go back from line to line: a trace may have its times to the millisecond."""
+"""Maximum time by which a line may be earlier than the line before, because times may be rounded to milliseconds."""
 FAR_AHEAD_S = 3600.0
-"""Between two handler runs of a life, longer than any mission's agent stands idle."""
-_PLACES_TOLD = 3
+"""Maximum time between two handler runs of an incarnation. No agent is idle for longer."""
+_MAX_LISTED = 3
 _BEGINNINGS = (b'{"t":', b'{"schema":', b'{"t" :', b'{"schema" :', b'{ "t":', b'{ "schema":')
-_TELLING = (b'"handler"', b'"ucp-trace/', b'"dropped"', b'"command"')
+_MARKERS = (b'"handler"', b'"ucp-trace/', b'"dropped"', b'"command"')
 _NULS = re.compile(rb"(\0+)")
 _BOM = b"\xef\xbb\xbf"
 
 
 @dataclass
-class Life:
-    """One life of an agent as far as its file has it. `header` is None where the line is lost."""
+class TraceIncarnation:
+    """One incarnation of an agent, as far as its file contains it. `header` is None if the header line is lost."""
 
     path: Path
     header: Header | None
     first_line: int
     agent: int | None = None
-    """Whose it is, as its source says."""
+    """The agent ID, if the source of the lines determines it."""
     counts: str = "line"
-    """What its lines are called."""
+    """The unit of line numbers."""
     runs: list[HandlerRun] = field(default_factory=list)
     run_lines: list[int] = field(default_factory=list)
     asides: list[tuple[int, Dropped | Commanded]] = field(default_factory=list)
@@ -61,7 +63,7 @@ class Life:
 
     @property
     def agent_id(self) -> int | None:
-        """By its header; else by the datagrams that it sent, or the file's name."""
+        """The agent ID in the header, else that in its sent datagrams, else that in the file name. None if unknown."""
         if self.header is not None:
             return self.header.agent_id
         if self.agent is not None:
@@ -86,8 +88,8 @@ class Life:
     def numbered_asides(self) -> Iterator[tuple[tuple[int, Dropped | Commanded], int]]:
         return zip(self.asides, self.aside_lines, strict=True)
 
-    def lose(self, lines: int, lost_bytes: int) -> None:
-        """A line that says nothing; what is lost in a row is one gap."""
+    def add_gap(self, lines: int, lost_bytes: int) -> None:
+        """Note lost or damaged lines. Consecutive ones form one gap."""
         position = len(self.runs)
         if self.gaps and self.gaps[-1].position == position:
             last = self.gaps.pop()
@@ -100,22 +102,22 @@ def _jumps(before: HandlerRun, after: HandlerRun) -> bool:
 
 
 def jumps_in(runs: list[HandlerRun]) -> list[int]:
-    """Before which of these the agent's clock was set, as it seems."""
+    """Return the positions of runs before which the agent's clock was probably changed."""
     return [position for position, pair in enumerate(pairwise(runs), 1) if _jumps(*pair)]
 
 
-def read_lives(path: Path, left_out: list[LeftOut]) -> list[Life]:
-    """The lives that are in a file, in its order; none if it is no trace. Raises OSError if it cannot be read."""
+def read_incarnations(path: Path, left_out: list[Omission]) -> list[TraceIncarnation]:
+    """Return the incarnations in a file, in order. Empty if the file is no trace. Raises OSError."""
     reader = TraceReader(path)
     with BoundedFile(path, MAX_TRACE_BYTES) as file:
-        for number, line, ended in _lines(file):
-            reader.take(number, line, ended)
-            if reader.hopeless:
+        for number, line, finish in _lines(file):
+            reader.add_line(number, line, finish)
+            if reader.gave_up:
                 break
-    lives = reader.ended(left_out)
-    if lives and file.problem:
-        left_out.append(LeftOut(path, file.problem))
-    return lives
+    incarnations = reader.finish(left_out)
+    if incarnations and file.problem:
+        left_out.append(Omission(path, file.problem))
+    return incarnations
 
 
 @dataclass
@@ -124,36 +126,42 @@ class _Damage:
     last: int
     why: str
 
-    def goes_on(self, line: int, why: str) -> bool:
+    def continues(self, line: int, why: str) -> bool:
         return line == self.last or (line == self.last + 1 and why == self.why)
 
 
 class TraceReader:
-    """Takes the lines of a trace one after another, whatever they are; `lives` are what they make."""
+    """A reader of the lines of a trace, in any condition. `incarnations` has the result so far.
+
+    `gave_up` is true if further lines are not needed, because a limit is exceeded.
+    """
 
     def __init__(self, path: Path, agent_id: int | None = None, counts: str = "line") -> None:
-        """`agent_id` is whose they are, if their source says it; `counts` what their numbers count."""
+        """Create a reader.
+
+        `agent_id` is the agent, if the source determines it. `counts` is the unit of line numbers.
+        """
         self.path = path
         self._agent_id, self._counts = agent_id, counts
-        self.lives: list[Life] = []
-        self.hopeless = False
+        self.incarnations: list[TraceIncarnation] = []
+        self.gave_up = False
         self._read_bytes = self._lines = self._runs = self._lost = 0
         self._damaged: list[_Damage] = []
         self._cut_off: int | None = None
 
-    def take(self, number: int, line: bytes, ended: bool = True) -> None:
-        """The line with this number; one that did not end may be cut off."""
+    def add_line(self, number: int, line: bytes, finish: bool = True) -> None:
+        """Read a line. A line without a line end may be truncated."""
         self._read_bytes += len(line)
         self._lines += 1
-        self.hopeless = not self.lives and (
-            self._read_bytes > NOTHING_WITHIN_BYTES or self._lines > NOTHING_WITHIN_LINES
+        self.gave_up = not self.incarnations and (
+            self._read_bytes > MAX_BYTES_BEFORE_TRACE or self._lines > MAX_LINES_BEFORE_TRACE
         )
-        if self._runs == MAX_RUNS or len(self.lives) > MAX_LIVES or self._lost == MAX_LOST:
-            if not self.hopeless:
-                limit = f"{MAX_RUNS} handler runs, {MAX_LIVES} lives of agents, or {MAX_LOST} damaged lines"
+        if self._runs == MAX_RUNS or len(self.incarnations) > MAX_INCARNATIONS or self._lost == MAX_DAMAGED:
+            if not self.gave_up:
+                limit = f"{MAX_RUNS} handler runs, {MAX_INCARNATIONS} lives of agents, or {MAX_DAMAGED} damaged lines"
                 what = f"it and all later lines are not read: a trace has at most {limit}"
-                self._damaged = [*self._damaged[:_PLACES_TOLD], _Damage(number, number, what)]
-            self.hopeless = True
+                self._damaged = [*self._damaged[:_MAX_LISTED], _Damage(number, number, what)]
+            self.gave_up = True
             return
         if number == 1:
             line = line.removeprefix(_BOM)
@@ -163,84 +171,84 @@ class TraceReader:
         pieces = [piece for piece in _NULS.split(line) if piece.strip()]
         for piece in pieces:
             if piece.startswith(b"\0"):
-                self._lose(number, piece, "NUL bytes here, as after a loss of power")
+                self._add_damaged(number, piece, "NUL bytes here, as after a loss of power")
             elif entry := _entry(piece):
                 self._add(entry, number)
             elif lost := parse_gap(piece):
-                self._was_lost(number, *lost)
-            elif rescued := _rescued(piece):
-                lost_bytes, at_its_end = rescued
-                self._lose(number, piece[:lost_bytes], "it is damaged; its readable end is used")
-                self._add(at_its_end, number)
-            elif ended or piece is not pieces[-1]:
-                self._lose(number, piece, "it is damaged" if _said(piece) is None else "its time cannot be")
+                self._add_earlier_gap(number, *lost)
+            elif recovered := _recover_tail(piece):
+                lost_bytes, tail_entry = recovered
+                self._add_damaged(number, piece[:lost_bytes], "it is damaged; its readable end is used")
+                self._add(tail_entry, number)
+            elif finish or piece is not pieces[-1]:
+                self._add_damaged(number, piece, "it is damaged" if _parse(piece) is None else "its time cannot be")
             else:
                 self._cut_off = number
-        if not ended and self.lives and pieces and (self._cut_off or pieces[-1].startswith(b"\0")):
-            self.lives[-1].cut_off = True
+        if not finish and self.incarnations and pieces and (self._cut_off or pieces[-1].startswith(b"\0")):
+            self.incarnations[-1].cut_off = True
 
     def _add(self, entry: Header | Entry, number: int) -> None:
         if isinstance(entry, Header):
-            self.lives.append(self._life(entry, number))
+            self.incarnations.append(self._new_incarnation(entry, number))
             return
-        if not self.lives:
-            self.lives.append(self._life(None, number))
-            self.lives[-1].lose(0, 0)  # nobody knows what was before it
+        if not self.incarnations:
+            self.incarnations.append(self._new_incarnation(None, number))
+            self.incarnations[-1].add_gap(0, 0)  # earlier lines may be lost
         self._runs += 1
-        self.lives[-1].add(entry, number)
+        self.incarnations[-1].add(entry, number)
 
-    def _life(self, header: Header | None, number: int) -> Life:
-        return Life(self.path, header, number, self._agent_id, self._counts)
+    def _new_incarnation(self, header: Header | None, number: int) -> TraceIncarnation:
+        return TraceIncarnation(self.path, header, number, self._agent_id, self._counts)
 
-    def _lose(self, number: int, text: bytes, why: str) -> None:
+    def _add_damaged(self, number: int, text: bytes, why: str) -> None:
         if b'"ucp-trace/' in text or b'"initial_data"' in text:
-            self.lives.append(self._life(None, number))  # that was a header, whatever else it said
-        elif self.lives:
-            self.lives[-1].lose(0 if text.startswith(b"\0") else 1, len(text))
+            self.incarnations.append(self._new_incarnation(None, number))  # the damaged line was a header
+        elif self.incarnations:
+            self.incarnations[-1].add_gap(0 if text.startswith(b"\0") else 1, len(text))
         self._lost += 1
-        self._say(number, why)
+        self._report(number, why)
 
-    def _say(self, number: int, why: str) -> None:
-        if self._damaged and (self._damaged[-1].goes_on(number, why) or len(self._damaged) > MAX_PLACES):
+    def _report(self, number: int, why: str) -> None:
+        if self._damaged and (self._damaged[-1].continues(number, why) or len(self._damaged) > MAX_PLACES):
             self._damaged[-1].last = number
         else:
             self._damaged.append(_Damage(number, number, why))
 
-    def lose_unseen(self) -> None:
-        """Here lines may be lost, which nobody has seen."""
-        if self.lives:
-            self.lives[-1].lose(0, 0)
+    def add_unknown_gap(self) -> None:
+        """Note that lines may be lost here."""
+        if self.incarnations:
+            self.incarnations[-1].add_gap(0, 0)
 
-    def _was_lost(self, number: int, lines: int, lost_bytes: int) -> None:
-        """Before this file was made, as an import says."""
-        if self.lives:
-            self.lives[-1].lose(lines, lost_bytes)
+    def _add_earlier_gap(self, number: int, lines: int, lost_bytes: int) -> None:
+        """Note lines that were lost before this file was written, as an import recorded it."""
+        if self.incarnations:
+            self.incarnations[-1].add_gap(lines, lost_bytes)
         what = "the part before this" if not lines else "1 line" if lines == 1 else f"{lines} lines"
-        self._say(number, f"{what} {'were' if lines > 1 else 'was'} lost before this file was written")
+        self._report(number, f"{what} {'were' if lines > 1 else 'was'} lost before this file was written")
 
-    def ended(self, left_out: list[LeftOut]) -> list[Life]:
-        """The lives; what was damaged is told if there are any."""
-        lives = [life for life in self.lives if life.runs or life.asides or life.header]
-        left_out += self._left_out() if lives else ()
-        return lives
+    def finish(self, left_out: list[Omission]) -> list[TraceIncarnation]:
+        """Return the incarnations. If there are any, the damage is added to `left_out`."""
+        incarnations = [life for life in self.incarnations if life.runs or life.asides or life.header]
+        left_out += self._left_out() if incarnations else ()
+        return incarnations
 
-    def _left_out(self) -> Iterator[LeftOut]:
-        for damage in self._damaged[:_PLACES_TOLD]:
+    def _left_out(self) -> Iterator[Omission]:
+        for damage in self._damaged[:_MAX_LISTED]:
             more = f", and so is the rest up to {self._counts} {damage.last}" if damage.last > damage.first else ""
-            yield LeftOut(self.path, f"{damage.why}{more}", damage.first, self._counts)
-        if rest := self._damaged[_PLACES_TOLD:]:
+            yield Omission(self.path, f"{damage.why}{more}", damage.first, self._counts)
+        if rest := self._damaged[_MAX_LISTED:]:
             places = "1 more place" if len(rest) == 1 else f"{len(rest)} more places"
-            yield LeftOut(
+            yield Omission(
                 self.path,
                 f"{places} in it {'is' if len(rest) == 1 else 'are'} damaged, the last at "
                 f"{self._counts} {rest[-1].last}",
             )
         if self._cut_off is not None:
-            yield LeftOut(self.path, "it is truncated at the end of the file", self._cut_off, self._counts)
+            yield Omission(self.path, "it is truncated at the end of the file", self._cut_off, self._counts)
 
 
 def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:
-    """Number, text, and whether it ended. Of a line that is too long, what follows its last NUL, or its end."""
+    """Yield (number, line, whether it has a line end). Of a line that is too long, only the last part is kept."""
     number, kept = 1, b""
     while text := file.readline(MAX_LINE_BYTES):
         if not text.endswith(b"\n") and len(text) == MAX_LINE_BYTES:
@@ -253,14 +261,14 @@ def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:
 
 
 def _entry(line: bytes) -> Header | Entry | None:
-    """What a line says, if it is whole and can be."""
-    entry = _said(line)
+    """Return the entry in a line, if it is complete and has a possible time."""
+    entry = _parse(line)
     return entry if entry is None or isinstance(entry, Header) or 0 <= entry.t <= LATEST_S else None
 
 
-def _said(line: bytes) -> Header | Entry | None:
-    """What a line says, if it is whole, at whatever time."""
-    if not any(word in line for word in _TELLING):
+def _parse(line: bytes) -> Header | Entry | None:
+    """Return the entry in a line, if it is complete. Its time is not checked."""
+    if not any(word in line for word in _MARKERS):
         return None
     try:
         entry = parse_line(line)
@@ -271,11 +279,11 @@ def _said(line: bytes) -> Header | Entry | None:
     return entry
 
 
-def _rescued(text: bytes) -> tuple[int, Header | Entry] | None:
-    """Where a whole line begins in what begins with a part of another, or with nothing readable, and what it says."""
-    begins = max(text.rfind(beginning) for beginning in _BEGINNINGS)
-    entry = _entry(text[begins:]) if begins > 0 else None
-    return None if entry is None else (begins, entry)
+def _recover_tail(text: bytes) -> tuple[int, Header | Entry] | None:
+    """Return the position and the entry of a complete line at the end of a damaged line."""
+    start = max(text.rfind(beginning) for beginning in _BEGINNINGS)
+    entry = _entry(text[start:]) if start > 0 else None
+    return None if entry is None else (start, entry)
 
 
 def _sender(datagram: str) -> int | None:

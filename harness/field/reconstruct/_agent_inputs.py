@@ -1,4 +1,4 @@
-"""What reached an agent, in order, and what it did then: a trace, taken apart into inputs."""
+"""Split a trace into inputs: the causes of handler runs in order, each with the handler runs that it caused."""
 
 import base64
 import math
@@ -17,92 +17,97 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 
 
 class UnusableInputError(Exception):
-    """What came is not on record, or is nothing that can come: a sentence."""
+    """An input is not recorded, or is impossible. The message is a sentence."""
 
 
 @dataclass(frozen=True, slots=True)
-class Logged:
+class EventLogged:
     """The vehicle logged an event."""
 
     event: LoggableEvent
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
-    """A datagram came."""
+class DatagramReceived:
+    """The agent received a datagram."""
 
     datagram: bytes
 
 
 @dataclass(frozen=True, slots=True)
-class TimerEnded:
-    """The timer of this name ended."""
+class TimerExpired:
+    """The timer `name` expired."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """The operator asked for a reconcile."""
+class ReconcileRequested:
+    """The operator requested a reconcile."""
 
 
 @dataclass(frozen=True, slots=True)
-class Booted:
-    """The agent went on from what was on its disk."""
+class BootedFromDisk:
+    """The agent restarted with the data on its disk."""
 
 
-What = Logged | Heard | TimerEnded | Asked | Booted
+Cause = EventLogged | DatagramReceived | TimerExpired | ReconcileRequested | BootedFromDisk
 
 
 @dataclass(slots=True)
 class Input:
-    """`at_s` is by the agent's own clock; `line` is that of its trace, counting from 1.
+    """An input of an agent. `at_s` is the time on the agent's own clock. `line` is the line of its trace, from 1.
 
-    `runs` are the handler runs that came of it, those of local events too.
+    `runs` are the handler runs that it caused, including those of local events.
     """
 
     at_s: float
     line: int
-    what: What
+    cause: Cause
     runs: list[HandlerRun] = field(default_factory=list)
 
 
-class Missing(Protocol):
-    """Where to look for what a trace of version 1 does not have."""
+class MissingInputs(Protocol):
+    """The records that may contain inputs which a trace of version 1 lacks."""
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]: ...
 
     def events(self, agent_id: int) -> list[LoggableEvent]: ...
 
 
-def lives_of(trace: Trace, header: CheckedHeader, missing: Missing) -> tuple[list[list[Input]], str | None]:
-    """The inputs of each life of the agent; and, naming the line, why not all of them if the rest cannot be used."""
+def inputs_by_incarnation(
+    trace: Trace, header: CheckedHeader, missing: MissingInputs
+) -> tuple[list[list[Input]], str | None]:
+    """Return the inputs of each incarnation, and the reason why the rest is unusable, or None.
+
+    The reason names the line.
+    """
     reader = _Reader(header, missing)
-    lives: list[list[Input]] = []
-    for life in trace.incarnations():
+    incarnations: list[list[Input]] = []
+    for handler_runs in trace.incarnations():
         inputs: list[Input] = []
-        lives.append(inputs)
+        incarnations.append(inputs)
         try:
-            for given in reader.inputs(life):
-                inputs.append(given)
+            for new_input in reader.inputs(handler_runs):
+                inputs.append(new_input)
         except UnusableInputError as error:
-            return lives, str(error)
-    return lives, None
+            return incarnations, str(error)
+    return incarnations, None
 
 
 class _Reader:
-    def __init__(self, header: CheckedHeader, missing: Missing) -> None:
+    def __init__(self, header: CheckedHeader, missing: MissingInputs) -> None:
         self._header = header
         self._missing = missing
         self._events: Iterator[LoggableEvent] | None = None
 
-    def inputs(self, life: Iterator[tuple[int, HandlerRun]]) -> Iterator[Input]:
+    def inputs(self, handler_runs: Iterator[tuple[int, HandlerRun]]) -> Iterator[Input]:
         current: Input | None = None
         last_s = float("-inf")
-        for line, run in life:
-            words = unknown_names([run])
-            if words.keys() - IGNORED_KINDS:
-                raise UnusableInputError(f"line {line}: {first_unknown(words)}")
+        for line, run in handler_runs:
+            unknown = unknown_names([run])
+            if unknown.keys() - IGNORED_KINDS:
+                raise UnusableInputError(f"line {line}: {first_unknown(unknown)}")
             if isinstance(run.trigger, LocalTrigger):
                 if current is None:
                     raise UnusableInputError(f"line {line}: {run.handler} ran for a local event before any input")
@@ -113,25 +118,27 @@ class _Reader:
             if not math.isfinite(run.t):
                 raise UnusableInputError(f"line {line}: {run.handler} ran at no time")
             last_s = max(last_s, self._header.local(run.t))
-            current = Input(last_s, line, self._what(line, run), [run])
+            current = Input(last_s, line, self._cause(line, run), [run])
         if current is not None:
             yield current
 
-    def _what(self, line: int, run: HandlerRun) -> What:
+    def _cause(self, line: int, run: HandlerRun) -> Cause:
         trigger = run.trigger
         try:
             if isinstance(trigger, MessageTrigger):
-                return Heard(self._datagram(line, run, trigger))
+                return DatagramReceived(self._datagram(line, run, trigger))
             if isinstance(trigger, EventTrigger):
-                return Logged(event_of(run.input) if run.input is not None else self._event(line, trigger.event_id))
+                return EventLogged(
+                    event_of(run.input) if run.input is not None else self._event(line, trigger.event_id)
+                )
         except (ValueError, MalformedEventsError):
             raise UnusableInputError(f"line {line}: the input of {run.handler} is damaged") from None
         if isinstance(trigger, TimerTrigger):
-            return TimerEnded(timer_that_ended(run, trigger))
+            return TimerExpired(timer_that_ended(run, trigger))
         if isinstance(trigger, OperatorTrigger):
-            return Asked()
+            return ReconcileRequested()
         if isinstance(trigger, BootTrigger):
-            return Booted()
+            return BootedFromDisk()
         raise UnusableInputError(f"line {line}: {run.handler} ran without a known trigger")
 
     def _datagram(self, line: int, run: HandlerRun, trigger: MessageTrigger) -> bytes:

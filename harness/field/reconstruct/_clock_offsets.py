@@ -1,29 +1,30 @@
-"""What the agents' clocks show beside each other, from messages alone.
+"""Estimate the offsets and drifts of the agents' clocks from messages alone.
 
-Between two agents every message says that it was received after it was sent. With t by the clock of A and u by that of
-B, messages from A to B are points (t sent, u received) above the line that leads from one clock to the other, messages
-from B to A are points (t received, u sent) below it: the nearer, the faster they were. The line taken is the one with
-the most room between both, as in synchronising traces by NTP's minimal delays; a line is an offset and a drift.
-If no drift fits as well, none is assumed: a few messages do not show one.
+Each message was received after it was sent. Let t be the time on the clock of agent A, and u that on the clock of B.
+Then the messages from A to B are points (t sent, u received) above the line that converts t to u. The messages from B
+to A are points (t received, u sent) below it. Fast messages are close to the line. The estimate is the line with the
+greatest distance to both groups of points, as in synchronising traces by the minimal delays of NTP. A line is an offset
+and a drift. Drift is assumed only if the points contradict a line without drift, because a few messages do not prove a
+drift.
 
-No clock is believed more than another: that of the agent with whom the most messages were exchanged is the measure.
+No clock is trusted more than another. The reference is the clock of the agent that exchanged the most messages.
 """
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-SLOWEST, FASTEST = 0.55, 1.8
-"""Rates beyond these are no clock's."""
+MIN_RATE, MAX_RATE = 0.55, 1.8
+"""Limits of a plausible clock rate."""
 SEARCH_STEPS = 100
-POINTS_FOR_DRIFT = 8
-"""Messages each way that it takes to speak of drift."""
+MESSAGES_FOR_DRIFT = 8
+"""Minimum number of messages in each direction for an estimate of drift."""
 OFFSET_DIGITS, DRIFT_DIGITS = 6, 9
 
 
 @dataclass(frozen=True)
-class Line:
-    """A clock beside another: it shows offset_s + rate * t when the other shows t."""
+class ClockLine:
+    """A clock relative to another one: it shows offset_s + rate * t when the other shows t."""
 
     offset_s: float = 0.0
     rate: float = 1.0
@@ -32,15 +33,15 @@ class Line:
         return self.offset_s + self.rate * t
 
     def at(self, shown: float) -> float:
-        """When it shows that."""
+        """Return the time on the other clock at which this clock shows `shown`."""
         return (shown - self.offset_s) / self.rate
 
-    def after(self, first: "Line") -> "Line":
-        """This clock beside that one beside which `first` is the clock between."""
-        return Line(self.shows(first.offset_s), self.rate * first.rate)
+    def after(self, first: "ClockLine") -> "ClockLine":
+        """Return this clock relative to the base of `first`. So far it is relative to the clock of `first`."""
+        return ClockLine(self.shows(first.offset_s), self.rate * first.rate)
 
-    def inverse(self) -> "Line":
-        return Line(-self.offset_s / self.rate, 1 / self.rate)
+    def inverse(self) -> "ClockLine":
+        return ClockLine(-self.offset_s / self.rate, 1 / self.rate)
 
 
 Point = tuple[float, float]
@@ -48,7 +49,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """A message on its way, each end by the clock of the agent there."""
+    """A message with its times of sending and reception, each on the clock of the agent there."""
 
     sender: int
     receiver: int
@@ -56,8 +57,11 @@ class Delivery:
     received_s: float
 
 
-def estimate(agents: Iterable[int], deliveries: Iterable[Delivery]) -> dict[int, Line]:
-    """Each agent's clock beside the measure; as good as the measure where no message says anything."""
+def estimate(agents: Iterable[int], deliveries: Iterable[Delivery]) -> dict[int, ClockLine]:
+    """Return each agent's clock relative to the reference.
+
+    Clocks without messages are assumed to equal the reference.
+    """
     between: dict[tuple[int, int], tuple[list[Point], list[Point]]] = defaultdict(lambda: ([], []))
     for delivery in deliveries:
         if delivery.sender < delivery.receiver:
@@ -70,18 +74,20 @@ def estimate(agents: Iterable[int], deliveries: Iterable[Delivery]) -> dict[int,
         pair: min(len(above), len(below)) + 1e-3 * (len(above) + len(below)) for pair, (above, below) in between.items()
     }
     total: dict[int, float] = dict.fromkeys(agents, 0.0)
-    for (a, b), heavy in weight.items():
-        total[a] += heavy
-        total[b] += heavy
-    clocks: dict[int, Line] = {}
-    while left := [agent for agent in total if agent not in clocks]:
-        links = [(heavy, pair) for pair, heavy in weight.items() if (pair[0] in clocks) != (pair[1] in clocks)]
+    for (a, b), pair_weight in weight.items():
+        total[a] += pair_weight
+        total[b] += pair_weight
+    clocks: dict[int, ClockLine] = {}
+    while unplaced := [agent for agent in total if agent not in clocks]:
+        links = [
+            (pair_weight, pair) for pair, pair_weight in weight.items() if (pair[0] in clocks) != (pair[1] in clocks)
+        ]
         if not links:
-            measure = max(left, key=lambda agent: (total[agent], -agent))
-            clocks[measure] = Line()
+            reference = max(unplaced, key=lambda agent: (total[agent], -agent))
+            clocks[reference] = ClockLine()
             continue
         _, (a, b) = max(links)
-        line = fit(*between[a, b])
+        line = fit_line(*between[a, b])
         if a in clocks:
             clocks[b] = line.after(clocks[a])
         else:
@@ -90,12 +96,12 @@ def estimate(agents: Iterable[int], deliveries: Iterable[Delivery]) -> dict[int,
 
 
 def _height(hull: list[Point], rate: float, of: Callable[[Iterator[float]], float]) -> float:
-    """Where the line with this rate crosses t = 0 that touches the hull."""
+    """Return the value at t = 0 of the line with this rate that touches the hull."""
     return of(u - rate * t for t, u in hull)
 
 
 def _hull(points: list[Point], side: int) -> list[Point]:
-    """Of the points those that a line can touch from below (side 1), or from above (-1)."""
+    """Return the points that a line can touch from below (side 1), or from above (-1): the convex hull of that side."""
     hull: list[Point] = []
     for t, u in sorted(points, key=lambda point: (point[0], side * point[1])):
         if hull and hull[-1][0] == t:
@@ -110,17 +116,19 @@ def _turn(a: Point, b: Point, c: Point) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-def fit(above: list[Point], below: list[Point]) -> Line:
-    """The line with the points of one list above it and those of the other below it, and the most room between."""
+def fit_line(above: list[Point], below: list[Point]) -> ClockLine:
+    """Return the line with the points `above` above it, the points `below` below it, and the greatest distance to
+    both.
+    """
     lower, upper = _hull(above, 1), _hull(below, -1)
 
     def room(rate: float) -> float:
         return _height(lower, rate, min) - _height(upper, rate, max)
 
     rate = 1.0
-    if min(len(above), len(below)) >= POINTS_FOR_DRIFT and room(1.0) < 0:
-        low, high = SLOWEST, FASTEST
-        for _ in range(SEARCH_STEPS):  # room is concave
+    if min(len(above), len(below)) >= MESSAGES_FOR_DRIFT and room(1.0) < 0:
+        low, high = MIN_RATE, MAX_RATE
+        for _ in range(SEARCH_STEPS):  # The distance is a concave function of the rate.
             third = (high - low) / 3
             if room(low + third) < room(high - third):
                 low += third
@@ -128,5 +136,5 @@ def fit(above: list[Point], below: list[Point]) -> Line:
                 high -= third
         rate = (low + high) / 2
     if above and below:
-        return Line((_height(lower, rate, min) + _height(upper, rate, max)) / 2, rate)
-    return Line(_height(lower, rate, min) if above else _height(upper, rate, max), rate)
+        return ClockLine((_height(lower, rate, min) + _height(upper, rate, max)) / 2, rate)
+    return ClockLine(_height(lower, rate, min) if above else _height(upper, rate, max), rate)

@@ -9,10 +9,10 @@ from harness.checker import Evidence, steps
 from harness.checker.judgement import agents
 from harness.checker.steps.trace_header import CheckedHeader
 from harness.field.ingest import Flight
-from harness.field.reconstruct._agent_inputs import Input, lives_of
+from harness.field.reconstruct._agent_inputs import Input, inputs_by_incarnation
 from harness.field.reconstruct._inferring import infer
-from harness.field.reconstruct._other_records import Elsewhere
-from harness.field.reconstruct._rehearsal import Allowed, Parting, Rehearsal, rehearse, same_sent
+from harness.field.reconstruct._other_records import OtherRecords
+from harness.field.reconstruct._rehearsal import ProtocolDeviation, Rehearsal, Tolerance, rehearse, same_sent
 from harness.field.reconstruct._timetable import Timetable
 from harness.run.simulate import Simulated
 from ucp.quirks import QUIRKS
@@ -22,9 +22,10 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True)
 class FirstDifference:
-    """Where virtual time does not do what is on record: agent, mission second of the reconstruction, line of its trace.
+    """The first step at which the simulation differs from a record. `at_s` is the mission second in the reconstruction.
 
-    `line` is None if the record has nothing more there. `recorded` and `played` are in words.
+    `line` is the line of the trace, None if the record has no further steps. `recorded` and `played` describe both
+    steps.
     """
 
     agent_id: int
@@ -43,14 +44,14 @@ class FirstDifference:
         )
 
 
-Step = tuple[float, int | None, HandlerRun]
-"""Mission second, line of the trace, and what ran."""
+PlayedStep = tuple[float, int | None, HandlerRun]
+"""Mission second, line of the trace, and handler run."""
 
 
 def first_difference(
     table: Timetable, rehearsals: Mapping[int, Rehearsal], simulated: Simulated
 ) -> FirstDifference | None:
-    """The first in mission time; None if every step that had an effect is the same."""
+    """Return the first difference in mission time. None if all steps with an effect are equal."""
     differences = []
     for agent_id in rehearsals:
         recorded = [*_effective(_recorded(table, agent_id))]
@@ -60,25 +61,25 @@ def first_difference(
     return min(differences, key=lambda difference: difference.at_s, default=None)
 
 
-def _recorded(table: Timetable, agent_id: int) -> Iterator[Step]:
-    for happening in table.happenings[agent_id]:
-        for run in happening.played.input.runs:
-            yield happening.at_s, happening.played.input.line, run
+def _recorded(table: Timetable, agent_id: int) -> Iterator[PlayedStep]:
+    for timed_input in table.inputs[agent_id]:
+        for run in timed_input.played.input.runs:
+            yield timed_input.at_s, timed_input.played.input.line, run
 
 
-def _played(trace: Trace | None) -> Iterator[Step]:
+def _played(trace: Trace | None) -> Iterator[PlayedStep]:
     for run in trace.runs if trace else ():
         yield run.t, None, run
 
 
-def _effective(steps: Iterable[Step]) -> Iterator[Step]:
-    """Without messages of which nothing came but a tally."""
+def _effective(steps: Iterable[PlayedStep]) -> Iterator[PlayedStep]:
+    """Yield the steps without messages that only changed a tally."""
     return (
         step for step in steps if step[2].changes or step[2].sent or not isinstance(step[2].trigger, MessageTrigger)
     )
 
 
-def _compare(agent_id: int, recorded: Sequence[Step], played: Sequence[Step]) -> FirstDifference | None:
+def _compare(agent_id: int, recorded: Sequence[PlayedStep], played: Sequence[PlayedStep]) -> FirstDifference | None:
     for ours, theirs in zip_longest(played, recorded):
         if ours is None or theirs is None or not _same(ours[2], theirs[2]):
             at_s = min(step[0] for step in (ours, theirs) if step is not None)
@@ -92,7 +93,7 @@ def _same(ours: HandlerRun, theirs: HandlerRun) -> bool:
     return ours.handler == theirs.handler and ours.changes == theirs.changes and same_sent(ours.sent, theirs.sent)
 
 
-def _in_words(step: Step | None) -> str:
+def _in_words(step: PlayedStep | None) -> str:
     if step is None:
         return "did nothing more"
     run = step[2]
@@ -102,23 +103,26 @@ def _in_words(step: Step | None) -> str:
     return ", ".join(filter(None, words))
 
 
-Lives = Sequence[Sequence[Input]]
+Incarnations = Sequence[Sequence[Input]]
 
 
-class Alone:
-    """`rehearsals` has every agent that can be played, and `why` says of whom it is not all that came home."""
+class SoloRehearsals:
+    """Rehearsals of each agent alone.
 
-    def __init__(self, flight: Flight, elsewhere: Elsewhere) -> None:
+    `rehearsals` has each agent that can be played, and `why` the reasons for incomplete ones.
+    """
+
+    def __init__(self, flight: Flight, other_records: OtherRecords) -> None:
         self.rehearsals: dict[int, Rehearsal] = {}
         self.why: dict[int, str] = {}
         self._flight = flight
-        self._elsewhere = elsewhere
+        self._other_records = other_records
         self._by_captures: list[int] = []
         self._remarks: list[str] = []
 
     @property
     def remarks(self) -> list[str]:
-        """What was assumed, and what was found."""
+        """Sentences on assumptions and findings."""
         if not self._by_captures:
             return self._remarks
         which = agents(self._by_captures)
@@ -126,86 +130,95 @@ class Alone:
         return [*self._remarks, inferred]
 
     def rehearse(self, header: CheckedHeader) -> None:
-        """By its trace; or, if that does not lead to its export, by its capture if that says more."""
+        """Rehearse an agent by its trace.
+
+        If that does not lead to its export, use its capture if that explains more inputs.
+        """
         agent_id = header.agent_id
         rehearsal = self._by_trace(header) if agent_id in self._flight.traces else None
-        if rehearsal is None or not rehearsal.parting:
+        if rehearsal is None or not rehearsal.deviation:
             rehearsal = self._by_capture(header, rehearsal)
-        if rehearsal is not None and (rehearsal.played or rehearsal.parting is None):
+        if rehearsal is not None and (rehearsal.played or rehearsal.deviation is None):
             self.rehearsals[agent_id] = rehearsal
 
     def _by_trace(self, header: CheckedHeader) -> Rehearsal:
         agent_id = header.agent_id
-        lives, problem = lives_of(self._flight.traces[agent_id], header, self._elsewhere)
-        rehearsal = rehearse(header, lives)
-        if rehearsal.parting is not None:
-            explained = self._with_a_quirk(header, lives, rehearsal.parting)
-            rehearsal = explained or self._with_what_is_not_right(header, lives) or rehearsal
-        elif not rehearsal.to_the_word and (words := self._judged(agent_id)):
+        incarnations, problem = inputs_by_incarnation(self._flight.traces[agent_id], header, self._other_records)
+        rehearsal = rehearse(header, incarnations)
+        if rehearsal.deviation is not None:
+            explained = self._explain_by_quirk(header, incarnations, rehearsal.deviation)
+            rehearsal = explained or self._explain_by_tolerance(header, incarnations) or rehearsal
+        elif not rehearsal.matches_exactly and (words := self._first_finding(agent_id)):
             self._remarks.append(f"agent {agent_id} deviates without effect: {words}")
-        if (parting := rehearsal.parting) is not None:
-            words = self._judged(agent_id) or f"trace line {parting.line}, t={parting.at_s:g} s: it {parting.what}"
-            self.why[agent_id] = f"deviates from the protocol, and is played up to trace line {parting.line}: {words}"
+        if (deviation := rehearsal.deviation) is not None:
+            words = (
+                self._first_finding(agent_id)
+                or f"trace line {deviation.line}, t={deviation.at_s:g} s: it {deviation.description}"
+            )
+            self.why[agent_id] = f"deviates from the protocol, and is played up to trace line {deviation.line}: {words}"
         elif problem is not None:
-            rehearsal.broken_off = True
+            rehearsal.truncated = True
             self.why[agent_id] = f"can be played only in part: {problem}"
         return rehearsal
 
     def _by_capture(self, header: CheckedHeader, by_trace: Rehearsal | None) -> Rehearsal | None:
-        """The rehearsal that explains more: this one, if it is needed at all."""
+        """Return the rehearsal that explains more inputs: `by_trace`, or one by the capture if it is needed."""
         agent_id = header.agent_id
-        home, captured = self._flight.exports.get(agent_id), self._elsewhere.captured.get(agent_id)
-        if captured is None or home is None or (by_trace and by_trace.chain == list(home.chain_of_block_hashes)):
+        export, capture = self._flight.exports.get(agent_id), self._other_records.captures.get(agent_id)
+        if capture is None or export is None or (by_trace and by_trace.chain == list(export.chain_of_block_hashes)):
             return by_trace
-        inferred = infer(header, captured, self._elsewhere.events(agent_id))
-        by_capture = rehearse(header, inferred.lives)
+        inferred = infer(header, capture, self._other_records.events(agent_id))
+        by_capture = rehearse(header, inferred.incarnations)
         if by_trace is not None and len(by_trace.played) >= len(by_capture.played):
             return by_trace
         self.why.pop(agent_id, None)
         if inferred.problem:
             self.why[agent_id] = inferred.problem
-            by_capture.broken_off = True
+            by_capture.truncated = True
         self._by_captures.append(agent_id)
         return by_capture
 
-    def _with_a_quirk(self, header: CheckedHeader, lives: Lives, at: Parting) -> Rehearsal | None:
-        """The rehearsal with a known mistake that explains the whole record, if possible to the word.
+    def _explain_by_quirk(
+        self, header: CheckedHeader, incarnations: Incarnations, at: ProtocolDeviation
+    ) -> Rehearsal | None:
+        """Return a rehearsal with a known quirk that explains the whole record, with equal branches and tallies if
+        possible.
 
-        Those of the handlers are tried first that ran where the agent parts from the protocol.
+        Quirks of the handlers that ran at the deviation are tried first.
         """
         explaining: dict[str, Rehearsal] = {}
-        certain = (quirk for quirk in QUIRKS.values() if not quirk.chance)
-        for quirk in sorted(certain, key=lambda quirk: at.algorithms.isdisjoint(quirk.algorithms)):
-            rehearsal = rehearse(header, lives, {quirk.name: True})
-            if rehearsal.parting is None:
+        deterministic = (quirk for quirk in QUIRKS.values() if not quirk.chance)
+        for quirk in sorted(deterministic, key=lambda quirk: at.algorithms.isdisjoint(quirk.algorithms)):
+            rehearsal = rehearse(header, incarnations, {quirk.name: True})
+            if rehearsal.deviation is None:
                 explaining[quirk.name] = rehearsal
-                if rehearsal.to_the_word:
+                if rehearsal.matches_exactly:
                     break
         if not explaining:
             return None
-        name = max(explaining, key=lambda name: explaining[name].to_the_word)
+        name = max(explaining, key=lambda name: explaining[name].matches_exactly)
         self._remarks.append(f"agent {header.agent_id} behaves as with {name}: {QUIRKS[name].sentence}")
         return explaining[name]
 
-    def _with_what_is_not_right(self, header: CheckedHeader, lives: Lives) -> Rehearsal | None:
-        """The rehearsal of an agent whose mistakes a scenario can do without: its chain comes out all the same."""
-        who = f"agent {header.agent_id}"
-        ignoring = rehearse(header, lives, allowed=Allowed(ignoring=True))
-        if ignoring.parting is None:
+    def _explain_by_tolerance(self, header: CheckedHeader, incarnations: Incarnations) -> Rehearsal | None:
+        """Return a rehearsal that tolerates ignored messages or early timers, if the chain is then as recorded."""
+        agent = f"agent {header.agent_id}"
+        ignoring = rehearse(header, incarnations, tolerance=Tolerance(ignoring=True))
+        if ignoring.deviation is None:
             first = ignoring.ignored[0]
-            many = f"{len(ignoring.ignored)} messages" if len(ignoring.ignored) > 1 else "a message"
+            count = f"{len(ignoring.ignored)} messages" if len(ignoring.ignored) > 1 else "a message"
             self._remarks.append(
-                f"{who} did not react to {many}, the first on trace line {first.line} ({first.runs[0].handler}): in "
+                f"{agent} did not react to {count}, the first on trace line {first.line} ({first.runs[0].handler}): in "
                 "the scenario these messages are lost"
             )
             return ignoring
-        early = rehearse(header, lives, allowed=Allowed(early_timers=True))
-        if early.parting is None:
-            self._remarks.append(f"timers of {who} expired too early by its clock, as if the clock had been set back")
+        early = rehearse(header, incarnations, tolerance=Tolerance(early_timers=True))
+        if early.deviation is None:
+            self._remarks.append(f"timers of {agent} expired too early by its clock, as if the clock had been set back")
             return early
         return None
 
-    def _judged(self, agent_id: int) -> str | None:
-        """The first step of the agent that the step judge finds wrong, in its words; None if it finds none."""
+    def _first_finding(self, agent_id: int) -> str | None:
+        """Return the first deviation that the step judge finds in the trace, as a sentence. None if it finds none."""
         judgement = steps.check(Evidence(self._flight.exports, {agent_id: self._flight.traces[agent_id]}))
         return next((finding.detail for finding in judgement.evidence if finding.agent_id == agent_id), None)

@@ -1,10 +1,12 @@
-"""What reached an agent that left no trace in full, inferred: from its capture, and the events in its blocks.
+"""Infer the inputs of an agent without a complete trace, from its capture and the events in its blocks.
 
-The capture says what came and what was sent, and when. What was logged is in the blocks. When timers ended is not on
-record: as a rule when they should, but a program is late now and then, and then another input may have come first. So
-the reference core is given everything in the order of time, and has to send what the capture saw leave; where it does
-not, what came while a timer was late is tried before the timer, the last such choice first. A reconcile that begins
-without anything that led to it is the operator's.
+The capture contains the received and sent datagrams with their times. The blocks contain the logged events. The expiry
+of timers is not recorded. Usually a timer expires on time, but a process is sometimes late, and another input may then
+come first.
+
+Therefore the reference core plays all inputs in order of time, and must send the datagrams in the capture. If it does
+not, the search tries other orders: datagrams that arrived shortly after a timer's deadline are played before the timer,
+the last such choice first. A reconcile without a cause in the records is attributed to the operator.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,8 +14,16 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from harness.checker.steps.trace_header import CheckedHeader
-from harness.field.reconstruct._agent_inputs import Asked, Booted, Heard, Input, Logged, TimerEnded, What
-from harness.field.reconstruct._other_records import Captured, Seen, seconds_of
+from harness.field.reconstruct._agent_inputs import (
+    BootedFromDisk,
+    Cause,
+    DatagramReceived,
+    EventLogged,
+    Input,
+    ReconcileRequested,
+    TimerExpired,
+)
+from harness.field.reconstruct._other_records import AgentCapture, Sighting, seconds_of
 from harness.play.simulation.air import NEVER
 from ucp.agent import Agent
 from ucp.events import LoggableEvent
@@ -30,105 +40,115 @@ from ucp.store import StoredState
 from ucp.trace import HandlerRun
 
 MAX_TRIES = 400
-MAX_GIVEN = 200_000
-"""Inputs that are given in all tries: some seconds."""
-LATE_WALL_S = 0.1
-"""A timer that is later than that was not only late."""
-UNREAD_WALL_S = 0.005
-"""So long a datagram may wait in a socket."""
+MAX_INPUTS = 200_000
+"""Maximum number of inputs played in all tries together, some seconds of work."""
+MAX_LATE_WALL_S = 0.1
+"""Maximum delay of a timer. If it is later, the process was paused."""
+MAX_UNREAD_WALL_S = 0.005
+"""Maximum time that a datagram waits in a socket."""
 ROUNDING_S = 1e-3
-Still = tuple[float, float]
-"""From when to when."""
-MAX_STILLS = 10
+Pause = tuple[float, float]
+"""The start and the end of a pause of the process."""
+MAX_PAUSES = 10
 JUST_AFTER_S = 1e-6
-MAX_BIRTHS = 50
-TRIES_AT_BIRTH = 5
-ANSWERED = (BlockAddRequest, ChainContainQuery, ChainHashSuccessorQuery)
-"""What an agent answers, unless it reconciles."""
-SENT_AS_TIMERS_END = (BlockAddRequest, CommitBlock, ChainContainQuery, ChainHashSuccessorQuery, RequestForBlock)
-"""Mostly: a query may also come of what another agent has sent."""
+MAX_STARTS = 50
+TRIES_PER_START = 5
+ANSWERED_QUERIES = (BlockAddRequest, ChainContainQuery, ChainHashSuccessorQuery)
+"""Messages that an agent always answers, except during a reconcile."""
+SENT_ON_TIMER_EXPIRY = (BlockAddRequest, CommitBlock, ChainContainQuery, ChainHashSuccessorQuery, RequestForBlock)
+"""Messages that an agent usually sends when a timer expires. A received datagram can cause queries, too."""
 
 
 @dataclass
-class Inferred:
-    """The inputs of each life as far as they explain what was sent; `problem` says what they do not explain, if any."""
+class InferredInputs:
+    """The inputs of each incarnation that explain the sent datagrams. `problem` names the first unexplained one."""
 
-    lives: list[list[Input]] = field(default_factory=list)
+    incarnations: list[list[Input]] = field(default_factory=list)
     problem: str | None = None
 
     @property
     def explained(self) -> int:
-        """How many inputs there are."""
-        return sum(map(len, self.lives))
+        """The number of inputs."""
+        return sum(map(len, self.incarnations))
 
 
 @dataclass(frozen=True)
-class _Span:
-    """What is on record of one life: what came, what it sent, and what it logged when."""
+class _IncarnationRecord:
+    """The records of one incarnation: received datagrams, sent datagrams, and logged events with their times."""
 
-    came: Sequence[Seen]
-    left: Sequence[Seen]
-    logged: Sequence[tuple[float, LoggableEvent]]
+    received: Sequence[Sighting]
+    sent: Sequence[Sighting]
+    logged_events: Sequence[tuple[float, LoggableEvent]]
     is_last: bool
 
-    def since(self, at_s: float) -> "_Span":
-        """Of a life that began then."""
-        came = [seen for seen in self.came if seen.at_s >= at_s]
-        logged = [timed for timed in self.logged if timed[0] >= at_s]
-        return _Span(came, self.left, logged, self.is_last)
+    def since(self, at_s: float) -> "_IncarnationRecord":
+        """Return the records of an incarnation that began at `at_s`."""
+        received = [sighting for sighting in self.received if sighting.at_s >= at_s]
+        logged_events = [timed for timed in self.logged_events if timed[0] >= at_s]
+        return _IncarnationRecord(received, self.sent, logged_events, self.is_last)
 
 
 def infer(
-    header: CheckedHeader, captured: Captured, events: Sequence[LoggableEvent], tries: int = MAX_TRIES
-) -> Inferred:
-    """What reached the agent. `header` is what it was told."""
-    late_s = LATE_WALL_S * captured.speedup + ROUNDING_S
-    inferred = Inferred()
+    header: CheckedHeader, capture: AgentCapture, events: Sequence[LoggableEvent], tries: int = MAX_TRIES
+) -> InferredInputs:
+    """Infer the inputs of an agent. `header` has its mission and settings."""
+    late_s = MAX_LATE_WALL_S * capture.speedup + ROUNDING_S
+    inferred = InferredInputs()
     stored: StoredState | None = None
-    for span in _spans(captured, events):
+    for record in _incarnation_records(capture, events):
         if stored is None:
-            attempt = _best(header, span, late_s, None, tries)
+            attempt = _infer_incarnation(header, record, late_s, None, tries)
         else:
-            attempt = _born_again(header, span, late_s, stored, tries)
-        inferred.lives.append(attempt.inputs)
+            attempt = _infer_restarted(header, record, late_s, stored, tries)
+        inferred.incarnations.append(attempt.inputs)
         if attempt.problem is not None:
             inferred.problem = attempt.problem
             break
-        stored = attempt.left_on_disk()
+        stored = attempt.stored_at_end()
     return inferred
 
 
-def _spans(captured: Captured, events: Sequence[LoggableEvent]) -> Iterator[_Span]:
-    """The lives: an agent that starts anew counts its datagrams from 0 again."""
-    came = [seen for seen in captured.seen if not seen.leaving and seen.at_s >= 0]
-    left = [seen for seen in captured.seen if seen.leaving]
-    logged = [(seconds_of(event, captured), event) for event in events]
-    firsts = [0, *(n for n in range(1, len(left)) if left[n].sequence <= left[n - 1].sequence), len(left)]
+def _incarnation_records(capture: AgentCapture, events: Sequence[LoggableEvent]) -> Iterator[_IncarnationRecord]:
+    """Yield the records of each incarnation. A restarted agent numbers its datagrams from 0 again."""
+    received = [sighting for sighting in capture.sightings if not sighting.outbound and sighting.at_s >= 0]
+    sent = [sighting for sighting in capture.sightings if sighting.outbound]
+    logged_events = [(seconds_of(event, capture), event) for event in events]
+    firsts = [0, *(n for n in range(1, len(sent)) if sent[n].sequence <= sent[n - 1].sequence), len(sent)]
     from_s = 0.0
     for number, (first, end) in enumerate(pairwise(firsts)):
         is_last = number == len(firsts) - 2
-        until_s = NEVER if is_last else _last_seen(came, left[end - 1].at_s, left[end].at_s)
-        within = [seen for seen in came if from_s <= seen.at_s < until_s]
-        yield _Span(within, left[first:end], [timed for timed in logged if from_s <= timed[0] < until_s], is_last)
-        from_s = left[end - 1].at_s if end else 0.0  # it may have been born at any time since
+        until_s = NEVER if is_last else _last_seen(received, sent[end - 1].at_s, sent[end].at_s)
+        within = [sighting for sighting in received if from_s <= sighting.at_s < until_s]
+        yield _IncarnationRecord(
+            within, sent[first:end], [timed for timed in logged_events if from_s <= timed[0] < until_s], is_last
+        )
+        from_s = sent[end - 1].at_s if end else 0.0  # The next incarnation may have begun at any time after this.
 
 
-def _last_seen(came: Sequence[Seen], last_s: float, again_s: float) -> float:
-    """Until when it certainly was there: it would have answered the next question."""
-    later = (seen for seen in came if last_s < seen.at_s)
-    questions = (seen.at_s for seen in later if isinstance(decode(seen.datagram).message, ANSWERED))
-    return min(next(questions, again_s), again_s)
+def _last_seen(received: Sequence[Sighting], last_s: float, restart_s: float) -> float:
+    """Return a time until which the incarnation certainly existed. It would have answered the next query."""
+    later = (sighting for sighting in received if last_s < sighting.at_s)
+    questions = (sighting.at_s for sighting in later if isinstance(decode(sighting.datagram).message, ANSWERED_QUERIES))
+    return min(next(questions, restart_s), restart_s)
 
 
-def _born_again(header: CheckedHeader, span: _Span, late_s: float, stored: StoredState, tries: int) -> "_Attempt":
-    """A life that began some time before its first message; with what was on disk, or with nothing."""
-    first_s = span.left[0].at_s if span.left else NEVER
-    given = sorted({first_s, *(seen.at_s for seen in span.came), *(at_s for at_s, _ in span.logged)})
-    births = [at_s for at_s in given if at_s <= first_s][-MAX_BIRTHS:][::-1]
+def _infer_restarted(
+    header: CheckedHeader, record: _IncarnationRecord, late_s: float, stored: StoredState, tries: int
+) -> "_Attempt":
+    """Infer an incarnation that began some time before its first datagram, with the data on its disk or with
+    nothing.
+    """
+    first_s = record.sent[0].at_s if record.sent else NEVER
+    times = sorted(
+        {first_s, *(sighting.at_s for sighting in record.received), *(at_s for at_s, _ in record.logged_events)}
+    )
+    starts = [at_s for at_s in times if at_s <= first_s][-MAX_STARTS:][::-1]
     best: _Attempt | None = None
-    for birth_s in births:
+    for start_s in starts:
         for disk in (None, stored):
-            attempt = _best(header, span.since(birth_s), late_s, disk, min(tries, TRIES_AT_BIRTH), birth_s)
+            attempt = _infer_incarnation(
+                header, record.since(start_s), late_s, disk, min(tries, TRIES_PER_START), start_s
+            )
             if attempt.problem is None:
                 return attempt
             if best is None or len(attempt.inputs) > len(best.inputs):
@@ -137,36 +157,36 @@ def _born_again(header: CheckedHeader, span: _Span, late_s: float, stored: Store
     return best
 
 
-def _best(
+def _infer_incarnation(
     header: CheckedHeader,
-    span: _Span,
+    record: _IncarnationRecord,
     late_s: float,
     stored: StoredState | None,
     tries: int,
-    birth_s: float = 0.0,
+    start_s: float = 0.0,
 ) -> "_Attempt":
-    """The order of things that explains the most."""
+    """Return the attempt whose order of inputs explains the most datagrams."""
     deferred: dict[int, int] = {}
-    stills: list[Still] = []
+    pauses: list[Pause] = []
     best: _Attempt | None = None
-    given = 0
+    inputs_tried = 0
     for _ in range(tries):
-        attempt = _Attempt(header, span, late_s, deferred, stored, birth_s, stills)
+        attempt = _Attempt(header, record, late_s, deferred, stored, start_s, pauses)
         attempt.run()
-        if attempt.stood_still is not None and len(stills) < MAX_STILLS:
-            stills.append(attempt.stood_still)
+        if attempt.pause is not None and len(pauses) < MAX_PAUSES:
+            pauses.append(attempt.pause)
             continue
         if best is None or attempt.problem is None or len(attempt.inputs) > len(best.inputs):
             best = attempt
-        given += len(attempt.inputs)
-        if attempt.problem is None or given > MAX_GIVEN or not _try_another(deferred, attempt.choices):
+        inputs_tried += len(attempt.inputs)
+        if attempt.problem is None or inputs_tried > MAX_INPUTS or not _next_combination(deferred, attempt.choices):
             break
     assert best is not None, "something was tried"
     return best
 
 
-def _try_another(deferred: dict[int, int], choices: Sequence[int]) -> bool:
-    """Let the last timer end elsewhere of which not all has been tried; False if there is none left."""
+def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
+    """Choose the next untried order, by changing the last timer that has one. Returns False if there is none."""
     for place in range(len(choices) - 1, -1, -1):
         if deferred.get(place, 0) < choices[place]:
             deferred[place] = deferred.get(place, 0) + 1
@@ -177,169 +197,183 @@ def _try_another(deferred: dict[int, int], choices: Sequence[int]) -> bool:
 
 
 class _Attempt:
-    """One way in which a life may have been. `deferred`: how far from the likely order timers end, by their number."""
+    """One possible course of an incarnation.
+
+    `deferred` maps timers, by number, to their deviation from the likely order.
+    """
 
     def __init__(
         self,
         header: CheckedHeader,
-        span: _Span,
+        record: _IncarnationRecord,
         late_s: float,
         deferred: dict[int, int],
         stored: StoredState | None,
-        birth_s: float,
-        stills: Sequence[Still],
+        start_s: float,
+        pauses: Sequence[Pause],
     ) -> None:
         self.inputs: list[Input] = []
         self.problem: str | None = None
         self.choices: list[int] = []
-        """For each timer how many other orders there are."""
+        """Number of other possible orders for each timer."""
         self._header = header
         self._agent = _agent(header)
-        self.stood_still: Still | None = None
-        """When it cannot have been at work, for it sent nothing and had something to send."""
-        self._stills = stills
-        self._given: list[tuple[float, What]] = [(self._awake(seen.at_s), Heard(seen.datagram)) for seen in span.came]
-        self._given += [(self._awake(at_s, 2 * JUST_AFTER_S), Logged(event)) for at_s, event in span.logged]
-        self._given.sort(key=lambda timed: timed[0])
-        self._left = span.left
-        self._is_last = span.is_last
+        self.pause: Pause | None = None
+        """A pause that the attempt found: the agent had something to send, but sent nothing for a long time."""
+        self._pauses = pauses
+        self._inputs_to_play: list[tuple[float, Cause]] = [
+            (self._end_of_pause(sighting.at_s), DatagramReceived(sighting.datagram)) for sighting in record.received
+        ]
+        self._inputs_to_play += [
+            (self._end_of_pause(at_s, 2 * JUST_AFTER_S), EventLogged(event)) for at_s, event in record.logged_events
+        ]
+        self._inputs_to_play.sort(key=lambda timed: timed[0])
+        self._sent = record.sent
+        self._is_last = record.is_last
         self._late_s = late_s
-        self._unread_s = late_s * UNREAD_WALL_S / LATE_WALL_S
+        self._unread_s = late_s * MAX_UNREAD_WALL_S / MAX_LATE_WALL_S
         self._deferred = deferred
         self._stored = stored
         self._explained = 0
-        self._over = False
-        """It did no more: it has died."""
-        self._now = birth_s
+        self._ended = False
+        """True if the incarnation has ended, because no further datagram was sent."""
+        self._now = start_s
 
-    def left_on_disk(self) -> StoredState:
-        """What it held at the end."""
+    def stored_at_end(self) -> StoredState:
+        """Return the data on the agent's disk at the end."""
         agent = _agent(self._header)
-        for given in self.inputs:
-            _feed(agent, given.at_s, given.what, self._stored)
+        for played in self.inputs:
+            _feed(agent, played.at_s, played.cause, self._stored)
         return StoredState.of(agent.state)
 
     def run(self) -> None:
         position = 0
         if self._stored is not None:
-            self._give(self._now, Booted())
-        while self.problem is None and not self._over:
-            next_s = self._given[position][0] if position < len(self._given) else NEVER
+            self._play(self._now, BootedFromDisk())
+        while self.problem is None and not self._ended:
+            next_s = self._inputs_to_play[position][0] if position < len(self._inputs_to_play) else NEVER
             deadline = self._next_timer()
-            if self._operator_asks(min(next_s, NEVER if deadline is None else deadline)):
+            if self._begin_requested_reconcile(min(next_s, NEVER if deadline is None else deadline)):
                 continue
             if deadline is not None and deadline <= next_s:
-                if next_s == NEVER and self._explained == len(self._left):
+                if next_s == NEVER and self._explained == len(self._sent):
                     return
-                position = self._end_timer(deadline, position)
+                position = self._expire_timer(deadline, position)
             elif next_s == NEVER:
                 break
             else:
-                self._give(*self._given[position])
+                self._play(*self._inputs_to_play[position])
                 position += 1
-        if self.problem is None and not self._over and self._explained < len(self._left):
-            self._fail(self._left[self._explained])
+        if self.problem is None and not self._ended and self._explained < len(self._sent):
+            self._fail(self._sent[self._explained])
 
-    def _awake(self, at_s: float, after_s: float = 0.0) -> float:
-        """When it was at work again, if it stood still then: what its socket holds comes first, timers, then events."""
-        return next((until_s + after_s for from_s, until_s in self._stills if from_s <= at_s < until_s), at_s)
+    def _end_of_pause(self, at_s: float, after_s: float = 0.0) -> float:
+        """Return the time at which an input is handled, if the process was paused when it arrived.
+
+        After a pause, the process first reads its socket, then it handles timers, then events.
+        """
+        return next((until_s + after_s for from_s, until_s in self._pauses if from_s <= at_s < until_s), at_s)
 
     def _next_timer(self) -> float | None:
         deadline = self._agent.next_timer()
-        return None if deadline is None else self._awake(deadline, JUST_AFTER_S)
+        return None if deadline is None else self._end_of_pause(deadline, JUST_AFTER_S)
 
-    def _operator_asks(self, next_s: float) -> bool:
-        """Whether a reconcile begins before anything else comes: then the operator has asked for it."""
-        if self._explained == len(self._left) or self._agent.state.reconcile_in_progress:
+    def _begin_requested_reconcile(self, next_s: float) -> bool:
+        """Return whether a reconcile begins before the next input. The operator must have requested it."""
+        if self._explained == len(self._sent) or self._agent.state.reconcile_in_progress:
             return False
-        seen = self._left[self._explained]
-        if seen.at_s >= next_s or not isinstance(decode(seen.datagram).message, ChainContainQuery):
+        sighting = self._sent[self._explained]
+        if sighting.at_s >= next_s or not isinstance(decode(sighting.datagram).message, ChainContainQuery):
             return False
-        self._give(seen.at_s, Asked())
+        self._play(sighting.at_s, ReconcileRequested())
         return True
 
-    def _end_timer(self, deadline: float, position: int) -> int:
-        """End the timer, after those inputs that came before; which input is next then."""
-        waits, least, most = self._order(deadline, position)
+    def _expire_timer(self, deadline: float, position: int) -> int:
+        """Expire the timer, after the inputs that came before. Returns the position of the next input."""
+        count, fewest, most = self._inputs_before_timer(deadline, position)
         place = len(self.choices)
-        self.choices.append(most - least)
+        self.choices.append(most - fewest)
         tried = self._deferred.get(place, 0)
-        waits = waits - tried if waits == most else waits + tried
-        for _ in range(waits):
+        count = count - tried if count == most else count + tried
+        for _ in range(count):
             if self.problem is None and self._next_timer() == deadline:
-                self._give(*self._given[position])
+                self._play(*self._inputs_to_play[position])
                 position += 1
         if self.problem is None and self._next_timer() == deadline:
             soonest = self._agent.next_timer()
             timer = next(timer for timer in self._agent.state.timers if timer.deadline == soonest)
-            self._give(max(deadline, self._now), TimerEnded(timer.name))
+            self._play(max(deadline, self._now), TimerExpired(timer.name))
         return position
 
-    def _order(self, deadline: float, position: int) -> tuple[int, int, int]:
-        """How many of the next inputs probably came before the timer ended, and how few or many may have.
+    def _inputs_before_timer(self, deadline: float, position: int) -> tuple[int, int, int]:
+        """Return the likely number of inputs before the expiry of the timer, and the fewest and most possible ones.
 
-        What was sent as it ended says when that was; what came just before that may still have waited in the socket.
+        The datagrams that the expiry caused show its time. Datagrams that arrived directly before may have waited in
+        the socket.
         """
         latest_s = deadline + self._late_s
-        for seen in self._left[self._explained :]:
-            if seen.at_s > latest_s:
+        for sighting in self._sent[self._explained :]:
+            if sighting.at_s > latest_s:
                 break
-            if seen.at_s >= deadline - ROUNDING_S and type(decode(seen.datagram).message) in SENT_AS_TIMERS_END:
-                most = self._before(position, seen.at_s)
-                return most, self._before(position, seen.at_s - self._unread_s), most
-        return 0, 0, self._before(position, latest_s)
+            if (
+                sighting.at_s >= deadline - ROUNDING_S
+                and type(decode(sighting.datagram).message) in SENT_ON_TIMER_EXPIRY
+            ):
+                most = self._count_before(position, sighting.at_s)
+                return most, self._count_before(position, sighting.at_s - self._unread_s), most
+        return 0, 0, self._count_before(position, latest_s)
 
-    def _before(self, position: int, at_s: float) -> int:
+    def _count_before(self, position: int, at_s: float) -> int:
         count = 0
-        while position + count < len(self._given) and self._given[position + count][0] < at_s:
+        while position + count < len(self._inputs_to_play) and self._inputs_to_play[position + count][0] < at_s:
             count += 1
         return count
 
-    def _give(self, at_s: float, what: What) -> None:
+    def _play(self, at_s: float, cause: Cause) -> None:
         agent = self._agent
         self._now = now = max(self._now, at_s)
-        if self._explained < len(self._left) and self._left[self._explained].at_s + self._late_s < at_s:
-            self._fail(self._left[self._explained])
+        if self._explained < len(self._sent) and self._sent[self._explained].at_s + self._late_s < at_s:
+            self._fail(self._sent[self._explained])
             return
-        _feed(agent, now, what, self._stored)
+        _feed(agent, now, cause, self._stored)
         runs = [entry for entry in agent.trace() if isinstance(entry, HandlerRun)]
         for sequence, message in agent.messages_to_send():
-            if self._explained == len(self._left) and not self._is_last:
-                self._over = True
+            if self._explained == len(self._sent) and not self._is_last:
+                self._ended = True
                 return
-            if self._explained == len(self._left) or self._left[self._explained].datagram != encode(
+            if self._explained == len(self._sent) or self._sent[self._explained].datagram != encode(
                 agent.agent_id, sequence, message
             ):
                 self.problem = f"should have sent a {message.NAME} by t={now:.3f} s, but its capture has none"
-                self._look_whether_still(at_s)
+                self._detect_pause(at_s)
                 return
             self._explained += 1
         if runs:
-            self.inputs.append(Input(now, 0, what, runs))
+            self.inputs.append(Input(now, 0, cause, runs))
 
-    def _look_whether_still(self, since_s: float) -> None:
-        """Nothing was sent when something should have been: until something is."""
-        until_s = self._left[self._explained].at_s if self._explained < len(self._left) else NEVER
+    def _detect_pause(self, since_s: float) -> None:
+        """Note a pause if the agent sent nothing for a long time although it should have."""
+        until_s = self._sent[self._explained].at_s if self._explained < len(self._sent) else NEVER
         if since_s + self._late_s < until_s < NEVER:
-            self.stood_still = since_s, until_s
+            self.pause = since_s, until_s
 
-    def _fail(self, seen: Seen) -> None:
-        message = decode(seen.datagram).message
-        self.problem = f"sent a {message.NAME} at t={seen.at_s:.3f} s, which no recorded input explains"
+    def _fail(self, sighting: Sighting) -> None:
+        message = decode(sighting.datagram).message
+        self.problem = f"sent a {message.NAME} at t={sighting.at_s:.3f} s, which no recorded input explains"
 
 
-def _feed(agent: Agent, now: float, what: What, stored: StoredState | None) -> None:
-    match what:
-        case Heard(datagram):
+def _feed(agent: Agent, now: float, cause: Cause, stored: StoredState | None) -> None:
+    match cause:
+        case DatagramReceived(datagram):
             agent.receive_datagram(datagram, now)
-        case Logged(event):
+        case EventLogged(event):
             agent.add_event(event, now)
-        case Asked():
+        case ReconcileRequested():
             agent.begin_reconcile(now)
-        case TimerEnded(name):
+        case TimerExpired(name):
             timer = next(timer for timer in agent.state.timers if timer.name == name)
             agent.end_timer(timer, max(now, timer.deadline or now))
-        case Booted():
+        case BootedFromDisk():
             assert stored is not None, "it boots from something"
             agent.boot(stored, now)
 

@@ -1,6 +1,7 @@
-"""The mission and settings of a flight: recorded, or inferred from what agents sent.
+"""The mission and settings of a flight: recorded, or inferred from the sent messages.
 
-Some show in messages: a vote that names a chain, and how full blocks are. Of the others each is tried by itself.
+Some settings are visible in messages and blocks: whether votes name a chain, and the size of a full block. For the
+others, each value is tried alone, and the one that explains the most messages is assumed.
 """
 
 import base64
@@ -15,74 +16,74 @@ from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderEr
 from harness.errors import FieldError
 from harness.field.ingest import Flight
 from harness.field.reconstruct._inferring import infer
-from harness.field.reconstruct._other_records import Captured, Elsewhere
+from harness.field.reconstruct._other_records import AgentCapture, OtherRecords
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.events import MalformedEventsError, decode_events
 from ucp.messages import BlockAddResponse, decode
 from ucp.settings import CHOICES, Settings
 
 TRIES = 10
-"""Orders of what one agent received that are tried with one reading."""
+"""Number of input orders that are tried for one agent and one combination of settings."""
 
 
-def likely(
-    elsewhere: Elsewhere, captured: dict[int, Captured], header_of: Callable[[int, Settings], CheckedHeader]
+def likely_settings(
+    other_records: OtherRecords, captures: dict[int, AgentCapture], header_of: Callable[[int, Settings], CheckedHeader]
 ) -> Settings:
-    """The settings that explain the most of what the captured agents sent."""
-    events = {agent_id: elsewhere.events(agent_id) for agent_id in captured}
+    """Return the settings that explain the most datagrams of the captured agents."""
+    events = {agent_id: other_records.events(agent_id) for agent_id in captures}
 
     def explained(settings: Settings) -> tuple[int, int]:
-        """How many agents, and how many of their inputs."""
+        """Return the number of completely explained agents, and the number of explained inputs."""
         inferred = [
-            infer(header_of(agent_id, settings), seen, events[agent_id], tries=TRIES)
-            for agent_id, seen in captured.items()
+            infer(header_of(agent_id, settings), capture, events[agent_id], tries=TRIES)
+            for agent_id, capture in captures.items()
         ]
         return sum(one.problem is None for one in inferred), sum(one.explained for one in inferred)
 
-    seen = _seen(elsewhere)
-    best, most = seen, explained(seen)
-    for settings in _others(seen):
-        if most[0] == len(captured):
+    visible = _visible_settings(other_records)
+    best, most = visible, explained(visible)
+    for settings in _alternatives(visible):
+        if most[0] == len(captures):
             break
-        if (more := explained(settings)) > most:
-            best, most = settings, more
+        if (score := explained(settings)) > most:
+            best, most = settings, score
     return best
 
 
 SHOWN_BY_VOTES = "vote_names_chain"
-"""The setting that `_seen` reads from the votes."""
+"""The setting that `_visible_settings` reads from the votes."""
 
 
-def _others(seen: Settings) -> Iterator[Settings]:
+def _alternatives(visible: Settings) -> Iterator[Settings]:
     for name, choice in reversed(CHOICES.items()):
         if choice.is_reading and name != SHOWN_BY_VOTES:
             for value in choice.values[1:]:
-                yield replace(seen, **{name: value})  # type: ignore[arg-type]  # each setting takes its own values
-    yield replace(seen, finalize_gap_s=0.0)
+                yield replace(visible, **{name: value})  # type: ignore[arg-type]  # each setting takes its own values
+    yield replace(visible, finalize_gap_s=0.0)
 
 
-def _seen(elsewhere: Elsewhere) -> Settings:
-    """What messages and blocks show."""
-    votes = (decode(datagram).message for datagram in elsewhere.all_datagrams())
+def _visible_settings(other_records: OtherRecords) -> Settings:
+    """Return the settings that are visible in messages and blocks."""
+    votes = (decode(datagram).message for datagram in other_records.all_datagrams())
     names_chain = any(isinstance(vote, BlockAddResponse) and vote.chain_hash is not None for vote in votes)
-    usual = Settings()
+    default = Settings()
     return replace(
-        usual,
+        default,
         vote_names_chain=names_chain,
-        max_block_bytes=_fullness(elsewhere.event_data(), usual.max_event_bytes),
+        max_block_bytes=_max_block_bytes(other_records.event_data(), default.max_event_bytes),
     )
 
 
-def _fullness(blocks: Iterable[bytes], largest: int) -> int:
-    """max_block_bytes: a block is full as soon as another event of the largest size might not fit."""
+def _max_block_bytes(blocks: Iterable[bytes], largest: int) -> int:
+    """Return the setting max_block_bytes. A block is full as soon as another event of maximum size might not fit."""
     least, most = largest, MAX_EVENT_DATA_BYTES
     for event_data in blocks:
         last = _last_event_bytes(event_data)
         if last is not None:
             least = max(least, len(event_data) - last + largest + 1)
             most = min(most, len(event_data) + largest)
-    usual = Settings().max_block_bytes
-    return usual if least <= usual <= most or least > most else most
+    default = Settings().max_block_bytes
+    return default if least <= default <= most or least > most else most
 
 
 def _last_event_bytes(event_data: bytes) -> int | None:
@@ -93,12 +94,12 @@ def _last_event_bytes(event_data: bytes) -> int | None:
     return events[-1].encoded_bytes if events else None
 
 
-NOTHING = "the records hold no inputs of agents: add traces (*.trace.jsonl), or captures together with exports"
+NO_INPUTS = "the records hold no inputs of agents: add traces (*.trace.jsonl), or captures together with exports"
 
 
 @dataclass(frozen=True)
 class Mission:
-    """What all agents of a flight were told."""
+    """The configuration that all agents of a flight shared."""
 
     name: str
     roster: tuple[int, ...]
@@ -106,10 +107,13 @@ class Mission:
     settings: Settings
 
 
-def told(
-    flight: Flight, elsewhere: Elsewhere, name: str, remarks: list[str]
+def known_mission(
+    flight: Flight, other_records: OtherRecords, name: str, remarks: list[str]
 ) -> tuple[Mission, dict[int, CheckedHeader]]:
-    """The mission, and what each agent was told of which enough is on record. Raises FieldError if of none."""
+    """Return the mission, and the header of each agent with enough records.
+
+    Raises FieldError if no agent has enough.
+    """
     initial_data = _initial_data(flight)
     headers: dict[int, CheckedHeader] = {}
     for agent_id, trace in sorted(flight.traces.items()):
@@ -117,43 +121,43 @@ def told(
         if header.initial_data is None and initial_data is not None:
             header = header.model_copy(update={"initial_data": initial_data})
         try:
-            headers[agent_id] = elsewhere.with_seal(checked(header))
+            headers[agent_id] = other_records.with_seal(checked(header))
         except ImpossibleHeaderError as error:
             remarks.append(f"agent {agent_id}: {error}")
     roster = {*flight.roster, *flight.agents, *(member for header in headers.values() for member in header.roster)}
-    roster |= {*elsewhere.senders()}
+    roster |= {*other_records.senders()}
     common = Counter(header.settings for header in headers.values()).most_common(1)
-    untraced = sorted({*elsewhere.captured} & {*flight.exports} - {*headers})
+    untraced = sorted({*other_records.captures} & {*flight.exports} - {*headers})
     if untraced and initial_data is not None:
-        whole = partial(_assumed, elsewhere, roster=roster, initial_data=initial_data)
-        captured = {agent_id: elsewhere.captured[agent_id] for agent_id in untraced}
-        settings = common[0][0] if common else likely(elsewhere, captured, whole)
-        headers |= {agent_id: whole(agent_id, settings) for agent_id in untraced}
-        whose = "as the others'" if common else f"the best fit to the records: {_in_words(settings)}"
-        remarks.append(f"settings of {agents(untraced)} are not recorded; assumed: {whose}")
+        header_of_agent = partial(_assumed, other_records, roster=roster, initial_data=initial_data)
+        captures = {agent_id: other_records.captures[agent_id] for agent_id in untraced}
+        settings = common[0][0] if common else likely_settings(other_records, captures, header_of_agent)
+        headers |= {agent_id: header_of_agent(agent_id, settings) for agent_id in untraced}
+        source = "as the others'" if common else f"the best fit to the records: {_in_words(settings)}"
+        remarks.append(f"settings of {agents(untraced)} are not recorded; assumed: {source}")
     settings = Counter(header.settings for header in headers.values()).most_common(1)[0][0] if headers else Settings()
     if not headers:
-        raise FieldError("; ".join([*elsewhere.problems[:1], NOTHING]))
-    of_all = Counter(header.initial_data for header in headers.values()).most_common(1)[0][0]
-    data = of_all if initial_data is None else base64.b64decode(initial_data)
+        raise FieldError("; ".join([*other_records.problems[:1], NO_INPUTS]))
+    common_initial_data = Counter(header.initial_data for header in headers.values()).most_common(1)[0][0]
+    data = common_initial_data if initial_data is None else base64.b64decode(initial_data)
     return Mission(name, tuple(sorted(roster)), data, settings), headers
 
 
 def _in_words(settings: Settings) -> str:
-    usual = asdict(Settings())
-    unusual = [f"{name} {value}" for name, value in asdict(settings).items() if value != usual[name]]
-    return ", ".join(unusual) or "the thesis's"
+    default = asdict(Settings())
+    changed = [f"{name} {value}" for name, value in asdict(settings).items() if value != default[name]]
+    return ", ".join(changed) or "the thesis's"
 
 
 def _initial_data(flight: Flight) -> str | None:
-    """In base64."""
+    """Return the initial data in base64."""
     if flight.initial_data is not None:
         return base64.b64encode(flight.initial_data).decode("ascii")
     return next((export.inception.block_data for export in flight.exports.values()), None)
 
 
 def _assumed(
-    elsewhere: Elsewhere, agent_id: int, settings: Settings, *, roster: Iterable[int], initial_data: str
+    other_records: OtherRecords, agent_id: int, settings: Settings, *, roster: Iterable[int], initial_data: str
 ) -> CheckedHeader:
     header = Header(agent_id=agent_id, roster=sorted(roster), settings={}, clock={}, initial_data=initial_data)
-    return elsewhere.with_seal(replace(checked(header), settings=settings))
+    return other_records.with_seal(replace(checked(header), settings=settings))

@@ -1,4 +1,4 @@
-"""What a trace does not have and others have on record: datagrams in captures and traces, events in blocks."""
+"""Datagrams and events that other records contain: captures, other agents' traces, and exported blocks."""
 
 import base64
 from collections import defaultdict
@@ -35,94 +35,101 @@ NANOSECONDS = 1_000_000_000
 
 
 @dataclass(slots=True)
-class Seen:
-    """A datagram at a vehicle's interface, at seconds by the vehicle's clock, from its mission second 0 on."""
+class Sighting:
+    """A datagram at the network interface of a vehicle. `at_s` is the mission second on the vehicle's clock."""
 
     at_s: float
-    leaving: bool
+    outbound: bool
     sender: int
     sequence: int
     datagram: bytes
 
 
 @dataclass
-class Captured:
-    """What a vehicle's capture saw, in order. Its mission second 0 is `epoch_us`."""
+class AgentCapture:
+    """The datagrams in the capture of a vehicle, in order. `epoch_us` is its mission second 0."""
 
     epoch_us: float
     speedup: float
-    seen: list[Seen] = field(default_factory=list)
-    closed: int = 0
-    """Datagrams that are sealed, and that nobody here can open."""
+    sightings: list[Sighting] = field(default_factory=list)
+    unreadable: int = 0
+    """Number of sealed datagrams that no given key decrypts."""
 
 
-class Elsewhere:
-    """All that the files of a flight say of datagrams and blocks."""
+class OtherRecords:
+    """All datagrams and blocks in the files of a flight."""
 
     def __init__(self, flight: Flight, opener: "Opener | None" = None, depot: "Depot | None" = None) -> None:
-        """Of a secured mission `opener` opens captures, and `depot` what was sealed to it."""
+        """Read the files. In a secured mission, `opener` decrypts captures, and `depot` decrypts event data."""
         self.sealed: dict[int, dict[bytes, bytes]] = defaultdict(dict)
-        """What each agent sealed, by the event that filled the block, encoded."""
+        """The sealed data of each agent's blocks. The key is the encoded event that filled the block."""
         self._depot = depot
-        self.captured: dict[int, Captured] = {}
+        self.captures: dict[int, AgentCapture] = {}
         self.problems: list[str] = []
         self._exports = flight.exports
         self._datagrams: dict[tuple[int, int], dict[bytes, None]] = defaultdict(dict)
         self._blocks: dict[str, Block] = {}
         for agent_id, path in sorted(flight.captures.items()):
             try:
-                self.captured[agent_id] = _read(path, agent_id, flight.epoch_us, opener)
+                self.captures[agent_id] = _read(path, agent_id, flight.epoch_us, opener)
             except CaptureError as error:
                 self.problems.append(str(error))
-        closed = {agent_id: captured.closed for agent_id, captured in self.captured.items() if captured.closed}
-        self.captured = {agent_id: captured for agent_id, captured in self.captured.items() if captured.seen}
-        if closed:
-            why = "are not read without --bundle" if opener is None else "are not authentic according to that bundle"
-            self.problems.append(f"{sum(closed.values())} datagrams in captures of {agents([*closed])} {why}")
-        for captured in self.captured.values():
-            for seen in captured.seen:
-                self._datagrams[seen.sender, seen.sequence][seen.datagram] = None
+        unreadable = {agent_id: capture.unreadable for agent_id, capture in self.captures.items() if capture.unreadable}
+        self.captures = {agent_id: capture for agent_id, capture in self.captures.items() if capture.sightings}
+        if unreadable:
+            reason = "are not read without --bundle" if opener is None else "are not authentic according to that bundle"
+            self.problems.append(
+                f"{sum(unreadable.values())} datagrams in captures of {agents([*unreadable])} {reason}"
+            )
+        for capture in self.captures.values():
+            for sighting in capture.sightings:
+                self._datagrams[sighting.sender, sighting.sequence][sighting.datagram] = None
         for agent_id, trace in flight.traces.items():
             for sequence, datagram in _sent(trace):
                 self._datagrams[agent_id, sequence][datagram] = None
             self.sealed[agent_id].update(_seals(trace))
-        self._learn_blocks(flight.exports.values())
-        self._opened = {block_hash: self._open(block) for block_hash, block in self._blocks.items()}
+        self._add_blocks(flight.exports.values())
+        self._event_data = {block_hash: self._open(block) for block_hash, block in self._blocks.items()}
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
-        """What the sender sent with this number; several if it started anew, or was imitated."""
+        """Return the datagrams of a sender with this sequence number.
+
+        Several if it restarted, or if an attacker imitated it.
+        """
         return [*self._datagrams.get((sender, sequence), ())]
 
     def senders(self) -> set[int]:
-        """Whose datagrams there are."""
+        """Return the IDs of all senders."""
         return {sender for sender, _ in self._datagrams}
 
     def all_datagrams(self) -> Iterator[bytes]:
-        """All that there are, each once."""
+        """Yield each datagram once."""
         for datagrams in self._datagrams.values():
             yield from datagrams
 
     def event_data(self) -> list[bytes]:
-        """The data of all blocks that are known, opened if it is sealed and the depot's key is here."""
-        return [*self._opened.values()]
+        """Return the event data of all known blocks, decrypted if the depot's key is given."""
+        return [*self._event_data.values()]
 
     def with_seal(self, header: CheckedHeader) -> CheckedHeader:
-        """What the agent was told, and how it sealed, if its mission does."""
+        """Return the header with the sealed data of the agent, if its mission seals event data."""
         if sealed_to(header.initial_data) is None:
             return header
-        most = min(header.settings.max_block_bytes, MAX_EVENT_DATA_BYTES - SEAL_BYTES)
+        max_block_bytes = min(header.settings.max_block_bytes, MAX_EVENT_DATA_BYTES - SEAL_BYTES)
         settings = replace(
-            header.settings, max_block_bytes=most, max_event_bytes=min(most, header.settings.max_event_bytes)
+            header.settings,
+            max_block_bytes=max_block_bytes,
+            max_event_bytes=min(max_block_bytes, header.settings.max_event_bytes),
         )
         return replace(header, settings=settings, seal=SealsOnRecord(self.sealed[header.agent_id]))
 
     def events(self, agent_id: int) -> list[LoggableEvent]:
-        """The events of an agent as far as they are known, in order: those of its blocks, and of the one it builds."""
+        """Return the known events of an agent in order: those of its blocks, and those of its current block."""
         export = self._exports.get(agent_id)
         own = [block for block in self._blocks.values() if block.agent_id == agent_id]
-        data = [self._opened[block.block_hash.hex()] for block in sorted(own, key=lambda block: block.timestamp_us)]
+        data = [self._event_data[block.block_hash.hex()] for block in sorted(own, key=lambda block: block.timestamp_us)]
         if export is not None:
-            known = [self._opened[block] for block in export.completed if block in self._opened]
+            known = [self._event_data[block] for block in export.completed if block in self._event_data]
             data = known if len(known) == len(export.completed) >= len(own) else data
             data.append(base64.b64decode(export.current_block.event_data))
         events: list[LoggableEvent] = []
@@ -130,12 +137,12 @@ class Elsewhere:
             try:
                 events += decode_events(event_data)
             except MalformedEventsError:
-                why = f"cannot be told apart{self._why_closed}"
-                self.problems.append(f"agent {agent_id}: the events of a block {why}")
+                reason = f"cannot be told apart{self._reason_unreadable}"
+                self.problems.append(f"agent {agent_id}: the events of a block {reason}")
         return events
 
     def _open(self, block: Block) -> bytes:
-        """The events of a block; as they are if they are not sealed, or cannot be opened."""
+        """Return the event data of a block, decrypted if possible."""
         if self._depot is None:
             return block.event_data
         from ucp.secure.sealing import NotOpenedError
@@ -148,18 +155,18 @@ class Elsewhere:
         return events
 
     @property
-    def _why_closed(self) -> str:
-        """Why event data may be no events, if the mission seals it."""
+    def _reason_unreadable(self) -> str:
+        """The reason why sealed event data cannot be split into events. "" if the mission does not seal."""
         exports = self._exports.values()
         if not any(sealed_to(base64.b64decode(export.inception.block_data)) for export in exports):
             return ""
         return ": they are sealed, and --depot-key opens them" if self._depot is None else ", or are not of that depot"
 
-    def _learn_blocks(self, exports: Iterable[Export]) -> None:
+    def _add_blocks(self, exports: Iterable[Export]) -> None:
         for export in exports:
             for block in export.blocks():
-                made = Block(block.agent_id, block.timestamp_us, block.event_bytes)
-                self._blocks[made.block_hash.hex()] = made
+                block_of_export = Block(block.agent_id, block.timestamp_us, block.event_bytes)
+                self._blocks[block_of_export.block_hash.hex()] = block_of_export
         for datagrams in self._datagrams.values():
             for datagram in datagrams:
                 message = decode(datagram).message
@@ -168,7 +175,7 @@ class Elsewhere:
 
 
 def _seals(trace: Trace) -> Iterator[tuple[bytes, bytes]]:
-    """What the agent sealed, by the event that filled the block."""
+    """Yield each event that filled a block, with the sealed data of the block."""
     for run in trace.runs:
         if (sealed := sealed_of(run.sealed)) is not None and run.input is not None:
             with suppress(ValueError, MalformedEventsError):
@@ -186,17 +193,17 @@ def _sent(trace: Trace) -> Iterator[tuple[int, bytes]]:
                 yield sent.seq, base64.b64decode(sent.datagram.text)
 
 
-def _read(path: Path, agent_id: int, epoch_us: int | None, opener: "Opener | None") -> Captured:
-    """Raises CaptureError."""
-    glance = Capture(0, path)
-    glance.read({}, most_frames=1)
+def _read(path: Path, agent_id: int, epoch_us: int | None, opener: "Opener | None") -> AgentCapture:
+    """Read the capture of an agent. Raises CaptureError."""
+    capture_file = Capture(0, path)
+    capture_file.read({}, most_frames=1)
     frames = [*CaptureFile(path)]
-    if glance.comment is not None:
-        captured = Captured(float(glance.comment.epoch_us), glance.comment.speedup)
+    if capture_file.comment is not None:
+        capture = AgentCapture(float(capture_file.comment.epoch_us), capture_file.comment.speedup)
     else:
         first_ns = min((frame.time_ns for frame in frames), default=0)
-        captured = Captured(float(epoch_us if epoch_us is not None else first_ns // 1000), 1.0)
-    epoch_ns = captured.epoch_us * 1000
+        capture = AgentCapture(float(epoch_us if epoch_us is not None else first_ns // 1000), 1.0)
+    epoch_ns = capture.epoch_us * 1000
     for frame in frames:
         try:
             datagram, direction = unwrap(frame)
@@ -207,16 +214,16 @@ def _read(path: Path, agent_id: int, epoch_us: int | None, opener: "Opener | Non
         except NotUcpError:
             continue
         except MalformedDatagramError:
-            captured.closed += is_sealed and datagram[3] != REVOCATION
+            capture.unreadable += is_sealed and datagram[3] != REVOCATION
             continue
-        leaving = direction == OUTBOUND or (not direction and sender == agent_id)
-        if leaving == (sender == agent_id):
-            at_s = (frame.time_ns - epoch_ns) / NANOSECONDS * captured.speedup
-            captured.seen.append(Seen(at_s, leaving, sender, sequence, datagram))
-    captured.seen.sort(key=lambda seen: seen.at_s)
-    return captured
+        outbound = direction == OUTBOUND or (not direction and sender == agent_id)
+        if outbound == (sender == agent_id):
+            at_s = (frame.time_ns - epoch_ns) / NANOSECONDS * capture.speedup
+            capture.sightings.append(Sighting(at_s, outbound, sender, sequence, datagram))
+    capture.sightings.sort(key=lambda sighting: sighting.at_s)
+    return capture
 
 
-def seconds_of(event: LoggableEvent, captured: Captured) -> float:
-    """When it was logged, by the clock of the capture: an event's time runs at the mission's speed."""
-    return (event.timestamp_us - captured.epoch_us) / MICROSECONDS
+def seconds_of(event: LoggableEvent, capture: AgentCapture) -> float:
+    """Return the mission second at which an event was logged, on the clock of the capture."""
+    return (event.timestamp_us - capture.epoch_us) / MICROSECONDS

@@ -1,8 +1,9 @@
-"""One agent alone: how far its record is what the protocol does with the inputs on it.
+"""Rehearse one agent alone, to find how far its record follows the protocol.
 
-Every input is given to the reference core, or to one with a known mistake, at the time on record. What comes of it has
-to be what is on record. So the first step of a wrong agent is found before any flight is played; and of a right one it
-is known which datagrams mattered, which timer was started when, and what was sent.
+The reference core, or a core with a known quirk, plays each recorded input at its recorded time. The resulting handler
+runs must equal the recorded ones. In this way the first deviation of an agent is known before a whole flight is
+simulated. The rehearsal also determines which datagrams had an effect, which timers were started, and which datagrams
+were sent.
 """
 
 import base64
@@ -14,7 +15,14 @@ from random import Random
 
 from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.trace_header import CheckedHeader
-from harness.field.reconstruct._agent_inputs import Asked, Booted, Heard, Input, Logged, TimerEnded
+from harness.field.reconstruct._agent_inputs import (
+    BootedFromDisk,
+    DatagramReceived,
+    EventLogged,
+    Input,
+    ReconcileRequested,
+    TimerExpired,
+)
 from harness.play.simulation.fate_script import LateTimers, Running
 from ucp.agent import Agent, why_not_handled
 from ucp.block import next_chain_hash
@@ -29,8 +37,12 @@ MAX_NAME = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Started:
-    """The `number`th timer that the agent has started; by the input at this place, for this long by its own clock."""
+class TimerStart:
+    """A timer that the agent started. `number` counts its timers, and `place` is the position of the input that started
+    it.
+
+    `duration_s` is measured on the agent's own clock.
+    """
 
     number: int
     place: int
@@ -38,58 +50,59 @@ class Started:
 
 
 @dataclass(frozen=True)
-class Parting:
-    """Where an agent's record is not what the protocol does."""
+class ProtocolDeviation:
+    """The place at which an agent's record deviates from the protocol."""
 
     line: int
     at_s: float
-    what: str
-    """Completes "agent 32 ..."."""
+    description: str
+    """A text that completes "agent 32 ..."."""
     algorithms: frozenset[int]
-    """What ran there, by the record."""
+    """The Algorithms of the recorded handler runs at this place."""
 
 
 @dataclass(slots=True)
-class Played:
-    """An input that the agent can be given again.
+class PlayedInput:
+    """An input that a simulated agent can receive again. `sent` are the datagrams that it caused.
 
-    `sent` are the datagrams that came of it. `matters` is false of a message that no handler does anything with. `ends`
-    is the timer that ended, if it is that; `stops` are those that run no longer, and did not end.
+    `matters` is false for a message that no handler uses. `expired` is the timer that expired, if the input is that.
+    `stopped` are timers that were stopped before their expiry.
     """
 
-    life: int
+    incarnation: int
     input: Input
     sent: list[bytes]
     matters: bool
-    ends: Started | None = None
-    stops: list[Started] = field(default_factory=list)
+    expired: TimerStart | None = None
+    stopped: list[TimerStart] = field(default_factory=list)
 
 
 @dataclass
 class Rehearsal:
-    """`played` are the inputs of all lives, up to where the record parts from the protocol; None is nowhere.
+    """The rehearsal of one agent. `played` are the inputs of all incarnations up to the deviation. `deviation` is None
+    without one.
 
-    `chain` has the block hashes of the chain that the agent then held.
-    `pending` are the timers that ran at the end of each life.
+    `chain` has the block hashes of the agent's chain at that point. `running_at_end` has the timers that ran at the end
+    of each incarnation.
     """
 
     agent_id: int
     quirks: Quirks
-    played: list[Played] = field(default_factory=list)
-    parting: Parting | None = None
+    played: list[PlayedInput] = field(default_factory=list)
+    deviation: ProtocolDeviation | None = None
     chain: list[str] = field(default_factory=list)
-    pending: list[list[Started]] = field(default_factory=list)
-    broken_off: bool = False
-    """Whether the record ends in the middle of what its last input led to; the input is played to its end."""
-    to_the_word: bool = True
-    """Whether the branches that were taken and the votes that were counted are those on record, too."""
+    running_at_end: list[list[TimerStart]] = field(default_factory=list)
+    truncated: bool = False
+    """True if the record ends before all effects of its last input. The input is played completely."""
+    matches_exactly: bool = True
+    """True if branches and tallies are equal to the recorded ones, too."""
     ignored: list[Input] = field(default_factory=list)
-    """Messages with which it did nothing, and should have done something; they are not played."""
+    """Messages that the agent ignored although they should have had an effect. They are not played."""
 
 
 @dataclass(frozen=True, slots=True)
-class Allowed:
-    """What an agent is allowed to do although no right one does it: have timers end early, ignore messages."""
+class Tolerance:
+    """Deviations that are accepted: timers that expire early, and ignored messages."""
 
     early_timers: bool = False
     ignoring: bool = False
@@ -97,34 +110,34 @@ class Allowed:
 
 def rehearse(
     header: CheckedHeader,
-    lives: Sequence[Sequence[Input]],
+    incarnations: Sequence[Sequence[Input]],
     quirks: Quirks | None = None,
-    allowed: Allowed | None = None,
+    tolerance: Tolerance | None = None,
 ) -> Rehearsal:
-    """Give the agent all that is on record, up to where it did not do what is on record."""
-    allowed = allowed or Allowed()
+    """Play all recorded inputs up to the first deviation."""
+    tolerance = tolerance or Tolerance()
     rehearsal = Rehearsal(header.agent_id, quirks or {})
     stored: StoredState | None = None
     timers = LateTimers()
-    for life, inputs in enumerate(lives):
-        one_life = _Life(header, rehearsal, life, timers, allowed)
-        for index, given in enumerate(inputs):
-            is_last = life == len(lives) - 1 and index == len(inputs) - 1
-            if parting := one_life.give(index, given, stored, is_last=is_last):
-                rehearsal.parting = parting
+    for incarnation, inputs in enumerate(incarnations):
+        rehearsed = _IncarnationRehearsal(header, rehearsal, incarnation, timers, tolerance)
+        for index, recorded_input in enumerate(inputs):
+            is_last = incarnation == len(incarnations) - 1 and index == len(inputs) - 1
+            if deviation := rehearsed.play(index, recorded_input, stored, is_last=is_last):
+                rehearsal.deviation = deviation
                 break
-        agent = one_life.agent
-        rehearsal.pending.append(one_life.pending())
+        agent = rehearsed.agent
+        rehearsal.running_at_end.append(rehearsed.running_at_end())
         rehearsal.chain = [block.block_hash.hex() for block in agent.state.chain]
-        if rehearsal.parting:
+        if rehearsal.deviation:
             break
         stored = StoredState.of(agent.state)
     return rehearsal
 
 
-class _Life:
+class _IncarnationRehearsal:
     def __init__(
-        self, header: CheckedHeader, rehearsal: Rehearsal, life: int, timers: LateTimers, allowed: Allowed
+        self, header: CheckedHeader, rehearsal: Rehearsal, incarnation: int, timers: LateTimers, tolerance: Tolerance
     ) -> None:
         self.agent = Agent(
             header.agent_id,
@@ -135,90 +148,104 @@ class _Life:
             seal=header.seal,
         )
         self._rehearsal = rehearsal
-        self._hears_all = bool(rehearsal.quirks)
-        self._life = life
+        self._processes_all = bool(rehearsal.quirks)
+        self._incarnation = incarnation
         self._timers = timers
-        self._early_s = math.inf if allowed.early_timers else header.early_s
-        self._ignoring = allowed.ignoring
-        self._started: dict[int, Started] = {}
+        self._early_s = math.inf if tolerance.early_timers else header.early_s
+        self._ignoring = tolerance.ignoring
+        self._running_timers: dict[int, TimerStart] = {}
         """The timers that run, by number."""
         timers.look(self.agent.state)
 
-    def pending(self) -> list[Started]:
-        """The timers that run now."""
-        return [*self._started.values()]
+    def running_at_end(self) -> list[TimerStart]:
+        """Return the running timers."""
+        return [*self._running_timers.values()]
 
-    def give(self, index: int, given: Input, stored: StoredState | None, *, is_last: bool) -> Parting | None:
-        """Where the agent did something else with it than is on record; None if it did not."""
-        ends = self._timers.running.get(given.what.name) if isinstance(given.what, TimerEnded) else None
-        matters = not isinstance(given.what, Heard) or self._hears_all or self._matters(given.what.datagram)
-        if matters and self._ignoring and self._ignores(given):
-            self._rehearsal.ignored.append(given)
+    def play(
+        self, index: int, recorded_input: Input, stored: StoredState | None, *, is_last: bool
+    ) -> ProtocolDeviation | None:
+        """Play an input. Returns the deviation if the result differs from the record, else None."""
+        expired = (
+            self._timers.running.get(recorded_input.cause.name)
+            if isinstance(recorded_input.cause, TimerExpired)
+            else None
+        )
+        matters = (
+            not isinstance(recorded_input.cause, DatagramReceived)
+            or self._processes_all
+            or self._matters(recorded_input.cause.datagram)
+        )
+        if matters and self._ignoring and self._ignores(recorded_input):
+            self._rehearsal.ignored.append(recorded_input)
             matters = False
-        problem = self._feed(given, stored if index == 0 else None) if matters else None
+        problem = self._feed(recorded_input, stored if index == 0 else None) if matters else None
         entries = self.agent.trace()
-        if is_last and len(given.runs) < len(entries) and not _differs(given.runs, entries[: len(given.runs)]):
-            self._rehearsal.broken_off = True
-            given.runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
-        problem = problem or _differs(given.runs, entries)
+        if (
+            is_last
+            and len(recorded_input.runs) < len(entries)
+            and not _difference(recorded_input.runs, entries[: len(recorded_input.runs)])
+        ):
+            self._rehearsal.truncated = True
+            recorded_input.runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
+        problem = problem or _difference(recorded_input.runs, entries)
         if problem is not None:
-            algorithms = frozenset(run.algorithm for run in given.runs)
-            return Parting(given.line, given.runs[0].t, problem, algorithms)
-        self._rehearsal.to_the_word &= _to_the_word(given.runs, entries)
-        sent = self._sent(given)
-        played = Played(self._life, given, sent, matters)
+            algorithms = frozenset(run.algorithm for run in recorded_input.runs)
+            return ProtocolDeviation(recorded_input.line, recorded_input.runs[0].t, problem, algorithms)
+        self._rehearsal.matches_exactly &= _matches_exactly(recorded_input.runs, entries)
+        sent = self._sent(recorded_input)
+        played = PlayedInput(self._incarnation, recorded_input, sent, matters)
         if matters:
-            self._follow_timers(played, ends)
+            self._follow_timers(played, expired)
         self._rehearsal.played.append(played)
         return None
 
-    def _sent(self, given: Input) -> list[bytes]:
-        """The datagrams that left, as they are on record; as the reference makes them where they are not."""
+    def _sent(self, recorded_input: Input) -> list[bytes]:
+        """Return the sent datagrams as recorded. Datagrams that are not recorded come from the reference core."""
         encoded = [encode(self.agent.agent_id, *numbered) for numbered in self.agent.messages_to_send()]
-        recorded = [sent.datagram for run in given.runs for sent in run.sent]
+        recorded = [sent.datagram for run in recorded_input.runs for sent in run.sent]
         both = zip(encoded, recorded, strict=False)
         return [our if their is None else base64.b64decode(their.text) for our, their in both]
 
-    def _follow_timers(self, played: Played, ended: Running | None) -> None:
-        """Which timers the input has started, and which run no longer."""
-        place, before = len(self._rehearsal.played), self._started
+    def _follow_timers(self, played: PlayedInput, ended: Running | None) -> None:
+        """Note the timers that the input started, and those that no longer run."""
+        place, before = len(self._rehearsal.played), self._running_timers
         self._timers.look(self.agent.state)
-        self._started = {}
+        self._running_timers = {}
         for _, number, deadline in self._timers.running.values():
             duration_s = round(deadline - self.agent.state.now, 9)
-            self._started[number] = before.get(number) or Started(number, place, duration_s)
+            self._running_timers[number] = before.get(number) or TimerStart(number, place, duration_s)
         if ended is not None:
-            played.ends = before.pop(ended.number)
-        played.stops = [started for number, started in before.items() if number not in self._started]
+            played.expired = before.pop(ended.number)
+        played.stopped = [started for number, started in before.items() if number not in self._running_timers]
 
-    def _feed(self, given: Input, stored: StoredState | None) -> str | None:
-        """Why that cannot be; None if it can."""
-        agent, now = self.agent, given.at_s
-        match given.what:
-            case Logged(event):
+    def _feed(self, recorded_input: Input, stored: StoredState | None) -> str | None:
+        """Give an input to the core. Returns the reason if the input is impossible, else None."""
+        agent, now = self.agent, recorded_input.at_s
+        match recorded_input.cause:
+            case EventLogged(event):
                 try:
                     agent.add_event(event, now)
                 except ValueError as error:
                     return f"logged an invalid event: {error}"
-            case Heard(datagram):
+            case DatagramReceived(datagram):
                 agent.receive_datagram(datagram, now)
-            case TimerEnded(name):
+            case TimerExpired(name):
                 timer = next((timer for timer in agent.state.timers if timer.name == name), None)
                 if timer is None or timer.deadline is None:
                     return f"recorded the expiry of its {name[:MAX_NAME]} timer, which was not running"
                 if now < timer.deadline - self._early_s:
                     return f"recorded the expiry of its {name} timer {timer.deadline - now:.3g} s early"
                 agent.end_timer(timer, max(now, timer.deadline))
-            case Asked():
+            case ReconcileRequested():
                 agent.begin_reconcile(now)
-            case Booted():
+            case BootedFromDisk():
                 if stored is None:
                     return "restarted from its disk, whose content is not recorded"
                 agent.boot(stored, now)
         return None
 
     def _matters(self, datagram: bytes) -> bool:
-        """Whether a right agent does anything with it."""
+        """Return whether a correct agent uses the datagram."""
         try:
             sender, _, message = decode(datagram)
         except MalformedDatagramError:
@@ -228,12 +255,14 @@ class _Life:
             return False
         return MATTERS[type(message)](agent.state, sender, message)
 
-    def _ignores(self, given: Input) -> bool:
-        """Whether nothing came of a message of which something should have come."""
-        if not isinstance(given.what, Heard) or any(run.changes or run.sent for run in given.runs):
+    def _ignores(self, recorded_input: Input) -> bool:
+        """Return whether a message had no effect although it should have had one."""
+        if not isinstance(recorded_input.cause, DatagramReceived) or any(
+            run.changes or run.sent for run in recorded_input.runs
+        ):
             return False
-        message, state = decode(given.what.datagram).message, self.agent.state
-        if type(message) in ONLY_COUNTED or len(given.runs) > 1:
+        message, state = decode(recorded_input.cause.datagram).message, self.agent.state
+        if type(message) in ONLY_COUNTED or len(recorded_input.runs) > 1:
             return False
         if not isinstance(message, CommitBlock):
             return True
@@ -241,15 +270,15 @@ class _Life:
         return succeeds and not state.holds(message.block.block_hash)
 
 
-def _to_the_word(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> bool:
+def _matches_exactly(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> bool:
     ours = [(entry.branch, entry.tally) for entry in entries if isinstance(entry, HandlerRun)]
     return not ours or ours == [
         (run.branch, our[1] if run.tally is None else run.tally) for run, our in zip(recorded, ours, strict=False)
     ]
 
 
-def _differs(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str | None:
-    """What the protocol does otherwise than is on record, as far as anybody is affected by it."""
+def _difference(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str | None:
+    """Return a description of the first difference with an effect. None if there is none."""
     runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
     for ours, theirs in zip_longest(runs, recorded):
         if ours is None:
@@ -265,7 +294,7 @@ def _differs(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str | 
 
 
 def same_sent(ours: Sequence[Sent], theirs: Sequence[Sent]) -> bool:
-    """Whether the messages are the same; their sequence numbers mean nothing to the protocol."""
+    """Return whether the messages are equal. Sequence numbers are ignored, because the protocol does not use them."""
     if len(ours) != len(theirs):
         return False
     return all(_same_message(our, their) for our, their in zip(ours, theirs, strict=True))

@@ -1,11 +1,12 @@
-"""When everything happens, on one time for all: every input of every agent that is played.
+"""Put the inputs of all agents on one time axis.
 
-Each agent's inputs keep their order, a message arrives after it was sent, and a timer ends no sooner than its duration
-after it was started. Every input happens as soon as these allow, and not before its agent's clock says. So chains come
-out as they did even where clocks are known badly, or were set back or forward on the way: only times are stretched.
+Three rules hold. The inputs of each agent keep their order. A message arrives after it was sent. A timer expires no
+sooner than its duration after its start. Each input happens as early as these rules allow, but not before its recorded
+time on the agent's clock. Therefore the simulated chains equal the recorded ones, even if a clock was changed or is
+known only roughly. Only times are stretched.
 
-What was received and is not known to have been sent by an agent that is played is a stray: it is put on the air as it
-is. So is what was received, by the records, before it was sent, which no order of things explains.
+A received datagram that no played agent sent is a stray. The scenario sends it as a separate datagram. A datagram that
+was received before it was sent, according to the records, becomes a stray, too.
 """
 
 import math
@@ -14,28 +15,28 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
-from harness.field.reconstruct._agent_inputs import Booted, Heard
-from harness.field.reconstruct._clock_offsets import FASTEST, SLOWEST, Delivery, Line, estimate
-from harness.field.reconstruct._rehearsal import Played, Rehearsal, Started
+from harness.field.reconstruct._agent_inputs import BootedFromDisk, DatagramReceived
+from harness.field.reconstruct._clock_offsets import MAX_RATE, MIN_RATE, ClockLine, Delivery, estimate
+from harness.field.reconstruct._rehearsal import PlayedInput, Rehearsal, TimerStart
 
-APART_S = 2e-5
-"""Two inputs of an agent, and a message's leaving and its arrival, are at least so far apart."""
+MIN_GAP_S = 2e-5
+"""Minimum time between two inputs of an agent, and between the sending and the arrival of a message."""
 DIGITS = 6
 MILLION = 10.0**DIGITS
-LONG_BEFORE_S = 86400.0
-"""Nobody waits so long for a mission's first event: its clocks count from something else."""
-WITHIN_S = 1.0
-"""Of two equal datagrams one is meant that was sent no later than that after it was received, for clocks differ."""
+MAX_WAIT_S = 86400.0
+"""Maximum mission second of the first input. If it is later, the clocks do not count from the start of the mission."""
+MAX_CLOCK_ERROR_S = 1.0
+"""Maximum time by which a datagram may seem to be sent after its arrival. It selects one of several equal datagrams."""
 
 
 @dataclass(slots=True)
-class Happening:
-    """An input of an agent at mission second `at_s`; `number` is that of the sender's datagram, None for a stray.
+class TimedInput:
+    """An input of an agent at mission second `at_s`. `number` is that of the sender's datagram, None for a stray.
 
-    `late_s` is by how much a timer ended late.
+    `late_s` is the delay of an expired timer.
     """
 
-    played: Played
+    played: PlayedInput
     at_s: float
     late_s: float = 0.0
     sender: int | None = None
@@ -43,14 +44,15 @@ class Happening:
 
 
 @dataclass
-class Life:
-    """Mission seconds of the first and last input, and whether the agent went on from its disk; numbers are from 0.
+class IncarnationTimes:
+    """The mission seconds of the first and the last input of an incarnation. `boots` is true if it began with data on
+    its disk.
 
-    By `there_s` it was there: the first message that it heard was sent then, or something else came.
+    The incarnation existed at `present_s`: the first message that it received was sent then, or another input came.
     """
 
     number: int
-    there_s: float
+    present_s: float
     began_s: float
     ended_s: float
     boots: bool
@@ -58,61 +60,72 @@ class Life:
 
 @dataclass
 class Timetable:
-    """`clocks` are beside mission time. `impossible` names what no order of things explains."""
+    """The inputs of all agents in mission time. `clocks` are relative to mission time.
 
-    clocks: dict[int, Line]
-    happenings: dict[int, list[Happening]] = field(default_factory=dict)
+    `contradictions` has a sentence for each record that no order of inputs explains.
+    """
+
+    clocks: dict[int, ClockLine]
+    inputs: dict[int, list[TimedInput]] = field(default_factory=dict)
     sent: dict[int, list[bytes]] = field(default_factory=dict)
-    """Every datagram that each agent sends, in order."""
+    """All datagrams that each agent sends, in order."""
     sent_at_s: dict[int, list[float]] = field(default_factory=dict)
     lateness: dict[int, dict[int, float]] = field(default_factory=dict)
-    """By how much timers end late, by their numbers."""
-    impossible: list[str] = field(default_factory=list)
+    """The delays of timers, by their numbers."""
+    contradictions: list[str] = field(default_factory=list)
 
-    def lives(self, agent_id: int) -> list[Life]:
-        lives: list[Life] = []
+    def incarnations(self, agent_id: int) -> list[IncarnationTimes]:
+        incarnations: list[IncarnationTimes] = []
         number = -1
-        for happening in self.happenings[agent_id]:
-            if happening.played.life != number:
-                number = happening.played.life
-                boots = isinstance(happening.played.input.what, Booted)
-                lives.append(Life(number, happening.at_s, happening.at_s, happening.at_s, boots))
-            lives[-1].ended_s = happening.at_s
-            if happening.sender is not None and happening.number is not None:
-                lives[-1].there_s = min(lives[-1].there_s, self.sent_at_s[happening.sender][happening.number])
-        return lives
+        for timed_input in self.inputs[agent_id]:
+            if timed_input.played.incarnation != number:
+                number = timed_input.played.incarnation
+                boots = isinstance(timed_input.played.input.cause, BootedFromDisk)
+                incarnations.append(
+                    IncarnationTimes(number, timed_input.at_s, timed_input.at_s, timed_input.at_s, boots)
+                )
+            incarnations[-1].ended_s = timed_input.at_s
+            if timed_input.sender is not None and timed_input.number is not None:
+                incarnations[-1].present_s = min(
+                    incarnations[-1].present_s, self.sent_at_s[timed_input.sender][timed_input.number]
+                )
+        return incarnations
 
 
 def timetable(rehearsals: Mapping[int, Rehearsal]) -> Timetable:
-    """Of what was rehearsed."""
+    """Return the timetable of the rehearsed inputs."""
     senders = _Senders(rehearsals)
     clocks = estimate(rehearsals, senders.deliveries())
     clocks = _from_zero(clocks, rehearsals)
     return _Planner(rehearsals, senders, clocks).plan()
 
 
-def _from_zero(clocks: Mapping[int, Line], rehearsals: Mapping[int, Rehearsal]) -> dict[int, Line]:
-    """Mission second 0 is when the first clock shows 0; if the first input comes sooner, or much later, it is then."""
+def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, Rehearsal]) -> dict[int, ClockLine]:
+    """Return the clocks relative to mission time.
+
+    Mission second 0 is the time at which the first clock shows 0. If the first input is earlier, or much later, mission
+    second 0 is directly before it.
+    """
     played = {agent: rehearsal.played[0] for agent, rehearsal in rehearsals.items() if rehearsal.played}
     first = min((clocks[agent].at(of_agent.input.at_s) for agent, of_agent in played.items()), default=0.0)
     zero = min(line.at(0.0) for line in clocks.values())
-    start = zero if APART_S < first - zero < LONG_BEFORE_S else first - APART_S
-    begin = Line(start)
+    start = zero if MIN_GAP_S < first - zero < MAX_WAIT_S else first - MIN_GAP_S
+    begin = ClockLine(start)
     rounded = {}
     for agent, line in clocks.items():
-        line = line.after(begin) if SLOWEST <= line.rate <= FASTEST else Line().after(begin)
-        rounded[agent] = Line(round(line.offset_s, DIGITS), 1 + round(line.rate - 1, 9))
+        line = line.after(begin) if MIN_RATE <= line.rate <= MAX_RATE else ClockLine().after(begin)
+        rounded[agent] = ClockLine(round(line.offset_s, DIGITS), 1 + round(line.rate - 1, 9))
     return rounded
 
 
 class _Senders:
-    """Who has sent what, of those that are played, and which of their datagrams somebody has heard."""
+    """The datagrams that each played agent sent, and their receivers among the played agents."""
 
     def __init__(self, rehearsals: Mapping[int, Rehearsal]) -> None:
         self._rehearsals = rehearsals
         self.sent: dict[int, list[bytes]] = {agent: [] for agent in rehearsals}
         self._sent_by: dict[int, list[int]] = {agent: [] for agent in rehearsals}
-        """Of each datagram the place of the input that it came of."""
+        """The position of the input that caused each datagram."""
         self._numbers: dict[bytes, list[tuple[int, int]]] = defaultdict(list)
         for agent, rehearsal in rehearsals.items():
             for place, played in enumerate(rehearsal.played):
@@ -122,40 +135,40 @@ class _Senders:
                     self._sent_by[agent].append(place)
 
     def of(self, datagram: bytes, receiver: int) -> list[tuple[int, int]]:
-        """(agent, number) of each time that it was sent by another."""
+        """Return (agent, number) for each time that an agent other than the receiver sent the datagram."""
         return [sent for sent in self._numbers.get(datagram, ()) if sent[0] != receiver]
 
-    def left_s(self, agent: int, number: int) -> float:
-        """When, by the sender's clock."""
+    def sent_s(self, agent: int, number: int) -> float:
+        """Return the time at which a datagram was sent, on the sender's clock."""
         return self._rehearsals[agent].played[self._sent_by[agent][number]].input.at_s
 
     def deliveries(self) -> list[Delivery]:
-        """What was sent once, and received."""
+        """Return the datagrams that were sent once, with each reception."""
         found = []
         for receiver, rehearsal in self._rehearsals.items():
             for played in rehearsal.played:
-                if isinstance(played.input.what, Heard):
-                    sent = self.of(played.input.what.datagram, receiver)
+                if isinstance(played.input.cause, DatagramReceived):
+                    sent = self.of(played.input.cause.datagram, receiver)
                     if len(sent) == 1:
                         sender, number = sent[0]
-                        found.append(Delivery(sender, receiver, self.left_s(sender, number), played.input.at_s))
+                        found.append(Delivery(sender, receiver, self.sent_s(sender, number), played.input.at_s))
         return found
 
 
 class _Planner:
-    def __init__(self, rehearsals: Mapping[int, Rehearsal], senders: _Senders, clocks: dict[int, Line]) -> None:
+    def __init__(self, rehearsals: Mapping[int, Rehearsal], senders: _Senders, clocks: dict[int, ClockLine]) -> None:
         self._rehearsals = rehearsals
         self._senders = senders
         self._table = Timetable(clocks, sent=senders.sent)
         for agent in rehearsals:
-            self._table.happenings[agent], self._table.sent_at_s[agent], self._table.lateness[agent] = [], [], {}
+            self._table.inputs[agent], self._table.sent_at_s[agent], self._table.lateness[agent] = [], [], {}
         self._played = {agent: rehearsal.played for agent, rehearsal in rehearsals.items()}
         self._next = dict.fromkeys(rehearsals, 0)
         self._at: dict[int, list[float]] = {agent: [0.0] * len(played) for agent, played in self._played.items()}
-        """What each agent's own clock shows at its inputs, by place, once they are planned."""
+        """The time on each agent's own clock at its planned inputs, by position."""
         self._ready: list[tuple[float, int]] = []
         self._waiting: dict[tuple[int, int], list[int]] = defaultdict(list)
-        self._as_stray: set[tuple[int, int]] = set()
+        self._as_strays: set[tuple[int, int]] = set()
 
     def plan(self) -> Timetable:
         for agent in self._played:
@@ -163,18 +176,18 @@ class _Planner:
         while True:
             while self._ready:
                 _, agent = heappop(self._ready)
-                self._happen(agent)
+                self._schedule(agent)
             if not self._waiting:
                 break
-            self._break_circle()
+            self._break_cycle()
         for agent, rehearsal in self._rehearsals.items():
-            for life in self._table.lives(agent):
-                for timer in rehearsal.pending[life.number]:
-                    self._let_run(agent, timer, life.ended_s + APART_S)
+            for incarnation in self._table.incarnations(agent):
+                for timer in rehearsal.running_at_end[incarnation.number]:
+                    self._keep_running(agent, timer, incarnation.ended_s + MIN_GAP_S)
         return self._table
 
     def _queue(self, agent: int) -> None:
-        """The next input of the agent that matters is ready, or waits for a message to be sent."""
+        """Mark the next input of the agent that matters as ready, or as waiting for the sending of a message."""
         played = self._played[agent]
         place = self._next[agent]
         while place < len(played) and not played[place].matters:
@@ -186,27 +199,30 @@ class _Planner:
         if sent is not None and len(self._table.sent_at_s[sent[0]]) <= sent[1]:
             self._waiting[sent].append(agent)
         else:
-            heappush(self._ready, (self._told_s(agent, place), agent))
+            heappush(self._ready, (self._recorded_s(agent, place), agent))
 
-    def _told_s(self, agent: int, place: int) -> float:
+    def _recorded_s(self, agent: int, place: int) -> float:
         return self._table.clocks[agent].at(self._played[agent][place].input.at_s)
 
     def _sent(self, agent: int, place: int) -> tuple[int, int] | None:
-        """(sender, number) of the datagram that arrives; None for other inputs, and for strays."""
-        what = self._played[agent][place].input.what
-        if not isinstance(what, Heard) or (agent, place) in self._as_stray:
+        """Return (sender, number) of the arriving datagram. None for other inputs and for strays."""
+        cause = self._played[agent][place].input.cause
+        if not isinstance(cause, DatagramReceived) or (agent, place) in self._as_strays:
             return None
-        candidates = self._senders.of(what.datagram, agent)
+        candidates = self._senders.of(cause.datagram, agent)
         if len(candidates) < 2:
             return candidates[0] if candidates else None
-        by = self._told_s(agent, place) + WITHIN_S
-        before = [sent for sent in candidates if self._table.clocks[sent[0]].at(self._senders.left_s(*sent)) <= by]
+        limit_s = self._recorded_s(agent, place) + MAX_CLOCK_ERROR_S
+        before = [sent for sent in candidates if self._table.clocks[sent[0]].at(self._senders.sent_s(*sent)) <= limit_s]
         return before[-1] if before else candidates[0]
 
-    def _break_circle(self) -> None:
-        """Everybody waits for what is sent later: what should come first is taken for a stray."""
+    def _break_cycle(self) -> None:
+        """Resolve a deadlock, in which each agent waits for a later message.
+
+        The earliest waiting input becomes a stray.
+        """
         waiting = [
-            (self._told_s(agent, self._next[agent]), agent, sent)
+            (self._recorded_s(agent, self._next[agent]), agent, sent)
             for sent, agents in self._waiting.items()
             for agent in agents
         ]
@@ -215,63 +231,63 @@ class _Planner:
         self._waiting[sent].remove(agent)
         if not self._waiting[sent]:
             del self._waiting[sent]
-        self._as_stray.add((agent, place))
+        self._as_strays.add((agent, place))
         line = self._played[agent][place].input.line
-        self._table.impossible.append(
+        self._table.contradictions.append(
             f"agent {agent} recorded a message before agent {sent[0]} sent it (trace line {line}, "
             f"t={self._played[agent][place].input.at_s:g} s): the scenario sends it at the recorded time"
         )
         heappush(self._ready, (at_s, agent))
 
-    def _happen(self, agent: int) -> None:
+    def _schedule(self, agent: int) -> None:
         place = self._next[agent]
         played = self._played[agent][place]
-        happenings, clock = self._table.happenings[agent], self._table.clocks[agent]
+        inputs, clock = self._table.inputs[agent], self._table.clocks[agent]
         sent = self._sent(agent, place)
-        soonest = self._told_s(agent, place)
-        if happenings:
-            before = happenings[-1]
-            gap = APART_S if before.played.life == played.life else 10 * APART_S
-            soonest = max(soonest, before.at_s + gap)
+        earliest_s = self._recorded_s(agent, place)
+        if inputs:
+            before = inputs[-1]
+            gap = MIN_GAP_S if before.played.incarnation == played.incarnation else 10 * MIN_GAP_S
+            earliest_s = max(earliest_s, before.at_s + gap)
         if sent is not None:
-            soonest = max(soonest, self._table.sent_at_s[sent[0]][sent[1]] + APART_S)
-        happening = Happening(played, _rounded_up(max(soonest, APART_S)))
+            earliest_s = max(earliest_s, self._table.sent_at_s[sent[0]][sent[1]] + MIN_GAP_S)
+        timed_input = TimedInput(played, _rounded_up(max(earliest_s, MIN_GAP_S)))
         if sent is not None:
-            happening.sender, happening.number = sent
-        local = clock.shows(happening.at_s)
-        if played.ends is not None:
-            ends_local, ends_s = self._ends(agent, played.ends)
-            late_s = _rounded_up(soonest - ends_s) if soonest > ends_s else 0.0
-            happening.at_s = ends_s + late_s
-            local = max(ends_local, clock.shows(happening.at_s))
-            self._be_late(agent, played.ends, late_s)
-            happening.late_s = late_s
-        for stopped in played.stops:
-            self._let_run(agent, stopped, happening.at_s)
+            timed_input.sender, timed_input.number = sent
+        local = clock.shows(timed_input.at_s)
+        if played.expired is not None:
+            expiry_local, expiry_s = self._expiry(agent, played.expired)
+            late_s = _rounded_up(earliest_s - expiry_s) if earliest_s > expiry_s else 0.0
+            timed_input.at_s = expiry_s + late_s
+            local = max(expiry_local, clock.shows(timed_input.at_s))
+            self._delay(agent, played.expired, late_s)
+            timed_input.late_s = late_s
+        for stopped in played.stopped:
+            self._keep_running(agent, stopped, timed_input.at_s)
         self._at[agent][place] = local
-        happenings.append(happening)
+        inputs.append(timed_input)
         for _ in played.sent:
             number = len(self._table.sent_at_s[agent])
-            self._table.sent_at_s[agent].append(happening.at_s)
+            self._table.sent_at_s[agent].append(timed_input.at_s)
             for receiver in self._waiting.pop((agent, number), ()):
-                heappush(self._ready, (self._told_s(receiver, self._next[receiver]), receiver))
+                heappush(self._ready, (self._recorded_s(receiver, self._next[receiver]), receiver))
         self._next[agent] += 1
         self._queue(agent)
 
-    def _ends(self, agent: int, timer: Started) -> tuple[float, float]:
-        """When the timer ends if it is not late, by the agent's clock and in mission seconds."""
-        ends_local = self._at[agent][timer.place] + timer.duration_s
-        return ends_local, self._table.clocks[agent].at(ends_local)
+    def _expiry(self, agent: int, timer: TimerStart) -> tuple[float, float]:
+        """Return the expiry of a timer without delay, on the agent's clock and in mission seconds."""
+        expiry_local = self._at[agent][timer.place] + timer.duration_s
+        return expiry_local, self._table.clocks[agent].at(expiry_local)
 
-    def _let_run(self, agent: int, timer: Started, until_s: float) -> None:
-        """The timer does not end up to then."""
-        _, ends_s = self._ends(agent, timer)
-        if ends_s < until_s + APART_S:
-            self._be_late(agent, timer, _rounded_up(until_s + 2 * APART_S - ends_s))
+    def _keep_running(self, agent: int, timer: TimerStart, until_s: float) -> None:
+        """Delay the timer so that it does not expire until then."""
+        _, expiry_s = self._expiry(agent, timer)
+        if expiry_s < until_s + MIN_GAP_S:
+            self._delay(agent, timer, _rounded_up(until_s + 2 * MIN_GAP_S - expiry_s))
 
-    def _be_late(self, agent: int, timer: Started, by_s: float) -> None:
-        if by_s > 0:
-            self._table.lateness[agent][timer.number] = by_s
+    def _delay(self, agent: int, timer: TimerStart, delay_s: float) -> None:
+        if delay_s > 0:
+            self._table.lateness[agent][timer.number] = delay_s
 
 
 def _rounded_up(seconds: float) -> float:

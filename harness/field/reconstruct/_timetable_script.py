@@ -1,4 +1,4 @@
-"""A timetable as a scenario: events, datagrams, late timers and faults, word for word."""
+"""Write a timetable as a scenario with exact events, datagrams, timer delays and faults."""
 
 import base64
 import dataclasses
@@ -7,46 +7,49 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
-from harness.field.reconstruct._agent_inputs import Asked, Heard, Logged
+from harness.field.reconstruct._agent_inputs import DatagramReceived, EventLogged, ReconcileRequested
 from harness.field.reconstruct._known_mission import Mission
 from harness.field.reconstruct._rehearsal import Rehearsal
-from harness.field.reconstruct._timetable import APART_S, DIGITS, Happening, Life, Timetable
+from harness.field.reconstruct._timetable import DIGITS, MIN_GAP_S, IncarnationTimes, TimedInput, Timetable
 from harness.scenario.scenario_file import Document
 from harness.scenario.strict_model import in_text
 from ucp.messages import MalformedDatagramError, decode
 from ucp.quirks import Quirks
 from ucp.settings import Settings
 
-MOMENT_S = APART_S / 2
+HALF_GAP_S = MIN_GAP_S / 2
 Sealed = Mapping[int, Mapping[bytes, bytes]]
-"""By agent, and by the event that filled the block."""
-LONG_S = 0.5
-"""A timer that is so late was not only waiting for its turn: its agent stood still."""
+"""The sealed data of blocks, by agent and by the event that filled the block."""
+MIN_PAUSE_S = 0.5
+"""Minimum delay of a timer that shows a pause of its agent."""
 
 
-def scenario_of(
+def scenario_document(
     mission: Mission, table: Timetable, rehearsals: Mapping[int, Rehearsal], lost: Collection[int], sealed: Sealed
 ) -> Document:
-    """The scenario, as a document. An agent of the roster that was not rehearsed has no part in it.
+    """Return the scenario as a document. An agent of the roster without a rehearsal takes no part in it.
 
-    Those that were `lost` are switched off with the last thing on record; so is who had more to do then. `sealed` is
-    what agents sealed.
+    `lost` agents, and agents whose record ends early, are switched off after their last input. `sealed` has the sealed
+    data of agents.
     """
-    lives = {agent: _lives(table.lives(agent), len(rehearsal.pending)) for agent, rehearsal in rehearsals.items()}
+    incarnations = {
+        agent: _all_incarnations(table.incarnations(agent), len(rehearsal.running_at_end))
+        for agent, rehearsal in rehearsals.items()
+    }
     strays = _Strays()
-    fates = [*_fates(mission.roster, table, lives, strays)]
-    entries = [*_entries(mission.roster, table, rehearsals, lives, lost)]
+    fates = [*_fates(mission.roster, table, incarnations, strays)]
+    entries = [*_entries(mission.roster, table, rehearsals, incarnations, lost)]
     last_s = max([at_s for at_s, _ in entries], default=0.0)
-    last_s = max([last_s, *(happenings[-1].at_s for happenings in table.happenings.values() if happenings)])
+    last_s = max([last_s, *(inputs[-1].at_s for inputs in table.inputs.values() if inputs)])
     document: Document = {
         "name": mission.name,
         "agents": list(mission.roster),
-        "duration_s": float(max(1, math.ceil(last_s + APART_S))),
+        "duration_s": float(max(1, math.ceil(last_s + MIN_GAP_S))),
         "initial_data": _base64(mission.initial_data),
         "clocks": _clocks(table),
         "settings": _settings(mission.settings),
         "quirks": _quirks({agent: rehearsal.quirks for agent, rehearsal in rehearsals.items()}),
-        "timeline": _at_instants_of_their_own(entries),
+        "timeline": _with_unique_times(entries),
         "events": {"source": "scripted", "script": _events(table, sealed)},
         "fates": fates,
         "datagrams": strays.documents(),
@@ -55,22 +58,28 @@ def scenario_of(
     return {key: value for key, value in document.items() if value not in ({}, [])}
 
 
-def _lives(known: Sequence[Life], count: int) -> list[Life]:
-    """All lives of an agent, also those in which nothing came."""
-    lives: list[Life] = []
-    by_number = {life.number: life for life in known}
+def _all_incarnations(known: Sequence[IncarnationTimes], count: int) -> list[IncarnationTimes]:
+    """Return all incarnations of an agent, including those without inputs."""
+    incarnations: list[IncarnationTimes] = []
+    by_number = {incarnation.number: incarnation for incarnation in known}
     for number in range(count):
-        after_s = lives[-1].ended_s + 2 * APART_S if lives else 0.0
-        lives.append(by_number.get(number) or Life(number, after_s, after_s, after_s, False))
-    return lives
+        after_s = incarnations[-1].ended_s + 2 * MIN_GAP_S if incarnations else 0.0
+        incarnations.append(by_number.get(number) or IncarnationTimes(number, after_s, after_s, after_s, False))
+    return incarnations
 
 
-def _births(lives: Sequence[Life]) -> list[float]:
-    """When each life begins: the first at 0; one that goes on from its disk with that; another before it hears."""
-    births = [0.0]
-    for before, life in pairwise(lives):
-        births.append(life.began_s if life.boots else max(before.ended_s + APART_S, life.there_s - MOMENT_S))
-    return births
+def _start_times(incarnations: Sequence[IncarnationTimes]) -> list[float]:
+    """Return the start of each incarnation: 0 for the first, the boot for one with data on its disk, else before its
+    first reception.
+    """
+    start_times = [0.0]
+    for before, incarnation in pairwise(incarnations):
+        start_times.append(
+            incarnation.began_s
+            if incarnation.boots
+            else max(before.ended_s + MIN_GAP_S, incarnation.present_s - HALF_GAP_S)
+        )
+    return start_times
 
 
 def _clocks(table: Timetable) -> Document:
@@ -84,8 +93,8 @@ def _clocks(table: Timetable) -> Document:
 
 
 def _settings(settings: Settings) -> Document:
-    usual = dataclasses.asdict(Settings())
-    return {key: value for key, value in dataclasses.asdict(settings).items() if value != usual[key]}
+    default = dataclasses.asdict(Settings())
+    return {key: value for key, value in dataclasses.asdict(settings).items() if value != default[key]}
 
 
 def _quirks(by_agent: Mapping[int, Quirks]) -> Document:
@@ -98,20 +107,20 @@ def _quirks(by_agent: Mapping[int, Quirks]) -> Document:
 
 def _events(table: Timetable, sealed: Sealed) -> list[Document]:
     events: list[Document] = []
-    for agent, happenings in table.happenings.items():
-        for happening in happenings:
-            if isinstance(logged := happening.played.input.what, Logged):
+    for agent, inputs in table.inputs.items():
+        for timed_input in inputs:
+            if isinstance(logged := timed_input.played.input.cause, EventLogged):
                 event = logged.event
                 data = {"data": _base64(event.data)} if event.data.strip(b"\0") else {"bytes": len(event.data)}
                 own = {"event_id": event.event_id, "timestamp_us": event.timestamp_us}
                 blocks = sealed.get(agent, {}).get(event.encode())
                 seal = {} if blocks is None else {"sealed": _base64(blocks)}
-                events.append({"at_s": happening.at_s, "agent": agent, **own, **data, **seal})
+                events.append({"at_s": timed_input.at_s, "agent": agent, **own, **data, **seal})
     return sorted(events, key=lambda event: (event["at_s"], event["agent"]))
 
 
 class _Strays:
-    """Datagrams that are put on the air as they came."""
+    """Datagrams that the scenario sends separately."""
 
     def __init__(self) -> None:
         self._reached: dict[bytes, list[dict[int, float]]] = defaultdict(list)
@@ -126,19 +135,19 @@ class _Strays:
 
     def documents(self) -> list[Document]:
         documents = [
-            {"source": _source(datagram), "datagram": _base64(datagram), "reaches": _with_names(copy)}
+            {"source": _source(datagram), "datagram": _base64(datagram), "reaches": _with_text_keys(copy)}
             for datagram, copies in self._reached.items()
             for copy in copies
         ]
         return sorted(documents, key=lambda document: min(document["reaches"].values()))
 
 
-def _with_names(reached: Mapping[int, float]) -> Document:
+def _with_text_keys(reached: Mapping[int, float]) -> Document:
     return {str(agent): at_s for agent, at_s in reached.items()}
 
 
 def _source(datagram: bytes) -> int:
-    """The agent that the datagram names."""
+    """Return the sender that the datagram names."""
     try:
         return decode(datagram).sender
     except MalformedDatagramError:
@@ -146,89 +155,95 @@ def _source(datagram: bytes) -> int:
 
 
 def _fates(
-    roster: Iterable[int], table: Timetable, lives: Mapping[int, Sequence[Life]], strays: _Strays
+    roster: Iterable[int], table: Timetable, incarnations: Mapping[int, Sequence[IncarnationTimes]], strays: _Strays
 ) -> Iterator[Document]:
-    """What arrived where; all else is lost. What a receiver cannot be sent is put on the air by itself."""
+    """Yield the arrivals of all datagrams.
+
+    All others are lost. Datagrams that no agent can send to the receiver become strays.
+    """
     arrivals: dict[tuple[int, int], list[tuple[int, float]]] = defaultdict(list)
-    for receiver, happenings in table.happenings.items():
-        births = _births(lives[receiver])
-        for happening in happenings:
-            if not isinstance(heard := happening.played.input.what, Heard):
+    for receiver, inputs in table.inputs.items():
+        start_times = _start_times(incarnations[receiver])
+        for timed_input in inputs:
+            if not isinstance(received := timed_input.played.input.cause, DatagramReceived):
                 continue
-            if _can_be_sent(happening, table, births):
-                assert happening.sender is not None and happening.number is not None, "it can be sent"
-                arrivals[happening.sender, receiver].append((happening.number, happening.at_s))
+            if _can_be_sent(timed_input, table, start_times):
+                assert timed_input.sender is not None and timed_input.number is not None, "it can be sent"
+                arrivals[timed_input.sender, receiver].append((timed_input.number, timed_input.at_s))
             else:
-                strays.add(heard.datagram, receiver, happening.at_s)
+                strays.add(received.datagram, receiver, timed_input.at_s)
     for (sender, receiver), numbered in sorted(arrivals.items()):
         yield {"sender": sender, "receiver": receiver, "arrivals": in_text(sorted(numbered), "@")}
-    speak = [agent for agent, sent in table.sent.items() if sent]
-    if any((sender, receiver) not in arrivals for sender in speak for receiver in roster if receiver != sender):
+    senders = [agent for agent, sent in table.sent.items() if sent]
+    if any((sender, receiver) not in arrivals for sender in senders for receiver in roster if receiver != sender):
         yield {"drop": True}
 
 
-def _can_be_sent(happening: Happening, table: Timetable, births: Sequence[float]) -> bool:
-    """Not what was sent before the receiver was there to hear it."""
-    if happening.sender is None or happening.number is None:
+def _can_be_sent(timed_input: TimedInput, table: Timetable, start_times: Sequence[float]) -> bool:
+    """Return whether the receiver existed when the datagram was sent."""
+    if timed_input.sender is None or timed_input.number is None:
         return False
-    return table.sent_at_s[happening.sender][happening.number] >= births[happening.played.life]
+    return table.sent_at_s[timed_input.sender][timed_input.number] >= start_times[timed_input.played.incarnation]
 
 
 def _entries(
     roster: Iterable[int],
     table: Timetable,
     rehearsals: Mapping[int, Rehearsal],
-    lives: Mapping[int, Sequence[Life]],
+    incarnations: Mapping[int, Sequence[IncarnationTimes]],
     lost: Collection[int],
 ) -> Iterator[tuple[float, Document]]:
-    """What happened to agents, and what the operator asked."""
+    """Yield the faults of agents, and the commands of the operator."""
     yield from _pauses(table)
     if absent := [agent for agent in roster if agent not in rehearsals]:
         yield 0.0, {"kill": absent}
-    for agent, happenings in table.happenings.items():
-        for happening in happenings:
-            if isinstance(happening.played.input.what, Asked):
-                yield happening.at_s, {"reconcile": [agent]}
+    for agent, inputs in table.inputs.items():
+        for timed_input in inputs:
+            if isinstance(timed_input.played.input.cause, ReconcileRequested):
+                yield timed_input.at_s, {"reconcile": [agent]}
     for agent, rehearsal in rehearsals.items():
-        births = _births(lives[agent])
-        for (before, after), birth_s in zip(pairwise(lives[agent]), births[1:], strict=True):
-            died_s = round(before.ended_s + MOMENT_S, DIGITS)
+        start_times = _start_times(incarnations[agent])
+        for (before, after), start_s in zip(pairwise(incarnations[agent]), start_times[1:], strict=True):
+            end_s = round(before.ended_s + HALF_GAP_S, DIGITS)
             if after.boots:
-                yield died_s, {"reboot": [agent], "down_s": round(birth_s - died_s, 9), "disk": "kept"}
+                yield end_s, {"reboot": [agent], "down_s": round(start_s - end_s, 9), "disk": "kept"}
             else:
-                yield died_s, {"kill": [agent]}
-                yield birth_s, {"restart": [agent]}
-        if agent in lost or rehearsal.parting is not None or rehearsal.broken_off or rehearsal.pending[-1]:
-            yield round(lives[agent][-1].ended_s + MOMENT_S, DIGITS), {"switch_off": [agent]}
+                yield end_s, {"kill": [agent]}
+                yield start_s, {"restart": [agent]}
+        if agent in lost or rehearsal.deviation is not None or rehearsal.truncated or rehearsal.running_at_end[-1]:
+            yield round(incarnations[agent][-1].ended_s + HALF_GAP_S, DIGITS), {"switch_off": [agent]}
 
 
 def _pauses(table: Timetable) -> Iterator[tuple[float, Document]]:
-    """Who did nothing for as long as a timer was late, and that was long: it stood still."""
-    for agent, happenings in table.happenings.items():
-        paused: set[float] = set()
-        for index, happening in enumerate(happenings):
-            if happening.late_s < LONG_S:
+    """Yield a pause for each agent that did nothing while a timer was long overdue."""
+    for agent, inputs in table.inputs.items():
+        pause_starts: set[float] = set()
+        for index, timed_input in enumerate(inputs):
+            if timed_input.late_s < MIN_PAUSE_S:
                 continue
             gaps = []
-            for after, before in pairwise(reversed(happenings[: index + 1])):
-                if after.at_s < happening.at_s - happening.late_s or before.played.life != happening.played.life:
+            for after, before in pairwise(reversed(inputs[: index + 1])):
+                if (
+                    after.at_s < timed_input.at_s - timed_input.late_s
+                    or before.played.incarnation != timed_input.played.incarnation
+                ):
                     break
                 gaps.append((after.at_s - before.at_s, before.at_s, after.at_s))
             longest_s, since_s, until_s = max(gaps, default=(0.0, 0.0, 0.0))
-            if longest_s > LONG_S / 2 and since_s not in paused:
-                paused.add(since_s)
-                yield round(since_s + MOMENT_S, DIGITS), {"pause": [agent]}
-                yield round(until_s - MOMENT_S, DIGITS), {"resume": [agent]}
+            if longest_s > MIN_PAUSE_S / 2 and since_s not in pause_starts:
+                pause_starts.add(since_s)
+                yield round(since_s + HALF_GAP_S, DIGITS), {"pause": [agent]}
+                yield round(until_s - HALF_GAP_S, DIGITS), {"resume": [agent]}
 
 
-def _at_instants_of_their_own(entries: Iterable[tuple[float, Document]]) -> list[Document]:
-    taken: set[float] = set()
+def _with_unique_times(entries: Iterable[tuple[float, Document]]) -> list[Document]:
+    used: set[float] = set()
     timeline = []
     for at_s, entry in sorted(entries, key=lambda timed: timed[0]):
         at_s = round(at_s, DIGITS)
-        while at_s in taken:
+        while at_s in used:
             at_s = round(at_s + 10**-DIGITS, DIGITS)
-        taken.add(at_s)
+        used.add(at_s)
         timeline.append({"at_s": at_s, **entry})
     return timeline
 

@@ -1,4 +1,4 @@
-"""Reconstruct a flight as a scenario, write it, and check that it replays."""
+"""Reconstruct a flight as a scenario, write the scenario, and verify that it replays the flight."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,12 +10,12 @@ from harness.archive.exports import Export
 from harness.checker.judgement import agents
 from harness.errors import FieldError, MachineError
 from harness.field.ingest import Flight
-from harness.field.reconstruct._comparing import Alone, FirstDifference, first_difference
-from harness.field.reconstruct._known_mission import NOTHING, told
-from harness.field.reconstruct._other_records import Elsewhere
+from harness.field.reconstruct._comparing import FirstDifference, SoloRehearsals, first_difference
+from harness.field.reconstruct._known_mission import NO_INPUTS, known_mission
+from harness.field.reconstruct._other_records import OtherRecords
 from harness.field.reconstruct._rehearsal import Rehearsal
 from harness.field.reconstruct._timetable import Timetable, timetable
-from harness.field.reconstruct._timetable_script import scenario_of
+from harness.field.reconstruct._timetable_script import scenario_document
 from harness.run.simulate import InMemory, Simulated, simulate_in_memory
 from harness.scenario.load import parse
 from harness.scenario.scenario_file import Document, to_yaml
@@ -26,14 +26,16 @@ if TYPE_CHECKING:
     from ucp.secure.sealing import Depot
 
 SEED = 1
-"""Of the reconstruction, in which nothing is left to chance."""
+"""The seed of the simulation. The scenario does not depend on it."""
 
-Tell = Callable[[str], None]
+ReportProgress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class AgentOutcome:
-    """What became of one agent: how many `blocks` its chain has in virtual time, and `why` that is not its flight."""
+    """The result of one agent: number of blocks in its simulated chain, and `why` the chain is not as recorded, else
+    None.
+    """
 
     agent_id: int
     blocks: int
@@ -42,10 +44,10 @@ class AgentOutcome:
 
 @dataclass
 class Reconstruction:
-    """A scenario, and what it reproduces.
+    """A scenario and the part of the flight that it reproduces.
 
-    `agents` are those that left a record; `remarks` say what was assumed; `difference` is the first step at which
-    virtual time did something else than the record of an agent that was to be played in full.
+    `agents` are those with a record, and `remarks` the assumptions. `difference` is the first step at which the
+    simulation differs from the record of an agent that should be played completely.
     """
 
     document: Document
@@ -57,13 +59,13 @@ class Reconstruction:
 
     @property
     def problems(self) -> list[str]:
-        """Why it is not the whole flight, the first place first; empty if it is."""
+        """Sentences on the parts that are not reproduced, the first difference first. Empty if all is reproduced."""
         first = [self.difference.sentence] if self.difference else []
         return first + [f"agent {agent.agent_id} {agent.why}" for agent in self.agents if agent.why]
 
     @property
     def blocks(self) -> int:
-        """How many there are in the chains that came out as they did."""
+        """Number of distinct blocks in the reproduced chains."""
         exports = self.simulated.evidence.exports
         chains = (exports[agent].chain_of_block_hashes for agent in self.reproduced if agent in exports)
         return len({block for chain in chains for block in chain})
@@ -74,12 +76,12 @@ class Reconstruction:
 
     @property
     def sentence(self) -> str:
-        """What it comes to."""
-        whole, all_of_them = len(self.reproduced), len(self.agents)
+        """The result in one sentence."""
+        reproduced, all_of_them = len(self.reproduced), len(self.agents)
         if not self.problems:
-            chains = "the chain" if whole == 1 else f"all {whole} chains"
+            chains = "the chain" if reproduced == 1 else f"all {reproduced} chains"
             return f"reproduces {chains}, {self.blocks} blocks"
-        return f"reproduces {whole} of {all_of_them} chains: {self.problems[0]}"
+        return f"reproduces {reproduced} of {all_of_them} chains: {self.problems[0]}"
 
     def to_json(self) -> dict[str, Any]:
         exports = self.simulated.evidence.exports
@@ -113,58 +115,58 @@ class Reconstruction:
 def reconstruct(
     flight: Flight,
     name: str,
-    tell: Tell = lambda sentence: None,
+    report_progress: ReportProgress = lambda sentence: None,
     *,
     opener: "Opener | None" = None,
     depot: "Depot | None" = None,
 ) -> Reconstruction:
-    """Fly it again. `tell` is told what is being done. Raises FieldError if there is nothing to fly it by.
+    """Reconstruct a flight. `report_progress` receives a text at each step. Raises FieldError without usable records.
 
-    Of a secured mission `opener` opens captures, and `depot` blocks.
+    In a secured mission, `opener` decrypts captures, and `depot` decrypts blocks.
     """
-    tell("reading the inputs of each agent")
+    report_progress("reading the inputs of each agent")
     remarks: list[str] = []
-    elsewhere = Elsewhere(flight, opener, depot)
-    mission, headers = told(flight, elsewhere, name, remarks)
-    alone = Alone(flight, elsewhere)
-    rehearsals, why = alone.rehearsals, alone.why
+    other_records = OtherRecords(flight, opener, depot)
+    mission, headers = known_mission(flight, other_records, name, remarks)
+    solo = SoloRehearsals(flight, other_records)
+    rehearsals, why = solo.rehearsals, solo.why
     for agent_id, header in headers.items():
-        tell(f"agent {agent_id} alone")
+        report_progress(f"agent {agent_id} alone")
         if header.settings == mission.settings:
-            alone.rehearse(header)
+            solo.rehearse(header)
         else:
             why[agent_id] = "has other settings than the other agents, and a scenario has one set of settings"
-    remarks += dict.fromkeys(elsewhere.problems)
+    remarks += dict.fromkeys(other_records.problems)
     if any(header.secured for header in headers.values()):
         remarks.append(
             "the flight was secured and is reproduced without keys: datagrams that agents dropped as not "
             "authentic are left out"
         )
-    remarks += alone.remarks
+    remarks += solo.remarks
     if not any(rehearsal.played for rehearsal in rehearsals.values()):
         first = next((f"agent {agent_id} {words}; " for agent_id, words in why.items()), "")
-        raise FieldError(first + NOTHING)
-    tell("ordering the inputs")
+        raise FieldError(first + NO_INPUTS)
+    report_progress("ordering the inputs")
     table = timetable(rehearsals)
     lost = {agent_id for agent_id in rehearsals if flight.exports and agent_id not in flight.exports}
     if lost:
         remarks.append(f"no export of {agents(lost)}: the vehicle counts as lost at the end of its trace")
-    document = scenario_of(mission, table, rehearsals, lost, elsewhere.sealed)
-    tell("playing the scenario")
+    document = scenario_document(mission, table, rehearsals, lost, other_records.sealed)
+    report_progress("playing the scenario")
     simulated = simulate_in_memory(InMemory(tracing=True), parse(document), SEED)
     difference = first_difference(table, rehearsals, simulated)
     _compare_chains(flight, rehearsals, simulated, why)
-    came_home = sorted({*flight.traces, *flight.exports})
-    for agent_id in came_home:
+    recorded_agents = sorted({*flight.traces, *flight.exports})
+    for agent_id in recorded_agents:
         if agent_id not in rehearsals and agent_id not in why:
             why[agent_id] = "has no trace, and its inputs are not recorded"
     if absent := set(mission.roster) - set(rehearsals):
         remarks.append(
             f"{agents(absent)} not played: the scenario sends the messages that other agents received from them"
         )
-    remarks += table.impossible
+    remarks += table.contradictions
     remarks += _clocks_in_words(table)
-    outcomes = [AgentOutcome(agent_id, _blocks(simulated, agent_id), why.get(agent_id)) for agent_id in came_home]
+    outcomes = [AgentOutcome(agent_id, _blocks(simulated, agent_id), why.get(agent_id)) for agent_id in recorded_agents]
     document["expect"] = _expected(simulated, rehearsals)
     return Reconstruction(document, outcomes, remarks, difference, simulated, table)
 
@@ -177,21 +179,21 @@ def _compare_chains(
             continue
         played: Export | None = simulated.evidence.exports.get(agent_id)
         chain = list(played.chain_of_block_hashes) if played else None
-        home = flight.exports.get(agent_id)
+        export = flight.exports.get(agent_id)
         if chain != rehearsal.chain:
             why[agent_id] = "ends with another chain in virtual time than in its trace"
-        elif home is not None and list(home.chain_of_block_hashes) != chain:
-            why[agent_id] = _export_differs(home, rehearsal, flight)
+        elif export is not None and list(export.chain_of_block_hashes) != chain:
+            why[agent_id] = _export_differs(export, rehearsal, flight)
 
 
-def _export_differs(home: Export, rehearsal: Rehearsal, flight: Flight) -> str:
-    trace = flight.traces.get(home.agent_id)
+def _export_differs(export: Export, rehearsal: Rehearsal, flight: Flight) -> str:
+    trace = flight.traces.get(export.agent_id)
     if trace is None:
-        return f"has another chain in its export ({len(home.chain)} blocks) than its recorded inputs lead to"
+        return f"has another chain in its export ({len(export.chain)} blocks) than its recorded inputs lead to"
     last_s = trace.runs[-1].t if trace.runs else 0.0
     return (
         f"is played up to the end of its trace at t={last_s:g} s, with {len(rehearsal.chain)} blocks in its chain; "
-        f"its export has {len(home.chain)}, and the inputs between are not recorded"
+        f"its export has {len(export.chain)}, and the inputs between are not recorded"
     )
 
 
@@ -208,20 +210,20 @@ def _blocks(simulated: Simulated, agent_id: int) -> int:
 
 
 def _expected(simulated: Simulated, rehearsals: Mapping[int, Rehearsal]) -> Document:
-    """What this run comes to: its chains, and the verdicts that are bad, which are what happened."""
+    """Return the expected results: the chains, and the bad verdicts, because they occurred in the flight."""
     exports = simulated.evidence.exports
     chains = {str(agent): exports[agent].top_chain_hash for agent in sorted(rehearsals) if agent in exports}
     bad = {key: simulated.result.judgements[key].verdict for key in simulated.result.bad}
     characteristics = {key: verdict for key, verdict in bad.items() if key.isdecimal()}
-    beside = {key: verdict for key, verdict in bad.items() if not key.isdecimal()}
-    return {**({"characteristics": characteristics} if characteristics else {}), **beside, "chains": chains}
+    further = {key: verdict for key, verdict in bad.items() if not key.isdecimal()}
+    return {**({"characteristics": characteristics} if characteristics else {}), **further, "chains": chains}
 
 
 WIDTH = 116
 
 
 def write(reconstruction: Reconstruction, path: Path, sources: Sequence[Path], left_out: Sequence[str]) -> None:
-    """Raises MachineError if the file cannot be written."""
+    """Write the scenario. Raises MachineError if that is not possible."""
     sentences = _sentences(reconstruction, path, sources, left_out)
     comment = [line for sentence in sentences for line in wrap(sentence, WIDTH)]
     try:

@@ -1,4 +1,4 @@
-"""One agent's record as it is played: its lines in order, and what is known beside it."""
+"""The record of one agent for a replay: its lines in order, and the other records of the flight."""
 
 from bisect import bisect_right
 from collections import deque
@@ -17,25 +17,26 @@ from harness.errors import FieldError
 from ucp.clock import MICROSECONDS
 from ucp.trace import Commanded, Dropped, HandlerRun
 
-JUMPS, JUMPING = 3, 0.1
-"""More jumps in the numbers of messages than this, and in more than this share, are the agent's way to count."""
+MAX_JUMPS, MAX_JUMP_SHARE = 3, 0.1
+"""Limits for jumps in an agent's sequence numbers: their number, and their share. An agent with more jumps numbers
+its messages in its own way, so a jump does not prove that lines are missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A line of the record; lines, and lives of the agent, count from 1.
+    """A line of the record. Line numbers and incarnations count from 1.
 
-    `gap` says what is missing right before it, such as "2 lines are damaged"; None where nothing is.
+    `gap` describes missing lines directly before it, such as "2 lines are damaged", else None.
     """
 
     line: int
-    life: int
-    what: HandlerRun | Dropped | Commanded
+    incarnation: int
+    content: HandlerRun | Dropped | Commanded
     gap: str | None = None
 
 
-class Beside(Protocol):
-    """What is known of a flight; each is read when it is first asked for."""
+class FlightRecords(Protocol):
+    """The records of a flight. Each is read at its first use."""
 
     @property
     def exports(self) -> Mapping[int, Export]: ...
@@ -45,23 +46,23 @@ class Beside(Protocol):
 
     @property
     def record(self) -> JudgedRecord | None:
-        """What a run says of itself; no flight in the field does."""
+        """The record of the run. None for a flight in the field."""
 
 
 class Record:
-    """The trace of one agent; `path` is where it is from, and `named` how the command line names it.
+    """The trace of one agent. `path` is its file, and `argument` is its name on the command line.
 
-    Raises FieldError if nothing of it can be played.
+    Raises FieldError if no part of it can be played.
     """
 
-    def __init__(self, path: Path, named: str, trace: Trace, beside: Beside, problems: list[str]) -> None:
+    def __init__(self, path: Path, argument: str, trace: Trace, flight: FlightRecords, problems: list[str]) -> None:
         self.path = path
-        self.named = named
+        self.argument = argument
         self.trace = trace
-        self.beside = beside
+        self.flight = flight
         self.problems = problems
         self.agent_id = trace.header.agent_id
-        self.lives = len(trace.starts) + 1
+        self.incarnations = len(trace.starts) + 1
         if not trace.header.has_inputs:
             raise FieldError(
                 f"{path}: it has the version ucp-trace/1, which lacks received messages; agents must write ucp-trace/2"
@@ -75,86 +76,87 @@ class Record:
             raise FieldError(f"{path}: it has no handler runs of agent {self.agent_id}, so there is nothing to play")
 
     def position_of_line(self, line: int) -> int:
-        """How many entries stand before this line of the file."""
+        """Return the number of entries before this line of the file."""
         return next((number for number, entry in enumerate(self.entries) if entry.line >= line), len(self.entries))
 
     def position_of_second(self, at_s: float) -> int:
-        """How many entries stand before the first that is not before this mission second."""
-        return next((number for number, entry in enumerate(self.entries) if entry.what.t >= at_s), len(self.entries))
+        """Return the number of entries before this mission second."""
+        return next((number for number, entry in enumerate(self.entries) if entry.content.t >= at_s), len(self.entries))
 
     @cached_property
-    def unwritten(self) -> dict[int, str]:
-        """Entries before which lines are missing without a sign, by the numbers of what the agent sent; and why.
+    def unrecorded(self) -> dict[int, str]:
+        """Positions at which lines may be missing without a trace, with the reason.
 
-        Of the entries since it sent anything before that, nobody knows before which. An agent whose numbers often jump
-        counts wrongly: then nothing is missing.
+        A jump in the sequence numbers of sent messages shows that lines are missing, somewhere after the last sent
+        message. If an agent's numbers jump often, it numbers its messages in its own way, and no line counts as
+        missing.
         """
-        unwritten: dict[int, str] = {}
-        life, expected, sent_at = 0, None, 0
+        unrecorded: dict[int, str] = {}
+        incarnation, expected, sent_at = 0, None, 0
         sendings = jumps = 0
         for position, entry in enumerate(self.entries):
-            if entry.life != life or entry.gap is not None:
-                life, expected = entry.life, None
-            if isinstance(entry.what, HandlerRun) and entry.what.sent:
-                first = entry.what.sent[0].seq
+            if entry.incarnation != incarnation or entry.gap is not None:
+                incarnation, expected = entry.incarnation, None
+            if isinstance(entry.content, HandlerRun) and entry.content.sent:
+                first = entry.content.sent[0].seq
                 sendings += 1
                 if expected is not None and expected < first:
                     jumps += 1
                     why = f"lines are missing (no line has its message{_numbers(expected, first - 1)})"
-                    unwritten.update(dict.fromkeys(range(sent_at, position + 1), why))
-                expected, sent_at = entry.what.sent[-1].seq + 1, position + 1
-        return unwritten if jumps <= max(JUMPS, sendings * JUMPING) else {}
+                    unrecorded.update(dict.fromkeys(range(sent_at, position + 1), why))
+                expected, sent_at = entry.content.sent[-1].seq + 1, position + 1
+        return unrecorded if jumps <= max(MAX_JUMPS, sendings * MAX_JUMP_SHARE) else {}
 
     @property
-    def ends_s(self) -> float:
-        """The mission second of its last line."""
-        return self.entries[-1].what.t
+    def end_s(self) -> float:
+        """The mission second of the last line."""
+        return self.entries[-1].content.t
 
     @cached_property
-    def was_there_until_s(self) -> float | None:
-        """When the agent was there for certain after its last line, so that what is overdue by then is missing.
+    def present_until_s(self) -> float | None:
+        """A mission second at which the agent certainly still ran, after its last line. None if unknown.
 
-        In mission seconds; None if nobody knows that it was.
+        Steps that were due before this time, but have no line, are missing.
         """
-        if self.trace.cut_off or self.trace.problem or self.agent_id not in self.beside.exports:
+        if self.trace.cut_off or self.trace.problem or self.agent_id not in self.flight.exports:
             return None
-        if self.beside.record is not None:
-            return self.beside.record.end_of(self.agent_id)
+        if self.flight.record is not None:
+            return self.flight.record.end_of(self.agent_id)
         epoch_us = self.trace.header.clock.get("epoch_us")
         if not isinstance(epoch_us, int):
             return None
-        exported_s = (self.beside.exports[self.agent_id].exported_at_us - epoch_us) / MICROSECONDS
+        exported_s = (self.flight.exports[self.agent_id].exported_at_us - epoch_us) / MICROSECONDS
         exported_s = (exported_s - self.header.offset_s) / self.header.rate
-        return exported_s if exported_s >= self.ends_s else None
+        return exported_s if exported_s >= self.end_s else None
 
     def was_paused(self, since: float, until: float) -> bool:
-        """Whether the agent stood still at any time between two mission seconds, or may have.
+        """Return whether the agent was paused, or may have been, at any time between two mission seconds.
 
-        Where no run's record tells, its own lines do: one that is not heard of while a timer ends, and that catches up
-        as soon as it is heard of again, may have stood still.
+        The record of a run contains the pauses. Without it, an agent may have been paused if it wrote no line while a
+        timer was overdue, and caught up with its next line.
         """
-        if self.beside.record is not None:
-            return Evidence({}, record=self.beside.record).was_paused(self.agent_id, since, until)
+        if self.flight.record is not None:
+            return Evidence({}, record=self.flight.record).was_paused(self.agent_id, since, until)
         after = bisect_right(self._times, since)
-        awake_s = self._times[after] if after < len(self._times) else until
-        return since + self.header.late_s < awake_s and until <= awake_s + self.header.late_s
+        next_s = self._times[after] if after < len(self._times) else until
+        return since + self.header.late_s < next_s and until <= next_s + self.header.late_s
 
     @cached_property
     def _times(self) -> list[float]:
-        return sorted(entry.what.t for entry in self.entries)
+        return sorted(entry.content.t for entry in self.entries)
 
 
 def _entries(trace: Trace) -> Iterator[Entry]:
-    """The lines of a trace in their order."""
+    """Yield the lines of a trace in order."""
     missing = {gap.position: _missing(gap.lines) for gap in trace.gaps}
     missing |= dict.fromkeys(trace.jumps, "the agent's clock was set")
     asides = deque(zip((position for position, _ in trace.asides), trace.numbered_asides(), strict=True))
     position = 0
-    for life, of_life in enumerate(trace.incarnations(), 1):
-        for line, run in of_life:
+    for incarnation, numbered_runs in enumerate(trace.incarnations(), 1):
+        for line, run in numbered_runs:
             while asides and asides[0][0] <= position:
-                yield Entry(asides[0][1][0], life, asides.popleft()[1][1])
-            yield Entry(line, life, run, missing.get(position))
+                yield Entry(asides[0][1][0], incarnation, asides.popleft()[1][1])
+            yield Entry(line, incarnation, run, missing.get(position))
             position += 1
     for _, (line, aside) in asides:
         yield Entry(line, len(trace.starts) + 1, aside)

@@ -1,4 +1,4 @@
-"""What the other agents did at the moment at which a record stands, if their records are there."""
+"""The steps of the other agents at the current moment of a replay, if their records are available."""
 
 from bisect import bisect_right
 from collections.abc import Iterator
@@ -8,9 +8,9 @@ from itertools import accumulate
 from rich.text import Text
 
 from harness.archive.traces import Trace
-from harness.field.reconstruct._clock_offsets import Line, estimate
+from harness.field.reconstruct._clock_offsets import ClockLine, estimate
 from harness.field.replay._agent_record import Record
-from harness.field.replay._peer_messages import Exchanges
+from harness.field.replay._peer_messages import PeerMessages
 from harness.field.replay._player import Player
 from harness.present.text import shown
 from ucp.clock import MICROSECONDS
@@ -18,33 +18,33 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 NEAR_S = 2.0
-"""Steps of others so near to the moment are shown, in mission seconds before and after."""
+"""Maximum time between a shown step and the moment, in mission seconds before and after."""
 STEPS_SHOWN = 2
-"""Before, and after; besides what has to do with the step."""
+"""Maximum number of shown steps before, and after, the moment. Steps related to the current one are shown as well."""
 
 
-class Others:
-    """Reads their records when it is first asked.
+class OtherAgents:
+    """The records of the other agents. They are read at their first use.
 
-    The agents of a run share one clock. What came home from the field has clocks of its own, which the messages between
-    two agents tell apart.
+    The agents of a run share one clock. Agents in the field have separate clocks, whose offsets follow from the
+    messages between two agents.
     """
 
     def __init__(self, record: Record) -> None:
         self._record = record
 
     @cached_property
-    def _traces(self) -> dict[int, "_Other"]:
+    def _traces(self) -> dict[int, "_OtherAgent"]:
         record = self._record
-        others = {agent_id: trace for agent_id, trace in record.beside.traces.items() if agent_id != record.agent_id}
-        return {agent_id: _Other(record, trace) for agent_id, trace in others.items()}
+        others = {agent_id: trace for agent_id, trace in record.flight.traces.items() if agent_id != record.agent_id}
+        return {agent_id: _OtherAgent(record, trace) for agent_id, trace in others.items()}
 
     def at(self, player: Player) -> Iterator[Text]:
-        """What each did around this moment, what it held then, and what it has to do with this step."""
+        """Yield for each agent its steps at this moment, its state, and its relation to the current step."""
         entry = player.entry
-        now = entry.what.t if entry else 0.0
+        now = entry.content.t if entry else 0.0
         top = player.state.chain.top_chain_hash.hex()
-        run = entry.what if entry and isinstance(entry.what, HandlerRun) else None
+        run = entry.content if entry and isinstance(entry.content, HandlerRun) else None
         if not self._traces:
             yield shown("  no records of other agents in this directory", style="yellow")
         for agent_id in sorted({*self._record.header.roster, *self._traces} - {self._record.agent_id}):
@@ -52,43 +52,42 @@ class Others:
             if other is None:
                 yield shown(f"  agent {agent_id}: no record in this directory", style="dim")
                 continue
-            yield shown(f"  agent {agent_id}: ", style="bold").append(shown(other.held(now, top), "not bold"))
+            yield shown(f"  agent {agent_id}: ", style="bold").append(shown(other.state_text(now, top), "not bold"))
             if run is not None:
-                yield from other.has_to_do_with(agent_id, run)
-            for number in other.near(now):
-                line, theirs = other.runs[number]
-                after_s = other.clock.at(theirs.t) - now
-                words = (
-                    f"{after_s:+8.3f} s  line {line}: A{theirs.algorithm} {theirs.handler[:40]}: {theirs.branch[:40]}"
-                )
+                yield from other.related_lines(agent_id, run)
+            for number in other.runs_near(now):
+                line, their_run = other.runs[number]
+                after_s = other.clock.at(their_run.t) - now
+                handler = f"A{their_run.algorithm} {their_run.handler[:40]}: {their_run.branch[:40]}"
+                words = f"{after_s:+8.3f} s  line {line}: {handler}"
                 yield shown(f"    {words}", style="dim")
 
 
-class _Other:
-    """`clock` is what its clock shows beside ours."""
+class _OtherAgent:
+    """Another agent. `clock` is its clock relative to that of the replayed agent."""
 
     def __init__(self, record: Record, trace: Trace) -> None:
-        self._exchanges = Exchanges(record, trace)
-        self.runs = self._exchanges.runs
-        self.clock = Line() if record.beside.record is not None else self._estimated(record, trace)
+        self._messages = PeerMessages(record, trace)
+        self.runs = self._messages.runs
+        self.clock = ClockLine() if record.flight.record is not None else self._estimated(record, trace)
         self._times = [*accumulate((self.clock.at(run.t) for _, run in self.runs), max)]
 
-    def _estimated(self, record: Record, trace: Trace) -> Line:
+    def _estimated(self, record: Record, trace: Trace) -> ClockLine:
         own, other = record.agent_id, trace.header.agent_id
-        deliveries = [exchange.delivery for exchange in self._exchanges]
+        deliveries = [message.delivery for message in self._messages]
         if not deliveries:
-            return Line(_ahead_s(record.trace, trace))
+            return ClockLine(_ahead_s(record.trace, trace))
         clocks = estimate((own, other), deliveries)
         return clocks[other].after(clocks[own].inverse())
 
-    def near(self, now: float) -> range:
-        """Its last runs before this moment, and the next."""
+    def runs_near(self, now: float) -> range:
+        """Return the positions of its last runs before this moment, and of the next ones."""
         first, until = (bisect_right(self._times, now + seconds) for seconds in (-NEAR_S, NEAR_S))
         middle = bisect_right(self._times, now)
         return range(max(first, middle - STEPS_SHOWN), min(until, middle + STEPS_SHOWN))
 
-    def held(self, now: float, top: str) -> str:
-        """What it held."""
+    def state_text(self, now: float, top: str) -> str:
+        """Return its state at this moment."""
         number = bisect_right(self._times, now) - 1
         if number < 0:
             return "nothing yet"
@@ -100,33 +99,33 @@ class _Other:
             f"{chain}, deque {state.deque}, stack {state.stack}, {doing} since line {line}, {run.t:.3f} s of its clock"
         )
 
-    def has_to_do_with(self, theirs: int, run: HandlerRun) -> Iterator[Text]:
-        """Where it sent what triggered our run, and what it made of what our run sent."""
+    def related_lines(self, their_run: int, run: HandlerRun) -> Iterator[Text]:
+        """Yield the step that sent the message which triggered our run, and the steps that received our messages."""
         trigger = run.trigger
-        if isinstance(trigger, MessageTrigger) and trigger.sender == theirs:
-            numbers = self._exchanges.that_sent(trigger.message, trigger.sequence)
+        if isinstance(trigger, MessageTrigger) and trigger.sender == their_run:
+            numbers = self._messages.runs_that_sent(trigger.message, trigger.sequence)
             for line, sending in self._nearest(numbers, run.t):
                 yield shown(
                     f"    sent it at line {line}, by {sending.handler[:40]}: {sending.branch[:40]}", style="green"
                 )
         for message in run.sent:
-            heard = self._nearest(self._exchanges.that_heard(message.message, message.seq), run.t)
-            for line, hearing in heard:
-                words = f"heard {message.message[:60]} {message.seq} at line {line}: {hearing.branch[:40]}"
+            receipts = self._nearest(self._messages.runs_that_received(message.message, message.seq), run.t)
+            for line, receipt in receipts:
+                words = f"heard {message.message[:60]} {message.seq} at line {line}: {receipt.branch[:40]}"
                 yield shown(f"    {words}", style="green")
-            if not heard:
+            if not receipts:
                 yield shown(f"    has no line for {message.message[:60]} {message.seq}", style="yellow")
 
     def _nearest(self, numbers: list[int], at_s: float) -> list[tuple[int, HandlerRun]]:
-        """The sequence numbers of a new life begin anew: it is the run nearest in time."""
+        """Return the run nearest in time. Sequence numbers repeat in each incarnation, so several runs may match."""
         runs = (self.runs[number] for number in numbers)
         return sorted(runs, key=lambda numbered: abs(self.clock.at(numbered[1].t) - at_s))[:1]
 
 
-def _ahead_s(ours: Trace, theirs: Trace) -> float:
-    """How much more their mission clock shows than ours, by the moments at which they began."""
-    own, other = (trace.header.clock.get("epoch_us") for trace in (ours, theirs))
-    speedup = ours.header.clock.get("speedup", 1.0)
+def _ahead_s(our_trace: Trace, their_run: Trace) -> float:
+    """Return the offset of the other mission clock from ours, from the start times of both."""
+    own, other = (trace.header.clock.get("epoch_us") for trace in (our_trace, their_run))
+    speedup = our_trace.header.clock.get("speedup", 1.0)
     if not (isinstance(own, int) and isinstance(other, int) and isinstance(speedup, int | float)):
         return 0.0
     return (own - other) / MICROSECONDS * speedup

@@ -1,4 +1,4 @@
-"""The messages between the agent of a record and another, as both records have them."""
+"""The messages between the agent of a record and one other agent, as both records contain them."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -10,50 +10,50 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 
-class Exchange(NamedTuple):
-    """A message on its way, and which entry of the record sent or heard it."""
+class PeerMessage(NamedTuple):
+    """A message, with the position of the entry that sent or received it."""
 
     position: int
     delivery: Delivery
 
 
-class Exchanges:
-    """`runs` are the other's handler runs, with their lines."""
+class PeerMessages:
+    """The messages between both agents. `runs` are the handler runs of the other agent, with line numbers."""
 
-    def __init__(self, record: Record, theirs: Trace) -> None:
-        self.runs = [numbered for life in theirs.incarnations() for numbered in life]
+    def __init__(self, record: Record, other_trace: Trace) -> None:
+        self.runs = [numbered for numbered_runs in other_trace.incarnations() for numbered in numbered_runs]
         self._record = record
-        self._agents = record.agent_id, theirs.header.agent_id
+        self._agents = record.agent_id, other_trace.header.agent_id
         self._sent: dict[tuple[object, object], list[int]] = {}
-        self._heard: dict[tuple[object, object], list[int]] = {}
+        self._received: dict[tuple[object, object], list[int]] = {}
         for number, (_, run) in enumerate(self.runs):
             for message in run.sent:
                 self._sent.setdefault((message.message, message.seq), []).append(number)
             trigger = run.trigger
             if isinstance(trigger, MessageTrigger) and trigger.sender == record.agent_id:
-                self._heard.setdefault((trigger.message, trigger.sequence), []).append(number)
+                self._received.setdefault((trigger.message, trigger.sequence), []).append(number)
 
-    def that_sent(self, message: object, sequence: object) -> list[int]:
-        """The other's runs that sent a message of this type and number: one in each of its lives, at most."""
+    def runs_that_sent(self, message: object, sequence: object) -> list[int]:
+        """Return the positions of runs that sent a message of this type and number: at most one per incarnation."""
         return self._sent.get((message, sequence), [])
 
-    def that_heard(self, message: object, sequence: object) -> list[int]:
-        """The other's runs that such a message of ours triggered."""
-        return self._heard.get((message, sequence), [])
+    def runs_that_received(self, message: object, sequence: object) -> list[int]:
+        """Return the positions of runs that such a message of our agent triggered."""
+        return self._received.get((message, sequence), [])
 
-    def __iter__(self) -> Iterator[Exchange]:
-        """What is certain to be the same message on both records, in the order of ours."""
+    def __iter__(self) -> Iterator[PeerMessage]:
+        """Yield the messages that both records certainly contain, in the order of our record."""
         own, other = self._agents
         for position, entry in enumerate(self._record.entries):
-            run = entry.what
+            run = entry.content
             if not isinstance(run, HandlerRun):
                 continue
             trigger = run.trigger
             if isinstance(trigger, MessageTrigger) and trigger.sender == other:
-                sent = self.that_sent(trigger.message, trigger.sequence)
+                sent = self.runs_that_sent(trigger.message, trigger.sequence)
                 if len(sent) == 1:
-                    yield Exchange(position, Delivery(other, own, self.runs[sent[0]][1].t, run.t))
+                    yield PeerMessage(position, Delivery(other, own, self.runs[sent[0]][1].t, run.t))
             for message in run.sent:
-                heard = self.that_heard(message.message, message.seq)
-                if len(heard) == 1:
-                    yield Exchange(position, Delivery(own, other, run.t, self.runs[heard[0]][1].t))
+                received = self.runs_that_received(message.message, message.seq)
+                if len(received) == 1:
+                    yield PeerMessage(position, Delivery(own, other, run.t, self.runs[received[0]][1].t))

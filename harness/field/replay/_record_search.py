@@ -1,6 +1,7 @@
-"""Finds the records in what a user names: a trace, the directory of a run, or one of files in any state.
+"""Find the records in a path: a trace, the directory of a run, or a directory of any files.
 
-What a run left has its place there, and nothing else is read; all else is sorted out first.
+In the directory of a run, the files have known names, and only the needed ones are read. In every other directory all
+files are ingested first.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,16 +15,16 @@ from harness.archive.run_record import JudgedRecord
 from harness.archive.traces import HEADER, MAX_LINE_BYTES, SUFFIX, Trace, read_trace
 from harness.checker.evidence import check_variant
 from harness.errors import FieldError, RunDirectoryError
-from harness.field.ingest import Flight, Homecoming, sort_out
+from harness.field.ingest import Flight, IngestResult, ingest_files
 from harness.field.replay._agent_record import Record
 from harness.gc_pause import gc_paused
 
 AGENTS = "agents"
-"""Directory in a run's with what the agents left."""
+"""Directory of the agents' files in a run directory."""
 
 
-class _Run:
-    """What the directory of a run holds."""
+class _RunRecords:
+    """The records in the directory of a run."""
 
     def __init__(self, directory: Path) -> None:
         self._archive = RunArchive(directory)
@@ -43,8 +44,8 @@ class _Run:
         return self._archive.judged_record
 
 
-class _Around:
-    """What lies around a trace in its directory, of the same mission."""
+class _DirectoryRecords:
+    """The records of the same mission in the directory of a trace."""
 
     record = None
 
@@ -58,18 +59,20 @@ class _Around:
             exports = RunArchive(self._directory).exports.by_agent
         except RunDirectoryError:
             return {}
-        ours = self._header.initial_data
-        return {agent_id: export for agent_id, export in exports.items() if export.inception.block_data == ours}
+        own_flights = self._header.initial_data
+        return {agent_id: export for agent_id, export in exports.items() if export.inception.block_data == own_flights}
 
     @cached_property
     def traces(self) -> Mapping[int, Trace]:
-        flights = sort_out([self._directory]).flights
-        ours = (flight for flight in flights if self._header in (trace.header for trace in flight.traces.values()))
-        return next(ours, Flight(None)).traces
+        flights = ingest_files([self._directory]).flights
+        own_flights = (
+            flight for flight in flights if self._header in (trace.header for trace in flight.traces.values())
+        )
+        return next(own_flights, Flight(None)).traces
 
 
-class _OfFlight:
-    """What has been sorted out already."""
+class _IngestedRecords:
+    """The records of a flight that was ingested before."""
 
     record = None
 
@@ -79,7 +82,7 @@ class _OfFlight:
 
 
 def open_record(path: Path, agent_id: int | None = None) -> Record:
-    """The record in a trace, or that of an agent in a directory. Raises FieldError if there is none to play."""
+    """Return the record in a trace, or that of an agent in a directory. Raises FieldError if none can be played."""
     records = open_records(path, agent_id)
     if len(records) > 1:
         names = ", ".join(str(record.agent_id) for record in records)
@@ -88,30 +91,35 @@ def open_record(path: Path, agent_id: int | None = None) -> Record:
 
 
 def open_records(path: Path, agent_id: int | None = None) -> list[Record]:
-    """All records in a trace or a directory, or that of an agent. Raises FieldError if there is none to play."""
+    """Return all records in a trace or a directory, or that of one agent. Raises FieldError if none can be played."""
     files = _files_in(path, agent_id) if path.is_dir() else [path]
     directory = path if path.is_dir() else _directory_of(path)
     traces = [trace for file in files if (trace := _read(file)) and not trace.problem and not trace.cut_off]
     if len(traces) < len(files):
-        return _sorted_out(path, agent_id, files) or _sorted_out(path, agent_id, [path])
+        return _open_ingested(path, agent_id, files) or _open_ingested(path, agent_id, [path])
     if not files:
-        return _sorted_out(path, agent_id, [path])
+        return _open_ingested(path, agent_id, [path])
     if agent_id is not None and traces[0].header.agent_id != agent_id:
         raise FieldError(f"{files[0]}: the trace belongs to agent {traces[0].header.agent_id}, not to agent {agent_id}")
-    run = _Run(directory) if (directory / RUN_FILE).is_file() else None
-    found = []
+    run_records = _RunRecords(directory) if (directory / RUN_FILE).is_file() else None
+    records_to_open = []
     for file, trace in zip(files, traces, strict=True):
-        named = _named(path, trace.header.agent_id if path.is_dir() else None)
-        found.append(partial(Record, file, named, trace, run or _Around(trace, file.parent), []))
-    return _playable(found)
+        argument = _command_argument(path, trace.header.agent_id if path.is_dir() else None)
+        records_to_open.append(
+            partial(Record, file, argument, trace, run_records or _DirectoryRecords(trace, file.parent), [])
+        )
+    return _playable(records_to_open)
 
 
 def _playable(records: Iterable[Callable[[], Record]]) -> list[Record]:
-    """Those that can be played; of the others it is said with the first. Raises FieldError if it is none."""
+    """Return the records that can be played.
+
+    The problems of the others are added to the first. Raises FieldError if none can.
+    """
     playable, problems = [], []
-    for opened in records:
+    for open_record_of in records:
         try:
-            playable.append(opened())
+            playable.append(open_record_of())
         except FieldError as error:
             problems.append(str(error))
     if not playable:
@@ -120,7 +128,7 @@ def _playable(records: Iterable[Callable[[], Record]]) -> list[Record]:
     return playable
 
 
-def _named(path: Path, agent_id: int | None) -> str:
+def _command_argument(path: Path, agent_id: int | None) -> str:
     return f"{path} --agent {agent_id}" if agent_id else f"{path}"
 
 
@@ -130,15 +138,15 @@ def _read(file: Path) -> Trace | None:
 
 
 def _directory_of(file: Path) -> Path:
-    """That of the run that left the file, or the one that it is in."""
-    run = file.parent.parent
-    return run if file.parent.name == AGENTS and (run / RUN_FILE).is_file() else file.parent
+    """Return the directory of the run that wrote the file, else the directory of the file."""
+    run_records = file.parent.parent
+    return run_records if file.parent.name == AGENTS and (run_records / RUN_FILE).is_file() else file.parent
 
 
 def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
-    """The traces of all agents, or of one, if they are where a run leaves them and nothing else there can be of these.
+    """Return the traces of all agents, or of one, if their names identify them and no other file can belong to them.
 
-    Nothing if all has to be sorted out, which takes as long as reading all.
+    Otherwise return nothing. Then all files must be ingested, which takes longer.
     """
     agents = agents_directory(directory)
     if (directory / RUN_FILE).is_file():
@@ -147,58 +155,64 @@ def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
     file = agents / f"{agent_id}{SUFFIX}"
     if agent_id is None or not file.is_file():
         return []
-    return [file] if all(_is_of_another(path, agent_id) for path in agents.iterdir() if path != file) else []
+    return [file] if all(_belongs_to_another(path, agent_id) for path in agents.iterdir() if path != file) else []
 
 
-def _is_of_another(path: Path, agent_id: int) -> bool:
-    """Whether a file can be no record of the agent, by its name or its beginning."""
+def _belongs_to_another(path: Path, agent_id: int) -> bool:
+    """Return whether a file certainly contains no record of the agent, judged by its name or first line."""
     if path.name.endswith((".chain.json", ".mission.json", ".log", ".store")):
         return True
     try:
         with path.open("rb") as other:
-            begins = other.readline(MAX_LINE_BYTES)
-            return begins[:4] in MAGICS or HEADER.validate_json(begins).agent_id != agent_id
+            beginning = other.readline(MAX_LINE_BYTES)
+            return beginning[:4] in MAGICS or HEADER.validate_json(beginning).agent_id != agent_id
     except (OSError, ValueError):
         return False
 
 
-def _sorted_out(path: Path, agent_id: int | None, sources: Sequence[Path]) -> list[Record]:
-    """The records in files of any kind and in any state; none if only a part of `path` was looked at, and has none."""
-    homecoming = sort_out(sources)
-    flights = [flight for flight in homecoming.flights if flight.traces]
+def _open_ingested(path: Path, agent_id: int | None, sources: Sequence[Path]) -> list[Record]:
+    """Return the records in files of any kind. Empty if only a part of `path` was read, and it has too few records."""
+    ingested = ingest_files(sources)
+    flights = [flight for flight in ingested.flights if flight.traces]
     if path not in sources and len({agent for flight in flights for agent in flight.traces}) < len(sources):
         return []
     if not flights:
-        why = f": {homecoming.left_out[0].why}" if homecoming.left_out else ""
+        why = f": {ingested.left_out[0].why}" if ingested.left_out else ""
         raise FieldError(f"{path}: no trace here can be played{why}; give a trace, or a directory of traces")
-    whose = sorted({agent for flight in flights for agent in flight.traces})
-    if agent_id is not None and agent_id not in whose:
-        raise FieldError(f"{path}: no trace of agent {agent_id}; choose one of {', '.join(map(str, whose))}")
-    chosen = whose if agent_id is None else [agent_id]
+    recorded_agents = sorted({agent for flight in flights for agent in flight.traces})
+    if agent_id is not None and agent_id not in recorded_agents:
+        raise FieldError(f"{path}: no trace of agent {agent_id}; choose one of {', '.join(map(str, recorded_agents))}")
+    chosen = recorded_agents if agent_id is None else [agent_id]
     directory = path if path.is_dir() else _directory_of(path)
-    run = _Run(directory) if (directory / RUN_FILE).is_file() else None
+    run_records = _RunRecords(directory) if (directory / RUN_FILE).is_file() else None
     records = []
     for agent in chosen:
-        flown = [flight for flight in flights if agent in flight.traces]
-        trace, file = flown[0].traces[agent], flown[0].sources[agent][0]
-        problems = [*_remarks(homecoming, agent)]
-        if len(flown) > 1:
-            problems.append(f"{path}: agent {agent} has {len(flown)} flights; the one with the most files is played")
-        beside = run or (_OfFlight(flown[0]) if path.is_dir() and path in sources else _Around(trace, file.parent))
-        named = _named(path, agent if path.is_dir() or len(whose) > 1 else None)
-        records.append(partial(Record, file, named, trace, beside, problems))
+        agent_flights = [flight for flight in flights if agent in flight.traces]
+        trace, file = agent_flights[0].traces[agent], agent_flights[0].sources[agent][0]
+        problems = [*_remarks(ingested, agent)]
+        if len(agent_flights) > 1:
+            problems.append(
+                f"{path}: agent {agent} has {len(agent_flights)} flights; the one with the most files is played"
+            )
+        flight_records = run_records or (
+            _IngestedRecords(agent_flights[0])
+            if path.is_dir() and path in sources
+            else _DirectoryRecords(trace, file.parent)
+        )
+        argument = _command_argument(path, agent if path.is_dir() or len(recorded_agents) > 1 else None)
+        records.append(partial(Record, file, argument, trace, flight_records, problems))
     return _playable(records)
 
 
-def _remarks(homecoming: Homecoming, agent_id: int) -> Iterator[str]:
-    """What is to say of all files but those of other agents."""
+def _remarks(ingested: IngestResult, agent_id: int) -> Iterator[str]:
+    """Yield the remarks on all files except those of other agents."""
     of_others = {
         file
-        for flight in homecoming.flights
+        for flight in ingested.flights
         for agent, sources in flight.sources.items()
         if agent != agent_id
         for file in sources
     }
-    for remark in (*homecoming.left_out, *homecoming.remarks):
+    for remark in (*ingested.left_out, *ingested.remarks):
         if remark.path not in of_others:
             yield remark.sentence

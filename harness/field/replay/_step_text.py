@@ -1,4 +1,4 @@
-"""A step, a state and a difference, for people to read; a line each, 100 columns mostly."""
+"""The text of a step, a state and a difference, mostly one line of at most 100 columns each."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import zip_longest
@@ -11,7 +11,7 @@ from harness.checker.steps.deviation import Deviation
 from harness.field.replay._agent_record import Entry
 from harness.field.replay._player import Player
 from harness.field.replay.breakpoints import source_of
-from harness.field.replay.replay_names import SHOWN, Names
+from harness.field.replay.replay_names import SHOWN, ReplayNames
 from harness.present.text import shown
 from ucp.agent import HANDLERS
 from ucp.block import Block
@@ -23,47 +23,51 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 BLOCKS_SHOWN = 8
 
 
-class Words:
-    """How a player's record is put, `names` being those of its blocks."""
+class StepText:
+    """The texts of a player's record. `names` has the names of its blocks."""
 
-    def __init__(self, player: Player, names: Names) -> None:
+    def __init__(self, player: Player, names: ReplayNames) -> None:
         self._player = player
         self._names = names
 
     # A step
 
     def line(self, number: int, entry: Entry) -> Text:
-        """The entry of this number, from 1: "  212   604.278 s  A18 receive_response_block_for_hash: committed"."""
-        where = f"{entry.line:>7} {entry.what.t:>10.3f} s  "
-        match entry.what:
+        """Return the line of the entry with this number, from 1: " 212 604.278 s A18
+        receive_response_block_for_hash: committed".
+        """
+        where = f"{entry.line:>7} {entry.content.t:>10.3f} s  "
+        match entry.content:
             case HandlerRun() as run:
-                words = f"A{run.algorithm:<3}{run.handler[:40]}: {run.branch[:40]}"
-            case Dropped() as aside:
-                words = f"    dropped a datagram: {aside.dropped[:60]}"
-            case aside:
-                words = f"    command {aside.command[:40]}"
-        differs = number in self._player.found.positions
-        return shown(f"{'✘' if differs else ' '}{where}{words}", style="red" if differs else "")
+                text = f"A{run.algorithm:<3}{run.handler[:40]}: {run.branch[:40]}"
+            case Dropped() as entry_content:
+                text = f"    dropped a datagram: {entry_content.dropped[:60]}"
+            case entry_content:
+                text = f"    command {entry_content.command[:40]}"
+        differs = number in self._player.result.positions
+        return shown(f"{'✘' if differs else ' '}{where}{text}", style="red" if differs else "")
 
     def step(self) -> Iterator[Text]:
-        """What was played last: why, what the algorithm says of it, what came of it, and where that is wrong."""
+        """Yield the lines of the step played last: its cause, the rule of its Algorithm, its effects and its
+        deviations.
+        """
         player = self._player
         entry = player.entry
         if entry is None:
             yield shown(f"before line 1: agent {player.record.agent_id} as it begins", style="bold")
             return
-        life = f", life {entry.life}" if player.record.lives > 1 and entry.life else ""
-        place = f"line {entry.line}{life}, t={entry.what.t:.3f} s"
+        incarnation = f", life {entry.incarnation}" if player.record.incarnations > 1 and entry.incarnation else ""
+        place = f"line {entry.line}{incarnation}, t={entry.content.t:.3f} s"
         if entry.gap is not None:
             yield shown(f"before this {entry.gap}", style="yellow")
-        match entry.what:
+        match entry.content:
             case HandlerRun() as run:
                 yield from self._run(run, place)
-            case Dropped() as aside:
-                yield shown(f"{place}: dropped, {aside.dropped[:60]}", style="bold")
-                yield _row("came", self._datagram(aside.datagram))
-            case aside:
-                yield shown(f"{place}: command {aside.command[:60]}", style="bold")
+            case Dropped() as entry_content:
+                yield shown(f"{place}: dropped, {entry_content.dropped[:60]}", style="bold")
+                yield _row("came", self._datagram(entry_content.datagram))
+            case entry_content:
+                yield shown(f"{place}: command {entry_content.command[:60]}", style="bold")
         for deviation in player.deviations_here():
             yield self.deviation(deviation)
         if player.lost is not None:
@@ -90,14 +94,14 @@ class Words:
             yield _row("counted", ", ".join(self._counted(key, count) for key, count in run.tally.items()))
 
     def deviation(self, deviation: Deviation) -> Text:
-        """Which step it is of is said where that is another than the one played last."""
+        """Return the line of a deviation. It names the step if that is not the one played last."""
         entry = self._player.entry
-        own = entry is not None and entry.line == deviation.line and isinstance(entry.what, HandlerRun)
+        own = entry is not None and entry.line == deviation.line and isinstance(entry.content, HandlerRun)
         whose = "" if own else f"of line {deviation.line}, {deviation.handler}: "
         return shown(f"  ✘ {whose}{deviation.difference(self._names.of)}", style="bold red")
 
-    def beside(self, deviation: Deviation) -> Table | Text:
-        """The agent's own record of a step beside what the reference does; what differs is marked."""
+    def side_by_side(self, deviation: Deviation) -> Table | Text:
+        """Return a table of the recorded step and the step of the reference. Differences are marked."""
         if deviation.run is None or deviation.expected is None:
             return self.deviation(deviation)
         table = Table("", "the agent's record", "the reference", box=None, padding=(0, 2, 0, 0))
@@ -117,8 +121,8 @@ class Words:
         )
         counted = ([self._counted(key, count) for key, count in (run.tally or {}).items()] for run in runs)
         yield from _paired("counted", *counted)
-        for what in ("chain", "deque", "stack", "reconciling", "idle"):
-            yield what, str(getattr(own.state, what)), str(getattr(right.state, what))
+        for content in ("chain", "deque", "stack", "reconciling", "idle"):
+            yield content, str(getattr(own.state, content)), str(getattr(right.state, content))
         yield "top", own.state.top[:SHOWN], right.state.top[:SHOWN]
 
     def _trigger(self, run: HandlerRun) -> str:
@@ -147,19 +151,19 @@ class Words:
         if isinstance(message, CommitBlock | BlockResponse):
             block = f"block {self._names.of(message.block.block_hash.hex())}"
             return f"{block} for {self.chain(message.chain_hash)}" if isinstance(message, CommitBlock) else block
-        words = []
+        text = []
         for field in type(message).WIRE:
             value = getattr(message, field)
             if field == "chain_hash":
-                words += [self.chain(value)] if value else []
+                text += [self.chain(value)] if value else []
             elif field == "block_hash":
-                words.append(f"block {self._names.of(value.hex())}" if value else "Is Top Of Chain")
+                text.append(f"block {self._names.of(value.hex())}" if value else "Is Top Of Chain")
             elif isinstance(value, bool):
-                words.append("yes" if value else "no")
-        return ", ".join(words)
+                text.append("yes" if value else "no")
+        return ", ".join(text)
 
     def chain(self, chain_hash: bytes) -> str:
-        """A chain by its hash, and where it is in the agent's own, if it is."""
+        """Return a chain hash, and whether it belongs to the agent's own chain."""
         chain = self._player.state.chain
         if chain_hash == chain.top_chain_hash:
             own = "our top"
@@ -181,7 +185,7 @@ class Words:
     # The state
 
     def in_short(self) -> Text:
-        """The state in a line."""
+        """Return the state in one line."""
         if self._player.lost is not None:
             return shown("  the state of the agent is not known", style="yellow")
         state = self._player.state
@@ -189,11 +193,11 @@ class Words:
             f"chain {len(state.chain)}, deque {len(state.blocks_to_be_committed)}, stack {len(state.reconcile_stack)}"
         )
         doing = "reconciling" if state.reconcile_in_progress else "idle" if state.idle else "voting"
-        timers = "".join(f", {words}" for words in self._timers())
+        timers = "".join(f", {text}" for text in self._timers())
         return shown(f"  {held}, {doing}{timers}", style="cyan")
 
     def state(self) -> Iterator[Text]:
-        """All that the agent holds, asks and counts after the step."""
+        """Yield the lines of the complete state after the step."""
         if self._player.lost is not None:
             yield self.in_short()
             return
@@ -246,9 +250,9 @@ class Words:
         return f"{len(blocks)}: … {names}" if last else f"{len(blocks)}: {names} …"
 
 
-def _row(label: str, words: str, style: str = "") -> Text:
+def _row(label: str, text: str, style: str = "") -> Text:
     return shown(f"  {label:<10}", style="dim").append(
-        shown(words, style=f"not dim {style}" if style != "dim" else "dim")
+        shown(text, style=f"not dim {style}" if style != "dim" else "dim")
     )
 
 
@@ -257,8 +261,8 @@ def _paired(label: str, own: list[str], right: list[str]) -> Iterator[tuple[str,
         yield label if not number else "", of_own, of_right
 
 
-def _some(words: Iterable[str], count: int) -> str:
-    shown = [word for word, _ in zip(words, range(BLOCKS_SHOWN), strict=False)]
+def _some(text: Iterable[str], count: int) -> str:
+    shown = [word for word, _ in zip(text, range(BLOCKS_SHOWN), strict=False)]
     more = f" and {count - len(shown)} more" if count > len(shown) else ""
     return ", ".join(shown) + more
 

@@ -1,4 +1,4 @@
-"""The commands of whoever steps through a record: forward and back, by step, handler, block, line and second."""
+"""The interactive command line of a replay: go forward and back by step, handler, block, line and second."""
 
 import cmd
 import sys
@@ -11,15 +11,15 @@ from rich.console import Console, RenderableType
 from harness.checker.steps.core_in_use import IN_USE
 from harness.errors import FieldError
 from harness.field.replay._agent_record import Entry
-from harness.field.replay._other_agents import Others
+from harness.field.replay._other_agents import OtherAgents
 from harness.field.replay._player import Player
-from harness.field.replay._step_text import Words
-from harness.field.replay.breakpoints import Place, next_place, place
-from harness.field.replay.replay_names import Names
+from harness.field.replay._step_text import StepText
+from harness.field.replay.breakpoints import Breakpoint, next_stop, parse_breakpoint
+from harness.field.replay.replay_names import ReplayNames
 
-AROUND = 5
-"""Lines that `list` shows before and after."""
-SHORT = {
+LINES_AROUND = 5
+"""Number of lines that `list` shows before and after."""
+SHORT_FORMS = {
     "n": "next",
     "b": "back",
     "c": "continue",
@@ -36,14 +36,14 @@ SHORT = {
 
 
 class Prompt(cmd.Cmd):
-    """Reads commands from standard input until it ends, or `quit`; `ended` says which of these.
+    """A prompt that reads commands from standard input until its end or `quit`. `quit` is true after the latter.
 
-    `breaks` are where `continue` stops, besides differences.
+    `breaks` are the places at which `continue` stops, in addition to differences.
     """
 
     identchars = cmd.Cmd.identchars + "-"
 
-    def __init__(self, player: Player, names: Names, console: Console, breaks: Sequence[str]) -> None:
+    def __init__(self, player: Player, names: ReplayNames, console: Console, breaks: Sequence[str]) -> None:
         self._terminal = sys.stdin.isatty()
         super().__init__()
         self.use_rawinput = self._terminal
@@ -51,24 +51,27 @@ class Prompt(cmd.Cmd):
         self._player = player
         self._names = names
         self._console = console
-        self._breaks: dict[str, Place] = {words: place(words, names) for words in breaks}
-        self._words = Words(player, names)
-        self._others = Others(player.record)
+        self._breakpoints: dict[str, Breakpoint] = {text: parse_breakpoint(text, names) for text in breaks}
+        self._text = StepText(player, names)
+        self._other_agents = OtherAgents(player.record)
 
     def begin(self, at_start: bool) -> None:
-        """Show the beginning of the record, or go on to the first break."""
+        """Show the beginning of the record, or go to the first breakpoint."""
         self._show()
         if not at_start:
             self.do_continue("")
 
-    # What cmd.Cmd asks for
+    # Overridden members of cmd.Cmd
 
     @property
     def prompt(self) -> str:  # type: ignore[override]
         return f"(replay {self._player.position}/{len(self._player.entries)}) " if self._terminal else ""
 
     def onecmd(self, line: str) -> bool:
-        """Run a command; a short form or the beginning of a name will do. An empty line is the last command again."""
+        """Run a command.
+
+        Short forms and unique beginnings of names are accepted. An empty line repeats the last command.
+        """
         name, argument, _ = self.parseline(line)
         if line == "EOF":
             if self._terminal:
@@ -78,40 +81,40 @@ class Prompt(cmd.Cmd):
             return self.emptyline()
         if not self._terminal:
             self._console.print(f"> {line.strip()[:60]}", style="dim", markup=False)
-        name = SHORT.get(name or line.strip(), name or "")
-        known = {command.removeprefix("do_").replace("_", "-") for command in self.get_names() if command[:3] == "do_"}
-        meant = [command for command in sorted(known) if command.startswith(name)]
-        if name not in known and len(meant) != 1:
-            self._say(f"no command {line.strip()[:60]!r}; help lists the commands")
+        name = SHORT_FORMS.get(name or line.strip(), name or "")
+        names = {command.removeprefix("do_").replace("_", "-") for command in self.get_names() if command[:3] == "do_"}
+        matching = [command for command in sorted(names) if command.startswith(name)]
+        if name not in names and len(matching) != 1:
+            self._print_message(f"no command {line.strip()[:60]!r}; help lists the commands")
             return False
         self.lastcmd = line
         run: Callable[[str], bool | None] = getattr(
-            self, f"do_{(name if name in known else meant[0]).replace('-', '_')}"
+            self, f"do_{(name if name in names else matching[0]).replace('-', '_')}"
         )
         try:
             return bool(run((argument or "").strip()))
         except FieldError as error:
-            self._say(str(error))
+            self._print_message(str(error))
             return False
 
     def do_help(self, arg: str) -> None:
-        """help: this"""
+        """help: list the commands"""
         for name in self.get_names():
             if name.startswith("do_"):
                 self._console.print(f"  {(getattr(self, name).__doc__ or '').strip()}", soft_wrap=True)
 
-    # Going
+    # Commands that move
 
     def do_next(self, arg: str) -> None:
-        """next [N | HANDLER | BLOCK | difference] (n): play the next step, N steps, or up to the next there"""
+        """next [N | HANDLER | BLOCK | difference] (n): play one step, N steps, or up to the next such step"""
         self._go(arg, backward=False)
 
     def do_back(self, arg: str) -> None:
-        """back [N | HANDLER | BLOCK | difference] (b): the same backward"""
+        """back [N | HANDLER | BLOCK | difference] (b): go back in the same way"""
         self._go(arg, backward=True)
 
     def do_continue(self, arg: str) -> None:
-        """continue (c): play up to the next break or difference, or to the end"""
+        """continue (c): play up to the next breakpoint or difference, or to the end"""
         player = self._player
         while not player.at_end:
             if self._stops_at(player.forward()):
@@ -119,8 +122,8 @@ class Prompt(cmd.Cmd):
         self._show()
 
     def do_reverse_continue(self, arg: str) -> None:
-        """reverse-continue (rc): go back to the break or difference before, or to the start"""
-        player, differing = self._player, {*self._player.found.positions}
+        """reverse-continue (rc): go back to the previous breakpoint or difference, or to the start"""
+        player, differing = self._player, {*self._player.result.positions}
         earlier = next(
             (
                 at
@@ -147,21 +150,21 @@ class Prompt(cmd.Cmd):
             player.to(record.position_of_second(at_s))
         self._show()
 
-    # Stopping
+    # Commands for breakpoints
 
     def do_break(self, arg: str) -> None:
-        """break [HANDLER | LINE | BLOCK]: let `continue` stop there; without anything, show where it does"""
+        """break [HANDLER | LINE | BLOCK]: let `continue` stop there; without an argument, list the breakpoints"""
         if arg:
-            self._breaks[arg] = place(arg, self._names)
-        self._say("stops at differences" + "".join(f", {words}" for words in self._breaks))
+            self._breakpoints[arg] = parse_breakpoint(arg, self._names)
+        self._print_message("stops at differences" + "".join(f", {text}" for text in self._breakpoints))
 
     def do_clear(self, arg: str) -> None:
-        """clear HANDLER | LINE | BLOCK: do not stop there any more"""
-        if self._breaks.pop(arg, None) is None:
-            self._say(f"no breakpoint at {arg[:60]!r}")
+        """clear HANDLER | LINE | BLOCK: remove the breakpoint"""
+        if self._breakpoints.pop(arg, None) is None:
+            self._print_message(f"no breakpoint at {arg[:60]!r}")
 
     def do_debug(self, arg: str) -> None:
-        """debug (d): play this step once more in the debugger, pdb or the IDE's; `step` from there is in its handler"""
+        """debug (d): play this step again in the debugger, pdb or that of the IDE; `step` then enters its handler"""
         player = self._player
         if not player.position:
             raise FieldError("nothing is played yet: enter next, then debug")
@@ -171,94 +174,94 @@ class Prompt(cmd.Cmd):
             in_use.forward(into_debugger=True)
         self._show()
 
-    # Looking
+    # Commands that show
 
     def do_state(self, arg: str) -> None:
-        """state (s): all that the agent holds, asks and counts after this step"""
-        self._print(*self._words.state())
+        """state (s): show the complete state of the agent after this step"""
+        self._print(*self._text.state())
 
     def do_why(self, arg: str) -> None:
-        """why (w): this step again: what triggered it, what the algorithm says, what came of it"""
+        """why (w): show this step again: its cause, the rule of its Algorithm, and its effects"""
         self._show()
 
     def do_compare(self, arg: str) -> None:
-        """compare: the agent's own record of this step beside what the reference does"""
+        """compare: show the recorded step and the step of the reference side by side"""
         deviations = self._player.deviations_here()
         if not deviations:
-            self._say("no difference here: the record equals the reference")
+            self._print_message("no difference here: the record equals the reference")
         for deviation in deviations:
-            self._print(self._words.beside(deviation))
+            self._print(self._text.side_by_side(deviation))
 
     def do_others(self, arg: str) -> None:
-        """others (o): what the other agents did at this moment, and who heard what this one sent"""
+        """others (o): show the steps of the other agents at this moment, and the receivers of this step's messages"""
         with self._console.status("reading the records of other agents"):
-            shown = [*self._others.at(self._player)]
+            shown = [*self._other_agents.at(self._player)]
         self._print(*shown)
 
     def do_list(self, arg: str) -> None:
-        """list (l): the lines around this one"""
+        """list (l): show the lines before and after this one"""
         player = self._player
-        first = max(0, player.position - 1 - AROUND)
-        for number, entry in enumerate(player.entries[first : player.position + AROUND], first + 1):
+        first = max(0, player.position - 1 - LINES_AROUND)
+        for number, entry in enumerate(player.entries[first : player.position + LINES_AROUND], first + 1):
             mark = "→" if number == player.position else " "
-            self._print(self._words.line(number, entry), before=mark)
+            self._print(self._text.line(number, entry), before=mark)
 
     def do_quit(self, arg: str) -> bool:
-        """quit (q): end here"""
+        """quit (q): end the replay"""
         self.quit = True
         return True
 
-    # How
+    # Helpers
 
     def _go(self, arg: str, backward: bool) -> None:
         player = self._player
         if not arg or arg.isdigit():
             steps = int(arg or 1)
             if (player.position == 0) if backward else player.at_end:
-                self._say("start of the record" if backward else "end of the record")
+                self._print_message("start of the record" if backward else "end of the record")
                 return
             player.to(player.position + (-steps if backward else steps))
         elif "difference".startswith(arg):
             self._go_to_difference(backward)
             return
         else:
-            position = next_place(player, place(arg, self._names), backward)
+            position = next_stop(player, parse_breakpoint(arg, self._names), backward)
             if position is None:
-                self._say(f"there is no {arg[:60]} {'before' if backward else 'after'} this")
+                self._print_message(f"there is no {arg[:60]} {'before' if backward else 'after'} this")
                 return
             player.to(position)
         self._show()
 
     def _go_to_difference(self, backward: bool) -> None:
         player = self._player
-        positions = player.found.positions
+        positions = player.result.positions
         if backward:
             earlier = [position for position in positions if position < player.position]
             if not earlier:
-                self._say("no difference before this step")
+                self._print_message("no difference before this step")
                 return
             player.to(earlier[-1])
         else:
-            known = len(positions)
-            while not player.at_end and len(player.found.positions) == known:
+            names = len(positions)
+            while not player.at_end and len(player.result.positions) == names:
                 player.forward()
-            if len(player.found.positions) == known:
-                self._say("no difference after this step")
+            if len(player.result.positions) == names:
+                self._print_message("no difference after this step")
         self._show()
 
     def _stops_at(self, entry: Entry) -> bool:
-        """Whether `continue` stops at the entry played last."""
-        positions = self._player.found.positions
+        """Return whether `continue` stops at the entry played last."""
+        positions = self._player.result.positions
         return positions[-1:] == [self._player.position] or self._breaks_at(entry)
 
     def _breaks_at(self, entry: Entry) -> bool:
-        return any(at(entry) for at in self._breaks.values())
+        return any(at(entry) for at in self._breakpoints.values())
 
     def _show(self) -> None:
-        self._print(*self._words.step(), self._words.in_short())
+        self._print(*self._text.step(), self._text.in_short())
 
-    def _say(self, words: str) -> None:
-        self._console.print(words, style="yellow", soft_wrap=True, markup=False)
+    def _print_message(self, text: str) -> None:
+        self._console.print(text, style="yellow", soft_wrap=True, markup=False)
 
     def _print(self, *lines: RenderableType, before: str = "") -> None:
         for line in lines:

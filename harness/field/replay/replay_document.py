@@ -1,4 +1,4 @@
-"""The result of a replay: the document `ucp-replay/1`, and a summary for people."""
+"""The result of a replay: the document `ucp-replay/1`, and a summary for users."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -11,9 +11,9 @@ from rich.text import Text
 from harness.checker.judgement import times
 from harness.checker.steps.deviation import Deviation
 from harness.field.replay._agent_record import Record
-from harness.field.replay._player import Found
+from harness.field.replay._player import ReplayResult
 from harness.field.replay.breakpoints import source_of
-from harness.field.replay.replay_names import Names
+from harness.field.replay.replay_names import ReplayNames
 from harness.present.text import shown
 from ucp.agent import HANDLERS
 
@@ -65,22 +65,22 @@ def document(records: Iterable[ReplayedRecord]) -> dict[str, Any]:
     return ReplayDocument(records=list(records)).model_dump(by_alias=True)
 
 
-def verdict(found: Found) -> Verdict:
-    """What it comes to; what could not be judged is never as specified."""
-    if found.deviations:
+def verdict(result: ReplayResult) -> Verdict:
+    """Return the verdict. A record without compared steps is "not judged", never "as specified"."""
+    if result.deviations:
         return "deviates"
-    return "as specified" if found.steps else "not judged"
+    return "as specified" if result.steps else "not judged"
 
 
-def replayed(record: Record, found: Found, names: Names) -> ReplayedRecord:
-    deviations = found.deviations
+def replayed(record: Record, result: ReplayResult, names: ReplayNames) -> ReplayedRecord:
+    deviations = result.deviations
     return ReplayedRecord(
         record=str(record.path),
         agent_id=record.agent_id,
-        verdict=verdict(found),
-        steps=found.steps,
-        unjudged=found.unjudged,
-        unjudged_because=found.lost,
+        verdict=verdict(result),
+        steps=result.steps,
+        unjudged=result.unjudged,
+        unjudged_because=result.lost,
         problems=record.problems,
         differences=[_difference(deviation, names) for deviation in deviations[:MAX_DIFFERENCES]],
         differences_in_all=len(deviations),
@@ -88,7 +88,7 @@ def replayed(record: Record, found: Found, names: Names) -> ReplayedRecord:
     )
 
 
-def _difference(deviation: Deviation, names: Names) -> DifferenceRecord:
+def _difference(deviation: Deviation, names: ReplayNames) -> DifferenceRecord:
     handler = HANDLERS.get(deviation.handler or "")
     return DifferenceRecord(
         line=deviation.line,
@@ -104,44 +104,44 @@ HANDLERS_SHOWN = 10
 LOST_SHOWN = 5
 
 
-def head(record: Record) -> Text:
-    """Whose record it is, and how much of it there is."""
-    lives = f", {record.lives} lives" if record.lives > 1 else ""
+def header_text(record: Record) -> Text:
+    """Return the line with the agent and the length of its record."""
+    incarnations = f", {record.incarnations} lives" if record.incarnations > 1 else ""
     return shown(
         f"agent {record.agent_id}, one of {len(record.header.roster)}: {len(record.entries):,} lines, "
-        f"{record.ends_s:,.0f} s of the mission{lives}; {record.path}",
+        f"{record.end_s:,.0f} s of the mission{incarnations}; {record.path}",
         style="dim",
     )
 
 
-def summary(record: Record, found: Found, names: Names) -> Iterator[Text]:
-    """The first difference in full, what follows counted by handler, and what could not be judged."""
-    steps = f"{found.steps:,} handler run{'s' if found.steps != 1 else ''}"
-    match verdict(found):
+def summary(record: Record, result: ReplayResult, names: ReplayNames) -> Iterator[Text]:
+    """Yield the first difference in detail, the others by handler, and the reasons for steps that were not compared."""
+    steps = f"{result.steps:,} handler run{'s' if result.steps != 1 else ''}"
+    match verdict(result):
         case "as specified":
-            words = "all" if not found.unjudged else "the steps that could be played"
-            yield shown(f"✔ no difference: {steps}, {words} follow Algorithms 1 to 20", style="green")
+            scope = "all" if not result.unjudged else "the steps that could be played"
+            yield shown(f"✔ no difference: {steps}, {scope} follow Algorithms 1 to 20", style="green")
         case "not judged":
             yield shown("- nothing could be judged", style="yellow")
         case "deviates":
-            yield from _differences(record, found, steps, names)
-    if found.unjudged:
-        runs = "handler run" if found.unjudged == 1 else "handler runs"
-        yield shown(f"- {found.unjudged:,} {runs} could not be judged:", style="yellow")
-        for sentence in found.lost[:LOST_SHOWN]:
+            yield from _differences(record, result, steps, names)
+    if result.unjudged:
+        runs = "handler run" if result.unjudged == 1 else "handler runs"
+        yield shown(f"- {result.unjudged:,} {runs} could not be judged:", style="yellow")
+        for sentence in result.lost[:LOST_SHOWN]:
             yield shown(f"  {sentence}", style="yellow")
 
 
-def _differences(record: Record, found: Found, steps: str, names: Names) -> Iterator[Text]:
-    first = found.first
+def _differences(record: Record, result: ReplayResult, steps: str, names: ReplayNames) -> Iterator[Text]:
+    first = result.first
     assert first is not None, "it deviates"
-    count = len(found.deviations)
+    count = len(result.deviations)
     yield shown(f"✘ {count:,} difference{'s' if count > 1 else ''} in {steps}; the first:", style="bold red")
     yield shown(f"  line {first.line}, t={first.t:g} s: {title(first)}")
     yield shown(f"  {first.difference(names.of)}", style="red")
-    yield shown(f"  ucp-harness replay {record.named} --break {first.line}", style="dim")
+    yield shown(f"  ucp-harness replay {record.argument} --break {first.line}", style="dim")
     of_handler: dict[str, list[Deviation]] = {}
-    for deviation in found.deviations:
+    for deviation in result.deviations:
         of_handler.setdefault(title(deviation), []).append(deviation)
     if len(of_handler) > 1:
         yield shown("By handler, with the line of the first:")
@@ -150,7 +150,7 @@ def _differences(record: Record, found: Found, steps: str, names: Names) -> Iter
 
 
 def title(deviation: Deviation) -> str:
-    """ "Algorithm 13, receive_request_next_in_sequence (ucp/reconcile.py:130)"."""
+    """Return a text such as "Algorithm 13, receive_request_next_in_sequence (ucp/reconcile.py:130)"."""
     handler = HANDLERS.get(deviation.handler or "")
     if handler is None:
         return "an unknown handler"

@@ -17,13 +17,13 @@ _HASH = re.compile("[0-9a-f]{6,64}")
 _NAME = re.compile(r"\d+\.\d+")
 
 
-def is_block(words: str) -> bool:
-    """Whether these may be the name of a block, or the beginning of its hash."""
-    return bool(_NAME.fullmatch(words) or (_HASH.fullmatch(words) and not words.isdigit()))
+def is_block(text: str) -> bool:
+    """Return whether a text may be the name of a block, or the beginning of its hash."""
+    return bool(_NAME.fullmatch(text) or (_HASH.fullmatch(text) and not text.isdigit()))
 
 
-class Names:
-    """Names by hash and back. Exports say them, and traces where there are none."""
+class ReplayNames:
+    """Names of blocks by hash, and hashes by name. They come from exports, or from traces if there are none."""
 
     def __init__(self, record: Record) -> None:
         self._record = record
@@ -31,16 +31,19 @@ class Names:
     def of(self, block_hash: str) -> str:
         return self._names.get(block_hash) or block_hash[:SHOWN]
 
-    def begins(self, words: str) -> str:
-        """What the hash begins with of a block that is called so; the words themselves if nobody knows the name."""
-        return self._hashes.get(words, words)
+    def prefix_of(self, text: str) -> str:
+        """Return the hash of the block with this name.
+
+        If no block has it, return the text itself as a prefix of a hash.
+        """
+        return self._hashes.get(text, text)
 
     @cached_property
     def _names(self) -> dict[str, str]:
         names: dict[str, str] = {}
-        exports = self._record.beside.exports
-        others = () if exports else self._record.beside.traces.values()
-        for trace in (self._record.trace, *others):
+        exports = self._record.flight.exports
+        other_traces = () if exports else self._record.flight.traces.values()
+        for trace in (self._record.trace, *other_traces):
             completed = dict.fromkeys(trace.completed())
             names.update((block, f"{trace.header.agent_id}.{count}") for count, block in enumerate(completed, 1))
         return names | name_blocks(exports)
@@ -51,7 +54,7 @@ class Names:
 
 
 class RecordedBlocks(Blocks):
-    """What was played by now makes no difference to what is known."""
+    """All blocks in the records of the flight, whether or not they were played already."""
 
     def __init__(self, record: Record) -> None:
         super().__init__(())
@@ -70,19 +73,19 @@ class RecordedBlocks(Blocks):
                 self.add(block)
 
     def _sources(self) -> Iterator[Iterator[Block]]:
-        """What is to be read, the quickest first."""
+        """Yield the sources of blocks, the fastest first."""
         yield _blocks_of(self._record.trace)
         yield self._of_exports()
-        yield from map(_blocks_of, self._record.beside.traces.values())
+        yield from map(_blocks_of, self._record.flight.traces.values())
 
     def _of_exports(self) -> Iterator[Block]:
-        for export in self._record.beside.exports.values():
+        for export in self._record.flight.exports.values():
             for exported in export.blocks():
                 yield Block(exported.agent_id, exported.timestamp_us, exported.event_bytes)
 
 
 def _blocks_of(trace: Trace) -> Iterator[Block]:
-    """Those that the agent received or sent whole."""
+    """Yield the blocks in messages that the agent received or sent."""
     for run in trace.runs:
         datagrams = [run.input] if isinstance(run.trigger, MessageTrigger) else []
         for datagram in (*datagrams, *(sent.datagram for sent in run.sent)):

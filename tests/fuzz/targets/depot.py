@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from harness.errors import HarnessError
-from harness.field.depot.collected_exports import came_home
+from harness.field.depot.collected_exports import collect_exports
 from harness.field.depot.consolidation import consolidate
 from harness.field.depot.mission_comparison import compare
 from harness.field.depot.mission_files import Plan, write
@@ -36,11 +36,16 @@ def run(data: bytes) -> None:
 
 def _consolidate(paths: list[Path]) -> None:
     try:
-        record = consolidate(came_home(paths))
+        record = consolidate(collect_exports(paths))
     except HarnessError as error:
         sound(str(error))
         return
-    for sentence in (*record.home.problems, *record.home.left_out, *record.home.remarks, *in_words(record, None)):
+    for sentence in (
+        *record.collected.problems,
+        *record.collected.left_out,
+        *record.collected.remarks,
+        *in_words(record, None),
+    ):
         sound(sentence)
     for line in "".join(lines(record)).splitlines():
         json.loads(line)

@@ -14,11 +14,11 @@ from harness.archive.archive import RunArchive
 from harness.archive.run_record import RogueInjection
 from harness.archive.traces import read_trace_lines
 from harness.errors import HarnessError
-from harness.field.adapters import bring_in
-from harness.field.adapters.csv_adapter import CommaSeparated
+from harness.field.adapters import import_records
+from harness.field.adapters.csv_adapter import CsvAdapter
+from harness.field.adapters.imported_records import FILE, ImportRecord
 from harness.field.adapters.rosbag_adapter import RosBag
-from harness.field.adapters.written_records import FILE, ImportRecord
-from harness.field.ingest import Homecoming, sort_out
+from harness.field.ingest import IngestResult, ingest_files
 from harness.field.replay import Player, open_record
 from tests.fuzz.finding import require, sound
 from tests.harness.field.flights import flown
@@ -66,7 +66,7 @@ def came_home(name: str, data: bytes) -> None:
     with TemporaryDirectory() as directory:
         path = Path(directory) / name
         path.write_bytes(data)
-        _named(path, sort_out([path]))
+        _named(path, ingest_files([path]))
         if lot % 4 == 0:
             _among_others(path)
         if _import(path, Path(directory) / "out") and lot % 8 == 0:
@@ -90,30 +90,30 @@ def in_its_run(place: str, data: bytes) -> None:
             path.write_bytes(whole)
 
 
-def _named(path: Path, homecoming: Homecoming) -> None:
+def _named(path: Path, result: IngestResult) -> None:
     """Whatever is not used is said."""
-    for sentence in homecoming.sentences():
+    for sentence in result.sentences():
         sound(sentence)
-    dropped = bool(homecoming.left_out)
-    if not homecoming.flights:
+    dropped = bool(result.left_out)
+    if not result.flights:
         require(dropped, "nothing is used, and nobody says why")
         return
     if not dropped and path.suffix == ".jsonl":
         lines = [line for line in path.read_bytes().removeprefix(b"\xef\xbb\xbf").split(b"\n") if line.strip()]
         used = sum(
             len(trace.runs) + len(trace.asides) + len(trace.starts) + 1
-            for flight in homecoming.flights
+            for flight in result.flights
             for trace in flight.traces.values()
-        ) + sum(len(events) for flight in homecoming.flights for events in flight.logged.values())
+        ) + sum(len(events) for flight in result.flights for events in flight.logged.values())
         require(used >= len(lines), f"{len(lines) - used} lines are not used, and nobody says so")
 
 
 def _among_others(path: Path) -> None:
     """A damaged file takes nothing away from the sound ones beside it."""
-    homecoming = sort_out([sound_run(), path])
-    for sentence in homecoming.sentences():
+    result = ingest_files([sound_run(), path])
+    for sentence in result.sentences():
         sound(sentence)
-    flight = homecoming.largest()
+    flight = result.largest()
     require({*flight.traces} & {*flight.exports} & {*flight.captures} >= _AGENTS, "a sound file is not used")
 
 
@@ -131,7 +131,7 @@ def _check(out: Path) -> None:
 def _import(path: Path, out: Path) -> bool:
     """Whether anything came of it."""
     try:
-        record = bring_in([path], [CommaSeparated(), RosBag()], out)
+        record = import_records([path], [CsvAdapter(), RosBag()], out)
     except HarnessError as error:
         sound(str(error))
         require(not out.exists(), "nothing is used, and yet there is a directory")
@@ -139,7 +139,7 @@ def _import(path: Path, out: Path) -> bool:
     for remark in (*record.left_out, *record.remarks):
         sound(remark.sentence)
     ImportRecord.model_validate_json((out / FILE).read_bytes())
-    again = sort_out([out])
+    again = ingest_files([out])
     imported = {(len(trace.runs), len(trace.asides)) for flight in again.flights for trace in flight.traces.values()}
     runs = sum(agent.handler_runs for flight in record.flights for agent in flight.agents.values())
     require(sum(count for count, _ in imported) <= runs, "more is read of an import than was written")

@@ -1,4 +1,4 @@
-"""A client of the Debug Adapter Protocol, as an IDE is one: it attaches to debugpy, and asks what is where."""
+"""A client of the Debug Adapter Protocol, like an IDE. It attaches to debugpy and reads the state of the program."""
 
 import json
 import socket
@@ -10,10 +10,10 @@ DEADLINE_S = 60.0
 
 
 class Ide:
-    """Attaches to the debugger that listens at `port`. Raises OSError if none ever does."""
+    """A client that attaches to the debugger at `port`. Raises OSError if no debugger listens before the deadline."""
 
     def __init__(self, port: int) -> None:
-        self._connection = _connected(port)
+        self._connection = _connect(port)
         self._file = self._connection.makefile("rwb")
         self._sequence = 0
         self._events: list[dict[str, Any]] = []
@@ -23,7 +23,7 @@ class Ide:
         self._connection.close()
 
     def attach(self, breakpoints: dict[Path, int]) -> None:
-        """With a breakpoint in a line of each file."""
+        """Attach with one breakpoint per file, at the given line."""
         self.ask("initialize", adapterID="test", pathFormat="path", linesStartAt1=True)
         attaching = self._send("attach", {"justMyCode": False})
         self.event("initialized")
@@ -36,7 +36,7 @@ class Ide:
         self._answer(attaching)
 
     def stopped_in(self) -> dict[str, Any]:
-        """The frame in which the program has stopped."""
+        """Return the frame in which the program has stopped."""
         thread = self.event("stopped")["threadId"]
         frame: dict[str, Any] = self.ask("stackTrace", threadId=thread)["stackFrames"][0]
         return {**frame, "thread": thread}
@@ -48,7 +48,7 @@ class Ide:
         return self._answer(self._send(command, arguments))
 
     def event(self, name: str) -> dict[str, Any]:
-        """The body of the next event of this name."""
+        """Return the body of the next event of this name."""
         while True:
             for number, event in enumerate(self._events):
                 if event["event"] == name:
@@ -86,7 +86,7 @@ class Ide:
         return message
 
 
-def _connected(port: int) -> socket.socket:
+def _connect(port: int) -> socket.socket:
     deadline = time.monotonic() + DEADLINE_S
     while True:
         try:

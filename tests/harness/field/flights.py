@@ -1,4 +1,4 @@
-"""Runs in virtual time, left on disk as any run is, whose records are then played again."""
+"""Runs in virtual time whose records the tests read."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from tests.harness.virtual import scenario
 
 
 def flown(directory: Path, seed: int = 1, **keys: Any) -> Path:
-    """The directory of a run of some minutes; `keys` are the scenario's."""
+    """Write the directory of a run of some minutes. `keys` are keys of the scenario."""
     mission = {"agents": 3, "duration_s": 400, "network": {"loss": 0.2}, **keys}
     return run(scenario(**mission), seed, directory, Silent(), "sim").directory
 

@@ -1,4 +1,4 @@
-"""Records of a run as others would have them: in CSV, and in ROS bags as `rosbags` writes them."""
+"""The records of a run as other recorders would write them: CSV files, and ROS bags made by `rosbags`."""
 
 import base64
 import csv
@@ -18,8 +18,8 @@ from harness.archive.packets.pcap import OUTBOUND, CaptureFile
 EPOCH_NS = 1_790_000_000_000_000_000
 
 
-class Said(NamedTuple):
-    """What one agent's recorder writes down: `kind` as in the CSV's column."""
+class RecordedItem(NamedTuple):
+    """One item of an agent's recorder. `kind` is that of the CSV column."""
 
     time_ns: int
     agent: int
@@ -27,15 +27,15 @@ class Said(NamedTuple):
     data: bytes
 
 
-def of_run(directory: Path, kinds: tuple[str, ...] = ("trace", "export")) -> Iterator[Said]:
-    """What the agents of a run left, by agent."""
+def of_run(directory: Path, kinds: tuple[str, ...] = ("trace", "export")) -> Iterator[RecordedItem]:
+    """Yield the records of a run, agent by agent."""
     for trace in sorted((directory / "agents").glob("*.trace.jsonl")):
         agent = int(trace.name.partition(".")[0])
         if "trace" in kinds:
             for line in trace.read_bytes().splitlines():
-                yield Said(EPOCH_NS, agent, "trace", line)
+                yield RecordedItem(EPOCH_NS, agent, "trace", line)
         if "export" in kinds:
-            yield Said(EPOCH_NS, agent, "export", (trace.parent / f"{agent}.chain.json").read_bytes())
+            yield RecordedItem(EPOCH_NS, agent, "export", (trace.parent / f"{agent}.chain.json").read_bytes())
         if "sent" in kinds:
             for frame in CaptureFile(directory / "capture" / f"{agent}.pcapng"):
                 try:
@@ -43,10 +43,10 @@ def of_run(directory: Path, kinds: tuple[str, ...] = ("trace", "export")) -> Ite
                 except NotUcpError:
                     continue
                 kind = "sent" if direction == OUTBOUND else "received"
-                yield Said(EPOCH_NS + frame.time_ns, agent, kind, datagram)
+                yield RecordedItem(EPOCH_NS + frame.time_ns, agent, kind, datagram)
 
 
-def write_csv(path: Path, records: Iterator[Said]) -> Path:
+def write_csv(path: Path, records: Iterator[RecordedItem]) -> Path:
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["time_s", "agent", "kind", "event", "data"])
@@ -56,7 +56,7 @@ def write_csv(path: Path, records: Iterator[Said]) -> Path:
     return path
 
 
-def write_bag1(path: Path, records: Iterator[Said], compression: str | None = None) -> Path:
+def write_bag1(path: Path, records: Iterator[RecordedItem], compression: str | None = None) -> Path:
     types = get_typestore(Stores.ROS1_NOETIC)
     writer = Writer1(path)
     if compression:
@@ -66,14 +66,16 @@ def write_bag1(path: Path, records: Iterator[Said], compression: str | None = No
     return path
 
 
-def write_bag2(path: Path, records: Iterator[Said], storage: str = "sqlite3") -> Path:
+def write_bag2(path: Path, records: Iterator[RecordedItem], storage: str = "sqlite3") -> Path:
     types = get_typestore(Stores.ROS2_HUMBLE)
     with Writer2(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
         _write(writer, types, types.serialize_cdr, records, typestore=types)
     return path
 
 
-def _write(writer: Any, types: Any, serialize: Callable[..., Any], records: Iterator[Said], **options: Any) -> None:
+def _write(
+    writer: Any, types: Any, serialize: Callable[..., Any], records: Iterator[RecordedItem], **options: Any
+) -> None:
     string, array = (types.types[f"std_msgs/msg/{name}"] for name in ("String", "UInt8MultiArray"))
     layout = types.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
     connections: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""What docs/how-to/import-other-logs.md shows does what it says."""
+"""The examples in docs/how-to/import-other-logs.md work as the page describes."""
 
 import re
 from pathlib import Path
@@ -7,16 +7,16 @@ import pytest
 
 from harness.archive.packets.capture_files import capture_files, read_captures
 from harness.errors import FieldError
-from harness.field.adapters import bring_in
+from harness.field.adapters import import_records
 from harness.field.adapters.adapter import load_adapter
-from harness.field.adapters.csv_adapter import CommaSeparated
+from harness.field.adapters.csv_adapter import CsvAdapter
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of
 
 PAGE = (Path(__file__).parents[3] / "docs/how-to/import-other-logs.md").read_text()
 TEXTS = re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
 LOG = "".join(line for line in TEXTS[0].splitlines(keepends=True) if " STEP " not in line)
-"""Its step is an abridged one."""
+"""The log without its step, which is abridged on the page."""
 PROGRAMS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
@@ -27,7 +27,7 @@ def swarmlog(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_worked_example_reads_the_log_beside_it(swarmlog: Path, tmp_path: Path) -> None:
+def test_example_adapter_reads_the_example_log(swarmlog: Path, tmp_path: Path) -> None:
     (tmp_path / "flight.log").write_text(LOG + "1790000015.0 ??? 12\n")
     done = harness("import", "--adapter", f"{swarmlog}:SwarmLog", tmp_path / "flight.log", "-o", tmp_path / "home")
     assert done.returncode == 0
@@ -39,39 +39,39 @@ def test_the_worked_example_reads_the_log_beside_it(swarmlog: Path, tmp_path: Pa
     assert captures.used[0].vehicle == 7 and [each.sender for each in captures.datagrams] == [7, 28]
 
 
-def test_its_steps_are_judged(swarmlog: Path, tmp_path: Path) -> None:
+def test_steps_of_the_example_are_judged(swarmlog: Path, tmp_path: Path) -> None:
     run = flown(tmp_path / "run")
     for agent in (1, 2, 3):
         lines = (f"1790000000.0 STEP {line}" for line in trace_of(run, agent).read_text().splitlines())
         (tmp_path / f"{agent}.log").write_text("\n".join([f"# swarmlog 1 agent={agent}", *lines, ""]))
     logs = [tmp_path / f"{agent}.log" for agent in (1, 2, 3)]
-    bring_in(logs, [load_adapter(f"{swarmlog}:SwarmLog")], tmp_path / "home")
+    import_records(logs, [load_adapter(f"{swarmlog}:SwarmLog")], tmp_path / "home")
     checked = harness("check", tmp_path / "home")
     assert re.search(r"every step +✔ as specified", checked.stdout)
 
 
-def test_the_other_topics_of_the_page_are_understood(tmp_path: Path) -> None:
+def test_example_subclass_reads_other_topics(tmp_path: Path) -> None:
     (tmp_path / "our_bags.py").write_text(PROGRAMS[1])
     assert load_adapter(f"{tmp_path / 'our_bags.py'}:OurBags").counts == "message"
 
 
-def test_the_rows_of_the_page_are_read(tmp_path: Path) -> None:
+def test_example_rows_are_read(tmp_path: Path) -> None:
     (tmp_path / "rows.csv").write_text(TEXTS[1])
-    record = bring_in([tmp_path / "rows.csv"], [CommaSeparated()], tmp_path / "home")
+    record = import_records([tmp_path / "rows.csv"], [CsvAdapter()], tmp_path / "home")
     assert not record.left_out and record.flights[0].agents[7].capture and record.flights[0].agents[7].events
 
 
 @pytest.mark.parametrize("name", ["nothing", "nowhere:SwarmLog", "{}:Nobody", "{}:Path", "no.py:A", ":", "json:loads"])
-def test_an_adapter_that_is_none_is_said_in_a_sentence(swarmlog: Path, name: str) -> None:
+def test_invalid_adapter_gives_one_sentence(swarmlog: Path, name: str) -> None:
     with pytest.raises(FieldError, match=r"import-other-logs\.md"):
         load_adapter(name.format(swarmlog))
 
 
-def test_an_adapter_that_fails_keeps_what_it_had(swarmlog: Path, tmp_path: Path) -> None:
+def test_failing_adapter_keeps_earlier_observations(swarmlog: Path, tmp_path: Path) -> None:
     swarmlog.write_text(PROGRAMS[0].replace("except ValueError", "except KeyError"))
     (tmp_path / "flight.log").write_text(LOG + "nonsense\n")
     out = tmp_path / "home"
-    record = bring_in([tmp_path / "flight.log"], [load_adapter(f"{swarmlog}:SwarmLog")], out)
+    record = import_records([tmp_path / "flight.log"], [load_adapter(f"{swarmlog}:SwarmLog")], out)
     assert record.flights[0].agents[7].capture
     (left_out,) = record.left_out
     assert "reading failed after line 4: ValueError: not enough values to unpack" in left_out.sentence

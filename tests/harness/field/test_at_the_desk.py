@@ -1,4 +1,4 @@
-"""The table of wrong agents at the desk is whole, and its rows say what replay said."""
+"""The table of wrong agents in replay is complete, and its rows agree with the replays."""
 
 from docs.generate.wrong_agents.at_the_desk import PAGE, AtTheDesk, Named, row
 from docs.generate.wrong_agents.trials_page import rows_of
@@ -7,15 +7,15 @@ from ucp.quirks import QUIRKS
 ROWS = rows_of(PAGE.read_text(encoding="utf-8"))
 
 
-def test_every_quirk_has_a_row() -> None:
+def test_each_quirk_has_a_row() -> None:
     assert list(ROWS) == list(QUIRKS), "write it again: python -m docs.generate.wrong_agents.at_the_desk"
 
 
-def test_no_wrong_agent_passes_for_a_right_one() -> None:
+def test_replay_finds_each_wrong_agent() -> None:
     assert not [quirk for quirk, line in ROWS.items() if "no difference" in line]
 
 
-def test_a_row_has_the_earliest_difference_and_how_many_records_name_the_handler_rightly() -> None:
+def test_row_has_the_first_difference_and_counts_correct_handlers() -> None:
     late = Named(120.0, "vote_timer_expiration", "it sent nothing; it should have sent Commit Block about block 2.1")
     early = Named(60.0, "receive_commit_block", "it took the branch 'a|b'")
     assert row("hide_commits", AtTheDesk(2, 5, (late, early))) == (

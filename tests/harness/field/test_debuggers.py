@@ -1,4 +1,4 @@
-"""A breakpoint in a handler of ucp/ stops a replay there, with the agent's real state: under pdb, and under an IDE."""
+"""A breakpoint in a handler of ucp/ stops a replay with the agent's real state, in pdb and in an IDE."""
 
 import socket
 import subprocess
@@ -19,7 +19,7 @@ LINE = next(
     for number, text in enumerate(SOURCE.read_text().splitlines(), 1)
     if "core.majority_response_block_hash = majority_response" in text
 )
-"""Of Algorithm 15: phase 2 has chosen a block."""
+"""A line of Algorithm 15 at which phase 2 has chosen a block."""
 
 
 @pytest.fixture(scope="module")
@@ -29,11 +29,11 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def expected(record: Path) -> tuple[float, int]:
-    """When the agent was there first, and how many blocks its chain had then."""
+    """Return the mission second at which the agent first reaches the line, and the length of its chain then."""
     player = Player(open_record(record))
     while not player.at_end:
         entry = player.forward()
-        if getattr(entry.what, "branch", "") in ("block", "tie: block"):
+        if getattr(entry.content, "branch", "") in ("block", "tie: block"):
             return player.state.now, len(player.state.chain)
     raise AssertionError("no mission of this loss is without a reconcile")
 
@@ -49,7 +49,7 @@ def pdb(commands: list[str], *arguments: object) -> str:
     return ended.stdout + ended.stderr
 
 
-def test_pdb_stops_in_a_handler_with_the_state_of_the_agent(record: Path, expected: tuple[float, int]) -> None:
+def test_pdb_stops_in_a_handler_with_the_agent_state(record: Path, expected: tuple[float, int]) -> None:
     said = pdb(
         [f"break {SOURCE}:{LINE}", "continue", "p (core.now, len(core.chain), core.agent_id)", "quit"],
         *("-m", "pdb", "-m", "harness.cli", "replay", record),
@@ -58,10 +58,8 @@ def test_pdb_stops_in_a_handler_with_the_state_of_the_agent(record: Path, expect
     assert str((*expected, 2)) in said
 
 
-def test_replay_calls_the_debugger_right_before_the_handler_of_a_break(
-    record: Path, expected: tuple[float, int]
-) -> None:
-    line = next(entry.line for entry in open_record(record).entries if getattr(entry.what, "algorithm", 0) == 15)
+def test_replay_calls_the_debugger_directly_before_the_handler(record: Path, expected: tuple[float, int]) -> None:
+    line = next(entry.line for entry in open_record(record).entries if getattr(entry.content, "algorithm", 0) == 15)
     said = pdb(
         ["step", "where", "p (core.now, len(core.chain))", "quit"],
         *("-m", "harness.cli", "replay", record, "--break", line, "--debug"),
@@ -71,14 +69,12 @@ def test_replay_calls_the_debugger_right_before_the_handler_of_a_break(
 
 
 @pytest.mark.parametrize("calls_it", [False, True], ids=["a breakpoint", "--debug"])
-def test_an_ide_stops_in_a_handler_with_the_state_of_the_agent(
-    calls_it: bool, record: Path, expected: tuple[float, int]
-) -> None:
+def test_ide_stops_in_a_handler_with_the_agent_state(calls_it: bool, record: Path, expected: tuple[float, int]) -> None:
     pytest.importorskip("debugpy")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     under = ["-Xfrozen_modules=off", "-m", "debugpy", "--listen", f"127.0.0.1:{port}", "--wait-for-client"]
-    line = next(entry.line for entry in open_record(record).entries if getattr(entry.what, "algorithm", 0) == 15)
+    line = next(entry.line for entry in open_record(record).entries if getattr(entry.content, "algorithm", 0) == 15)
     options = ["--break", str(line), "--debug"] if calls_it else []
     with subprocess.Popen(
         [sys.executable, *under, "-m", "harness.cli", "replay", str(record), *options],

@@ -1,4 +1,4 @@
-"""docs/how-to/find-a-field-bug.md is true: each of its commands runs, and prints what the page shows."""
+"""The commands in docs/how-to/find-a-field-bug.md print the output on the page."""
 
 import shutil
 import tarfile
@@ -12,20 +12,20 @@ LOGS = ROOT / "docs/field_test_2020.tar.xz"
 MAX_BYTES = 1_500_000
 
 
-def test_every_command_of_the_page_prints_what_it_shows(tmp_path: Path) -> None:
+def test_commands_print_the_output_on_the_page(tmp_path: Path) -> None:
     for directory in ("ucp", "docs"):
         shutil.copytree(ROOT / directory, tmp_path / directory, ignore=shutil.ignore_patterns("__pycache__"))
     assert play(PAGE, tmp_path, columns=150) > 12
 
 
-def test_the_logs_are_small_and_of_six_vehicles() -> None:
+def test_logs_are_small_and_from_six_vehicles() -> None:
     assert LOGS.stat().st_size < MAX_BYTES
     with tarfile.open(LOGS) as archive:
         traces = {int(name.split("/")[-1].split(".")[0]) for name in archive.getnames() if ".trace.jsonl" in name}
     assert traces == {10, 28, 32, 118, 120, 122}
 
 
-def test_the_lines_that_the_page_comes_to_are_those_of_the_code() -> None:
+def test_code_lines_on_the_page_are_current() -> None:
     code = (ROOT / "ucp/quirks/_reconcile_quirks.py").read_text().splitlines()
     assert code[164].strip() == "raise NameError"
     assert code[189].strip() == "core.start(core.phase_three_timer, 0.0)"

@@ -1,4 +1,4 @@
-"""A flight flown again: from what came home of runs in virtual time."""
+"""Reconstruction of flights from the records of runs in virtual time."""
 
 import base64
 import json
@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from harness.errors import FieldError
-from harness.field.ingest import sort_out
+from harness.field.ingest import ingest_files
 from harness.field.reconstruct import Reconstruction, reconstruct, write
 from harness.run.simulate import simulate
 from harness.scenario import load_scenario
@@ -37,8 +37,8 @@ FIELD: dict[str, Any] = {
 }
 
 
-def home(directory: Path, run: Path, *left_out: str) -> Path:
-    """What a flight would bring home of a run: no record of the harness."""
+def field_records(directory: Path, run: Path, *left_out: str) -> Path:
+    """Copy the records of a run that a real flight would have, without those of the harness."""
     directory.mkdir()
     for path in (run / "agents").glob("*.json*"):
         if path.name not in left_out:
@@ -46,12 +46,12 @@ def home(directory: Path, run: Path, *left_out: str) -> Path:
     return directory
 
 
-def again(directory: Path) -> Reconstruction:
-    return reconstruct(sort_out([directory]).largest(), "again")
+def reconstruct_from(directory: Path) -> Reconstruction:
+    return reconstruct(ingest_files([directory]).largest(), "again")
 
 
-def test_a_flight_with_all_that_happens_in_the_field_is_flown_again(tmp_path: Path) -> None:
-    reconstruction = again(home(tmp_path / "home", flown(tmp_path / "run", **FIELD)))
+def test_flight_with_typical_faults_is_reproduced(tmp_path: Path) -> None:
+    reconstruction = reconstruct_from(field_records(tmp_path / "home", flown(tmp_path / "run", **FIELD)))
     assert reconstruction.problems == []
     assert reconstruction.reproduced == FIELD["agents"]
     faults = [key for entry in reconstruction.document["timeline"] for key in entry if key != "at_s"]
@@ -60,8 +60,8 @@ def test_a_flight_with_all_that_happens_in_the_field_is_flown_again(tmp_path: Pa
     ]
 
 
-def test_the_file_is_a_scenario_that_comes_to_the_same_and_to_what_it_expects(tmp_path: Path) -> None:
-    reconstruction = again(home(tmp_path / "home", flown(tmp_path / "run", **FIELD)))
+def test_written_scenario_meets_its_expectations(tmp_path: Path) -> None:
+    reconstruction = reconstruct_from(field_records(tmp_path / "home", flown(tmp_path / "run", **FIELD)))
     write(reconstruction, tmp_path / "again.yaml", [tmp_path / "home"], [])
     scenario = load_scenario(tmp_path / "again.yaml")
     simulated = simulate(scenario, 77, tracing=True)
@@ -72,66 +72,68 @@ def test_the_file_is_a_scenario_that_comes_to_the_same_and_to_what_it_expects(tm
     assert all(scenario.expect.as_expected(key, of.verdict) for key, of in simulated.result.judgements.items())
 
 
-def test_who_left_a_trace_and_no_export_was_lost_as_it_ends(tmp_path: Path) -> None:
+def test_agent_without_export_is_lost_at_end_of_trace(tmp_path: Path) -> None:
     run = flown(tmp_path / "run", events={"source": "random", "mean_s": 8}, timeline=[{"at_s": 200, "kill": [3]}])
-    reconstruction = again(home(tmp_path / "home", run))
+    reconstruction = reconstruct_from(field_records(tmp_path / "home", run))
     assert reconstruction.reproduced == [1, 2, 3]
     (off,) = [entry for entry in reconstruction.document["timeline"] if entry.get("switch_off") == [3]]
     assert off["at_s"] < 200
 
 
-def test_clocks_come_out_beside_each_other(tmp_path: Path) -> None:
-    clocks = again(home(tmp_path / "home", flown(tmp_path / "run", **FIELD))).table.clocks
+def test_clock_offsets_and_drifts_are_estimated(tmp_path: Path) -> None:
+    clocks = reconstruct_from(field_records(tmp_path / "home", flown(tmp_path / "run", **FIELD))).table.clocks
     beside = clocks[28].after(clocks[10].inverse())
     assert beside.shows(300.0) - 300.0 == pytest.approx(3.2 + 0.0001 * 300, abs=0.05)
 
 
-def test_of_an_agent_that_did_not_come_home_what_others_heard_is_on_the_air(tmp_path: Path) -> None:
+def test_messages_of_an_unrecorded_agent_are_sent_separately(tmp_path: Path) -> None:
     run = flown(tmp_path / "run", **FIELD)
-    reconstruction = again(home(tmp_path / "home", run, "118.trace.jsonl", "118.chain.json"))
+    reconstruction = reconstruct_from(field_records(tmp_path / "home", run, "118.trace.jsonl", "118.chain.json"))
     assert reconstruction.problems == []
     assert reconstruction.reproduced == [10, 28, 32, 120]
     assert {datagram["source"] for datagram in reconstruction.document["datagrams"]} == {118}
     assert any("agent 118 not played" in remark for remark in reconstruction.remarks)
 
 
-def test_what_comes_after_the_end_of_a_trace_that_was_cut_is_said_to_be_unknown(tmp_path: Path) -> None:
-    directory = home(tmp_path / "home", flown(tmp_path / "run", **FIELD))
+def test_inputs_after_a_truncated_trace_are_reported_as_unknown(tmp_path: Path) -> None:
+    directory = field_records(tmp_path / "home", flown(tmp_path / "run", **FIELD))
     trace = directory / "118.trace.jsonl"
     lines = trace.read_bytes().splitlines(keepends=True)
     trace.write_bytes(b"".join(lines[: len(lines) // 2]))
-    reconstruction = again(directory)
+    reconstruction = reconstruct_from(directory)
     assert reconstruction.reproduced == [10, 28, 32, 120]
     assert "agent 118 is played up to the end of its trace" in reconstruction.problems[0]
 
 
-def test_of_a_wrong_agent_the_first_wrong_step_is_named_or_its_mistake(tmp_path: Path) -> None:
+def test_wrong_agent_is_explained_by_a_quirk_or_its_first_deviation(tmp_path: Path) -> None:
     wrong = {"approve_everything": {"agents": [2]}}
-    named = again(home(tmp_path / "home", flown(tmp_path / "run", network={"loss": 0.3}, quirks=wrong)))
+    named = reconstruct_from(
+        field_records(tmp_path / "home", flown(tmp_path / "run", network={"loss": 0.3}, quirks=wrong))
+    )
     assert named.problems == []
     assert any("agent 2 behaves as with approve_everything" in remark for remark in named.remarks)
     ignoring = {"ignore_commit": {"agents": [2], "value": 0.5}}
-    parted = again(home(tmp_path / "home2", flown(tmp_path / "run2", quirks=ignoring)))
+    parted = reconstruct_from(field_records(tmp_path / "home2", flown(tmp_path / "run2", quirks=ignoring)))
     assert parted.problems == []
     assert any("agent 2 did not react to" in remark and "receive_commit_block" in remark for remark in parted.remarks)
 
 
-def test_an_agent_that_is_wrong_in_no_known_way_is_played_up_to_its_first_wrong_step(tmp_path: Path) -> None:
-    directory = home(tmp_path / "home", flown(tmp_path / "run", events={"source": "random", "mean_s": 5}))
+def test_unknown_deviation_ends_the_play_of_its_agent(tmp_path: Path) -> None:
+    directory = field_records(tmp_path / "home", flown(tmp_path / "run", events={"source": "random", "mean_s": 5}))
     trace = directory / "2.trace.jsonl"
     lines = [json.loads(line) for line in trace.read_text().splitlines()]
     number = next(n for n, line in enumerate(lines) if n > 20 and line.get("branch") == "full")
     del lines[number]["changes"][-1]
     trace.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    reconstruction = again(directory)
+    reconstruction = reconstruct_from(directory)
     assert reconstruction.reproduced == [1, 3]
     assert "agent 2 deviates from the protocol, and is played up to trace line" in reconstruction.problems[0]
     assert "build_data_block" in reconstruction.problems[0]
     assert {datagram["source"] for datagram in reconstruction.document["datagrams"]} == {2}
 
 
-def test_a_record_without_the_parts_that_may_be_missing_will_do(tmp_path: Path) -> None:
-    directory = home(tmp_path / "home", flown(tmp_path / "run", agents=3))
+def test_record_without_optional_parts_is_reproduced(tmp_path: Path) -> None:
+    directory = field_records(tmp_path / "home", flown(tmp_path / "run", agents=3))
     for path in directory.glob("*.trace.jsonl"):
         lines = [json.loads(line) for line in path.read_text().splitlines()]
         for line in lines:
@@ -140,16 +142,18 @@ def test_a_record_without_the_parts_that_may_be_missing_will_do(tmp_path: Path) 
             if "t" in line:
                 line["t"] = round(line["t"], 3)
         path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert again(directory).problems == []
+    assert reconstruct_from(directory).problems == []
 
 
-def test_nothing_to_fly_by_is_a_mistake_of_the_request(tmp_path: Path) -> None:
-    directory = home(tmp_path / "home", flown(tmp_path / "run"), *(f"{agent}.trace.jsonl" for agent in (1, 2, 3)))
+def test_records_without_inputs_are_rejected(tmp_path: Path) -> None:
+    directory = field_records(
+        tmp_path / "home", flown(tmp_path / "run"), *(f"{agent}.trace.jsonl" for agent in (1, 2, 3))
+    )
     with pytest.raises(FieldError, match="add traces"):
-        again(directory)
+        reconstruct_from(directory)
 
 
-def test_the_command_says_what_it_reproduces(tmp_path: Path) -> None:
+def test_command_prints_the_reproduced_part(tmp_path: Path) -> None:
     run = flown(tmp_path / "run")
     out = tmp_path / "again.yaml"
     made = harness("reconstruct", run, "-o", out, "--json")
@@ -166,19 +170,19 @@ def test_the_command_says_what_it_reproduces(tmp_path: Path) -> None:
     assert cut.stdout.startswith("reproduces 2 of 3 chains: agent 2 is played up to the end of its trace")
 
 
-def test_exports_and_captures_will_do_where_there_are_no_traces(tmp_path: Path) -> None:
+def test_exports_and_captures_suffice_without_traces(tmp_path: Path) -> None:
     run = flown(tmp_path / "run", network={"loss": 0.2}, capture=True, final_reconcile=True)
-    directory = home(tmp_path / "home", run, *(f"{agent}.trace.jsonl" for agent in (1, 2, 3)))
+    directory = field_records(tmp_path / "home", run, *(f"{agent}.trace.jsonl" for agent in (1, 2, 3)))
     for path in (run / "capture").glob("*.pcapng"):
         shutil.copy(path, directory)
-    reconstruction = again(directory)
+    reconstruction = reconstruct_from(directory)
     assert reconstruction.problems == []
     assert reconstruction.reproduced == [1, 2, 3]
     assert any("captures and blocks" in remark for remark in reconstruction.remarks)
 
 
-def test_what_a_trace_of_version_1_lacks_is_found_in_others(tmp_path: Path) -> None:
-    directory = home(tmp_path / "home", flown(tmp_path / "run", network={"loss": 0.2}))
+def test_missing_inputs_of_version_1_come_from_other_records(tmp_path: Path) -> None:
+    directory = field_records(tmp_path / "home", flown(tmp_path / "run", network={"loss": 0.2}))
     trace = directory / "2.trace.jsonl"
     lines = [json.loads(line) for line in trace.read_text().splitlines()]
     lines[0]["schema"] = "ucp-trace/1"
@@ -188,24 +192,24 @@ def test_what_a_trace_of_version_1_lacks_is_found_in_others(tmp_path: Path) -> N
         for sent in line.get("sent", ()):
             del sent["datagram"]
     trace.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert again(directory).problems == []
+    assert reconstruct_from(directory).problems == []
 
 
-def test_settings_and_a_life_of_which_nothing_is_on_record_are_inferred(tmp_path: Path) -> None:
+def test_unrecorded_settings_and_incarnations_are_inferred(tmp_path: Path) -> None:
     flight = {"capture": True, "events": {"source": "random", "mean_s": 8}, "settings": {"vote_names_chain": True}}
     reboot = [{"at_s": 150, "reboot": [2], "down_s": 20, "disk": "kept"}]
     run = flown(tmp_path / "run", network={"loss": 0.1}, timeline=reboot, **flight)
-    directory = home(tmp_path / "home", run, *(f"{agent}.trace.jsonl" for agent in (1, 2, 3)))
+    directory = field_records(tmp_path / "home", run, *(f"{agent}.trace.jsonl" for agent in (1, 2, 3)))
     for path in (run / "capture").glob("*.pcapng"):
         shutil.copy(path, directory)
-    reconstruction = again(directory)
+    reconstruction = reconstruct_from(directory)
     assert reconstruction.problems == []
     assert any("vote_names_chain True" in remark for remark in reconstruction.remarks)
     assert any("reboot" in entry for entry in reconstruction.document["timeline"])
 
 
-def test_how_an_agent_counts_its_datagrams_is_its_own_affair(tmp_path: Path) -> None:
-    directory = home(tmp_path / "home", flown(tmp_path / "run", network={"loss": 0.2}))
+def test_sequence_numbers_of_an_agent_do_not_matter(tmp_path: Path) -> None:
+    directory = field_records(tmp_path / "home", flown(tmp_path / "run", network={"loss": 0.2}))
 
     def recounted(text: str) -> str:
         sender, sequence, message = decode(base64.b64decode(text))
@@ -222,6 +226,6 @@ def test_how_an_agent_counts_its_datagrams_is_its_own_affair(tmp_path: Path) -> 
                 sent["seq"] += 5 * path.name.startswith("2.")
                 sent["datagram"] = recounted(sent["datagram"])
         path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    reconstruction = again(directory)
+    reconstruction = reconstruct_from(directory)
     assert reconstruction.problems == []
     assert "datagrams" not in reconstruction.document

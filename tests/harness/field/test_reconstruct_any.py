@@ -1,4 +1,4 @@
-"""Whatever happens to a swarm of right agents: a record that is whole is flown again, to the last block."""
+"""Any flight of correct agents with complete records is reproduced to the last block."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -7,7 +7,7 @@ from typing import Any
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from harness.field.ingest import sort_out
+from harness.field.ingest import ingest_files
 from harness.field.reconstruct import reconstruct
 from tests.harness.field.flights import flown
 
@@ -17,7 +17,7 @@ DURATION_S = 300
 
 @st.composite
 def flights(draw: st.DrawFn) -> dict[str, Any]:
-    """Loss, a partition, one death or pause, and clocks that are off and drift."""
+    """Draw a flight with loss, a partition, a kill or a pause, and clocks with offset and drift."""
     struck, at_s = draw(st.sampled_from(AGENTS)), draw(st.integers(60, 120))
     back_s = at_s + draw(st.integers(5, 100))
     death = draw(
@@ -50,9 +50,9 @@ def flights(draw: st.DrawFn) -> dict[str, Any]:
 
 @settings(max_examples=12, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(flight=flights(), seed=st.integers(0, 1000))
-def test_a_whole_record_is_flown_again(flight: dict[str, Any], seed: int) -> None:
+def test_complete_record_is_reproduced(flight: dict[str, Any], seed: int) -> None:
     with TemporaryDirectory() as kept:
         run = flown(Path(kept) / "run", seed, **flight)
-        made = reconstruct(sort_out([run / "agents"]).largest(), "again")
+        made = reconstruct(ingest_files([run / "agents"]).largest(), "again")
     assert made.problems == []
-    assert made.table.impossible == []
+    assert made.table.contradictions == []

@@ -1,4 +1,4 @@
-"""Records as they come home: what is left of them is played, and nobody is charged with what is missing."""
+"""Replay of damaged records: the remaining parts are played, and missing parts count as no deviation."""
 
 import base64
 import gzip
@@ -21,8 +21,8 @@ def run_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def home(run_directory: Path, tmp_path: Path) -> Path:
-    """The traces, and nothing else."""
+def traces_only(run_directory: Path, tmp_path: Path) -> Path:
+    """Copy the traces of the run, without its other files."""
     directory = tmp_path / "home"
     directory.mkdir()
     for agent in (1, 2, 3, 4):
@@ -65,11 +65,11 @@ def remove(first: int, last: int) -> Callable[[list[str]], None]:
     ],
     ids=["a line", "lines", "header", "beginning", "first line", "no header", "no beginning", "lines without a sign"],
 )
-def test_what_is_missing_is_no_difference_and_what_is_left_is_played(
-    home: Path, edit: Callable[[list[str]], None]
+def test_missing_lines_are_no_difference_and_the_rest_is_played(
+    traces_only: Path, edit: Callable[[list[str]], None]
 ) -> None:
-    change(home / "2.trace.jsonl", edit)
-    ended = harness("replay", home, "--agent", 2, "--json")
+    change(traces_only / "2.trace.jsonl", edit)
+    ended = harness("replay", traces_only, "--agent", 2, "--json")
     (document,) = json.loads(ended.stdout)["records"]
     assert (ended.returncode, document["verdict"], document["differences"]) == (0, "as specified", [])
     assert document["steps"] > 30
@@ -77,10 +77,10 @@ def test_what_is_missing_is_no_difference_and_what_is_left_is_played(
     sentences(ended.stderr)
 
 
-def test_a_difference_after_a_gap_is_found(home: Path) -> None:
-    record = open_record(home / "2.trace.jsonl")
+def test_difference_after_a_gap_is_found(traces_only: Path) -> None:
+    record = open_record(traces_only / "2.trace.jsonl")
     positions = [
-        number for number, entry in enumerate(record.entries) if getattr(entry.what, "branch", "") == "approve"
+        number for number, entry in enumerate(record.entries) if getattr(entry.content, "branch", "") == "approve"
     ]
     line = record.entries[positions[-1]].line
 
@@ -88,28 +88,28 @@ def test_a_difference_after_a_gap_is_found(home: Path) -> None:
         lines[line - 1] = lines[line - 1].replace('"branch":"approve"', '"branch":"disapprove"')
         damage(30)(lines)
 
-    change(home / "2.trace.jsonl", disapprove)
-    found = Player(open_record(home, 2)).to_end()
+    change(traces_only / "2.trace.jsonl", disapprove)
+    found = Player(open_record(traces_only, 2)).to_end()
     assert found.unjudged and found.lost
     assert [(deviation.line, deviation.handler) for deviation in found.deviations] == [
         (line, "receive_request_add_block")
     ]
 
 
-def test_the_same_in_a_zip_twice_and_among_other_files(home: Path) -> None:
-    whole = Player(open_record(home, 2)).to_end().steps
-    content = (home / "2.trace.jsonl").read_bytes()
-    (home / "2.trace.jsonl").unlink()
-    (home / "two.gz").write_bytes(gzip.compress(content))
-    (home / "copy of two.jsonl").write_bytes(content)
-    (home / "holiday.jpg").write_bytes(b"\xff\xd8\xff\xe0 no trace")
-    found = Player(open_record(home, 2)).to_end()
+def test_compressed_duplicate_and_unrelated_files_change_nothing(traces_only: Path) -> None:
+    whole = Player(open_record(traces_only, 2)).to_end().steps
+    content = (traces_only / "2.trace.jsonl").read_bytes()
+    (traces_only / "2.trace.jsonl").unlink()
+    (traces_only / "two.gz").write_bytes(gzip.compress(content))
+    (traces_only / "copy of two.jsonl").write_bytes(content)
+    (traces_only / "holiday.jpg").write_bytes(b"\xff\xd8\xff\xe0 no trace")
+    found = Player(open_record(traces_only, 2)).to_end()
     assert (found.steps, found.deviations) == (whole, [])
-    assert Player(open_record(home / "two.gz")).to_end().steps == whole
+    assert Player(open_record(traces_only / "two.gz")).to_end().steps == whole
 
 
-def test_a_record_cut_off_is_played_up_to_there(home: Path) -> None:
-    path = home / "2.trace.jsonl"
+def test_truncated_record_is_played_up_to_its_end(traces_only: Path) -> None:
+    path = traces_only / "2.trace.jsonl"
     path.write_bytes(path.read_bytes()[:20_000])
     ended = harness("replay", path)
     assert ended.returncode == 0
@@ -117,7 +117,7 @@ def test_a_record_cut_off_is_played_up_to_there(home: Path) -> None:
     assert "truncated" in said
 
 
-def test_nothing_usable_is_status_2(tmp_path: Path) -> None:
+def test_unusable_files_give_status_2(tmp_path: Path) -> None:
     (tmp_path / "1.trace.jsonl").write_bytes(bytes(range(256)) * 50)
     for path in (tmp_path, tmp_path / "1.trace.jsonl", tmp_path / "none"):
         ended = harness("replay", path)
@@ -125,25 +125,31 @@ def test_nothing_usable_is_status_2(tmp_path: Path) -> None:
         assert len(sentences(ended.stderr)) == 1
 
 
-def test_of_the_old_version_nothing_can_be_played(home: Path) -> None:
-    change(home / "2.trace.jsonl", lambda lines: lines.__setitem__(0, lines[0].replace("ucp-trace/2", "ucp-trace/1")))
-    ended = harness("replay", home / "2.trace.jsonl")
+def test_trace_of_version_1_cannot_be_played(traces_only: Path) -> None:
+    change(
+        traces_only / "2.trace.jsonl",
+        lambda lines: lines.__setitem__(0, lines[0].replace("ucp-trace/2", "ucp-trace/1")),
+    )
+    ended = harness("replay", traces_only / "2.trace.jsonl")
     assert ended.returncode == 2
     assert "lacks received messages" in sentences(ended.stderr)[-1]
 
 
-def test_one_that_cannot_be_played_keeps_nobody_from_the_others(home: Path) -> None:
-    change(home / "2.trace.jsonl", lambda lines: lines.__setitem__(0, lines[0].replace("ucp-trace/2", "ucp-trace/1")))
-    ended = harness("replay", home)
+def test_unplayable_record_does_not_prevent_the_others(traces_only: Path) -> None:
+    change(
+        traces_only / "2.trace.jsonl",
+        lambda lines: lines.__setitem__(0, lines[0].replace("ucp-trace/2", "ucp-trace/1")),
+    )
+    ended = harness("replay", traces_only)
     assert ended.returncode == 0
     assert ended.stdout.count("✔ no difference") == 3
     assert any("lacks received messages" in said for said in sentences(ended.stderr))
 
 
 @pytest.mark.parametrize("by_s", [30.0, -30.0, 5000.0])
-def test_a_clock_that_was_set_is_nobodys_mistake(by_s: float, home: Path) -> None:
-    """Set while a vote runs, of all moments: the timer ends as it should, and the record says otherwise."""
-    path = home / "2.trace.jsonl"
+def test_changed_clock_causes_no_deviation(by_s: float, traces_only: Path) -> None:
+    """Change the clock during a vote. The timer expires correctly, but the recorded times contradict that."""
+    path = traces_only / "2.trace.jsonl"
     lines = path.read_text().splitlines()
     votes = [number for number, line in enumerate(lines) if '"branch":"proposed"' in line]
     for number in range(votes[len(votes) // 2] + 1, len(lines)):
@@ -151,13 +157,13 @@ def test_a_clock_that_was_set_is_nobodys_mistake(by_s: float, home: Path) -> Non
         entry["t"] = round(entry["t"] + by_s, 6)
         lines[number] = json.dumps(entry, separators=(",", ":"))
     path.write_text("\n".join(lines) + "\n")
-    found = Player(open_record(home, 2)).to_end()
+    found = Player(open_record(traces_only, 2)).to_end()
     assert found.deviations == []
     assert found.unjudged
     assert "clock was set" in found.lost[0]
 
 
-def test_what_a_record_has_for_words_does_nothing_to_a_terminal(home: Path) -> None:
+def test_control_characters_of_a_record_are_not_printed(traces_only: Path) -> None:
     evil = "\x1b]0;title\x07\x1b[2J[bold]"
 
     def swear(lines: list[str]) -> None:
@@ -165,17 +171,17 @@ def test_what_a_record_has_for_words_does_nothing_to_a_terminal(home: Path) -> N
         entry["branch"], entry["trigger"] = evil, {"message": evil, "from": 1, "seq": 2}
         lines[20] = json.dumps(entry) + "\n"
 
-    change(home / "2.trace.jsonl", swear)
+    change(traces_only / "2.trace.jsonl", swear)
     commands = "goto 21\ns\ncompare\nl\no\n"
-    ended = harness("replay", home, "--agent", 2, "--step", input=commands)
+    ended = harness("replay", traces_only, "--agent", 2, "--step", input=commands)
     assert ended.returncode == 0, "what nobody understands is no accusation"
     assert "[bold]" in ended.stdout
     assert not any(character in ended.stdout + ended.stderr for character in "\x1b\x07")
 
 
 @pytest.mark.parametrize(("first", "by"), [(1, 1), (0, 2)], ids=["from one", "by two"])
-def test_an_agent_that_counts_its_messages_wrongly_has_lost_no_lines(first: int, by: int, home: Path) -> None:
-    path = home / "2.trace.jsonl"
+def test_irregular_sequence_numbers_are_no_missing_lines(first: int, by: int, traces_only: Path) -> None:
+    path = traces_only / "2.trace.jsonl"
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     for line in lines:
         for sent in line.get("sent", ()):
@@ -184,7 +190,7 @@ def test_an_agent_that_counts_its_messages_wrongly_has_lost_no_lines(first: int,
             datagram[8:12] = sequence.to_bytes(4, "big")
             sent |= {"seq": sequence, "datagram": base64.b64encode(datagram).decode()}
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    found = Player(open_record(home, 2)).to_end()
+    found = Player(open_record(traces_only, 2)).to_end()
     assert found.deviations
     assert found.unjudged == 0
     assert "with sequence number" in found.deviations[0].difference(str)

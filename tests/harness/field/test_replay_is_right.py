@@ -1,4 +1,4 @@
-"""Replaying what a right agent did gives no difference, always: in virtual time, over processes, in containers."""
+"""Replay of correct agents never finds a difference: in virtual time, with processes, and in containers."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -40,12 +40,12 @@ FAULTS: list[list[dict[str, Any]]] = [
 
 
 def assert_no_difference(directory: Path) -> None:
-    """Of any record: in its run's directory, and by itself, where nothing says what became of the agent."""
+    """Replay each record in the directory of its run, and alone, where the fate of the agent is unknown."""
     traces = sorted((directory / "agents").glob("*.trace.jsonl"))
     assert traces
     for trace in traces:
         if trace.read_bytes().count(b"\n") == 1:
-            continue  # it was killed before it did anything
+            continue  # It was killed before its first handler run.
         with TemporaryDirectory() as alone:
             (Path(alone) / trace.name).write_bytes(trace.read_bytes())
             for path in (trace, Path(alone) / trace.name):
@@ -69,7 +69,7 @@ def assert_no_difference(directory: Path) -> None:
         max_size=2,
     ),
 )
-def test_in_virtual_time(
+def test_replay_finds_no_difference_in_virtual_time(
     agents: int,
     seed: int,
     loss: float,
@@ -96,11 +96,11 @@ MISSION: dict[str, Any] = {
 
 
 @pytest.mark.lab
-def test_over_processes(tmp_path: Path) -> None:
+def test_replay_finds_no_difference_with_processes(tmp_path: Path) -> None:
     assert_no_difference(run(scenario(**MISSION), 1, tmp_path / "run", Silent(), "process").directory)
 
 
 @pytest.mark.docker
-def test_in_containers(tmp_path: Path) -> None:
+def test_replay_finds_no_difference_in_containers(tmp_path: Path) -> None:
     mission = {**MISSION, "docker": {"image_from_host": True}}
     assert_no_difference(run(scenario(**mission), 1, tmp_path / "run", Silent(), "docker").directory)

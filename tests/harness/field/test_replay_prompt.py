@@ -1,4 +1,4 @@
-"""Stepping through a record: the commands, as a user pipes them in or types them."""
+"""Interactive replay: the commands, from a pipe and from a terminal."""
 
 import json
 import os
@@ -17,13 +17,13 @@ from tests.harness.field.flights import flown, trace_of
 
 
 @pytest.fixture(scope="module")
-def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wrong_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return flown(tmp_path_factory.mktemp("wrong") / "run", quirks={"stale_chain_hash": True}, duration_s=900)
 
 
-def told(wrong: Path, *commands: str, options: tuple[str, ...] = ("--step",)) -> dict[str, list[str]]:
-    """What was printed after each command, which are all different."""
-    ended = harness("replay", wrong, "--agent", 2, *options, input="".join(f"{command}\n" for command in commands))
+def output_of(wrong_run: Path, *commands: str, options: tuple[str, ...] = ("--step",)) -> dict[str, list[str]]:
+    """Return the output after each command. All commands are different."""
+    ended = harness("replay", wrong_run, "--agent", 2, *options, input="".join(f"{command}\n" for command in commands))
     assert sentences(ended.stderr) == []
     said: dict[str, list[str]] = {"": []}
     last = ""
@@ -36,14 +36,14 @@ def told(wrong: Path, *commands: str, options: tuple[str, ...] = ("--step",)) ->
     return said
 
 
-def first_difference(wrong: Path) -> int:
-    first = Player(open_record(wrong, 2)).to_end().first
+def first_difference(wrong_run: Path) -> int:
+    first = Player(open_record(wrong_run, 2)).to_end().first
     assert first is not None
     return first.line
 
 
-def test_a_step_says_why_and_what_came_of_it_and_the_state_what_is_held(wrong: Path) -> None:
-    said = told(wrong, "next", "state", "quit")
+def test_step_shows_cause_and_effects_and_state_shows_all_data(wrong_run: Path) -> None:
+    said = output_of(wrong_run, "next", "state", "quit")
     assert said[""][1] == "before line 1: agent 2 as it begins"
     assert said["next"][0].startswith("line 2, t=")
     assert "Algorithm 1, build_data_block" in said["next"][0]
@@ -52,16 +52,16 @@ def test_a_step_says_why_and_what_came_of_it_and_the_state_what_is_held(wrong: P
     assert "1 event, " in said["state"][3]
 
 
-def test_back_shows_what_was_shown_before(wrong: Path) -> None:
-    said = told(wrong, "n 30", "s", "n 40", "back 40", "state", "b 29", "w", "q")
+def test_back_shows_the_previous_step_again(wrong_run: Path) -> None:
+    said = output_of(wrong_run, "n 30", "s", "n 40", "back 40", "state", "b 29", "w", "q")
     assert said["back 40"] == said["n 30"]
     assert said["state"] == said["s"]
     assert said["b 29"][0] == said["w"][0] == "line 2, t=" + said["w"][0].partition("t=")[2]
 
 
-def test_breaks_and_differences_stop(wrong: Path) -> None:
-    line = first_difference(wrong)
-    said = told(wrong, "c", "compare", "reverse-continue", "next difference", "break 3", "rc", "q")
+def test_continue_stops_at_breakpoints_and_differences(wrong_run: Path) -> None:
+    line = first_difference(wrong_run)
+    said = output_of(wrong_run, "c", "compare", "reverse-continue", "next difference", "break 3", "rc", "q")
     assert said["c"][0].startswith(f"line {line},")
     assert any(row.startswith("  ✘ it had the top chain hash") for row in said["c"])
     assert any(row.startswith("top") for row in said["compare"])
@@ -70,47 +70,47 @@ def test_breaks_and_differences_stop(wrong: Path) -> None:
     assert said["rc"][0].startswith("line 3,")
 
 
-def test_a_break_is_where_it_stops_first(wrong: Path) -> None:
-    said = told(wrong, "q", options=("--break", "A2"))
+def test_break_option_determines_the_first_stop(wrong_run: Path) -> None:
+    said = output_of(wrong_run, "q", options=("--break", "A2"))
     assert any("Algorithm 2, process_next_deque_block" in line for line in said[""])
 
 
-def test_the_others_are_shown_as_they_were_at_that_moment(wrong: Path) -> None:
-    said = told(wrong, "n A2", "o", "n receive_vote_add_block", "others", "q")
+def test_others_shows_the_other_agents_at_that_moment(wrong_run: Path) -> None:
+    said = output_of(wrong_run, "n A2", "o", "n receive_vote_add_block", "others", "q")
     assert any(line.startswith("  agent 1: ") for line in said["others"])
     assert any("sent it at line " in line for line in said["others"])
     assert any("heard Block Add Request" in line for line in said["o"])
 
 
-def test_what_a_step_failed_to_trigger_is_shown_with_that_step(tmp_path: Path) -> None:
-    wrong = flown(tmp_path / "run", quirks={"give_up_unfinished": True}, duration_s=900, network={"loss": 0.4})
-    line = first_difference(wrong)
-    shown = told(wrong, "q", options=("--break", str(line)))[""]
+def test_missing_local_event_is_shown_with_its_step(tmp_path: Path) -> None:
+    wrong_run = flown(tmp_path / "run", quirks={"give_up_unfinished": True}, duration_s=900, network={"loss": 0.4})
+    line = first_difference(wrong_run)
+    shown = output_of(wrong_run, "q", options=("--break", str(line)))[""]
     assert any(row.startswith("  ✘ it triggered nothing; it should have triggered Reconcile Finalize") for row in shown)
-    went_on = told(wrong, "c", "rc", "next difference", "q")
+    went_on = output_of(wrong_run, "c", "rc", "next difference", "q")
     assert went_on["c"] == went_on["next difference"]
     assert went_on["rc"][0].startswith("before line 1")
 
 
-def test_the_others_are_found_by_the_messages_where_clocks_are_wrong(tmp_path: Path) -> None:
+def test_others_are_aligned_by_messages_if_clocks_are_wrong(tmp_path: Path) -> None:
     directory = flown(tmp_path / "run", clocks={1: {"offset_s": 120.0}, 3: {"offset_s": -30.0, "drift": 0.01}})
     late = {1: (120.0, 1.0), 3: (-30.0, 1.01)}
     for agent in (1, 2, 3):
         offset_s, rate = late.get(agent, (0.0, 1.0))
         lines = [json.loads(line) for line in trace_of(directory, agent).read_text().splitlines()]
-        lines[0]["clock"] = {"epoch_us": 0, "speedup": 1}  # the clock is wrong, and nobody knows
+        lines[0]["clock"] = {"epoch_us": 0, "speedup": 1}  # The clock is wrong, without any sign of it.
         for line in lines[1:]:
             line["t"] = round(offset_s + rate * line["t"], 6)
         (tmp_path / f"{agent}.trace.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     shutil.rmtree(directory)
-    said = told(tmp_path, "n receive_vote_add_block", "others", "q")["others"]
+    said = output_of(tmp_path, "n receive_vote_add_block", "others", "q")["others"]
     sending = next(number for number, row in enumerate(said) if "sent it at line" in row)
     around = next(row for row in said[sending + 1 :] if row.split()[3] == said[sending].split()[4].replace(",", ":"))
     assert -0.2 < float(around.split()[0]) < 0
 
 
-def test_leaving_the_debugger_leaves_the_record_as_it_was(wrong: Path) -> None:
-    ended = harness("replay", wrong, "--agent", 2, "--step", input="n 20\ns\ndebug\nq\ns\nb\nn\ns\nq\n")
+def test_leaving_the_debugger_keeps_the_position(wrong_run: Path) -> None:
+    ended = harness("replay", wrong_run, "--agent", 2, "--step", input="n 20\ns\ndebug\nq\ns\nb\nn\ns\nq\n")
     assert sentences(ended.stderr) == []
     first, second, third = (text.split("\n> ")[0] for text in ended.stdout.split("\n> s\n")[1:])
     assert first == second == third
@@ -119,14 +119,14 @@ def test_leaving_the_debugger_leaves_the_record_as_it_was(wrong: Path) -> None:
 @pytest.mark.parametrize(
     "options", [("--json", "--step"), ("--json", "--break", "A2"), ("--debug",), ("--break", "A99")]
 )
-def test_what_makes_no_sense_together_is_refused(options: tuple[str, ...], wrong: Path) -> None:
-    ended = harness("replay", wrong, "--agent", 2, *options, input="")
+def test_contradictory_options_are_rejected(options: tuple[str, ...], wrong_run: Path) -> None:
+    ended = harness("replay", wrong_run, "--agent", 2, *options, input="")
     assert ended.returncode == 2
     assert "Traceback" not in ended.stderr
 
 
-def test_what_cannot_be_done_is_said(wrong: Path) -> None:
-    said = told(wrong, "b", "fly", "goto x", "n nobody", "clear 7", "quit")
+def test_impossible_command_is_reported(wrong_run: Path) -> None:
+    said = output_of(wrong_run, "b", "fly", "goto x", "n nobody", "clear 7", "quit")
     assert said["b"] == ["start of the record"]
     assert said["fly"][0].startswith("no command 'fly'")
     assert said["goto x"][0].startswith("goto needs a line")
@@ -134,21 +134,21 @@ def test_what_cannot_be_done_is_said(wrong: Path) -> None:
     assert said["clear 7"] == ["no breakpoint at '7'"]
 
 
-def test_when_the_commands_end_the_rest_is_played(wrong: Path) -> None:
-    ended = harness("replay", wrong, "--agent", 2, "--step", input="n\n")
+def test_rest_is_played_at_the_end_of_the_commands(wrong_run: Path) -> None:
+    ended = harness("replay", wrong_run, "--agent", 2, "--step", input="n\n")
     assert ended.returncode == 1
     assert "the first:" in ended.stdout
-    ended = harness("replay", wrong, "--agent", 2, "--step", input="n\nq\n")
+    ended = harness("replay", wrong_run, "--agent", 2, "--step", input="n\nq\n")
     assert ended.returncode == 0
     assert "the first:" not in ended.stdout
 
 
-def test_no_colours_in_a_pipe(wrong: Path) -> None:
-    assert "\x1b" not in harness("replay", wrong, "--agent", 2, "--step", input="n 5\ns\nc\n").stdout
+def test_output_to_a_pipe_has_no_colours(wrong_run: Path) -> None:
+    assert "\x1b" not in harness("replay", wrong_run, "--agent", 2, "--step", input="n 5\ns\nc\n").stdout
 
 
-def test_a_reader_that_has_seen_enough_ends_it_quietly(wrong: Path) -> None:
-    command = f"{' '.join(COMMAND)} replay {trace_of(wrong, 2)} --step"
+def test_closed_output_pipe_causes_no_error(wrong_run: Path) -> None:
+    command = f"{' '.join(COMMAND)} replay {trace_of(wrong_run, 2)} --step"
     commands = "n\ns\n" * 2000
     ended = subprocess.run(
         ["bash", "-c", f"{command} | head -1"], input=commands, capture_output=True, text=True, timeout=DEADLINE_S
@@ -157,10 +157,10 @@ def test_a_reader_that_has_seen_enough_ends_it_quietly(wrong: Path) -> None:
     assert ended.stdout.count("\n") == 1
 
 
-def test_ctrl_c_at_the_prompt_is_130(wrong: Path) -> None:
+def test_interrupt_at_the_prompt_gives_status_130(wrong_run: Path) -> None:
     ours, its = pty.openpty()
     with subprocess.Popen(
-        [*COMMAND, "replay", str(trace_of(wrong, 2)), "--step"],
+        [*COMMAND, "replay", str(trace_of(wrong_run, 2)), "--step"],
         stdin=its,
         stdout=its,
         stderr=its,
@@ -174,7 +174,7 @@ def test_ctrl_c_at_the_prompt_is_130(wrong: Path) -> None:
             said += os.read(ours, 4096)
         replaying.send_signal(signal.SIGINT)
         try:
-            os.write(ours, b"\n")  # readline looks for signals at a key, if one came right before it began to wait
+            os.write(ours, b"\n")  # readline misses a signal directly before it starts to wait for a key.
             assert replaying.wait(DEADLINE_S) == 130
         finally:
             replaying.kill()

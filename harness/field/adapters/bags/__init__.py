@@ -14,14 +14,24 @@ from typing import NamedTuple
 
 from harness.archive.bounded_file import BoundedFile
 from harness.field.adapters.bags import _mcap_bag, _sqlite, _version_1
-from harness.field.adapters.bags._decompression import MAX_FILE_BYTES, ZSTD_MAGIC, Broken, Found, Item, unpacked_file
+from harness.field.adapters.bags._decompression import (
+    MAX_FILE_BYTES,
+    ZSTD_MAGIC,
+    Damage,
+    Item,
+    RawMessage,
+    decompress_file,
+)
 
 MAGICS = (_version_1.MAGIC, _mcap_bag.MAGIC, _sqlite.MAGIC, ZSTD_MAGIC)
-"""What a bag begins with."""
+"""The first bytes of bags, and of files compressed with zstd."""
 
 
 class BagMessage(NamedTuple):
-    """`number` counts the messages of the file from 1; `time_ns` is that of recording, since the Unix epoch."""
+    """A message in a bag.
+
+    `number` counts the messages of the file from 1. `time_ns` is the recording time since the epoch.
+    """
 
     number: int
     topic: str
@@ -30,12 +40,12 @@ class BagMessage(NamedTuple):
     data: bytes
 
 
-def messages(path: Path) -> Iterator[BagMessage | Broken]:
-    """All messages, and between them the places that cannot be read. Raises OSError."""
+def messages(path: Path) -> Iterator[BagMessage | Damage]:
+    """Yield all messages, and a Damage for each unreadable place between them. Raises OSError."""
     number = 0
     with TemporaryDirectory(prefix="ucp-bag-") as directory:
         for item in _items(path, Path(directory)):
-            if isinstance(item, Found):
+            if isinstance(item, RawMessage):
                 number += 1
                 yield BagMessage(number, *item)
             else:
@@ -43,16 +53,16 @@ def messages(path: Path) -> Iterator[BagMessage | Broken]:
 
 
 def _items(path: Path, scratch: Path) -> Iterator[Item]:
-    trouble = ""
+    problem = ""
     with BoundedFile(path, MAX_FILE_BYTES) as file:
         if file.packed:
             path = scratch / "unpacked"
             with path.open("wb") as copy:
                 shutil.copyfileobj(file, copy)
-            trouble = file.problem
+            problem = file.problem
     if _magic(path) == ZSTD_MAGIC:
-        packed, path = path, scratch / "unzstd"
-        trouble = unpacked_file(packed, path)
+        compressed, path = path, scratch / "unzstd"
+        problem = decompress_file(compressed, path)
     magic = _magic(path)
     if magic == _sqlite.MAGIC:
         yield from _sqlite.items(path, scratch)
@@ -60,12 +70,12 @@ def _items(path: Path, scratch: Path) -> Iterator[Item]:
         with path.open("rb") as bag, mmap.mmap(bag.fileno(), 0, access=mmap.ACCESS_READ) as content:
             yield from (_version_1 if magic == _version_1.MAGIC else _mcap_bag).items(content)
     else:
-        yield Broken("it is no ROS bag")
-    if trouble:
-        yield Broken(trouble)
+        yield Damage("it is no ROS bag")
+    if problem:
+        yield Damage(problem)
 
 
 def _magic(path: Path) -> bytes | None:
     with path.open("rb") as file:
-        begins = file.read(max(map(len, MAGICS)))
-    return next((magic for magic in MAGICS if begins.startswith(magic)), None)
+        beginning = file.read(max(map(len, MAGICS)))
+    return next((magic for magic in MAGICS if beginning.startswith(magic)), None)

@@ -1,4 +1,4 @@
-"""Bags of version 2 in MCAP, record by record (mcap.dev/spec). What is damaged is passed over."""
+"""Bags of version 2 in MCAP files, read record by record (mcap.dev/spec). Damaged records are skipped."""
 
 import re
 import struct
@@ -8,11 +8,11 @@ from harness.field.adapters.bags._decompression import (
     MAX_CHUNK_BYTES,
     MAX_RECORDS,
     MAX_TRIES,
-    Broken,
     Buffer,
+    Damage,
     Item,
     Topics,
-    unpacked,
+    decompress,
 )
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -23,7 +23,7 @@ _U16, _U32 = struct.Struct("<H"), struct.Struct("<I")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNK_HEAD = struct.Struct("<QQQI")
 _BEGINNING = re.compile(rb"(?s)[\x01-\x0f].{4}\0{4}")
-_NESTED = 2
+MAX_DEPTH = 2
 
 
 def items(bag: Buffer) -> Iterator[Item]:
@@ -31,10 +31,10 @@ def items(bag: Buffer) -> Iterator[Item]:
     reader = _Reader(topics)
     yield from reader.items(bag, len(MAGIC), 0)
     if next(reader.records, None) is None:
-        yield Broken(f"only the first {MAX_RECORDS} records are read")
+        yield Damage(f"only the first {MAX_RECORDS} records are read")
     elif not reader.closed:
-        yield Broken("it was not closed, and ends early")
-    yield from topics.rest()
+        yield Damage("it was not closed, and ends early")
+    yield from topics.pending()
 
 
 class _Reader:
@@ -46,37 +46,40 @@ class _Reader:
         self.closed = False
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
-        """Messages of the bag, or of a chunk; a part of a last record is no damage if the chunk is not `whole`."""
+        """Yield the messages of the bag or of a chunk.
+
+        If the chunk is not `whole`, an incomplete last record is no damage.
+        """
         while (
             position < len(buffer)
             and next(self.records, None) is not None
             and not (self.closed and buffer[position : position + len(MAGIC)] == MAGIC)
         ):
-            operation, begins, ends = _record_at(buffer, position)
+            operation, start, end = _record_at(buffer, position)
             if not operation:
-                following = self._next(buffer, position + 1)
-                if following is None:
+                next_position = self._next(buffer, position + 1)
+                if next_position is None:
                     if whole and depth:
-                        yield Broken("it ends early, or is damaged")
+                        yield Damage("it ends early, or is damaged")
                     return
-                yield Broken("it is damaged in the middle; the data after the damage is read")
-                position = following
+                yield Damage("it is damaged in the middle; the data after the damage is read")
+                position = next_position
                 continue
-            record = buffer[begins : min(ends, begins + MAX_CHUNK_BYTES)]
-            position = ends
-            if operation == _CHUNK and depth < _NESTED and not self.closed:
-                yield from self._chunk(record, depth, cut_off=ends > len(buffer))
+            record = buffer[start : min(end, start + MAX_CHUNK_BYTES)]
+            position = end
+            if operation == _CHUNK and depth < MAX_DEPTH and not self.closed:
+                yield from self._chunk(record, depth, cut_off=end > len(buffer))
             elif operation in (_DATA_END, _FOOTER):
-                self.closed = not depth or self.closed  # what follows repeats what is before, for whoever looks it up
+                self.closed = not depth or self.closed  # The summary after this record repeats earlier records.
             else:
                 yield from self._record(operation, record)
 
     def _chunk(self, record: bytes, depth: int, *, cut_off: bool) -> Iterator[Item]:
-        compression, rest = _string(record, _CHUNK_HEAD.size)
-        content, trouble = unpacked(compression, record[rest + 8 :])
-        yield from self.items(content, 0, depth + 1, not trouble and not cut_off)
-        if trouble:
-            yield Broken(trouble)
+        compression, position_after = _string(record, _CHUNK_HEAD.size)
+        content, problem = decompress(compression, record[position_after + 8 :])
+        yield from self.items(content, 0, depth + 1, not problem and not cut_off)
+        if problem:
+            yield Damage(problem)
 
     def _record(self, operation: int, record: bytes) -> Iterator[Item]:
         if operation == _SCHEMA and len(record) >= _U16.size:
@@ -89,31 +92,31 @@ class _Reader:
             yield from self._topics.message(number, log_time, record[_MESSAGE_HEAD.size :])
 
     def _next(self, buffer: Buffer, start: int) -> int | None:
-        """Where the next record begins that is followed by one, or by the end."""
+        """Return the position of the next record that another record or the end of the buffer follows."""
         for match in _BEGINNING.finditer(buffer, start):
             if next(self._tries, None) is None:
                 return None
-            operation, _, ends = _record_at(buffer, match.start())
-            if operation and (ends >= len(buffer) or _record_at(buffer, ends)[0]):
+            operation, _, end = _record_at(buffer, match.start())
+            if operation and (end >= len(buffer) or _record_at(buffer, end)[0]):
                 return match.start()
         return None
 
 
 def _record_at(buffer: Buffer, position: int) -> tuple[int, int, int]:
-    """What begins there, where its content does, and where it ends; 0 if there is none. The end may cut off a chunk."""
+    """Return (operation, start, end) of the record at a position, or zeros if there is none. A chunk may be cut off."""
     if position + _RECORD.size > len(buffer):
         return 0, 0, 0
     operation, length = _RECORD.unpack_from(buffer, position)
-    begins = position + _RECORD.size
-    if operation not in _OPERATIONS or (begins + length > len(buffer) and operation != _CHUNK):
+    start = position + _RECORD.size
+    if operation not in _OPERATIONS or (start + length > len(buffer) and operation != _CHUNK):
         return 0, 0, 0
-    return operation, begins, begins + length
+    return operation, start, start + length
 
 
 def _string(record: bytes, position: int) -> tuple[str, int]:
-    """A string, and where what follows it begins."""
+    """Return the string at a position, and the position after it."""
     if position + _U32.size > len(record):
         return "", len(record)
     (length,) = _U32.unpack_from(record, position)
-    begins = position + _U32.size
-    return record[begins : begins + length].decode("utf-8", "replace"), begins + length
+    start = position + _U32.size
+    return record[start : start + length].decode("utf-8", "replace"), start + length

@@ -1,4 +1,4 @@
-"""Bags of version 2 in SQLite (rosbag2_storage_sqlite3), in the order in which they were recorded."""
+"""Bags of version 2 in SQLite files (rosbag2_storage_sqlite3), read in the order of recording."""
 
 import shutil
 import sqlite3
@@ -11,15 +11,15 @@ from harness.field.adapters.bags._decompression import (
     MAX_CHUNK_BYTES,
     MAX_FILE_BYTES,
     MAX_MESSAGE_BYTES,
-    Broken,
-    Found,
+    Damage,
     Item,
+    RawMessage,
 )
 
 MAGIC = b"SQLite format 3\0"
 JOURNAL = "-wal"
 MAX_STEPS = 5_000_000_000
-_STEPS_AT_ONCE = 10_000_000
+_STEPS_PER_CHECK = 10_000_000
 _TABLES = ("messages", "topics")
 _TOPICS = "SELECT id, name, type FROM topics LIMIT 100000"
 _MESSAGES = "SELECT id, topic_id, timestamp, data FROM messages"
@@ -27,31 +27,34 @@ _FIRST = -(2**63)
 
 
 def items(path: Path, scratch: Path) -> Iterator[Item]:
-    """A database that was not closed has messages in its journal: of both there is a copy then, which SQLite mends."""
+    """Yield the messages.
+
+    A database that was not closed has messages in its journal. SQLite then repairs a copy of both files.
+    """
     journal = path.with_name(f"{path.name}{JOURNAL}")
     if journal.is_file() and 0 < journal.stat().st_size < MAX_FILE_BYTES:
         copy = scratch / "bag.db3"
         shutil.copyfile(path, copy)
         shutil.copyfile(journal, scratch / f"bag.db3{JOURNAL}")
-        path, how = copy, "mode=rw"
+        path, mode = copy, "mode=rw"
     else:
-        how = "mode=ro&immutable=1"
+        mode = "mode=ro&immutable=1"
     try:
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True)) as database:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True)) as database:
             yield from _rows(database)
     except sqlite3.Error as error:
-        yield Broken(f"its database cannot be read: {error}")
+        yield Damage(f"its database cannot be read: {error}")
 
 
 def _rows(database: sqlite3.Connection) -> Iterator[Item]:
-    steps = iter(range(MAX_STEPS // _STEPS_AT_ONCE))
-    database.set_progress_handler(lambda: next(steps, None) is None, _STEPS_AT_ONCE)
+    steps = iter(range(MAX_STEPS // _STEPS_PER_CHECK))
+    database.set_progress_handler(lambda: next(steps, None) is None, _STEPS_PER_CHECK)
     database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
     database.execute("PRAGMA trusted_schema = OFF")
     database.text_factory = lambda text: text.decode("utf-8", "replace")
     tables = database.execute("SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN (?, ?)", _TABLES)
     if tables.fetchone() != (len(_TABLES),):
-        yield Broken("it is not a ROS bag: the database has no tables messages and topics")
+        yield Damage("it is not a ROS bag: the database has no tables messages and topics")
         return
     topics = {number: (str(name), str(kind)) for number, name, kind in database.execute(_TOPICS)}
     last = _FIRST
@@ -61,24 +64,24 @@ def _rows(database: sqlite3.Connection) -> Iterator[Item]:
             yield _item(topics, *row)
         return
     except sqlite3.DatabaseError as error:
-        trouble = str(error)
-    # Pages behind a damaged one may be sound: they are read from the end.
-    behind: list[Item] = []
+        problem = str(error)
+    # Pages after a damaged one may be intact. They are read from the end.
+    messages_behind: list[Item] = []
     kept_bytes = 0
     try:
         for _, topic, time_ns, data in database.execute(f"{_MESSAGES} WHERE id > ? ORDER BY id DESC", (last,)):
-            behind.append(_item(topics, topic, time_ns, data))
+            messages_behind.append(_item(topics, topic, time_ns, data))
             kept_bytes += len(data) if isinstance(data, bytes) else 0
             if kept_bytes > MAX_CHUNK_BYTES:
                 break
     except sqlite3.DatabaseError as error:
-        trouble = str(error)
-    yield Broken(f"messages cannot be read here ({trouble})")
-    yield from reversed(behind)
+        problem = str(error)
+    yield Damage(f"messages cannot be read here ({problem})")
+    yield from reversed(messages_behind)
 
 
 def _item(topics: dict[Any, tuple[str, str]], topic: Any, time_ns: Any, data: Any) -> Item:
-    """A row; its values may be of any type, if the file is damaged."""
+    """Return the message in a row. In a damaged file, values may have any type."""
     if topic not in topics or not isinstance(time_ns, int) or not isinstance(data, bytes):
-        return Broken("a message is damaged")
-    return Found(*topics[topic], time_ns, data)
+        return Damage("a message is damaged")
+    return RawMessage(*topics[topic], time_ns, data)

@@ -1,4 +1,4 @@
-"""Bags of version 1, record by record (wiki.ros.org/Bags/Format/2.0). What is damaged is passed over."""
+"""Bags of version 1, read record by record (wiki.ros.org/Bags/Format/2.0). Damaged records are skipped."""
 
 import re
 import struct
@@ -8,11 +8,11 @@ from harness.field.adapters.bags._decompression import (
     MAX_CHUNK_BYTES,
     MAX_RECORDS,
     MAX_TRIES,
-    Broken,
     Buffer,
+    Damage,
     Item,
     Topics,
-    unpacked,
+    decompress,
 )
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -21,12 +21,12 @@ _MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
 _OPERATIONS = range(2, 8)
 _LONGEST_HEAD = 64 * 1024
 _HEAD_BEFORE = 300
-"""Bytes of a record's head before its operation, at most: the other fields that writers put there."""
+"""Maximum number of bytes in a record header before the operation field. Writers put other fields there."""
 _OPERATION = re.compile(rb"\x04\0\0\0op=[\x02-\x07]")
-_NESTED = 2
+MAX_DEPTH = 2
 
 _Record = tuple[dict[str, bytes], bytes, int]
-"""Fields of the head, data, and where the next begins."""
+"""Fields of the header, the data, and the position of the next record."""
 
 
 def items(bag: Buffer) -> Iterator[Item]:
@@ -34,8 +34,8 @@ def items(bag: Buffer) -> Iterator[Item]:
     reader = _Reader(topics)
     yield from reader.items(bag, len(MAGIC), 0)
     if next(reader.records, None) is None:
-        yield Broken(f"only the first {MAX_RECORDS} records are read")
-    yield from topics.rest()
+        yield Damage(f"only the first {MAX_RECORDS} records are read")
+    yield from topics.pending()
 
 
 class _Reader:
@@ -45,26 +45,29 @@ class _Reader:
         self.records = iter(range(MAX_RECORDS))
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
-        """Messages of the bag, or of a chunk; a part of a last record is no damage if the chunk is not `whole`."""
+        """Yield the messages of the bag or of a chunk.
+
+        If the chunk is not `whole`, an incomplete last record is no damage.
+        """
         while position < len(buffer) and next(self.records, None) is not None:
             record = _record_at(buffer, position)
             if record is None:
-                following = self._next(buffer, position + 1)
-                if following is None:
+                next_position = self._next(buffer, position + 1)
+                if next_position is None:
                     if whole:
-                        yield Broken("it ends early, or is damaged")
+                        yield Damage("it ends early, or is damaged")
                     return
-                yield Broken("it is damaged in the middle; the data after the damage is read")
-                position = following
+                yield Damage("it is damaged in the middle; the data after the damage is read")
+                position = next_position
                 continue
             fields, data, position = record
             operation = fields["op"][0]
-            if operation == _CHUNK and depth < _NESTED:
-                content, trouble = unpacked(fields.get("compression", b"none").decode("latin-1"), data)
-                sound = not trouble and len(data) == _claimed(buffer, position, data)
-                yield from self.items(content, 0, depth + 1, sound)
-                if trouble or not sound:
-                    yield Broken(trouble or "it ends early")
+            if operation == _CHUNK and depth < MAX_DEPTH:
+                content, problem = decompress(fields.get("compression", b"none").decode("latin-1"), data)
+                intact = not problem and len(data) == _declared_length(buffer, position, data)
+                yield from self.items(content, 0, depth + 1, intact)
+                if problem or not intact:
+                    yield Damage(problem or "it ends early")
             elif operation == _CONNECTION:
                 self._connection(fields, data)
             elif operation == _MESSAGE and len(fields.get("time", b"")) == _TIME.size:
@@ -72,47 +75,47 @@ class _Reader:
                 yield from self._topics.message(fields.get("conn", b""), seconds * 10**9 + nanoseconds, data)
 
     def _connection(self, fields: dict[str, bytes], data: bytes) -> None:
-        about = _fields(data) or {}
-        topic, kind = about.get("topic") or fields.get("topic", b""), about.get("type", b"")
-        known = topic.decode("utf-8", "replace"), kind.decode("utf-8", "replace")
-        self._topics.known.setdefault(fields.get("conn", b""), known)
+        connection_fields = _fields(data) or {}
+        topic, kind = connection_fields.get("topic") or fields.get("topic", b""), connection_fields.get("type", b"")
+        topic_and_type = topic.decode("utf-8", "replace"), kind.decode("utf-8", "replace")
+        self._topics.known.setdefault(fields.get("conn", b""), topic_and_type)
 
     def _next(self, buffer: Buffer, start: int) -> int | None:
-        """Where the next sound record begins."""
+        """Return the position of the next intact record."""
         for match in _OPERATION.finditer(buffer, start):
-            for begins in range(match.start() - _U32.size, max(start, match.start() - _HEAD_BEFORE) - 1, -1):
+            for candidate in range(match.start() - _U32.size, max(start, match.start() - _HEAD_BEFORE) - 1, -1):
                 if next(self._tries, None) is None:
                     return None
-                if _record_at(buffer, begins) is not None:
-                    return begins
+                if _record_at(buffer, candidate) is not None:
+                    return candidate
         return None
 
 
-def _claimed(buffer: Buffer, end: int, data: bytes) -> int:
-    """How long the data that ends at `end` should be."""
+def _declared_length(buffer: Buffer, end: int, data: bytes) -> int:
+    """Return the length that the record declares for the data ending at `end`."""
     return int(_U32.unpack_from(buffer, end - len(data) - _U32.size)[0])
 
 
 def _record_at(buffer: Buffer, position: int) -> _Record | None:
-    """The record that begins there, if one does. A chunk may be cut off by the end."""
+    """Return the record at a position, or None. A chunk may be cut off by the end of the buffer."""
     if position + _U32.size > len(buffer):
         return None
     (length,) = _U32.unpack_from(buffer, position)
-    ends = position + _U32.size + length
-    if length > _LONGEST_HEAD or ends + _U32.size > len(buffer):
+    head_end = position + _U32.size + length
+    if length > _LONGEST_HEAD or head_end + _U32.size > len(buffer):
         return None
-    fields = _fields(buffer[position + _U32.size : ends])
+    fields = _fields(buffer[position + _U32.size : head_end])
     if fields is None or len(fields.get("op", b"")) != 1 or fields["op"][0] not in _OPERATIONS:
         return None
-    (claimed,) = _U32.unpack_from(buffer, ends)
-    begins, data_ends = ends + _U32.size, ends + _U32.size + claimed
+    (declared,) = _U32.unpack_from(buffer, head_end)
+    start, data_ends = head_end + _U32.size, head_end + _U32.size + declared
     if data_ends > len(buffer) and fields["op"][0] != _CHUNK:
         return None
-    return fields, buffer[begins : min(data_ends, begins + MAX_CHUNK_BYTES)], min(data_ends, len(buffer))
+    return fields, buffer[start : min(data_ends, start + MAX_CHUNK_BYTES)], min(data_ends, len(buffer))
 
 
 def _fields(head: bytes) -> dict[str, bytes] | None:
-    """None if these are none."""
+    """Return the header fields in `head`. None if they are damaged."""
     fields: dict[str, bytes] = {}
     position = 0
     while position < len(head):

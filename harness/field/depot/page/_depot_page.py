@@ -1,4 +1,4 @@
-"""The page: what is shown where. Whatever comes from the vehicles is text to the template, which escapes all of it."""
+"""The layout of the page. The template escapes all data from vehicles."""
 
 import base64
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from harness.field.depot.depot_reconcile import Reconciliation
 from harness.field.depot.page import _holdings, _position_map, _time_chart
 from harness.field.depot.record_lines import Block
 from harness.field.depot.record_outputs import agents, fork_in_words, in_words, reconciled_in_words, tracks
-from harness.present import text as words
+from harness.present import text as text_module
 from harness.present.colours import Ink, inks
 from harness.report import html
 from harness.report.chain_tree_svg import STYLE as TREE_STYLE
@@ -28,15 +28,15 @@ MAX_TITLE = 100
 
 
 def draw(record: Consolidation, reconciliation: Reconciliation | None = None) -> str:
-    """The page, as HTML."""
+    """Return the page as HTML."""
     header = record.header
     ink = inks(header.roster)
-    when = _time_chart.span(record)
-    flown = tracks(record)
-    rare = [block.line.name for block in record.blocks if len(block.line.holders) < 2]
+    when = _time_chart.time_span_of(record)
+    agent_tracks = tracks(record)
+    single_copies = [block.line.name for block in record.blocks if len(block.line.holders) < 2]
     lost: dict[int, list[int]] = {}
-    for each in record.lost_blocks:
-        lost.setdefault(each.agent_id, []).append(int((each.block or "").partition(".")[2]))
+    for missing_block in record.lost_blocks:
+        lost.setdefault(missing_block.agent_id, []).append(int((missing_block.block or "").partition(".")[2]))
     reconciled = reconciliation.line if reconciliation else None
     return html.render(
         _TEMPLATE,
@@ -50,11 +50,11 @@ def draw(record: Consolidation, reconciliation: Reconciliation | None = None) ->
             ("Not all files are used.", header.left_out),
         ],
         remarks=header.remarks,
-        figures=_figures(record, rare),
-        map=_position_map.draw(flown, rare, lost, ink) if flown else None,
+        figures=_figures(record, single_copies),
+        map=_position_map.draw(agent_tracks, single_copies, lost, ink) if agent_tracks else None,
         when=when,
-        began=words.moment(when.first_us) if when else "",
-        ended=words.moment(when.last_us) if when else "",
+        began=text_module.moment(when.first_us) if when else "",
+        ended=text_module.moment(when.last_us) if when else "",
         along=_time_chart.draw(record, when, ink) if when else None,
         shades=range(_time_chart.SHADES),
         holdings=_holdings.draw(record),
@@ -71,7 +71,7 @@ def draw(record: Consolidation, reconciliation: Reconciliation | None = None) ->
 
 
 def _title(record: Consolidation) -> str:
-    """What the inception block says, if it says anything to people."""
+    """Return the inception data if it is readable text, else a title with the hash of the inception block."""
     text = base64.b64decode(record.header.inception.block_data).decode("utf-8", errors="replace")
     if text and text.isprintable() and "\ufffd" not in text:
         return text if len(text) <= MAX_TITLE else f"{text[: MAX_TITLE - 1]}…"
@@ -79,49 +79,49 @@ def _title(record: Consolidation) -> str:
 
 
 def _headline(record: Consolidation) -> tuple[str, str]:
-    """In a few words, and what kind of news it is, for the style sheet."""
-    gone = []
+    """Return a short headline, and its class in the style sheet."""
+    losses = []
     if record.missing:
-        gone.append("1 vehicle" if len(record.missing) == 1 else f"{len(record.missing)} vehicles")
+        losses.append("1 vehicle" if len(record.missing) == 1 else f"{len(record.missing)} vehicles")
     if record.lost_blocks:
-        gone.append("1 block" if len(record.lost_blocks) == 1 else f"{len(record.lost_blocks)} blocks")
-    if gone:
-        return f"{' and '.join(gone)} lost", "violated"
+        losses.append("1 block" if len(record.lost_blocks) == 1 else f"{len(record.lost_blocks)} blocks")
+    if losses:
+        return f"{' and '.join(losses)} lost", "violated"
     if record.header.problems or record.header.left_out:
         return "the files have errors", "violated"
     return "no known losses", "holds"
 
 
-def _summary(record: Consolidation, when: _time_chart.Span | None) -> list[str]:
+def _summary(record: Consolidation, when: _time_chart.TimeSpan | None) -> list[str]:
     header = record.header
     parts = [f"inception block {header.inception.block_hash[:12]}"]
     if when is not None:
-        parts.append(f"begun {words.moment(when.first_us)}")
-        parts.append(words.duration(round((when.last_us - when.first_us) / 1e6)))
+        parts.append(f"begun {text_module.moment(when.first_us)}")
+        parts.append(text_module.duration(round((when.last_us - when.first_us) / 1e6)))
     return parts
 
 
-def _figures(record: Consolidation, rare: list[str]) -> list[tuple[str, str]]:
+def _figures(record: Consolidation, single_copies: list[str]) -> list[tuple[str, str]]:
     header = record.header
     building = sum(block.line.events for block in record.unfinished)
     figures: list[tuple[str, int | str]] = [
-        ("vehicles with an export", f"{len(record.home.latest)} of {len(header.roster)}"),
+        ("vehicles with an export", f"{len(record.collected.latest)} of {len(header.roster)}"),
         ("events", header.events),
         ("blocks", header.blocks - len(record.unfinished)),
         ("blocks in the mutual chain", header.mutual_chain),
         ("distinct chains", header.distinct_chains),
-        ("blocks with one vehicle only", len(rare) - len(record.unfinished)),
+        ("blocks with one vehicle only", len(single_copies) - len(record.unfinished)),
         ("events in current blocks", building),
         ("blocks lost", header.lost_blocks),
     ]
-    return [(label, words.value(value)) for label, value in figures]
+    return [(label, text_module.value(value)) for label, value in figures]
 
 
 def _trees(
     record: Consolidation, reconciliation: Reconciliation | None, ink: Mapping[int, Ink]
 ) -> list[tuple[str, Markup]] | None:
-    """The chains as they came home, and as the reconcile left them; None if nobody could look at so many."""
-    exports = record.home.exports
+    """Return the chain trees of the exports and of the reconcile. None if there are too many blocks for a drawing."""
+    exports = record.collected.exports
     if len(record.blocks) > MAX_TREE_BLOCKS:
         return None
     drawn = [("As exported" if reconciliation else "", _tree(exports, record, ink, "home"))]
@@ -135,19 +135,22 @@ def _tree(exports: Mapping[int, Export], record: Consolidation, ink: Mapping[int
 
 
 def _vehicles(record: Consolidation, ink: Mapping[int, Ink]) -> list[dict[str, Any]]:
-    """A row for each export that was used, and for each vehicle that did not come home."""
+    """Return a table row for each export, and for each vehicle without one."""
     rows: list[dict[str, Any]] = [
         {
             "agent_id": used.agent_id,
             "ink": ink[used.agent_id],
             "why": "",
-            "exported": words.moment(used.exported_at_us) + ("" if used.latest else ", earlier"),
+            "exported": text_module.moment(used.exported_at_us) + ("" if used.latest else ", earlier"),
             "cells": (used.completed, used.chain, used.deque, used.stack, used.idle),
             "file": used.file,
         }
         for used in record.header.exports
     ]
-    absent = [{"agent_id": each.agent_id, "ink": ink[each.agent_id], "why": each.why} for each in record.missing]
+    absent = [
+        {"agent_id": missing_block.agent_id, "ink": ink[missing_block.agent_id], "why": missing_block.why}
+        for missing_block in record.missing
+    ]
     return sorted(rows + absent, key=lambda row: row["agent_id"])
 
 
@@ -160,7 +163,7 @@ def _row(block: Block, ink: Mapping[int, Ink]) -> dict[str, Any]:
         "number": block.number,
         "name": block.name,
         "ink": ink[block.agent_id],
-        "at": words.moment(block.timestamp_us),
+        "at": text_module.moment(block.timestamp_us),
         "events": block.events,
         "held": "; ".join(places),
         "block_hash": block.block_hash or "",

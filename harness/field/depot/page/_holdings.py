@@ -1,4 +1,6 @@
-"""Who holds what: a row for each vehicle, a column for each block in the order of the record, and what was lost."""
+"""A chart of the holders: a row for each vehicle, a column for each block in the order of the record, and lost
+blocks.
+"""
 
 import math
 from collections import Counter
@@ -8,16 +10,16 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
-from harness.field.depot.consolidation import BlockOnRecord, Consolidation
+from harness.field.depot.consolidation import Consolidation, RecordedBlock
 from harness.present import svg
 from harness.present.svg import n
 
 WIDTH, LEFT, RIGHT, TOP, BOTTOM = 900, 76, 12, 26, 8
 ROW, GAP = 22, 6
-FINEST = 1.0
-"""Pixels that anybody can tell apart."""
-WIDEST = 14.0
-"""Pixels of a column, however few there are."""
+MIN_CELL_PX = 1.0
+"""Minimum width of a visible cell, in pixels."""
+MAX_COLUMN_PX = 14.0
+"""Maximum width of a column, in pixels."""
 
 GROUPS = {
     "mutual": "mutual chain",
@@ -37,19 +39,19 @@ PLACES = {
 
 
 def draw(record: Consolidation) -> Markup:
-    """Columns in groups: what all share, what some have in their chains, what is in none, and what is gone."""
+    """Draw the columns in groups: blocks in all chains, in some chains, in no chain, and lost blocks."""
     columns = _columns(record)
     groups = [(group, list(members)) for group, members in groupby(columns, key=lambda column: column[0])]
-    room = WIDTH - LEFT - RIGHT - GAP * (len(groups) - 1)
-    each = min(WIDEST, room / max(1, len(columns)))
+    available_px = WIDTH - LEFT - RIGHT - GAP * (len(groups) - 1)
+    column_px = min(MAX_COLUMN_PX, available_px / max(1, len(columns)))
     roster = record.header.roster
     height = TOP + ROW * len(roster) + BOTTOM
     missing = {lost.agent_id for lost in record.missing}
     parts = []
     left = float(LEFT)
     for group, members in groups:
-        width = each * len(members)
-        parts.append(_group(group, members, left, each, roster, missing))
+        width = column_px * len(members)
+        parts.append(_group(group, members, left, column_px, roster, missing))
         parts.append(_heading(group, len(members), left, width))
         left += width + GAP
     names = (
@@ -76,14 +78,17 @@ def draw(record: Consolidation) -> Markup:
 
 
 Column = tuple[str, str, Mapping[int, str]]
-"""Group, name, and where each vehicle holds the block."""
+"""The group, the name, and the place of the block on each vehicle."""
 
 
-class _Stretch(NamedTuple):
-    """From column `begin` up to `end`: where the agent holds them; `share` is "part" if it does not hold all."""
+class _Range(NamedTuple):
+    """The columns from `begin` up to `end`, in which the agent holds blocks at `place`.
+
+    `fraction` is "part" if not all.
+    """
 
     place: str
-    share: str
+    fraction: str
     begin: int
     end: int
     names: str
@@ -96,7 +101,7 @@ def _columns(record: Consolidation) -> list[Column]:
     return sorted(columns, key=lambda column: order.index(column[0]))
 
 
-def _group_of(block: BlockOnRecord) -> str:
+def _group_of(block: RecordedBlock) -> str:
     if block.line.mutual:
         return "mutual"
     if block.line.claimed_hash is not None:
@@ -106,8 +111,8 @@ def _group_of(block: BlockOnRecord) -> str:
     return "chain" if any(held.place == "chain" for held in block.line.held) else "aside"
 
 
-def _places(block: BlockOnRecord) -> dict[int, str]:
-    """By agent; one that holds it in two places in the first."""
+def _places(block: RecordedBlock) -> dict[int, str]:
+    """Return the place of the block by agent. If an agent holds it in two places, the first counts."""
     places: dict[int, str] = {}
     for held in block.line.held:
         for agent_id in held.agents:
@@ -116,9 +121,9 @@ def _places(block: BlockOnRecord) -> dict[int, str]:
 
 
 def _group(
-    group: str, members: Sequence[Column], left: float, each: float, roster: Sequence[int], missing: set[int]
+    group: str, members: Sequence[Column], left: float, column_px: float, roster: Sequence[int], missing: set[int]
 ) -> Markup:
-    width = each * len(members)
+    width = column_px * len(members)
     parts = []
     if group == "lost":
         tip = ", ".join(name for _, name, _ in members[:20]) + (" …" if len(members) > 20 else "")
@@ -127,45 +132,51 @@ def _group(
         )
     for number, agent_id in enumerate(roster):
         top = TOP + ROW * number
-        looks = "absent" if agent_id in missing else "lane"
+        css_class = "absent" if agent_id in missing else "lane"
         parts.append(
             Markup('<rect class="{}" x="{}" y="{}" width="{}" height="{}"/>').format(
-                looks, n(left), top, n(width), ROW - 2
+                css_class, n(left), top, n(width), ROW - 2
             )
         )
-        for stretch in _stretches(members, agent_id, each):
+        for held_range in _ranges(members, agent_id, column_px):
             parts.append(
                 Markup('<rect class="{}" x="{}" y="{}" width="{}" height="{}"><title>{}</title></rect>').format(
-                    f"at-{stretch.place.replace(' ', '-')} {stretch.share}".rstrip(),
-                    n(left + stretch.begin * each),
+                    f"at-{held_range.place.replace(' ', '-')} {held_range.fraction}".rstrip(),
+                    n(left + held_range.begin * column_px),
                     top,
-                    n(max(0.8, (stretch.end - stretch.begin) * each)),
+                    n(max(0.8, (held_range.end - held_range.begin) * column_px)),
                     ROW - 2,
-                    f"vehicle {agent_id}: {stretch.names} {PLACES[stretch.place]}",
+                    f"vehicle {agent_id}: {held_range.names} {PLACES[held_range.place]}",
                 )
             )
     return Markup("").join(parts)
 
 
-def _stretches(members: Sequence[Column], agent_id: int, each: float) -> Iterator[_Stretch]:
-    """Blocks in a row that the agent holds in the same place; of columns that nobody could tell apart, most of them.
+def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Iterator[_Range]:
+    """Yield consecutive blocks that the agent holds in the same place.
 
-    Each cell is a column, or as many as make a pixel, and has the place where most of its blocks are that the agent
-    holds, and how many these are of all: none, some, or all.
+    Columns narrower than a pixel are combined into cells. A cell shows the place at which the agent holds most of its
+    blocks, and whether it holds all of them.
     """
-    together = max(1, math.ceil(FINEST / each))
-    cells = [members[at : at + together] for at in range(0, len(members), together)]
-    kinds = (_kind(cell, agent_id) for cell in cells)
+    columns_per_cell = max(1, math.ceil(MIN_CELL_PX / column_px))
+    cells = [members[at : at + columns_per_cell] for at in range(0, len(members), columns_per_cell)]
+    kinds = (_cell_state(cell, agent_id) for cell in cells)
     at = 0
-    for (place, share), alike in groupby(kinds):
+    for (place, fraction), alike in groupby(kinds):
         begin, at = at, at + len(list(alike))
         if place is not None:
-            held = members[begin * together : at * together]
-            yield _Stretch(place, share, begin * together, begin * together + len(held), _named(held, share))
+            held = members[begin * columns_per_cell : at * columns_per_cell]
+            yield _Range(
+                place,
+                fraction,
+                begin * columns_per_cell,
+                begin * columns_per_cell + len(held),
+                _range_text(held, fraction),
+            )
 
 
-def _kind(cell: Sequence[Column], agent_id: int) -> tuple[str | None, str]:
-    """Where the agent holds these blocks, and whether all of them."""
+def _cell_state(cell: Sequence[Column], agent_id: int) -> tuple[str | None, str]:
+    """Return the place at which the agent holds these blocks, and "part" if it does not hold all of them."""
     places = Counter(place for _, _, held in cell if (place := held.get(agent_id)) is not None)
     if not places:
         return None, ""
@@ -173,9 +184,9 @@ def _kind(cell: Sequence[Column], agent_id: int) -> tuple[str | None, str]:
     return place, "" if places.total() == len(cell) else "part"
 
 
-def _named(held: Sequence[Column], share: str) -> str:
+def _range_text(held: Sequence[Column], fraction: str) -> str:
     first, last = held[0][1], held[-1][1]
-    if share:
+    if fraction:
         return f"some of {len(held)} blocks from {first} to {last}"
     return first if len(held) == 1 else f"{first} to {last}, {len(held)} blocks,"
 

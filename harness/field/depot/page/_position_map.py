@@ -1,7 +1,8 @@
-"""Where it was logged: each vehicle's positions as a line in its colour, and its other events where it last was.
+"""A map of the logged events: the positions of each vehicle as a line in its colour, and its other events at its last
+position.
 
-What was with one vehicle only is ringed: the next loss would have taken it. Where blocks of a vehicle were lost, its
-line is dotted from the last position before to the first one after.
+A ring marks blocks that only one vehicle holds, which the next loss would have destroyed. If blocks of a vehicle were
+lost, its line is dotted between the positions before and after them.
 """
 
 import math
@@ -21,7 +22,7 @@ from harness.report.map_svg import end_mark, frame, start_mark, tags
 from ucp.telemetry import describe
 
 METRES_PER_DEGREE = 111_195.0
-"""Of latitude, on a sphere of 6,371 km."""
+"""Metres per degree of latitude, on a sphere with a radius of 6371 km."""
 FARTHEST_M = 1e6
 MAX_POINTS = 20_000
 MAX_FIXES = 50_000
@@ -32,7 +33,7 @@ _WIDTH, _HEIGHT = 900, 560
 
 @dataclass(frozen=True)
 class Map:
-    """The drawing, and sentences on what is not on it."""
+    """The drawing, and sentences on omitted events."""
 
     drawing: Markup
     notes: list[str]
@@ -41,45 +42,47 @@ class Map:
 def draw(
     tracks: Sequence[Track], rare: Iterable[str], lost: Mapping[int, Sequence[int]], ink: Mapping[int, Ink]
 ) -> Map:
-    """`rare` are the names of blocks that one vehicle alone holds; `lost` the ordinals of an agent's lost blocks.
+    """Draw the map. `rare` has the names of blocks that only one vehicle holds, and `lost` the ordinals of an agent's
+    lost blocks.
 
-    There is a position at least.
+    There is at least one position.
     """
     field = _Field(tracks)
-    ways = {track.agent_id: [field.fix(at_us, position) for at_us, position in track.fixes] for track in tracks}
-    far = field.far
-    land = extent([fix for way in ways.values() for fix in way])
-    to_px = Projection(land, _LEFT, _TOP, _WIDTH, _HEIGHT)
-    alone = set(rare)
-    logged = [event for track in tracks for event in _logged(track, alone)]
-    shown = sorted(logged[:: -(-len(logged) // MAX_EVENTS) or 1], key=lambda event: event[0])  # the rare ones on top
+    paths = {track.agent_id: [field.fix(at_us, position) for at_us, position in track.fixes] for track in tracks}
+    far_positions = field.far_positions
+    extent_of_map = extent([fix for path in paths.values() for fix in path])
+    projection = Projection(extent_of_map, _LEFT, _TOP, _WIDTH, _HEIGHT)
+    single_copies = set(rare)
+    logged = [event for track in tracks for event in _logged(track, single_copies)]
+    # single copies are drawn last, on top
+    shown = sorted(logged[:: -(-len(logged) // MAX_EVENTS) or 1], key=lambda event: event[0])
     drawing = Markup(
         '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
         ' aria-labelledby="map-title map-desc" font-family="{font}" font-size="12">'
         '<title id="map-title">Map of logged events</title><desc id="map-desc">{desc}</desc>\n'
-        "{frame}\n{ways}\n{marks}\n{ends}</svg>\n"
+        "{frame}\n{paths}\n{marks}\n{ends}</svg>\n"
     ).format(
-        w=n(_LEFT + to_px.width + _RIGHT),
-        h=n(_TOP + to_px.height + _BOTTOM),
+        w=n(_LEFT + projection.width + _RIGHT),
+        h=n(_TOP + projection.height + _BOTTOM),
         font=FONT,
-        desc=f"Positions of {len(tracks)} vehicles, {land.width_m:.0f} m from west to east.",
-        frame=frame(to_px),
-        ways=_ways(tracks, ways, lost, to_px, ink),
+        desc=f"Positions of {len(tracks)} vehicles, {extent_of_map.width_m:.0f} m from west to east.",
+        frame=frame(projection),
+        paths=_paths(tracks, paths, lost, projection, ink),
         marks=Markup("").join(
-            _mark(to_px(field.fix(entry.event.timestamp_us, entry.position)), entry, rare, ink[agent_id])
+            _mark(projection(field.fix(entry.event.timestamp_us, entry.position)), entry, rare, ink[agent_id])
             for rare, agent_id, entry in shown
             if entry.position is not None
         ),
-        ends=_ends(ways, to_px, ink),
+        ends=_ends(paths, projection, ink),
     )
     notes = [] if len(shown) == len(logged) else [f"The map shows {len(shown)} of {len(logged)} events."]
-    if far:
-        notes.append(f"{far} positions more than {FARTHEST_M / 1000:.0f} km away are at the edge.")
+    if far_positions:
+        notes.append(f"{far_positions} positions more than {FARTHEST_M / 1000:.0f} km away are at the edge.")
     return Map(drawing, notes)
 
 
 class _Field:
-    """Metres north and east of the middle of all positions."""
+    """A conversion of positions to metres north and east of the median of all positions."""
 
     def __init__(self, tracks: Sequence[Track]) -> None:
         positions = [position for track in tracks for _, position in track.fixes]
@@ -87,26 +90,26 @@ class _Field:
         self._lon = sorted(position.lon_e7 for position in positions)[len(positions) // 2] / 1e7
         self._east = METRES_PER_DEGREE * max(0.01, math.cos(math.radians(self._lat)))
         self._first_us = min(at_us for track in tracks for at_us, _ in track.fixes)
-        self.far = 0
+        self.far_positions = 0
 
     def fix(self, at_us: int, position: GlobalPosition) -> Fix:
         north_m = (position.lat_e7 / 1e7 - self._lat) * METRES_PER_DEGREE
         east_m = ((position.lon_e7 / 1e7 - self._lon + 180) % 360 - 180) * self._east
-        self.far += max(abs(north_m), abs(east_m)) > FARTHEST_M
+        self.far_positions += max(abs(north_m), abs(east_m)) > FARTHEST_M
         at_s = (at_us - self._first_us) / 1e6
         return Fix(at_s, *(max(-FARTHEST_M, min(FARTHEST_M, metres)) for metres in (north_m, east_m)))
 
 
-def _ways(
+def _paths(
     tracks: Sequence[Track],
-    ways: Mapping[int, Sequence[Fix]],
+    paths: Mapping[int, Sequence[Fix]],
     lost: Mapping[int, Sequence[int]],
-    to_px: Projection,
+    projection: Projection,
     ink: Mapping[int, Ink],
 ) -> Markup:
-    pieces = [(track, gap, piece) for track in tracks for gap, piece in _pieces(track, ways[track.agent_id], lost)]
-    every = sum(map(len, ways.values())) // MAX_FIXES + 1  # thinning looks at each point many times
-    lines = thin([[to_px(fix) for fix in (*piece[:-1:every], piece[-1])] for _, _, piece in pieces], MAX_POINTS)
+    pieces = [(track, gap, piece) for track in tracks for gap, piece in _pieces(track, paths[track.agent_id], lost)]
+    stride = sum(map(len, paths.values())) // MAX_FIXES + 1  # thinning visits each point several times
+    lines = thin([[projection(fix) for fix in (*piece[:-1:stride], piece[-1])] for _, _, piece in pieces], MAX_POINTS)
     drawn = []
     for (track, gap, _), line in zip(pieces, lines, strict=True):
         path = "M" + "L".join(f"{n(x)} {n(y)}" for x, y in line)
@@ -121,18 +124,21 @@ def _ways(
 
 
 def _pieces(
-    track: Track, way: Sequence[Fix], lost: Mapping[int, Sequence[int]]
+    track: Track, path: Sequence[Fix], lost: Mapping[int, Sequence[int]]
 ) -> Iterable[tuple[bool, Sequence[Fix]]]:
-    """The way, cut where blocks were lost between two positions; whether it is such a gap."""
+    """Yield the pieces of a path, and whether the piece is a gap.
+
+    A gap is where blocks between two positions were lost.
+    """
     missing = lost.get(track.agent_id, ())
     ordinals = [_ordinal(entry.block) for entry in track.entries if entry.is_position]
     begin = 0
     for at, (before, after) in enumerate(pairwise(ordinals), 1):
         if before and after and any(before < ordinal < after for ordinal in missing):
-            yield False, way[begin:at]
-            yield True, way[at - 1 : at + 1]
+            yield False, path[begin:at]
+            yield True, path[at - 1 : at + 1]
             begin = at
-    yield False, way[begin:]
+    yield False, path[begin:]
 
 
 def _ordinal(name: str) -> int | None:
@@ -140,10 +146,10 @@ def _ordinal(name: str) -> int | None:
     return int(ordinal) if ordinal.isdecimal() else None
 
 
-def _logged(track: Track, alone: set[str]) -> Iterable[tuple[bool, int, LogEntry]]:
-    """Each event but positions, and positions that one vehicle alone has: whether it is one of these, and whose."""
+def _logged(track: Track, single_copies: set[str]) -> Iterable[tuple[bool, int, LogEntry]]:
+    """Yield (whether only one vehicle holds it, agent ID, entry) for each event that the map marks."""
     for entry in track.entries:
-        rare = entry.block in alone
+        rare = entry.block in single_copies
         if entry.position is not None and (rare or not entry.is_position):
             yield rare, track.agent_id, entry
 
@@ -159,11 +165,13 @@ def _mark(place: Point, entry: LogEntry, rare: bool, ink: Ink) -> Markup:
     )
 
 
-def _ends(ways: Mapping[int, Sequence[Fix]], to_px: Projection, ink: Mapping[int, Ink]) -> Markup:
+def _ends(paths: Mapping[int, Sequence[Fix]], projection: Projection, ink: Mapping[int, Ink]) -> Markup:
     parts = []
-    for agent_id, way in ways.items():
+    for agent_id, path in paths.items():
         colours = ink[agent_id]
         first, last = f"first position of vehicle {agent_id}", f"last position of vehicle {agent_id}"
-        parts.append(start_mark(to_px(way[0]), first, colours.fill, colours.stroke))
-        parts.append(end_mark(to_px(way[-1]), last, colours.fill, colours.stroke))
-    return Markup("").join(parts) + tags([(agent_id, to_px(way[-1])) for agent_id, way in ways.items()], [], to_px, ink)
+        parts.append(start_mark(projection(path[0]), first, colours.fill, colours.stroke))
+        parts.append(end_mark(projection(path[-1]), last, colours.fill, colours.stroke))
+    return Markup("").join(parts) + tags(
+        [(agent_id, projection(path[-1])) for agent_id, path in paths.items()], [], projection, ink
+    )

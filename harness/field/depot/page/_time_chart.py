@@ -1,4 +1,6 @@
-"""When it was logged: a lane for each vehicle, above its events, below its blocks, by how many vehicles hold them."""
+"""A chart over time with a lane for each vehicle: its events above, and its blocks below, shaded by number of
+holders.
+"""
 
 from bisect import bisect_left
 from collections import defaultdict
@@ -7,7 +9,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.field.depot.consolidation import BlockOnRecord, Consolidation, events_in
+from harness.field.depot.consolidation import Consolidation, RecordedBlock, events_in
 from harness.present import svg, text
 from harness.present.colours import Ink
 from harness.present.svg import n
@@ -15,46 +17,46 @@ from harness.present.svg import n
 WIDTH, LEFT, RIGHT, TOP, BOTTOM = 900, 76, 24, 8, 34
 LANE, BARS, BOXES = 44, 20, 12
 BINS = 260
-TOUCHING = 0.6
-"""Pixels between two blocks that nobody sees."""
-OUTLIERS = 0.01
-"""The share of events at either end whose clocks may be far off."""
+MAX_GAP_PX = 0.6
+"""Maximum invisible gap between two blocks, in pixels."""
+OUTLIER_SHARE = 0.01
+"""Share of events at both ends of the time span whose clocks may be wrong."""
 SHADES = 4
 
 
 @dataclass(frozen=True)
-class Span:
-    """From when to when, in microseconds; `outside` are events of clocks that show quite another time."""
+class TimeSpan:
+    """A time span in microseconds. `outside` counts the events of clocks that show a different time."""
 
     first_us: int
     last_us: int
     outside: int
 
 
-def span(record: Consolidation) -> Span | None:
-    """When nearly all events were logged; None if there is none."""
+def time_span_of(record: Consolidation) -> TimeSpan | None:
+    """Return the time span of nearly all events. None without events."""
     times = sorted(timestamp_us for block in record.blocks for timestamp_us, *_ in events_in(block.event_data))
     if not times:
         return None
-    low, high = times[int(OUTLIERS * len(times))], times[len(times) - 1 - int(OUTLIERS * len(times))]
+    low, high = times[int(OUTLIER_SHARE * len(times))], times[len(times) - 1 - int(OUTLIER_SHARE * len(times))]
     slack = max(high - low, 1_000_000) // 4
     first = times[bisect_left(times, low - slack)]
     last = times[bisect_left(times, high + slack + 1) - 1]
     outside = bisect_left(times, first) + len(times) - bisect_left(times, last + 1)
-    return Span(first, last, outside)
+    return TimeSpan(first, last, outside)
 
 
-def draw(record: Consolidation, when: Span, ink: Mapping[int, Ink]) -> Markup:
-    """Lanes of all that flew."""
-    length_s = max(1.0, (when.last_us - when.first_us) / 1e6)
-    across = svg.linear_axis(0.0, length_s, (LEFT, WIDTH - RIGHT))
-    of_agent: dict[int, list[BlockOnRecord]] = defaultdict(list)
+def draw(record: Consolidation, time_span: TimeSpan, ink: Mapping[int, Ink]) -> Markup:
+    """Draw the lanes of all vehicles."""
+    length_s = max(1.0, (time_span.last_us - time_span.first_us) / 1e6)
+    axis = svg.linear_axis(0.0, length_s, (LEFT, WIDTH - RIGHT))
+    of_agent: dict[int, list[RecordedBlock]] = defaultdict(list)
     for block in record.blocks:
         of_agent[block.line.agent_id].append(block)
     roster = record.header.roster
     height = TOP + LANE * len(roster) + BOTTOM
     lanes = [
-        _lane(agent_id, of_agent[agent_id], record, when, across, TOP + LANE * number, ink[agent_id])
+        _lane(agent_id, of_agent[agent_id], record, time_span, axis, TOP + LANE * number, ink[agent_id])
         for number, agent_id in enumerate(roster)
     ]
     return Markup(
@@ -65,28 +67,28 @@ def draw(record: Consolidation, when: Span, ink: Mapping[int, Ink]) -> Markup:
         h=height,
         desc=f"Events and blocks of {len(roster)} vehicles along time",
         font=svg.FONT,
-        axis=_axis(across, TOP, height - BOTTOM),
+        axis=_axis(axis, TOP, height - BOTTOM),
         lanes=Markup("\n").join(lanes),
     )
 
 
-def _axis(across: svg.Axis, top: float, bottom: float) -> Markup:
-    rules = "".join(f"M{n(across(tick))} {n(top)}V{n(bottom)}" for tick in across.ticks)
+def _axis(axis: svg.Axis, top: float, bottom: float) -> Markup:
+    rules = "".join(f"M{n(axis(tick))} {n(top)}V{n(bottom)}" for tick in axis.ticks)
     texts = [
         Markup('<text class="quiet" x="{}" y="{}" text-anchor="middle">{}</text>').format(
-            n(across(tick)), n(bottom + 18), text.duration(tick)
+            n(axis(tick)), n(bottom + 18), text.duration(tick)
         )
-        for tick in across.ticks
+        for tick in axis.ticks
     ]
     return Markup('<path class="rule" d="{}"/>{}').format(rules, Markup("").join(texts))
 
 
 def _lane(
     agent_id: int,
-    blocks: Sequence[BlockOnRecord],
+    blocks: Sequence[RecordedBlock],
     record: Consolidation,
-    when: Span,
-    across: svg.Axis,
+    time_span: TimeSpan,
+    axis: svg.Axis,
     top: float,
     ink: Ink,
 ) -> Markup:
@@ -98,26 +100,26 @@ def _lane(
         [
             name,
             ground,
-            _bars(blocks, when, across, top + 4, ink),
-            _boxes(blocks, record, when, across, top + 4 + BARS + 2),
-            *_losses(agent_id, blocks, record, when, across, top + 4),
+            _bars(blocks, time_span, axis, top + 4, ink),
+            _boxes(blocks, record, time_span, axis, top + 4 + BARS + 2),
+            *_losses(agent_id, blocks, record, time_span, axis, top + 4),
         ]
     )
 
 
-def _bars(blocks: Sequence[BlockOnRecord], when: Span, across: svg.Axis, top: float, ink: Ink) -> Markup:
-    """How many events there are in each stretch of time, the tallest for most."""
-    width = (across.end - across.start) / BINS
-    length = max(1, when.last_us - when.first_us)
+def _bars(blocks: Sequence[RecordedBlock], time_span: TimeSpan, axis: svg.Axis, top: float, ink: Ink) -> Markup:
+    """Draw a histogram of the events over time."""
+    width = (axis.end - axis.start) / BINS
+    length = max(1, time_span.last_us - time_span.first_us)
     counts = [0] * BINS
     for block in blocks:
         for timestamp_us, *_ in events_in(block.event_data):
-            if when.first_us <= timestamp_us <= when.last_us:
-                counts[min(BINS - 1, (timestamp_us - when.first_us) * BINS // length)] += 1
+            if time_span.first_us <= timestamp_us <= time_span.last_us:
+                counts[min(BINS - 1, (timestamp_us - time_span.first_us) * BINS // length)] += 1
     most = max(counts, default=0)
     floor = n(top + BARS)
     path = "".join(
-        f"M{n(across.start + number * width)} {floor}v-{n(max(2.0, BARS * count / most))}h{n(width)}V{floor}z"
+        f"M{n(axis.start + number * width)} {floor}v-{n(max(2.0, BARS * count / most))}h{n(width)}V{floor}z"
         for number, count in enumerate(counts)
         if count
     )
@@ -127,63 +129,77 @@ def _bars(blocks: Sequence[BlockOnRecord], when: Span, across: svg.Axis, top: fl
 
 
 def shade(holders: int, vehicles: int) -> int:
-    """0 if one vehicle alone holds it, the last if all do."""
+    """Return the shade for a number of holders: 0 for one, and the last for all vehicles."""
     if holders <= 1:
         return 0
     return SHADES - 1 if holders >= vehicles else 1 if 2 * holders <= vehicles else 2
 
 
-def _boxes(blocks: Sequence[BlockOnRecord], record: Consolidation, when: Span, across: svg.Axis, top: float) -> Markup:
-    """Blocks that touch each other, and that as many hold, are one box."""
-    vehicles = len(record.home.latest)
+def _boxes(
+    blocks: Sequence[RecordedBlock], record: Consolidation, time_span: TimeSpan, axis: svg.Axis, top: float
+) -> Markup:
+    """Draw the blocks. Adjacent blocks with equal shades are one box."""
+    vehicles = len(record.collected.latest)
     merged: list[tuple[float, float, str, list[str]]] = []
     for block in sorted(blocks, key=lambda block: block.line.timestamp_us):
-        begin, end = _reach(block, when, across)
+        begin, end = _extent(block, time_span, axis)
         holders = block.line.holders
-        looks = "building" if block.line.block_hash is None else f"copies{shade(len(holders), vehicles)}"
-        if merged and merged[-1][2] == looks and begin - merged[-1][1] < TOUCHING and looks != "building":
+        css_class = "building" if block.line.block_hash is None else f"copies{shade(len(holders), vehicles)}"
+        if merged and merged[-1][2] == css_class and begin - merged[-1][1] < MAX_GAP_PX and css_class != "building":
             last = merged.pop()
-            merged.append((last[0], max(last[1], end), looks, [*last[3], block.line.name]))
+            merged.append((last[0], max(last[1], end), css_class, [*last[3], block.line.name]))
         else:
-            merged.append((begin, max(end, begin + 1.5), looks, [block.line.name]))
-    means = {
+            merged.append((begin, max(end, begin + 1.5), css_class, [block.line.name]))
+    meanings = {
         "building": "current block",
         "copies0": "with one vehicle only",
         f"copies{SHADES - 1}": "with all vehicles",
     }
     return Markup("").join(
         Markup('<rect class="{}" x="{}" y="{}" width="{}" height="{}"><title>{}</title></rect>').format(
-            looks, n(begin), n(top), n(end - begin), BOXES, f"{_named(names)}: {means.get(looks, 'with some vehicles')}"
+            css_class,
+            n(begin),
+            n(top),
+            n(end - begin),
+            BOXES,
+            f"{_names_text(names)}: {meanings.get(css_class, 'with some vehicles')}",
         )
-        for begin, end, looks, names in merged
+        for begin, end, css_class, names in merged
     )
 
 
-def _reach(block: BlockOnRecord, when: Span, across: svg.Axis) -> tuple[float, float]:
+def _extent(block: RecordedBlock, time_span: TimeSpan, axis: svg.Axis) -> tuple[float, float]:
     times = [timestamp_us for timestamp_us, *_ in events_in(block.event_data)] or [block.line.timestamp_us]
-    return across((min(times) - when.first_us) / 1e6), across((max(times) - when.first_us) / 1e6)
+    return axis((min(times) - time_span.first_us) / 1e6), axis((max(times) - time_span.first_us) / 1e6)
 
 
 def _losses(
-    agent_id: int, blocks: Sequence[BlockOnRecord], record: Consolidation, when: Span, across: svg.Axis, top: float
+    agent_id: int,
+    blocks: Sequence[RecordedBlock],
+    record: Consolidation,
+    time_span: TimeSpan,
+    axis: svg.Axis,
+    top: float,
 ) -> Iterable[Markup]:
-    """Hatched: from the last block before to the first after those that were lost; for a missing vehicle to the end."""
-    reach = {block.line.name: _reach(block, when, across) for block in blocks}
-    ordinals = sorted(int(name.partition(".")[2]) for name in reach if name.partition(".")[2].isdecimal())
+    """Draw hatched areas: for lost blocks from the block before to the block after them, for a missing vehicle to
+    the end.
+    """
+    extents = {block.line.name: _extent(block, time_span, axis) for block in blocks}
+    ordinals = sorted(int(name.partition(".")[2]) for name in extents if name.partition(".")[2].isdecimal())
     gaps: dict[tuple[float, float], list[str]] = {}
     for lost in record.lost_blocks:
         if lost.agent_id == agent_id and lost.block is not None:
             ordinal = int(lost.block.partition(".")[2])
             before = [other for other in ordinals if other < ordinal]
             after = [other for other in ordinals if other > ordinal]
-            begin = reach[f"{agent_id}.{before[-1]}"][1] if before else across.start
-            end = reach[f"{agent_id}.{after[0]}"][0] if after else across.end
+            begin = extents[f"{agent_id}.{before[-1]}"][1] if before else axis.start
+            end = extents[f"{agent_id}.{after[0]}"][0] if after else axis.end
             gaps.setdefault((begin, max(end, begin + 3)), []).append(lost.block)
     for (begin, end), names in gaps.items():
-        yield _hatched(begin, end, top, f"{_named(names)}: lost")
+        yield _hatched(begin, end, top, f"{_names_text(names)}: lost")
     if any(missing.agent_id == agent_id for missing in record.missing):
-        begin = max((end for _, end in reach.values()), default=across.start)
-        yield _hatched(begin, max(across.end, begin + 3), top, "later records are missing")
+        begin = max((end for _, end in extents.values()), default=axis.start)
+        yield _hatched(begin, max(axis.end, begin + 3), top, "later records are missing")
 
 
 def _hatched(begin: float, end: float, top: float, tip: str) -> Markup:
@@ -192,5 +208,5 @@ def _hatched(begin: float, end: float, top: float, tip: str) -> Markup:
     )
 
 
-def _named(names: Sequence[str]) -> str:
+def _names_text(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}, {len(names)} blocks"

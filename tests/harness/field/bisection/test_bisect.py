@@ -1,4 +1,4 @@
-"""It worked last week: the commit that breaks a handler is named, and nothing is left behind."""
+"""Bisection: the commit that breaks a handler is found, and no temporary files remain."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from harness.field.bisection import Outcome, differences
-from harness.field.bisection.outcome import OfAgent
+from harness.field.bisection.outcome import AgentResult
 from tests.harness.command import COMMAND, harness, sentences
 
 ROOT = Path(__file__).parents[4]
@@ -30,7 +30,10 @@ def git(repository: Path, *arguments: str) -> str:
 
 @pytest.fixture(scope="module")
 def repository(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """good, chore, does not start, broken, chore: one commit breaks a handler, and the one before cannot be tried."""
+    """Make commits: good, unrelated, does not start, broken, unrelated.
+
+    One breaks a handler, and the one before cannot run.
+    """
     path = tmp_path_factory.mktemp("project")
     for package in ("ucp", "harness", "netem", "sitl", "scenarios"):
         shutil.copytree(ROOT / package, path / package, ignore=shutil.ignore_patterns("__pycache__", "*.png"))
@@ -56,7 +59,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def records(tmp_path_factory: pytest.TempPathFactory, scenario: Path) -> Path:
-    """What came home from a flight with a right core."""
+    """Write the records of a flight with a correct core."""
     directory = tmp_path_factory.mktemp("flown")
     played = harness("run", scenario, "--backend", "sim", "--seed", 1, "--out", directory / "run")
     assert (directory / "run/run.json").exists(), played.stderr
@@ -65,7 +68,7 @@ def records(tmp_path_factory: pytest.TempPathFactory, scenario: Path) -> Path:
     return home
 
 
-def test_the_commit_that_broke_a_scenario_is_named(repository: Path, scenario: Path) -> None:
+def test_bisect_finds_the_commit_that_broke_a_scenario(repository: Path, scenario: Path) -> None:
     before = set(Path(tempfile.gettempdir()).glob("ucp-harness-*"))
     ended = harness("bisect", scenario, "--good", "HEAD~5", "--repository", repository, "--json", deadline_s=120)
     assert ended.returncode == 0, ended.stderr
@@ -80,7 +83,7 @@ def test_the_commit_that_broke_a_scenario_is_named(repository: Path, scenario: P
     assert set(Path(tempfile.gettempdir()).glob("ucp-harness-*")) == before
 
 
-def test_the_commit_with_which_a_record_no_longer_plays_is_named(repository: Path, records: Path) -> None:
+def test_bisect_finds_the_commit_that_broke_a_record(repository: Path, records: Path) -> None:
     ended = harness("bisect", records, "--good", "HEAD~5", "--repository", repository, "--json", deadline_s=120)
     assert ended.returncode == 0, ended.stderr
     document = json.loads(ended.stdout)
@@ -88,7 +91,7 @@ def test_the_commit_with_which_a_record_no_longer_plays_is_named(repository: Pat
     assert all("reconcile_phase_1_timer_expiration" in change for change in document["changes"])
 
 
-def test_what_cannot_be_tried_is_skipped_and_what_is_alike_is_no_finding(repository: Path, records: Path) -> None:
+def test_bisect_skips_untestable_commits_and_reports_equal_outcomes(repository: Path, records: Path) -> None:
     arguments = ["--repository", repository, "--agent", 1]
     alike = harness("bisect", records, "--good", "HEAD~5", "--bad", "HEAD~2", *arguments)
     assert alike.returncode == 1 and "the outcome at HEAD~2 is that at HEAD~5" in alike.stdout
@@ -113,7 +116,7 @@ def test_core_that_crashes_on_a_record_has_a_changed_outcome(repository: Path, r
     assert "it crashes: ZeroDivisionError: no votes (ucp/commit.py:" in ended.stdout
 
 
-def test_git_itself_bisects_with_once(repository: Path, records: Path, tmp_path: Path) -> None:
+def test_git_bisect_run_works_with_the_option_once(repository: Path, records: Path, tmp_path: Path) -> None:
     clone = tmp_path / "clone"
     git(tmp_path, "clone", "--quiet", str(repository), str(clone))
     git(clone, "bisect", "start", "HEAD", "HEAD~5")
@@ -125,7 +128,7 @@ def test_git_itself_bisects_with_once(repository: Path, records: Path, tmp_path:
     assert "is the first bad commit" in run.stdout and "broken" in run.stdout, run.stdout + run.stderr
 
 
-def test_exit_statuses_are_those_that_git_bisect_run_takes(repository: Path, scenario: Path, tmp_path: Path) -> None:
+def test_exit_statuses_fit_git_bisect_run(repository: Path, scenario: Path, tmp_path: Path) -> None:
     git(repository, "worktree", "add", "--quiet", "--detach", str(tmp_path / "good"), "HEAD~5")
     kept = tmp_path / "outcome.json"
     try:
@@ -147,7 +150,7 @@ def test_exit_statuses_are_those_that_git_bisect_run_takes(repository: Path, sce
     assert harness("bisect", "--once", tmp_path / "none.yaml", "--repository", repository).returncode == 128
 
 
-def test_interrupted_it_leaves_nothing_behind(repository: Path, scenario: Path, tmp_path: Path) -> None:
+def test_interrupted_bisection_leaves_no_files(repository: Path, scenario: Path, tmp_path: Path) -> None:
     environment = {**os.environ, "TMPDIR": str(tmp_path / "scratch")}
     (tmp_path / "scratch").mkdir()
     process = subprocess.Popen(
@@ -167,9 +170,9 @@ def test_interrupted_it_leaves_nothing_behind(repository: Path, scenario: Path, 
     assert list((tmp_path / "scratch").iterdir()) == []
 
 
-def test_outcomes_differ_in_words() -> None:
-    was = Outcome(subject="x", agents={1: OfAgent(chain=["1.1", "2.1"], top="b")}, verdicts={"6": "holds"})
-    now = Outcome(subject="x", agents={1: OfAgent(chain=["1.1"], top="a", deviates="")}, verdicts={"6": "violated"})
+def test_differences_of_outcomes_are_sentences() -> None:
+    was = Outcome(subject="x", agents={1: AgentResult(chain=["1.1", "2.1"], top="b")}, verdicts={"6": "holds"})
+    now = Outcome(subject="x", agents={1: AgentResult(chain=["1.1"], top="a", deviates="")}, verdicts={"6": "violated"})
     assert differences(was, was) == []
     assert differences(was, now) == [
         "characteristic 6: violated, was holds",

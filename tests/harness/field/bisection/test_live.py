@@ -1,4 +1,4 @@
-"""One agent's record, given to an agent as a process: a right one says what is in it, a wrong one is found."""
+"""Live replay: a correct agent process agrees with the record of an agent, and a wrong one does not."""
 
 import json
 import shlex
@@ -10,7 +10,7 @@ import pytest
 
 from harness.errors import FieldError
 from harness.field.bisection._live_replay import play_live, script_of
-from harness.field.bisection._scripted_peers import Lateness, what
+from harness.field.bisection._scripted_peers import Lateness, message_key
 from harness.field.replay import open_record
 from tests.harness.command import harness
 from ucp.messages import ChainContainQuery, encode
@@ -42,7 +42,7 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_a_right_agent_says_what_is_in_the_record_and_a_wrong_one_does_not(records: Path, tmp_path: Path) -> None:
+def test_only_a_correct_agent_agrees_with_the_record(records: Path, tmp_path: Path) -> None:
     options = ["--agent", 2, "--speedup", 10, "--agent-command"]
     right = harness("bisect", "--once", records, *options, RIGHT)
     assert right.returncode == 0, right.stdout + right.stderr
@@ -57,7 +57,7 @@ def test_a_right_agent_says_what_is_in_the_record_and_a_wrong_one_does_not(recor
     assert ending.returncode == 125 and "the agent ended with status 3" in ending.stderr
 
 
-def test_what_an_agent_asked_itself_is_answered_when_it_asks(records: Path) -> None:
+def test_script_answers_a_query_after_the_agent_sends_it(records: Path) -> None:
     script = script_of(open_record(records, 2))
     answers = [given for given in script.datagrams if given.after is not None]
     assert answers and all(given.asked_s < given.t < given.asked_s + 6 for given in answers)
@@ -65,23 +65,27 @@ def test_what_an_agent_asked_itself_is_answered_when_it_asks(records: Path) -> N
     assert script.expected == sorted(script.expected, key=lambda said: said.line)
 
 
-def test_a_record_in_words_that_nobody_knows_is_not_played(records: Path, tmp_path: Path) -> None:
+def test_record_with_unknown_names_is_rejected(records: Path, tmp_path: Path) -> None:
     (tmp_path / "2.trace.jsonl").write_text((records / "2.trace.jsonl").read_text().replace("vote_timer_", "poll_"))
     with pytest.raises(FieldError, match=r"unknown handler name 'poll_expiration', so it cannot be played; give"):
         play_live(open_record(tmp_path, 2), ["no-such-agent"], tmp_path, speedup=1.0)
 
 
-def test_whoever_is_late_is_heard_late_for_as_long_as_it_reconciles() -> None:
+def test_peers_are_delayed_while_a_late_agent_reconciles() -> None:
     lateness = Lateness(0.1)
     assert lateness.at(5.0) == 0.0
-    lateness.asks(10.5, [2.0, 10.0])
+    lateness.note_question(10.5, [2.0, 10.0])
     assert lateness.at(14.0) == pytest.approx(0.6)
     assert lateness.at(17.0) == 0.0
-    lateness.asks(30.0, [])
+    lateness.note_question(30.0, [])
     assert lateness.at(31.0) == 0.0
 
 
-def test_the_same_question_is_the_same_with_another_number() -> None:
+def test_message_key_ignores_sender_and_sequence_number() -> None:
     question = ChainContainQuery(bytes(32))
-    assert what(encode(1, 5, question)) == what(encode(1, 6, question)) == what(encode(2, 5, question))
-    assert what(encode(1, 5, question)) != what(encode(1, 5, ChainContainQuery(bytes(31) + b"x")))
+    assert (
+        message_key(encode(1, 5, question))
+        == message_key(encode(1, 6, question))
+        == message_key(encode(2, 5, question))
+    )
+    assert message_key(encode(1, 5, question)) != message_key(encode(1, 5, ChainContainQuery(bytes(31) + b"x")))

@@ -1,1 +1,1 @@
-"""Before and after a mission."""
+"""Tests of the depot: mission files, collected exports and the merged record."""

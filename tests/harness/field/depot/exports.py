@@ -1,4 +1,4 @@
-"""What came home, on disk."""
+"""Functions that write chain exports for tests."""
 
 import json
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.exports import Export
-from harness.field.depot.collected_exports import came_home
+from harness.field.depot.collected_exports import collect_exports
 from harness.field.depot.consolidation import Consolidation, consolidate
 from ucp.agent import Agent
 from ucp.block import Block
@@ -17,8 +17,8 @@ from ucp.store import StoredState
 DATA = b"the inception block"
 
 
-def made(agent_id: int, number: int, events: int = 2) -> Block:
-    """A block of its own for each number."""
+def make_block(agent_id: int, number: int, events: int = 2) -> Block:
+    """Return a distinct block for each number."""
     logged = [LoggableEvent(1000 * number + index, 1 + index, bytes([agent_id, number])) for index in range(events)]
     return Block(agent_id, logged[-1].timestamp_us, b"".join(event.encode() for event in logged))
 
@@ -34,10 +34,10 @@ def document(
     exported_at_us: int = 10**6,
     completed: str | None = None,
 ) -> dict[str, Any]:
-    """An export whose blocks are named as "1.1 2.1"; `building` events are in the block that is being built."""
+    """Return an export with blocks named like "1.1 2.1". `building` events are in the current block."""
 
     def blocks(names: str) -> list[Block]:
-        return [made(*map(int, name.split("."))) for name in names.split()]
+        return [make_block(*map(int, name.split("."))) for name in names.split()]
 
     held = [*blocks(chain), *blocks(deque), *blocks(stack)]
     own = [block for block in held if block.agent_id == agent_id] if completed is None else blocks(completed)
@@ -60,8 +60,8 @@ def write(directory: Path, *documents: Mapping[str, Any]) -> Path:
     return directory
 
 
-def brought(directory: Path, *documents: Mapping[str, Any]) -> Consolidation:
-    return consolidate(came_home([write(directory, *documents)]))
+def consolidated(directory: Path, *documents: Mapping[str, Any]) -> Consolidation:
+    return consolidate(collect_exports([write(directory, *documents)]))
 
 
 def write_exports(directory: Path, exports: Mapping[int, Export]) -> Path:

@@ -1,4 +1,4 @@
-"""`ucp-harness mission`: the files of a mission, and whether every vehicle carries the same."""
+"""`ucp-harness mission`: writing mission files, and comparing the files of all vehicles."""
 
 import json
 from collections.abc import Callable
@@ -38,14 +38,14 @@ def edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
     return path
 
 
-def said(comparison: Comparison) -> list[str]:
+def sentences_of(comparison: Comparison) -> list[str]:
     return [str(difference) for difference in comparison.differences]
 
 
 # New
 
 
-def test_every_vehicle_gets_a_file_that_its_agent_reads(directory: Path) -> None:
+def test_each_vehicle_gets_a_valid_mission_file(directory: Path) -> None:
     missions = {agent_id: load_mission(directory / f"{agent_id}.mission.json") for agent_id in ROSTER}
     assert {mission.initial_data for mission in missions.values()} == {DATA}
     assert {mission.roster for mission in missions.values()} == {tuple(ROSTER)}
@@ -59,7 +59,7 @@ def test_every_vehicle_gets_a_file_that_its_agent_reads(directory: Path) -> None
     }
 
 
-def test_the_manifest_has_the_inception_block_s_hashes(directory: Path) -> None:
+def test_manifest_has_the_hashes_of_the_inception_block(directory: Path) -> None:
     manifest = Manifest.model_validate_json((directory / "manifest.json").read_text())
     inception = InceptionBlock(DATA)
     assert manifest.inception.block_hash == inception.block_hash.hex()
@@ -67,7 +67,7 @@ def test_the_manifest_has_the_inception_block_s_hashes(directory: Path) -> None:
     assert manifest.roster == ROSTER
 
 
-def test_what_is_asked_for_is_in_every_file(tmp_path: Path) -> None:
+def test_each_file_has_the_requested_options(tmp_path: Path) -> None:
     done = harness(
         *("mission", "new", "--agents", "7,9", "--name", "two", "--out", tmp_path / "m", "--initial-data", "BD 0"),
         *("--setting", "vote_timeout_s=8", "--setting", "phase1_tie=pop", "--event", "log=mode,position"),
@@ -87,7 +87,7 @@ def test_what_is_asked_for_is_in_every_file(tmp_path: Path) -> None:
     assert harness("mission", "verify", tmp_path / "m").returncode == 0
 
 
-def test_a_scenario_gives_roster_and_settings_but_no_mistakes(tmp_path: Path) -> None:
+def test_scenario_gives_roster_and_settings_without_quirks(tmp_path: Path) -> None:
     path = tmp_path / "scenario.yaml"
     asked = {"name": "s", "agents": [3, 4], "settings": {"vote_timeout_s": 7}, "quirks": {"ignore_commit": 0.5}}
     asked["initial_data"] = "QkQgMA=="
@@ -101,7 +101,7 @@ def test_a_scenario_gives_roster_and_settings_but_no_mistakes(tmp_path: Path) ->
     assert harness("mission", "verify", tmp_path / "m").returncode == 0
 
 
-def test_two_missions_of_one_name_have_inception_blocks_of_their_own(tmp_path: Path) -> None:
+def test_missions_of_the_same_name_have_different_inception_blocks(tmp_path: Path) -> None:
     for name in ("a", "b"):
         assert harness("mission", "new", "--agents", "2", "--name", "same", "--out", tmp_path / name).returncode == 0
     done = harness("mission", "verify", tmp_path / "a", tmp_path / "b")
@@ -109,7 +109,7 @@ def test_two_missions_of_one_name_have_inception_blocks_of_their_own(tmp_path: P
     assert "inception block" in done.stdout
 
 
-def test_nothing_is_overwritten_without_being_asked(directory: Path) -> None:
+def test_existing_files_are_kept_without_the_overwrite_option(directory: Path) -> None:
     before = (directory / "10.mission.json").read_text()
     plan = Plan(scenario(agents=ROSTER), b"another")
     with pytest.raises(RunDirectoryError, match="--overwrite"):
@@ -119,7 +119,7 @@ def test_nothing_is_overwritten_without_being_asked(directory: Path) -> None:
     assert load_mission(directory / "10.mission.json").initial_data == b"another"
 
 
-def test_a_file_of_a_vehicle_that_no_longer_flies_is_not_left_among_the_others(directory: Path) -> None:
+def test_stale_mission_file_in_the_directory_is_an_error(directory: Path) -> None:
     with pytest.raises(RunDirectoryError, match=r"122\.mission\.json"):
         write(Plan(scenario(agents=ROSTER[:-1]), DATA), directory, overwrite=True)
 
@@ -147,7 +147,7 @@ def test_a_file_of_a_vehicle_that_no_longer_flies_is_not_left_among_the_others(d
         (("--scenario", "/does/not/exist"), "/does/not/exist"),
     ],
 )
-def test_what_makes_no_mission_is_one_sentence(tmp_path: Path, options: tuple[str, ...], sentence: str) -> None:
+def test_invalid_mission_gives_one_sentence(tmp_path: Path, options: tuple[str, ...], sentence: str) -> None:
     done = harness("mission", "new", *options, "--out", tmp_path / "m")
     assert done.returncode == 2
     (told,) = sentences(done.stderr)
@@ -155,7 +155,7 @@ def test_what_makes_no_mission_is_one_sentence(tmp_path: Path, options: tuple[st
     assert not (tmp_path / "m").exists()
 
 
-def test_initial_data_that_no_trace_could_hold_is_refused() -> None:
+def test_too_long_initial_data_is_rejected() -> None:
     with pytest.raises(MissionFileError, match="initial data"):
         Plan(scenario(), bytes(600_000)).documents()
 
@@ -163,9 +163,9 @@ def test_initial_data_that_no_trace_could_hold_is_refused() -> None:
 # Verify
 
 
-def test_files_of_one_mission_are_the_same(directory: Path) -> None:
+def test_files_of_one_mission_compare_as_equal(directory: Path) -> None:
     comparison = compare([directory])
-    assert (comparison.verdict, said(comparison)) == ("same", [])
+    assert (comparison.verdict, sentences_of(comparison)) == ("same", [])
     assert "6 mission files" in comparison.in_words()
 
 
@@ -189,7 +189,7 @@ def test_files_of_one_mission_are_the_same(directory: Path) -> None:
         (lambda d: d["settings"].update(vote_timeout_s=10), None, ""),
     ],
 )
-def test_each_difference_is_a_sentence_that_names_file_and_key(
+def test_each_difference_names_file_and_key(
     directory: Path, change: Callable[[dict[str, Any]], Any], key: str | None, words: str
 ) -> None:
     for manifest in (True, False):
@@ -198,7 +198,7 @@ def test_each_difference_is_a_sentence_that_names_file_and_key(
             (directory / "manifest.json").unlink()
         comparison = compare([directory])
         if key is None:
-            assert said(comparison) == []
+            assert sentences_of(comparison) == []
             continue
         about = [difference for difference in comparison.differences if difference.key == key]
         assert [difference.file for difference in about] == [path]
@@ -207,20 +207,20 @@ def test_each_difference_is_a_sentence_that_names_file_and_key(
         assert str(path) in str(about[0])
 
 
-def test_a_seed_that_two_have_is_told(directory: Path) -> None:
+def test_shared_seed_is_reported(directory: Path) -> None:
     seed = load_mission(directory / "10.mission.json").seed
     path = edit(directory / "28.mission.json", lambda document: document.update(seed=seed))
     (difference,) = compare([directory]).differences
     assert (difference.file, difference.key) == (path, "seed")
 
 
-def test_a_vehicle_of_the_roster_without_a_file_is_told(directory: Path) -> None:
+def test_vehicle_without_mission_file_is_reported(directory: Path) -> None:
     (directory / "32.mission.json").unlink()
     (difference,) = compare([directory]).differences
     assert "agent 32" in str(difference)
 
 
-def test_two_files_of_one_agent_are_told_but_one_named_twice_is_not(directory: Path, tmp_path: Path) -> None:
+def test_two_files_of_one_agent_differ_but_one_given_twice_does_not(directory: Path, tmp_path: Path) -> None:
     again = directory / "10.mission.json"
     assert compare([directory, again]).verdict == "same"
     (tmp_path / "copy.json").write_text(again.read_text())
@@ -228,14 +228,14 @@ def test_two_files_of_one_agent_are_told_but_one_named_twice_is_not(directory: P
     assert {difference.key for difference in comparison.differences} == {"agent_id", "network.address", "seed"}
 
 
-def test_a_directory_for_each_vehicle_will_do(directory: Path, tmp_path: Path) -> None:
+def test_files_may_be_in_one_directory_per_vehicle(directory: Path, tmp_path: Path) -> None:
     for path in directory.glob("*.mission.json"):
         (tmp_path / "vehicles" / path.name).mkdir(parents=True)
         path.rename(tmp_path / "vehicles" / path.name / "mission.json")
     assert compare([tmp_path / "vehicles"]).verdict == "same"
 
 
-def test_exports_and_traces_must_be_of_the_same_inception_block(directory: Path, tmp_path: Path) -> None:
+def test_exports_and_traces_must_have_the_same_inception_block(directory: Path, tmp_path: Path) -> None:
     for data in (DATA, b"another mission"):
         agent = Agent(28, ROSTER, data)
         (tmp_path / "28.chain.json").write_text(json.dumps(export_chain(agent.state, 0)))
@@ -254,7 +254,7 @@ def test_exports_and_traces_must_be_of_the_same_inception_block(directory: Path,
         )
 
 
-def test_a_trace_that_no_agent_has_begun_is_passed_over_among_others(directory: Path) -> None:
+def test_empty_trace_in_a_directory_is_ignored(directory: Path) -> None:
     trace = directory / "28.trace.jsonl"
     trace.touch()
     assert compare([directory]).verdict == "same"
@@ -262,7 +262,7 @@ def test_a_trace_that_no_agent_has_begun_is_passed_over_among_others(directory: 
     assert "empty" in str(difference)
 
 
-def test_an_export_of_a_stranger_is_told(directory: Path, tmp_path: Path) -> None:
+def test_export_of_an_unknown_agent_is_reported(directory: Path, tmp_path: Path) -> None:
     path = tmp_path / "5.chain.json"
     path.write_text(json.dumps(export_chain(Agent(5, [5], DATA).state, 0)))
     Export.model_validate_json(path.read_text())
@@ -287,7 +287,7 @@ def test_an_export_of_a_stranger_is_told(directory: Path, tmp_path: Path) -> Non
         b'{"schema": "ucp-trace/1", "agent_id": 1, "roster": [1], "settings": {}, "clock": {}}',
     ],
 )
-def test_a_file_that_cannot_be_compared_is_a_difference(directory: Path, tmp_path: Path, content: bytes) -> None:
+def test_unreadable_file_is_a_difference(directory: Path, tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "broken.mission.json"
     path.write_bytes(content)
     (difference,) = compare([directory, path]).differences
@@ -295,7 +295,7 @@ def test_a_file_that_cannot_be_compared_is_a_difference(directory: Path, tmp_pat
     assert compare([path]).verdict == "nothing usable"
 
 
-def test_the_command_says_which_by_its_exit_status(directory: Path, tmp_path: Path) -> None:
+def test_exit_status_shows_the_result_of_the_comparison(directory: Path, tmp_path: Path) -> None:
     assert harness("mission", "verify", directory).returncode == 0
     edit(directory / "120.mission.json", lambda document: document["network"].update(port=1))
     done = harness("mission", "verify", directory, "--json")
@@ -309,7 +309,7 @@ def test_the_command_says_which_by_its_exit_status(directory: Path, tmp_path: Pa
     assert harness("mission", "verify", tmp_path / "nowhere").returncode == 2
 
 
-def test_a_secured_mission_has_each_vehicles_keys_beside_its_file(tmp_path: Path) -> None:
+def test_secured_mission_has_a_key_bundle_per_vehicle(tmp_path: Path) -> None:
     home, out = tmp_path / "keys", tmp_path / "mission"
     assert harness("keys", "new", home, "--agents", "1,7").returncode == 0
     done = harness("mission", "new", "--agents", "1,7", "--keys", home, "--out", out)

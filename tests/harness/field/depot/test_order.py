@@ -1,4 +1,4 @@
-"""The order of all blocks of a mission."""
+"""The order of the blocks in a consolidated record."""
 
 from collections.abc import Sequence
 
@@ -29,20 +29,20 @@ def order(times: dict[str, int], *chains: str) -> str:
     ("chains", "expected"),
     [
         (["abc", "abc"], "abcd"),
-        (["cba", "cb"], "cbad"),  # the mutual chain as it is, whatever the clocks say
-        (["ca", "cb"], "cabd"),  # then by time
-        (["cba", "d"], "cbad"),  # above what chains say, d last by its clock
-        (["db", "ac"], "acdb"),  # b after d, for its chain has it so
-        (["ab", "ba"], "abcd"),  # a contradiction: by time
+        (["cba", "cb"], "cbad"),  # the mutual chain keeps its order, whatever the timestamps are
+        (["ca", "cb"], "cabd"),  # then by timestamp
+        (["cba", "d"], "cbad"),  # chains before timestamps; d is last by its timestamp
+        (["db", "ac"], "acdb"),  # b comes after d, as in its chain
+        (["ab", "ba"], "abcd"),  # contradicting chains: by timestamp
         (["bac", "cab", ""], "abcd"),
         (["", ""], "abcd"),
     ],
 )
-def test_chains_come_first_and_then_clocks(chains: list[str], expected: str) -> None:
+def test_order_follows_chains_first_and_then_timestamps(chains: list[str], expected: str) -> None:
     assert order({"a": 1, "b": 2, "c": 3, "d": 4}, *chains) == expected
 
 
-def test_a_block_that_all_chains_have_twice_is_there_once() -> None:
+def test_repeated_block_occurs_once() -> None:
     assert order({"a": 1, "b": 2}, "aba", "aba") == "ab"
 
 
@@ -52,7 +52,7 @@ chain = st.permutations(LETTERS).flatmap(
 
 
 @given(st.lists(chain, min_size=1, max_size=4), st.lists(st.integers(0, 5), min_size=8, max_size=8))
-def test_every_block_is_there_once_and_no_agreement_is_broken(chains: list[str], at: list[int]) -> None:
+def test_order_has_each_block_once_and_keeps_agreed_orders(chains: list[str], at: list[int]) -> None:
     times = dict(zip(LETTERS, at, strict=True))
     put = order(times, *chains)
     assert sorted(put) == sorted(LETTERS)
@@ -67,7 +67,7 @@ def test_every_block_is_there_once_and_no_agreement_is_broken(chains: list[str],
 
 
 def closure(chains: Sequence[str]) -> dict[str, set[str]]:
-    """What comes after a block in any chain, or after what does."""
+    """Return the direct and indirect successors of each block in any chain."""
     after: dict[str, set[str]] = {letter: set() for letter in LETTERS}
     for letters in chains:
         for position, letter in enumerate(letters):

@@ -1,4 +1,4 @@
-"""The final reconcile of what came home, by the protocol, without vehicles."""
+"""The final reconcile of exports by the protocol, without vehicles."""
 
 import random
 from pathlib import Path
@@ -11,15 +11,15 @@ from harness.field.depot.consolidation import Consolidation
 from harness.field.depot.depot_reconcile import reconcile
 from harness.field.depot.record_outputs import lines
 from harness.run.simulate import simulate
-from tests.harness.field.depot.exports import brought, document, made, write_exports
+from tests.harness.field.depot.exports import consolidated, document, make_block, write_exports
 from tests.harness.field.depot.test_consolidate import read
 from tests.harness.virtual import scenario
 
 RUNS = 25
 
 
-def flown(seed: int) -> dict[int, Export]:
-    """What the agents of a random run hold at its end: with loss, a partition, deaths, brown-outs, settled or not."""
+def random_run_exports(seed: int) -> dict[int, Export]:
+    """Return the exports of a random run with loss, a partition, kills and brown-outs, with or without an idle end."""
     lots = random.Random(seed)
     count = lots.randint(2, 7)
     agents = sorted(lots.sample(range(1, 300), count))
@@ -48,12 +48,12 @@ def flown(seed: int) -> dict[int, Export]:
 
 
 @pytest.mark.parametrize("seed", range(RUNS))
-def test_what_came_home_of_a_run_is_on_record_once_and_reconciles_to_one_chain(seed: int, tmp_path: Path) -> None:
-    from harness.field.depot.collected_exports import came_home
+def test_record_of_a_run_is_complete_and_reconciles_to_one_chain(seed: int, tmp_path: Path) -> None:
+    from harness.field.depot.collected_exports import collect_exports
     from harness.field.depot.consolidation import consolidate
 
-    exports = flown(seed)
-    record = consolidate(came_home([write_exports(tmp_path, exports)]))
+    exports = random_run_exports(seed)
+    record = consolidate(collect_exports([write_exports(tmp_path, exports)]))
     assert record.header.problems == record.header.left_out == []
     assert events_on_record(record) == events_held(exports)
     reconciled = reconcile(record)
@@ -71,7 +71,7 @@ def test_what_came_home_of_a_run_is_on_record_once_and_reconciles_to_one_chain(s
 
 
 def events_held(exports: dict[int, Export]) -> list[tuple[int, bytes]]:
-    """Each event that any export has, with its agent: those of blocks once, and of what was being built."""
+    """Return each event in any export, with its agent: those of each block once, and those of current blocks."""
     import base64
 
     from ucp.events import decode_events
@@ -90,38 +90,38 @@ def events_on_record(record: Consolidation) -> list[tuple[int, bytes]]:
     return sorted((block.line.agent_id, event.encode()) for block in record.blocks for event in block.events)
 
 
-def test_agents_that_would_all_propose_at_once_still_come_to_one_chain(tmp_path: Path) -> None:
+def test_agents_with_full_deques_reconcile_to_one_chain(tmp_path: Path) -> None:
     chains = [document(agent, f"{agent}.1 {agent}.2", deque=f"{agent}.3", stack=f"{agent}.4") for agent in range(1, 7)]
-    reconciled = reconcile(brought(tmp_path, *chains))
+    reconciled = reconcile(consolidated(tmp_path, *chains))
     assert reconciled.line.uniform
     assert len(reconciled.line.chain) == 24
     assert all(len(vehicle.gained) == 20 for vehicle in reconciled.line.vehicles)
 
 
-def test_one_vehicle_alone_keeps_what_it_has_and_says_so(tmp_path: Path) -> None:
-    line = reconcile(brought(tmp_path, document(1, "1.1", deque="1.2"))).line
+def test_single_vehicle_keeps_its_chain(tmp_path: Path) -> None:
+    line = reconcile(consolidated(tmp_path, document(1, "1.1", deque="1.2"))).line
     assert not line.uniform or len(line.chain) == 2
 
 
-def test_an_edited_block_is_given_to_nobody(tmp_path: Path) -> None:
+def test_edited_block_is_left_out_of_the_reconcile(tmp_path: Path) -> None:
     import base64
 
     edited = document(2, "1.1 2.1 2.2")
-    edited["chain"][1]["event_data"] = base64.b64encode(made(2, 9).event_data).decode()
-    line = reconcile(brought(tmp_path, document(1, "1.1"), edited)).line
+    edited["chain"][1]["event_data"] = base64.b64encode(make_block(2, 9).event_data).decode()
+    line = reconcile(consolidated(tmp_path, document(1, "1.1"), edited)).line
     assert line.uniform
-    assert line.chain == [made(1, 1).block_hash.hex(), made(2, 2).block_hash.hex()]
+    assert line.chain == [make_block(1, 1).block_hash.hex(), make_block(2, 2).block_hash.hex()]
     (left_out,) = line.left_out
     assert "edited" in left_out
 
 
-def test_what_only_an_earlier_export_has_reaches_the_chain(tmp_path: Path) -> None:
-    from harness.field.depot.collected_exports import came_home
+def test_block_of_an_earlier_export_reaches_the_chain(tmp_path: Path) -> None:
+    from harness.field.depot.collected_exports import collect_exports
     from harness.field.depot.consolidation import consolidate
     from tests.harness.field.depot.exports import write
 
     write(tmp_path / "before", document(1, "1.1 1.2", exported_at_us=1))
     write(tmp_path / "after", document(1, "1.3", exported_at_us=2), document(2, "1.3"))
-    line = reconcile(consolidate(came_home([tmp_path]))).line
+    line = reconcile(consolidate(collect_exports([tmp_path]))).line
     assert line.uniform
-    assert set(line.chain) == {made(1, number).block_hash.hex() for number in (1, 2, 3)}
+    assert set(line.chain) == {make_block(1, number).block_hash.hex() for number in (1, 2, 3)}

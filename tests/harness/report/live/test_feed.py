@@ -15,7 +15,7 @@ from harness.report.live import feed as feeds
 from harness.report.live._agent_course import KEY_LENGTH, AgentCourse, Change
 from harness.report.live.change_log import FAR_BEHIND_BYTES, ChangeLog
 from harness.report.live.feed import Feed
-from tests.harness.archive.test_history import a_run, a_trace
+from tests.harness.archive.test_history import handler_run, trace_of
 from tests.harness.report.live.runs import film, of_kind, played
 from ucp.trace import Sent
 from ucp.trigger import TimerTrigger
@@ -191,13 +191,13 @@ def reconcile_during_a_vote(directory: Path) -> tuple[list[Change], Trace]:
     """What the feed says of an agent that begins a reconcile before its vote timer expires, and its trace."""
     trigger = TimerTrigger("vote_timer_expiration")
     runs = [
-        a_run(1.0, "process_next_deque_block", "proposed", sent=[Sent("Block Add Request", 0, "aa")]),
-        a_run(3.0, "reconcile_begin", "begun", trigger=trigger),
-        a_run(3.0, "reconcile_phase_1"),
-        a_run(11.0, "vote_timer_expiration", "approved"),
-        a_run(15.0, "reconcile_finalize", "done"),
+        handler_run(1.0, "process_next_deque_block", "proposed", sent=[Sent("Block Add Request", 0, "aa")]),
+        handler_run(3.0, "reconcile_begin", "begun", trigger=trigger),
+        handler_run(3.0, "reconcile_phase_1"),
+        handler_run(11.0, "vote_timer_expiration", "approved"),
+        handler_run(15.0, "reconcile_finalize", "done"),
     ]
-    trace = a_trace(1, runs)
+    trace = trace_of(1, runs)
     lines = [trace.header.to_line(), *(run.to_line() for run in runs)]
     (directory / f"1{SUFFIX}").write_text("".join(lines))
     course = AgentCourse(directory, 1)

@@ -1,6 +1,7 @@
-"""Import records of any kind into one directory: read them with adapters, write the harness's own files.
+"""Import records of any kind into one directory: read them with adapters, and write them as files of the harness.
 
-What an agent did not record is not made up: who left handler runs has a trace, who was only heard has a capture.
+The import never invents records. An agent with recorded handler runs gets a trace. An agent of which only datagrams
+were recorded gets a capture.
 """
 
 import json
@@ -33,9 +34,9 @@ from harness.field.adapters.adapter import (
     TraceLine,
     Unusable,
 )
-from harness.field.ingest._file_owners import glance
+from harness.field.ingest._file_owners import summarise_capture
 from harness.field.ingest._file_search import files_of
-from harness.field.ingest._ingest import Flight, Homecoming, LeftOut, Remark
+from harness.field.ingest._ingest import Flight, IngestResult, Omission, Remark
 from harness.field.ingest._logged_events import SUFFIX as LOGGED_SUFFIX
 from harness.field.ingest._logged_events import EventLine
 from harness.field.ingest._sorting import Sorter
@@ -110,24 +111,24 @@ class ImportRecord(BaseModel):
 
 
 AGENTS = "agents"
-CUT_OFF = '{"lost_lines":'
-"""Half a line, as a trace ends that was cut off."""
-_COPIED_AT_ONCE = 1024 * 1024
+INCOMPLETE_LINE = '{"lost_lines":'
+"""The beginning of a line. A truncated trace ends with it."""
+_COPY_BYTES = 1024 * 1024
 
 
-def write_import(homecoming: Homecoming, sources: Sequence[Path], out: Path) -> ImportRecord:
-    """The largest flight into `out`, further ones into directories in it. Raises RunDirectoryError."""
+def write_import(result: IngestResult, sources: Sequence[Path], out: Path) -> ImportRecord:
+    """Write the largest flight to `out`, and further flights to directories in `out`. Raises RunDirectoryError."""
     claim(out)
     try:
         flights = []
-        for number, flight in enumerate(homecoming.flights, 1):
+        for number, flight in enumerate(result.flights, 1):
             directory = out if number == 1 else out / f"flight-{number}"
             flights.append(_write(flight, directory, "." if number == 1 else directory.name))
         record = ImportRecord(
             sources=[str(source) for source in sources],
             flights=flights,
-            left_out=[_remark(left_out) for left_out in homecoming.left_out],
-            remarks=[_remark(remark) for remark in homecoming.remarks],
+            left_out=[_remark(left_out) for left_out in result.left_out],
+            remarks=[_remark(remark) for remark in result.remarks],
         )
         text = json.dumps(record.to_json(), indent=1) + "\n"
         (out / FILE).write_text(text, encoding="utf-8")
@@ -151,7 +152,7 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
         agent = agents[agent_id]
         agent.trace = f"{AGENTS}/{agent_id}{TRACE_SUFFIX}"
         with (directory / agent.trace).open("w", encoding="utf-8", errors="replace") as file:
-            file.writelines(_lines(trace, lived_on=_lived_on(trace, flight.exports.get(agent_id))))
+            file.writelines(_trace_lines(trace, survived_trace=_survived_trace(trace, flight.exports.get(agent_id))))
         agent.handler_runs, agent.lives = len(trace.runs), len(trace.starts) + 1
         agent.gaps, agent.clock_jumps = len(trace.gaps), len(trace.jumps)
         agent.trace_from = [_printable(path) for path in flight.sources.get(agent_id, ())]
@@ -166,7 +167,7 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
     if flight.captures or flight.more_captures:
         (directory / CAPTURES).mkdir()
     for agent_id, capture in flight.captures.items():
-        agents[agent_id].capture = _copied(capture, directory, str(agent_id))
+        agents[agent_id].capture = _copy_capture(capture, directory, str(agent_id))
     if flight.public_keys is not None:
         from ucp.secure.bundle import write_public
 
@@ -179,86 +180,88 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
         roster=[*flight.roster],
         agents=agents,
         more_captures=[
-            _copied(capture, directory, f"more-{number}") for number, capture in enumerate(flight.more_captures, 1)
+            _copy_capture(capture, directory, f"more-{number}")
+            for number, capture in enumerate(flight.more_captures, 1)
         ],
     )
 
 
-def _lived_on(trace: Trace, export: Export | None) -> bool:
-    """Whether the agent was there after the end of its trace: it has left an export since."""
+def _survived_trace(trace: Trace, export: Export | None) -> bool:
+    """Return whether the agent was alive after the end of its trace, because its export is later."""
     if export is None:
         return False
     at_s = mission_s(export.exported_at_us, trace.header)
     return at_s is None or not trace.runs or at_s > trace.runs[-1].t + ROUNDED_S
 
 
-def _lines(trace: Trace, *, lived_on: bool) -> Iterator[str]:
-    """The trace as it is written: what is lost is said where it was.
+def _trace_lines(trace: Trace, *, survived_trace: bool) -> Iterator[str]:
+    """Yield the lines of a trace. Each gap is written as a line that stands for lost lines.
 
-    An agent whose trace ends in half a line may have been killed over it, unless it `lived_on` and left an export.
+    A trace that ends within a line gets an incomplete last line, because the agent may have been killed there. If it
+    survived, a gap is written instead.
     """
     for entry in trace.entries():
         yield gap_line(entry) if isinstance(entry, Gap) else entry.to_line()
     if trace.cut_off:
-        yield gap_line(Gap(len(trace.runs), 1, 0)) if lived_on else CUT_OFF
+        yield gap_line(Gap(len(trace.runs), 1, 0)) if survived_trace else INCOMPLETE_LINE
 
 
-def _copied(capture: Path, directory: Path, name: str) -> str:
+def _copy_capture(capture: Path, directory: Path, name: str) -> str:
     with BoundedFile(capture) as file:
         suffix = "pcapng" if file.peek(4)[:4] == PCAPNG_MAGIC else "pcap"
         path = f"{CAPTURES}/{name}.{suffix}"
         with (directory / path).open("wb") as copy:
-            while part := file.read(_COPIED_AT_ONCE):
+            while part := file.read(_COPY_BYTES):
                 copy.write(part)
     return path
 
 
 MAX_AGENTS = 1000
 LAST_NS = 2**63 - 1
-MAX_DROPPED = 200_000
-"""Of one file, places that say nothing usable: more are in none that is what it is taken for."""
-_PLACES_TOLD = 10
+MAX_REJECTED = 200_000
+"""Maximum number of unusable parts of a source. A source with more is probably no record at all."""
+_MAX_LISTED = 10
 
 
 @gc_paused()
-def bring_in(
+def import_records(
     sources: Sequence[Path],
     adapters: Iterable[Adapter],
     out: Path,
-    tell: Callable[[str], object] = str,
+    report_progress: Callable[[str], object] = str,
     *,
     by_content: bool = True,
 ) -> ImportRecord:
-    """Read `sources` and write what is in them to `out`, which must be empty or not be.
+    """Read `sources` with `adapters`, and write all flights found in them to `out`, an empty or new directory.
 
-    `tell` is told what is going on. Whatever no adapter recognises is taken for one of the house's own formats; not
-    `by_content`, all sources are for the first adapter. Raises FieldError if nothing of it can be used, or a source
-    does not exist, and RunDirectoryError if `out` cannot be written.
+    A file that no adapter recognises is read as a file of the harness. With `by_content=False` the first adapter reads
+    all files. `report_progress` receives a text at each step. Raises FieldError if a source does not exist or nothing
+    is usable, and RunDirectoryError if `out` cannot be written.
     """
-    left_out: list[LeftOut] = []
+    left_out: list[Omission] = []
     adapters = [*adapters]
     sorter = Sorter(left_out)
-    streams: dict[Path, _Stream] = {}
+    streams: dict[Path, _RecordingReader] = {}
     with TemporaryDirectory(prefix="ucp-import-") as scratch:
         for path in files_of(sources, left_out):
-            tell(f"reading {escape(path.name)}")
+            report_progress(f"reading {escape(path.name)}")
             adapter = _adapter_for(path, adapters) if by_content else adapters[0]
             if adapter is None:
-                sorter.take(path)
+                sorter.add_file(path)
                 continue
-            whole = adapter.part_of(path)
-            if whole not in streams:
+            recording = adapter.part_of(path)
+            if recording not in streams:
                 directory = Path(scratch) / str(len(streams))
                 directory.mkdir()
-                streams[whole] = _Stream(whole, adapter, directory, left_out)
-            streams[whole].take(path, sorter)
+                streams[recording] = _RecordingReader(recording, adapter, directory, left_out)
+            streams[recording].read_file(path, sorter)
         for stream in streams.values():
             stream.end(sorter)
-        tell("grouping the records by flight")
-        homecoming = sorter.sorted_out()
-        homecoming.largest()
-        tell("writing")
-        return write_import(homecoming, sources, out)
+        report_progress("grouping the records by flight")
+        result = sorter.result()
+        result.largest()
+        report_progress("writing")
+        return write_import(result, sources, out)
 
 
 def _adapter_for(path: Path, adapters: Iterable[Adapter]) -> Adapter | None:
@@ -266,86 +269,91 @@ def _adapter_for(path: Path, adapters: Iterable[Adapter]) -> Adapter | None:
         with BoundedFile(path) as file:
             beginning = file.peek(BEGINNING_BYTES)[:BEGINNING_BYTES]
     except OSError:
-        return None  # whoever reads it will say so
+        return None  # The reader of the file reports the error.
     return next((adapter for adapter in adapters if adapter.recognises(path, beginning)), None)
 
 
-class _Stream:
-    """What an adapter says of a file, or of the files of one recording, on its way to where it belongs."""
+class _RecordingReader:
+    """A reader of one recording, which may consist of several files.
 
-    def __init__(self, path: Path, adapter: Adapter, scratch: Path, left_out: list[LeftOut]) -> None:
+    It sorts the observations of the adapter by kind.
+    """
+
+    def __init__(self, path: Path, adapter: Adapter, scratch: Path, left_out: list[Omission]) -> None:
         self._path = path
         self._adapter = adapter
         self._scratch = scratch
         self._left_out = left_out
         self._readers: dict[int, TraceReader] = {}
         self._captures: dict[int, PcapngFile] = {}
-        self._lines: Counter[int] = Counter()
-        self._before = 0  # places in the files before this one
-        self._said = False
-        self._unusable: list[LeftOut] = []
-        self._dropped = 0
+        self._line_counts: Counter[int] = Counter()
+        self._earlier_places = 0  # number of places in the earlier files
+        self._has_records = False
+        self._listed: list[Omission] = []
+        self._rejected = 0
 
-    def take(self, path: Path, sorter: Sorter) -> None:
-        """The next file."""
+    def read_file(self, path: Path, sorter: Sorter) -> None:
+        """Read the next file of the recording."""
         last = 0
         try:
             for observation in self._adapter.observations(path):
                 last = max(last, observation.where or 0)
-                if self._dropped > MAX_DROPPED or any(reader.hopeless for reader in self._readers.values()):
-                    self._drop(f"there are too many {self._adapter.counts}s without use: the rest is not read", None)
+                if self._rejected > MAX_REJECTED or any(reader.gave_up for reader in self._readers.values()):
+                    self._reject(f"there are too many {self._adapter.counts}s without use: the rest is not read", None)
                     break
-                self._take(observation, self._before + observation.where if observation.where else None, sorter)
+                self._add_observation(
+                    observation, self._earlier_places + observation.where if observation.where else None, sorter
+                )
         except MachineError:
             raise
-        except Exception as error:  # an adapter is anybody's code, and what it reads anybody's file
+        except Exception as error:  # A user's adapter may raise anything for any input.
             what = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {str(error)[:200]}"
             after = f" after {self._adapter.counts} {last}" if last else ""
-            self._drop(f"reading failed{after}: {what}", None)
+            self._reject(f"reading failed{after}: {what}", None)
             for reader in self._readers.values():
-                reader.lose_unseen()
-        self._before += last
+                reader.add_unknown_gap()
+        self._earlier_places += last
 
-    def _take(self, observation: Observation, where: int | None, sorter: Sorter) -> None:
+    def _add_observation(self, observation: Observation, where: int | None, sorter: Sorter) -> None:
         if isinstance(observation, Unusable):
-            self._drop(observation.why, where)
+            self._reject(observation.why, where)
             for agent_id, reader in self._readers.items() if observation.of_a_trace else ():
                 if observation.agent_id in (None, agent_id):
-                    reader.lose_unseen()
+                    reader.add_unknown_gap()
             return
-        self._said = True
+        self._has_records = True
         if isinstance(observation, ChainExport):
-            sorter.take_exports(self._path, _text(observation.text), where, self._adapter.counts)
+            sorter.add_exports(self._path, _text(observation.text), where, self._adapter.counts)
         elif not 1 <= observation.agent_id <= MAX_AGENT_ID:
-            self._drop(f"agent {str(observation.agent_id)[:20]} is not an agent ID: use 1 to {MAX_AGENT_ID}", where)
+            self._reject(f"agent {str(observation.agent_id)[:20]} is not an agent ID: use 1 to {MAX_AGENT_ID}", where)
         elif isinstance(observation, TraceLine):
-            self._take_line(observation, where)
+            self._add_trace_line(observation, where)
         elif not 0 <= observation.time_ns <= LAST_NS:
-            self._drop("its time cannot be", where)
+            self._reject("its time cannot be", where)
         elif isinstance(observation, Datagram):
-            self._take_datagram(observation, where)
+            self._add_datagram(observation, where)
         else:
             event = LoggableEvent(observation.time_ns // 1000, observation.event_id, observation.data)
             sorter.logged.append((self._path, observation.agent_id, event))
 
-    def _take_line(self, line: TraceLine, where: int | None) -> None:
+    def _add_trace_line(self, line: TraceLine, where: int | None) -> None:
         reader = self._readers.get(line.agent_id)
         if reader is None:
             reader = self._readers[line.agent_id] = TraceReader(self._path, line.agent_id, self._adapter.counts)
-        self._lines[line.agent_id] += 1
+        self._line_counts[line.agent_id] += 1
         text = line.text.encode("utf-8", "replace") if isinstance(line.text, str) else line.text
-        reader.take(where or self._lines[line.agent_id], text)
+        reader.add_line(where or self._line_counts[line.agent_id], text)
 
-    def _take_datagram(self, datagram: Datagram, where: int | None) -> None:
+    def _add_datagram(self, datagram: Datagram, where: int | None) -> None:
         try:
             sender = decode(datagram.data)[0]
         except MalformedDatagramError as malformed:
-            self._drop(f"it is not a UCP datagram ({malformed.reason})", where)
+            self._reject(f"it is not a UCP datagram ({malformed.reason})", where)
             return
         capture = self._captures.get(datagram.agent_id)
         if capture is None:
             if len(self._captures) == MAX_AGENTS:
-                self._drop(f"it is of more than {MAX_AGENTS} agents", where)
+                self._reject(f"it is of more than {MAX_AGENTS} agents", where)
                 return
             path = self._scratch / f"{datagram.agent_id}.pcapng"
             path.write_bytes(header(f"vehicle {datagram.agent_id}", f"from {self._path.name}"))
@@ -353,28 +361,29 @@ class _Stream:
         capture.packet(datagram.time_ns, udp_broadcast(sender, PORT, datagram.data), outbound=datagram.sent)
 
     def end(self, sorter: Sorter) -> None:
-        """There is no more of it."""
+        """Give the records to the sorter after the last file."""
         for agent_id, capture in self._captures.items():
             capture.close()
-            seen = glance(self._scratch / f"{agent_id}.pcapng", self._left_out)
+            seen = summarise_capture(self._scratch / f"{agent_id}.pcapng", self._left_out)
             sorter.captures += [replace(seen, source=self._path)] if seen else []
         for agent_id, reader in self._readers.items():
-            lives = reader.ended(self._left_out)
-            sorter.lives += lives
-            if not lives:
-                self._drop(
-                    f"its {self._lines[agent_id]} line(s) of the trace of agent {agent_id} hold no handler run", None
+            incarnations = reader.finish(self._left_out)
+            sorter.incarnations += incarnations
+            if not incarnations:
+                self._reject(
+                    f"its {self._line_counts[agent_id]} line(s) of the trace of agent {agent_id} hold no handler run",
+                    None,
                 )
-        if not self._said and not self._dropped:
-            self._drop("it contains no records of agents", None)
-        self._left_out += self._unusable
-        if rest := self._dropped - len(self._unusable):
-            self._left_out.append(LeftOut(self._path, f"{rest} more places in it hold no usable record"))
+        if not self._has_records and not self._rejected:
+            self._reject("it contains no records of agents", None)
+        self._left_out += self._listed
+        if rest := self._rejected - len(self._listed):
+            self._left_out.append(Omission(self._path, f"{rest} more places in it hold no usable record"))
 
-    def _drop(self, why: str, where: int | None) -> None:
-        self._dropped += 1
-        if len(self._unusable) < _PLACES_TOLD:
-            self._unusable.append(LeftOut(self._path, why, where, self._adapter.counts))
+    def _reject(self, why: str, where: int | None) -> None:
+        self._rejected += 1
+        if len(self._listed) < _MAX_LISTED:
+            self._listed.append(Omission(self._path, why, where, self._adapter.counts))
 
 
 def _text(text: str | bytes) -> str:
