@@ -311,6 +311,11 @@ class Evidence:
         """True if a scenario script decided about the delivery of messages, in place of the network."""
         return self.record is not None and any(state.what == NO_MORE_FATES for state in self.record.network)
 
+    @property
+    def has_channel(self) -> bool:
+        """True if vehicles shared a radio channel, on which messages wait and are lost for further reasons."""
+        return self.record is not None and self.record.channel is not None
+
     def not_told_completed(self) -> set[int]:
         """Agents of which nothing tells all that they completed, for their traces have operations that nobody knows."""
         unknown = {agent_id for agent_id, words in self.unknown.items() if "operation" in words}

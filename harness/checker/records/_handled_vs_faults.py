@@ -107,9 +107,10 @@ class _Cuts:
 def _cuts(evidence: Evidence) -> _Cuts | None:
     """Return the cut links. None if no link was ever cut, or if messages may pass a cut link.
 
-    Scripted fates deliver messages regardless of the loss, and netem may pass a second copy of a lost message.
+    Scripted fates deliver messages regardless of the loss, netem may pass a second copy of a lost message, and on a
+    shared channel a message waits before it is sent.
     """
-    if evidence.has_fates or any(link.duplicate > 0 for link in evidence.links_asked or ()):
+    if evidence.has_fates or evidence.has_channel or any(link.duplicate > 0 for link in evidence.links_asked or ()):
         return None
     if not any(loss == 1.0 for _, losses in evidence.link_losses for loss in losses.values()):
         return None

@@ -89,6 +89,8 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     links = evidence.links_asked
     if not links or not evidence.link_losses or evidence.has_fates or evidence.injected.messages:
         return
+    if evidence.has_channel:
+        return
     if any(isinstance(link.loss, GilbertElliott) for link in links):
         return  # draws in a burst are not independent
     if any(link.delay or link.rate or link.corrupt or link.duplicate for link in links):
