@@ -415,6 +415,8 @@ class RunRecord(JudgedRecord):
     seed: int | None = None
     backend: BackendName | None = None
     versions: dict[str, str] = {}
+    all_delivered: bool = False
+    """True if virtual time also delivered messages without effect, as for `--watch`. Traces then have them too."""
     started_at: str | None = None
     wall_s: float | None = None
     settled: bool = False

@@ -33,6 +33,9 @@ from ucp.agent_files import write_atomically
 
 EVIDENCE_SHOWN = 3
 LONG_TEXT = 240
+SCENARIO_FILE = "scenario.yaml"
+MAX_SCENARIO = 100_000
+"""Characters of a scenario on the page. The run directory has longer scenarios."""
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
 
@@ -42,6 +45,7 @@ def draw(left: ReportSource) -> str:
     record, exports, ink = left.record, left.exports, left.ink
     judged, outcome = verdict_section.verdicts(record), facts.outcome(record)
     timeline_section = timeline.section(left, name_blocks(exports.by_agent))
+    scenario = facts.scenario_text(record)
     return html.render(
         _TEMPLATE,
         styles=[TREE_STYLE + MAP_STYLE + timeline.STYLE + html.PAGE_STYLE],
@@ -72,9 +76,20 @@ def draw(left: ReportSource) -> str:
         flight=_map_section.section(left.archive.tracks(ink), left.network, ink, facts.vehicle_types(record)),
         agents=_swarm_section.agents_table(left.archive, ink),
         versions=record.versions,
+        again=_again(left, scenario),
+        scenario_file=SCENARIO_FILE,
+        scenario=scenario if len(scenario) <= MAX_SCENARIO else "",
         evidence_shown=EVIDENCE_SHOWN,
         long_text=LONG_TEXT,
     )
+
+
+def _again(left: ReportSource, scenario: str) -> str:
+    """Return the command that plays the run again. Empty if the record lacks the scenario."""
+    if not scenario:
+        return ""
+    given = SCENARIO_FILE if len(scenario) <= MAX_SCENARIO else str(left.run_dir)
+    return facts.command_again(left.record, given)
 
 
 def _pictures(

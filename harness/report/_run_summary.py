@@ -37,6 +37,8 @@ def to_markdown(left: ReportSource) -> str:
     lines += _listed(_network_section.channel(record))
     lines += _listed([station] if (station := _network_section.ground_station(record)) else [])
     lines += _listed(_rogue_section.sentences(record.rogue))
+    if record.scenario is not None:
+        lines += [f"Play this run again: `{facts.command_again(record, 'RUN_DIRECTORY')}`", ""]
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
     return "\n".join([*lines, f"<sub>{_short(versions)}</sub>"]) + "\n"
 

@@ -1,5 +1,6 @@
 """Facts of a run that the page and report.md share: settings, outcome, figures, and gaps in captures."""
 
+import shlex
 from collections.abc import Mapping
 from itertools import pairwise
 
@@ -11,7 +12,10 @@ from harness.present import text
 from harness.report.agent_programs import programs
 from harness.report.chain_tree import ranges
 from harness.scenario.agent_options import in_words
+from harness.scenario.scenario_file import to_yaml
 from sitl.vehicle import VehicleType
+
+IN_UML = "User Mode Linux"
 
 FIGURES = {
     "blocks": "blocks completed",
@@ -98,3 +102,21 @@ def link_qualities() -> list[str]:
     """Return the words of a map's legend for each quality of a link, from 0 on."""
     limits = map(text.percent, QUALITY_LIMITS)
     return ["link", *(f"link that loses {low} to {high}" for low, high in pairwise(limits))]
+
+
+def command_again(record: RunRecord, scenario: str) -> str:
+    """Return the command that plays the run again. `scenario` is the path of its scenario.
+
+    In virtual time, the command gives the same exports and traces, to the byte.
+    """
+    words = ["ucp-harness", "run", scenario, "--backend", str(record.backend), "--seed", str(record.seed)]
+    words += ["--watch"] if record.all_delivered else []
+    words += ["--kernel", "uml"] if IN_UML in record.versions.get("kernel", "") else []
+    return shlex.join(words)
+
+
+def scenario_text(record: RunRecord) -> str:
+    """Return the recorded scenario as YAML, without keys that have their defaults. Empty if none is recorded."""
+    if record.scenario is None:
+        return ""
+    return to_yaml(record.scenario.model_dump(mode="json", exclude_defaults=True), [])

@@ -29,6 +29,7 @@ from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
 from harness.play.progress import Progress, Silent
 from harness.play.request_socket import listening
+from harness.report import facts
 from harness.run.provenance import versions
 from harness.scenario import Scenario
 from harness.scenario.scenario_file import to_yaml
@@ -37,9 +38,10 @@ from ucp.agent_files import write_atomically
 REPLAY_FILE = "replay.yaml"
 
 
-def replay_of(scenario: Scenario, by_hand_s: Collection[float], seed: int | None, backend: BackendName | None) -> str:
+def replay_of(record: RunRecord, by_hand_s: Collection[float]) -> str:
     """Return the text of the replay file. `by_hand_s` are the seconds of the timeline entries from a user."""
-    document = scenario.model_dump(mode="json", exclude_defaults=True)
+    assert record.scenario is not None
+    document = record.scenario.model_dump(mode="json", exclude_defaults=True)
     timeline = [{"at_s": entry["at_s"], **entry} for entry in document["timeline"]]
     document["timeline"] = sorted(timeline, key=lambda entry: entry["at_s"])
 
@@ -48,7 +50,7 @@ def replay_of(scenario: Scenario, by_hand_s: Collection[float], seed: int | None
 
     comment = [
         "A run with the changes that the user made by hand. To play it again:",
-        f"    ucp-harness run {REPLAY_FILE} --backend {backend} --seed {seed}",
+        f"    {facts.command_again(record, REPLAY_FILE)}",
     ]
     return to_yaml(document, comment, remark)
 
@@ -100,7 +102,7 @@ def run(
     out = out or default_path(scenario.name)
     chosen = BACKENDS[backend]
     chosen.refuse(scenario)
-    recording = Recording(scenario, seed, out, backend)
+    recording = Recording(scenario, seed, out, backend, all_delivered=delivers_all and in_virtual_time(backend))
     story: mission.Story = mission.play
     options: dict[str, Any] = {"delivers_all": delivers_all}
     if interventions is not None:
@@ -127,7 +129,9 @@ class Recording:
     Raises RunDirectoryError if `out` is neither new nor empty, and MachineError if the record cannot be written.
     """
 
-    def __init__(self, scenario: Scenario, seed: int, out: Path, backend: BackendName) -> None:
+    def __init__(
+        self, scenario: Scenario, seed: int, out: Path, backend: BackendName, *, all_delivered: bool = False
+    ) -> None:
         self.directory = RunDirectory(out)
         self._started = time.monotonic()
         self._scenario = scenario
@@ -137,6 +141,7 @@ class Recording:
             seed=seed,
             backend=backend,
             versions=versions(),
+            all_delivered=all_delivered,
             started_at=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
         )
         self.directory.write_record(self._record)
@@ -154,7 +159,7 @@ class Recording:
         """Write the requests of the user so far to the record, and a scenario that plays them again."""
         self.tell(interventions.scenario)
         by_hand_s = [entry.at_s for entry in interventions.by_hand]
-        replay = replay_of(interventions.scenario, by_hand_s, self._record.seed, self._record.backend)
+        replay = replay_of(self._record, by_hand_s)
         try:
             write_atomically(self.directory.path / REPLAY_FILE, replay)
         except OSError as error:
