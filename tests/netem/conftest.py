@@ -1,4 +1,4 @@
-"""What the tests of the lab share: each engine in turn, and programs on the air."""
+"""Common parts of the tests of the lab: each engine in turn, and test programs in vehicles."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""One scenario means the same to a kernel and to the medium: the same broadcasts go through both, and are compared.
+"""One scenario has the same meaning in a kernel and in the medium: the same broadcasts pass both, and are compared.
 
-The medium is told when each packet was really sent, so that what rates and limits do can be compared packet by packet.
-For the rest both drew lots: two-sample intervals, in which a right program fails one check in 100,000.
+The medium gets the real sending time of each packet, so effects of rates and limits can be compared packet by packet.
+Other conditions are random in both, and are compared by intervals of two samples. A correct program fails one check in
+100,000.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ from tests.netem.test_links import HEADERS, LATE_S, until_quiet
 
 pytestmark = pytest.mark.lab
 
-WITNESS = 2  # hears every packet after a constant delay, and so tells when it was sent and how late this machine is
+WITNESS = (
+    2  # receives each packet after a constant delay, which shows its sending time and the lateness of this machine
+)
 CONSTANT_S = 0.3
 CONSTANT = LinkConditions(delay=Delay(CONSTANT_S))
 DATA_BYTES = 1000
@@ -35,7 +38,7 @@ SEEDS = range(1, 6)
 
 @dataclass
 class Heard:
-    """What a receiver heard of numbered packets."""
+    """Numbered packets that a receiver received."""
 
     sent_at: list[float]
     """Seconds, by number."""
@@ -58,22 +61,22 @@ class Heard:
 
 @dataclass
 class Both:
-    """What a receiver heard through the kernel, and through the medium with one seed after the other."""
+    """The packets of a receiver through the kernel, and through the medium with several seeds."""
 
     kernel: Heard
     medium: list[Heard]
     late_s: float
-    """How late this machine may be: as late as the witness ever was, but always some."""
+    """Assumed lateness of this machine: the largest measured one, but more than zero."""
 
     def agree_on_copies(self) -> None:
-        """As many packets are lost, come once, and come twice."""
+        """The numbers of lost, single and duplicate packets agree."""
         for number in range(3):
             kernel, medium = ([len(copies) == number for copies in one.delays] for one in self.sides)
             assert_same_share(f"{number} copies", kernel, medium)
         assert max(map(len, self.kernel.delays)) <= 2
 
     def agree_on_delays(self) -> None:
-        """The distributions are the same, but for the lateness of this machine."""
+        """The distributions agree, except for the lateness of this machine."""
         kernel, medium = (one.all_delays for one in self.sides)
         for at in statistics.quantiles(medium, n=20):
             by_then = [delay <= at for delay in medium]
@@ -82,11 +85,13 @@ class Both:
 
     @property
     def late_in_queue_s(self) -> float:
-        """A packet that comes late into a queue makes all behind it late, too, and each is told of late besides."""
+        """Twice the lateness, because a late packet delays all packets behind it in a queue, and each of them is late
+        itself.
+        """
         return 2 * self.late_s
 
     def agree_on_arrivals(self) -> None:
-        """What comes through both comes at the same time, but for the lateness of this machine."""
+        """Packets that pass both arrive at the same time, except for the lateness of this machine."""
         pairs = zip(self.kernel.delays, self.medium[0].delays, strict=True)
         later = statistics.quantiles(one[0] - other[0] for one, other in pairs if one and other)
         assert all(-EARLY_S < late_s < self.late_in_queue_s for late_s in later), later
@@ -136,7 +141,7 @@ async def broadcast(
 def through_medium(
     vehicles: Sequence[int], seed: int, conditions: NetworkConditions, sender: int, sent_at: list[float]
 ) -> list[Heard]:
-    """What each vehicle hears; vehicles and `sender` by number."""
+    """Return the packets of each vehicle. Vehicles and `sender` are given by number."""
     medium = Medium(vehicles, seed)
     medium.apply(conditions)
     flown = [Heard(sent_at, [[] for _ in sent_at]) for _ in vehicles]
@@ -210,7 +215,7 @@ def test_bursts_and_directions_of_a_pair_agree(netem: str, tmp_path: Path) -> No
 
 
 def test_rates_and_limits_agree(netem: str, tmp_path: Path) -> None:
-    each_s = 2.0 / PACKETS  # so long takes a packet at the rate
+    each_s = 2.0 / PACKETS  # duration of a packet at the rate
     rate = (DATA_BYTES + HEADERS) * 8 / each_s
     limit = 40
     jitter = Delay(CONSTANT_S, 0.1, "normal")

@@ -1,4 +1,4 @@
-"""The capture of a lab: all that crossed the air, nothing that did not, each in the right vehicle's file."""
+"""The capture of a lab: all frames, no others, each in the file of the right vehicle."""
 
 import asyncio
 import signal

@@ -1,4 +1,4 @@
-"""Conditions are values: what they mean, and what is refused and how."""
+"""Conditions as values: their meaning, and the refusal of invalid ones."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def test_engine_refuses_unsupported_conditions_before_any_change(conditions: Net
 
 
 class _Forgetful(Engine):
-    """Holds what it is told, but for what is `refused`; `stuck`: and then nothing else any more."""
+    """Keeps all conditions except `refused`. If it is `stuck`, it keeps only the first ones."""
 
     name = "forgetful"
     has_queues = True

@@ -1,4 +1,4 @@
-"""What conditions do to real packets, the same for both engines, and what the kernel says about it."""
+"""The effect of conditions on real packets, the same for both engines, and the counts of the kernel."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_loss_per_receiver_is_as_requested_and_independent(engine: str, tmp_path
             assert_binomial(len(lost[vehicle]), PACKETS, asked[vehicle])
         for one, other in ((2, 3), (2, 4), (3, 4)):
             assert_binomial(len(lost[one] & lost[other]), PACKETS, asked[one] * asked[other])
-        # The kernel counted what the receivers saw, packet for packet.
+        # The kernel counted the same packets as the receivers.
         figures = (await air.lab.read()).receivers
         for vehicle in asked:
             assert (figures[vehicle].passed, figures[vehicle].lost) == (len(got[vehicle]), len(lost[vehicle]))
@@ -82,7 +82,7 @@ def test_loss_per_receiver_is_as_requested_and_independent(engine: str, tmp_path
 
 
 async def crossings(air: Air, vehicles: Sequence[int]) -> set[tuple[int, int, str]]:
-    """Who hears whom and with which protocol, by frames of every kind to everyone, a group and each one."""
+    """Return pairs and protocols that are connected, tested by all kinds of frames with all kinds of destinations."""
     listeners = {vehicle: await air.start_ready(vehicle, "listen") for vehicle in vehicles}
     for sender in vehicles:
         destinations = [EVERYONE, MULTICAST, *(addresses.mac(v) for v in vehicles if v != sender)]
@@ -187,7 +187,7 @@ def test_each_direction_of_each_pair_has_its_own_loss(engine: str, tmp_path: Pat
         figures = (await air.lab.read()).receivers
         assert {vehicle: figures[vehicle].lost for vehicle in lost} == lost
         assert all(figures[vehicle].passed == 3 * PACKETS - lost[vehicle] for vehicle in lost)
-        # Back to what everybody shares, with a partition that comes and goes.
+        # Back to common conditions, with a temporary partition.
         await air.lab.apply(conditions.with_partition([[1, 2], [3]]))
         applied = await air.lab.apply(loss(0.0))
         assert not any(figures.links for figures in applied.receivers.values())

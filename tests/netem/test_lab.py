@@ -55,7 +55,7 @@ def test_a_vehicle_has_its_address_a_broadcast_address_and_a_default_route(tmp_p
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may enter a network that somebody else made")
 def test_cable_can_end_in_an_existing_network(tmp_path: Path) -> None:
-    """Whoever lives there is on the air, under its conditions; when the lab is gone they have what they had."""
+    """Programs in that network are reachable under its conditions. After the lab, the network is as before."""
     neighbour = subprocess.Popen(["unshare", "--net", "sleep", "60"])
     network = Path(f"/proc/{neighbour.pid}/ns/net")
 
@@ -119,7 +119,7 @@ def test_kernel_counts_datagrams_that_programs_read(tmp_path: Path) -> None:
 
 
 def test_the_first_process_loads_little() -> None:
-    """A lab is up as soon as it is: what it imports is most of what it waits for."""
+    """Imports take most of the start time of a lab."""
     words = subprocess.check_output(
         [sys.executable, "-P", "-c", "import sys, netem.init; print(*sys.modules)"], text=True
     )

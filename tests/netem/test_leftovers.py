@@ -27,7 +27,7 @@ NAMESPACES = ("net", "user", "mnt", "pid")
 
 
 def processes_of(mark: Path) -> set[int]:
-    """Processes that carry the mark in their environment; what has ended, or is not ours, has none."""
+    """Return the processes with the mark in their environment. Ended and foreign processes have none."""
     found = set()
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -39,7 +39,7 @@ def processes_of(mark: Path) -> set[int]:
 
 
 def namespaces() -> set[str]:
-    """Every namespace that some process is in; who has ended is in none, whenever whoever inherited it collects it."""
+    """Return each namespace that a process is in. An ended process is in none, even before its parent collects it."""
     found = set()
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -49,7 +49,7 @@ def namespaces() -> set[str]:
 
 
 def has_ended(folder: Path) -> bool:
-    """Whether it is a zombie; the state comes after the name, see proc(5)."""
+    """Return whether the process is a zombie. The state follows the name (proc(5))."""
     return (folder / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
@@ -59,7 +59,7 @@ def interfaces() -> set[str]:
 
 @contextmanager
 def orchestrator_in(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """`bare.py`, killed if the test fails; it and all that it starts carry the folder's name as their mark."""
+    """Start `bare.py` in the folder, and kill it if the test fails. The folder's name marks it and all its children."""
     env = {**os.environ, "UCP_TEST_MARK": str(folder)}
     with subprocess.Popen([sys.executable, str(BARE), str(folder)], stdout=subprocess.PIPE, env=env) as orchestrator:
         try:

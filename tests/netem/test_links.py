@@ -30,7 +30,7 @@ from tests.netem.test_engine import in_lab
 pytestmark = pytest.mark.lab
 
 HEADERS = 42  # bytes: Ethernet, IPv4, UDP
-LATE_S = 0.015  # how late the test machine may be, even if what tells it was in time
+LATE_S = 0.015  # lateness of the test machine that the reference may not show
 
 
 async def heard(air: Air, sender: int, receivers: dict[int, Any], count: int, size: int = 12) -> dict[int, Any]:
@@ -83,7 +83,7 @@ def test_delays_have_the_requested_mean_deviation_and_shape(netem: str, tmp_path
 
 
 def median(delay: Delay) -> float:
-    """Of a delay, in seconds: Pareto's is below its mean."""
+    """Return the median of a delay in seconds. For Pareto, it is below the mean."""
     shift = {"pareto": -0.32, "paretonormal": -0.2}.get(delay.distribution, 0.0)
     return delay.mean_s + shift * delay.jitter_s
 
@@ -104,7 +104,7 @@ def test_bursts_are_as_requested_and_independent_between_links(netem: str, tmp_p
         found = await heard(air, 1, {2: bursts, 3: bursts, 4: soft}, PACKETS)
         got = {vehicle: set(result["numbers"]) for vehicle, result in found.items()}
         for vehicle in (2, 3):
-            # What is lost tells the state: how often did it change from one packet to the next?
+            # Losses show the state, so count its changes from packet to packet.
             pairs = Counter((number in got[vehicle], number + 1 in got[vehicle]) for number in range(PACKETS - 1))
             assert_binomial(pairs[True, False], pairs[True, False] + pairs[True, True], bursts.p)
             assert_binomial(pairs[False, True], pairs[False, True] + pairs[False, False], bursts.r)
@@ -254,7 +254,7 @@ def test_kernel_without_mixed_duplicates_refuses_and_changes_nothing(netem: str,
             assert "duplicat" in str(error)
             assert "in force again" in str(error)
             assert await air.lab.read() == before
-        # Where a receiver hears everybody alike they work on all kernels, before and after other conditions.
+        # With equal conditions for all senders they work on all kernels, before and after other conditions.
         await air.lab.apply(NetworkConditions(twice))
         await air.lab.apply(NetworkConditions(twice).with_partition([[1]]))
         await air.lab.apply(NetworkConditions(links={(1, 2): LinkConditions(0.5)}))

@@ -22,13 +22,13 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 def run_as_nobody(argv: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a command as an ordinary user: this one, or nobody if this one is root."""
+    """Run a command as an ordinary user: this one, or the user `nobody` for root."""
     nobody = {"user": "nobody", "group": "nogroup", "extra_groups": []} if os.geteuid() == 0 else {}
     return subprocess.run(argv, capture_output=True, text=True, check=False, **nobody, **options)
 
 
 def require_nobody_can() -> None:
-    """Skip where root keeps its Python or this checkout to itself; an ordinary user needs no nobody."""
+    """Skip if only root can read its Python or this checkout."""
     probe = [sys.executable, "-c", "import netem.lab"]
     try:
         done = run_as_nobody(probe, env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(REPOSITORY)}, cwd="/")

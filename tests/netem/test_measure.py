@@ -1,4 +1,4 @@
-"""What was asked beside what is measured: the statistics, the questions, and that a wrong network is found out."""
+"""Requested and measured values: the statistics, the questions, and the detection of wrong networks."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_delay_excludes_the_lateness_of_the_machine() -> None:
     arrivals = [(number, sent_s[number] + 0.1 + way_s[number]) for number in range(100)]
     mean = estimates.delay_mean(received(arrivals, sent_s, Lateness(way_s, [0.002, 0.002])))
     assert (mean.measured, mean.high) == pytest.approx((0.1, 0.1))
-    assert mean.low == pytest.approx(0.098)  # timers may have been late by so much
+    assert mean.low == pytest.approx(0.098)  # possible lateness of timers
     deviation = estimates.delay_deviation(received(arrivals, sent_s, Lateness(way_s, [0.0, 0.0])))
     assert (deviation.low, deviation.high) == pytest.approx((0, 0), abs=1e-9)
     jittered = [(number, sent_s[number] + (0.09, 0.11)[number % 2]) for number in range(100)]
@@ -137,7 +137,7 @@ def one_question(asked: float) -> Study:
 
 
 def losing(*shares: float) -> tuple[list[tuple[Study, int]], EngineMeasurement]:
-    """What is asked of an observer that loses such shares, one stream after the other, and what comes of it."""
+    """Return question and answer of an observer that loses these shares, one stream after the other."""
     asked: list[tuple[Study, int]] = []
     kept = iter(shares)
 

@@ -1,4 +1,4 @@
-"""nft is told no more at once than an ordinary user may send, and a change that stops half-way can be undone."""
+"""Long changes are split for ordinary users, and a partly applied change can be undone."""
 
 from typing import Any
 

@@ -31,7 +31,7 @@ def guest(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.fixture(scope="module")
 def check(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The program that looks at its registers; it says what it lost, and then ends with status 1."""
+    """The program that checks its registers. It prints lost ones, and then ends with status 1."""
     program = tmp_path_factory.mktemp("registers") / "check"
     argv = ["cc", "-O1", "-fno-builtin", "-pthread", "-o", str(program), str(PROGRAMS / "check.c")]
     if not _uml_registers.has_compiler():

@@ -1,4 +1,4 @@
-"""Running a project's tests inside a test, and what they say."""
+"""Run a project's tests inside a test, and read their output."""
 
 import json
 import os
@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-# Imported before pytester takes its picture of what is imported, so that inner runs find it and are quick.
+# Imported before pytester saves the imported modules, so that inner runs are fast.
 import harness.pytest_plugin._items
 import harness.report  # noqa: F401
 
@@ -16,7 +16,7 @@ SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 
 def run(pytester: pytest.Pytester, *arguments: object) -> pytest.RunResult:
-    """In this process."""
+    """Run the tests in this process."""
     return pytester.runpytest_inprocess("-p", "no:cacheprovider", *map(str, arguments))
 
 
@@ -38,7 +38,7 @@ def report(result: pytest.RunResult) -> Path:
 
 
 def no_internals(result: pytest.RunResult) -> None:
-    """What is shown is the test and sentences: no line of ours."""
+    """Check that the output shows the test and sentences, but no line of the harness."""
     shown = result.stdout.str() + result.stderr.str()
     assert "Traceback" not in shown
     assert not re.search(r"harness/(?!harness/|pytest_plugin/_?judged_run\.py:\d+: )\w+[\w/]*\.py:\d+", shown), shown

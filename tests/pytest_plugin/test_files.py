@@ -1,4 +1,4 @@
-"""Scenarios that are tests by themselves, and YAML files that are somebody else's."""
+"""Scenarios that are tests by themselves, and YAML files of other tools."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The fixture `scenario`: a scenario played for a test that looks at what came of it."""
+"""The fixture `scenario`: it plays a scenario and provides the findings."""
 
 import pytest
 

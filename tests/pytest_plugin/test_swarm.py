@@ -1,4 +1,4 @@
-"""The fixture `swarm`: a run told sentence by sentence, judged when its test ends."""
+"""The fixture `swarm`: a run controlled by actions, and judged when its test ends."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""What a test tells its swarm beside faults: to wait for a handler, hold messages back, change links, inject."""
+"""Further actions of the fixture `swarm`: wait for a handler, delay messages, change links, inject datagrams."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ pytest_plugins = "pytester"
 
 
 def record(pytester: pytest.Pytester) -> dict[str, Any]:
-    """That of the one run that was kept."""
+    """Return the record of the only kept run."""
     (kept,) = run_directories(pytester)
     told: dict[str, Any] = json.loads((kept / "run.json").read_text())
     return told
@@ -27,7 +27,7 @@ def given(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def is_played_again_alike(pytester: pytest.Pytester, directory: Path) -> None:
-    """What was told, played as a scenario, leads everybody to the same chain."""
+    """Check that the recorded scenario leads to the same chain when it is played again."""
     (kept,) = run_directories(pytester)
     told = record(pytester)
     play(parse(told["scenario"]), told["seed"], directory, Silent(), "sim")

@@ -1,4 +1,4 @@
-"""What the Docker backend says where there is no engine, or one that does not answer; and what it knows without one."""
+"""The Docker backend without an engine, or with one that does not answer."""
 
 import asyncio
 import json
@@ -63,7 +63,7 @@ def test_stopped_engine_is_one_sentence(tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody who may not")
 def test_inaccessible_engine_is_one_sentence(tmp_path: Path) -> None:
-    path = Path("/tmp", f"ucp-test-{os.getpid()}.sock")  # noqa: S108  (where nobody can look)
+    path = Path("/tmp", f"ucp-test-{os.getpid()}.sock")  # noqa: S108  (every user can reach it)
     server = listening(path)
     path.chmod(0o600)
     code = f"""

@@ -1,4 +1,4 @@
-"""The rogue node by itself: what it makes of what it hears."""
+"""The rogue node alone: its reactions to received datagrams."""
 
 from random import Random
 from typing import Any
@@ -48,7 +48,7 @@ def receive(one: Rogue, datagram: bytes, now: float) -> list[RogueDatagram]:
 
 
 def wait(one: Rogue, until: float) -> list[tuple[float, RogueDatagram]]:
-    """What it sends when."""
+    """Return the datagrams that it sends, with their times."""
     sent = []
     while (at := one.next_timer()) is not None and at <= until:
         one.handle_timer(at)

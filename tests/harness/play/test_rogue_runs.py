@@ -1,4 +1,4 @@
-"""Injections into whole runs, in virtual time and on the air: what the agents do with them, and who notices."""
+"""Injections in whole runs, in virtual time and in a lab: the reactions of the agents, and the verdicts."""
 
 import json
 import os
@@ -45,7 +45,7 @@ def violated(finished: Run) -> set[str]:
 
 
 def only(finished: Run) -> InjectedMessages:
-    """Of the run's only injection the only type of message."""
+    """Return the only message type of the run's only injection."""
     (injection,) = finished.rogue
     (messages,) = injection.messages
     return messages
@@ -115,7 +115,7 @@ def test_forged_votes_delay_the_commit_of_a_block(tmp_path: Path) -> None:
 
 
 def check_forgery(finished: Run) -> None:
-    """Everybody else commits the forged block, and characteristic 4 names it, whose it claims to be, and when."""
+    """Check that all other agents commit the forged block, and that characteristic 4 names it with agent and time."""
     assert finished.exit_status == 1
     assert only(finished).handled == {"committed": 4}
     assert violated(finished) == {"1", "4"}

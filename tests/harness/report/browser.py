@@ -47,7 +47,7 @@ class Browser:
 
     @contextlib.contextmanager
     def fresh(self) -> Iterator["Browser"]:
-        """With an empty page that shares nothing with pages before it, as if the browser had just been started."""
+        """Open an empty page that shares nothing with earlier pages, as in a new browser."""
         self.complaints = []
         context = self._call("Target.createBrowserContext")["browserContextId"]
         target = self._call("Target.createTarget", url="about:blank", browserContextId=context)["targetId"]
@@ -79,7 +79,7 @@ class Browser:
         self._call("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """With the mouse, from one place in the window to another."""
+        """Drag the mouse from one point of the window to another."""
         for event, (x, y), buttons in (("mousePressed", start, 1), ("mouseMoved", end, 1), ("mouseReleased", end, 0)):
             self._call("Input.dispatchMouseEvent", type=event, x=x, y=y, button="left", buttons=buttons, clickCount=1)
 
@@ -91,7 +91,7 @@ class Browser:
         self._call("Emulation.setEmulatedMedia", media="")
 
     def screenshot(self, path: Path) -> None:
-        """The whole page, also what is below the fold."""
+        """Return a picture of the whole page."""
         shot = self._call("Page.captureScreenshot", captureBeyondViewport=True)
         path.write_bytes(b64decode(shot["data"]))
 

@@ -33,7 +33,7 @@ def split_and_rejoin(vehicle: int) -> Way:
 
 
 def write_flight(run_dir: Path, scenario: Scenario, ways: Mapping[int, Way], seconds: int) -> None:
-    """Fly `ways` for so many seconds, a look a second, and have the scenario's network follow."""
+    """Record flights along `ways` once per second, and apply the scenario's network."""
     reach = RadioRange(scenario)
     changes = timeline_of(scenario)
     lines: list[dict[str, Any]] = []

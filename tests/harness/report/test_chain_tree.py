@@ -1,4 +1,4 @@
-"""What the tree says about chains that agree, part, end early, and hold the same block after different histories."""
+"""The tree of chains that agree, diverge, end early, or hold the same block after different histories."""
 
 from collections.abc import Iterator
 

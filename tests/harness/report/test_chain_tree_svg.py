@@ -1,4 +1,4 @@
-"""The tree as SVG: well formed, described in words, and telling of each block what it is and who holds it."""
+"""The tree as SVG: well-formed, with a description, and with the name and holders of each block."""
 
 import re
 from xml.etree import ElementTree

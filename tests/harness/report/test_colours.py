@@ -1,4 +1,4 @@
-"""Agents' colours: told apart, and readable under their labels."""
+"""Agents' colours differ, and labels on them are readable."""
 
 from harness.present.colours import contrast, inks
 

@@ -25,7 +25,7 @@ IN_NO_FIGURE = {
     "reconcile_phase_3": {"held already"},
     "reconcile_finalize": {"asked who follows"},
 }
-"""Branches that are ours: what the thesis is silent about."""
+"""Branches of the harness for cases that the thesis does not cover."""
 
 
 def told(story: Story, directory: Path, seed: int = 1) -> str:

@@ -1,4 +1,4 @@
-"""junit.xml of a run: what a build server shows of it, and that it can read it whatever the run holds."""
+"""junit.xml of a run: its test cases, and valid XML for any run."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from harness.report._run_summary import to_junit
 from tests.harness.report.runs import result_of, write_run
 
 Case = tuple[str, str, str] | None
-"""Tag, message and text of what is in a test case; None if it passed."""
+"""Tag, message and text of the element in a test case; None if it passed."""
 
 
 def suite_of(result: dict[str, Any]) -> ElementTree.Element:

@@ -1,4 +1,4 @@
-"""The map: which vehicle flew where, in which part of the network, and what is said of it."""
+"""The map: tracks of the vehicles, parts of the network, and descriptions."""
 
 import math
 import re

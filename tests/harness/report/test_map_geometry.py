@@ -1,4 +1,4 @@
-"""North is up, one scale holds both ways, and thinning changes nothing that anybody sees."""
+"""Geometry of the map: north is up, one scale applies to both axes, and thinning makes no visible change."""
 
 import math
 from itertools import pairwise
@@ -72,7 +72,7 @@ def test_no_point_is_farther_from_the_thinned_line_than_the_tolerance(line: list
 
 
 def _distance(point: Point, start: Point, end: Point) -> float:
-    """By trying places along the line: slow, and with no formula in common with what it checks."""
+    """Return the distance, found by trying points along the line. It shares no formula with the tested code."""
     low, high = 0.0, 1.0
 
     def at(share: float) -> float:

@@ -1,4 +1,4 @@
-"""The strip of what the network did along mission time, as it is on record."""
+"""The strip of the recorded network over mission time."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The page says what the run directory holds, whole or not, and nothing from it becomes markup."""
+"""The page shows the contents of complete and damaged run directories, and escapes all of them."""
 
 import gc
 import json

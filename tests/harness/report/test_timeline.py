@@ -1,4 +1,4 @@
-"""The timeline on the page: it says what happened, stays small, and makes no markup of what it is given."""
+"""The timeline of the page: its contents, its size, and the escaping of texts."""
 
 import base64
 import hashlib

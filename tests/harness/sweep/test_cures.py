@@ -13,18 +13,18 @@ from tests.harness.scenario.test_scenarios import SCENARIOS
 PAGE = Path(__file__).parents[3] / "docs/appendix/livelock-measurements.md"
 SEED = 1
 SIZES = range(4, 9)
-"""Of swarms in which all refuse one agent."""
+"""Sizes of swarms in which all other agents refuse one agent."""
 
 
 def rows() -> list[tuple[str, list[str]]]:
-    """The cure, and its cells."""
+    """Return pairs of a cure and the cells of its row."""
     table = PAGE.read_text(encoding="utf-8").partition("<!-- cures: begin -->\n")[2].partition("<!-- cures: end -->")[0]
     cells = [[cell.strip() for cell in line.strip("|\n").split("|")] for line in table.splitlines()[2:]]
     return [(cure, played) for cure, *played in cells]
 
 
 def refused(agents: int, *, partition: bool) -> dict[str, Any]:
-    """As many as it takes commit a block each, of which the others know nothing; then agent 1 completes one."""
+    """Some agents commit a block each that the others do not receive. Then agent 1 completes a block."""
     alone = range(2, 2 + (agents + 1) // 2)
     heals_s = 20.0 * len(alone) + 16
     script = [{"at_s": 20.0 * place + 1, "agent": agent} for place, agent in enumerate(alone)]
@@ -46,7 +46,7 @@ def refused(agents: int, *, partition: bool) -> dict[str, Any]:
 
 
 def outcome(document: dict[str, Any], cure: str) -> str:
-    """What the page says of a run: "round", or how many chains all come to rest with."""
+    """Return the outcome of a run as the page names it: "round", or the number of chains at rest."""
     document = {key: value for key, value in document.items() if key not in ("expect", "about", "stagger")}
     for part in cure.split("`")[1::2]:
         for key, value in yaml.safe_load(part).items():

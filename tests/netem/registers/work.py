@@ -1,4 +1,4 @@
-"""Work that fills floating point and vector registers, under signals and beside children; prints what came out."""
+"""Fill floating point and vector registers, under signals and beside children, and print the results."""
 
 import hashlib
 import math

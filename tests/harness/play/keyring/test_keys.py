@@ -1,4 +1,4 @@
-"""`ucp-harness keys`: what stays home stays there, what is handed out is one vehicle's, and nothing secret is told."""
+"""`ucp-harness keys`: secrets stay in the directory, a bundle has the keys of one vehicle, and output has no secret."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ from ucp.secure.bundle import load_bundle, load_public
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys of three vehicles, and their bundles; nobody changes them."""
+    """Keys of three vehicles with their bundles, shared by read-only tests."""
     home = tmp_path_factory.mktemp("keys") / "home"
     Home.new(home, [1, 7, 28], seals=True, epoch_s=60.0).write_bundles(home.parent / "bundles")
     return home
@@ -25,7 +25,7 @@ def home(tmp_path: Path) -> Path:
 
 
 def secrets(home: Path) -> list[str]:
-    """Of all files."""
+    """Return the secrets of all files."""
     private = json.loads((home / "vehicles.key").read_text())
     keys = [json.loads((home / name).read_text())["private_key"] for name in ("authority.key", "depot.key")]
     return [*keys, private["group_secret"], *private["vehicles"].values()]

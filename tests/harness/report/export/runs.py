@@ -1,4 +1,4 @@
-"""Runs to export: one in virtual time that has everything but telemetry, and what a vehicle's log would add."""
+"""Runs to export: a complete one in virtual time without telemetry, and a telemetry log to add."""
 
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ def play(directory: Path) -> Path:
 
 
 def add_telemetry(run: Path, vehicle: int = 1, seconds: int = 30) -> Path:
-    """What a vehicle said in the first seconds of a mission that begins in 1970."""
+    """Add telemetry of the first seconds of a mission that begins in 1970."""
     directory = run / "vehicles" / str(vehicle)
     directory.mkdir(parents=True, exist_ok=True)
     coder = mavlink.MAVLink(None, srcSystem=vehicle)

@@ -1,4 +1,4 @@
-"""What is hostile in a run directory, or a disk that is full, ends in a sentence, and in no half a file."""
+"""Hostile run directories and full disks give one sentence and no partial file."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""`ucp-harness export --mcap`: what a run left as MCAP, read back by the format's own library."""
+"""`ucp-harness export --mcap`: the exported run, read by the format's own library."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""A page that a command serves, and waiting for what it shows."""
+"""Pages that a command serves, and functions that wait for their contents."""
 
 import signal
 import subprocess
@@ -28,7 +28,7 @@ def page_of(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def until(browser: Browser, expression: str) -> Any:
-    """What the expression comes to, once that is something."""
+    """Return the value of the expression as soon as it is true."""
     deadline = time.monotonic() + DEADLINE_S
     while time.monotonic() < deadline:
         if value := browser.evaluate(expression):

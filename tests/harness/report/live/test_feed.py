@@ -1,4 +1,4 @@
-"""The stream of changes that a page is told: the same of a run that goes on and of one that is over."""
+"""The stream of changes for the page. Active and finished runs give the same stream."""
 
 import json
 import shutil
@@ -27,7 +27,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def chains_of(told: list[Change]) -> dict[int, list[str]]:
-    """What is in each agent's chain at the end, by the changes alone."""
+    """Return each agent's final chain, computed from the changes."""
     chains: dict[int, list[str]] = {}
     for kind, _, *rest in told:
         if kind == "z":
@@ -188,7 +188,7 @@ def of_report(traces: dict[int, Trace]) -> list[tuple[str, float, float, str]]:
 
 
 def reconcile_during_a_vote(directory: Path) -> tuple[list[Change], Trace]:
-    """What the feed says of an agent that begins a reconcile before its vote timer expires, and its trace."""
+    """Return changes and trace of an agent that begins a reconcile before its vote timer expires."""
     trigger = TimerTrigger("vote_timer_expiration")
     runs = [
         handler_run(1.0, "process_next_deque_block", "proposed", sent=[Sent("Block Add Request", 0, "aa")]),

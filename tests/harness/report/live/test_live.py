@@ -1,4 +1,4 @@
-"""`run --watch`: a run while it goes on, and what somebody has happen to it from the page."""
+"""`run --watch`: an active run, and requests from its page."""
 
 import asyncio
 import json
@@ -31,17 +31,17 @@ def scenario(directory: Path) -> Path:
 
 
 class Page:
-    """What a page hears and says, without a browser."""
+    """A page without a browser: it receives changes and sends requests."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._socket = socket
         self._unread: list[list[Any]] = []
         self._number = 0
         self.interventions: dict[str, Any] | None = None
-        """What can be asked for, as it was last told: that may be before the run is."""
+        """The last state of the controls, or None before the first."""
 
     async def next(self, kind: str) -> list[Any]:
-        """The next change of that kind."""
+        """Return the next change of that kind."""
         async with asyncio.timeout(DEADLINE_S):
             while True:
                 while self._unread:

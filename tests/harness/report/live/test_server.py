@@ -1,4 +1,4 @@
-"""The server of the page: who is let in, who is not, and what it does when a browser is slow or goes away."""
+"""The server of the page: access, and slow or closed browsers."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""`ucp-harness watch`, and `run --watch`: what a user is told when it cannot be."""
+"""`ucp-harness watch` and `run --watch`: the messages for impossible requests."""
 
 import socket
 import sys

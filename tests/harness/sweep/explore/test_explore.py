@@ -1,4 +1,4 @@
-"""From a scenario to the smallest run that violates a characteristic, as a file that plays it again."""
+"""Exploration of a scenario up to the smallest run that violates a characteristic, and the file that plays it again."""
 
 import dataclasses
 import signal

@@ -217,7 +217,7 @@ def test_kept_runs_are_stored_once_over_several_nights(tmp_path: Path) -> None:
 
 
 def test_short_document_shows_an_agent_that_is_refused_forever() -> None:
-    """What a hunt found: of five with four chains at rest one has a block, and nobody takes it."""
+    """A hunt found this document: five agents rest with four chains, and all others refuse the block of one agent."""
     script = [(1.0, 3), (42.944, 2), (48.087, 1), (82.944, 4)]
     document = {
         "name": "c",

@@ -27,7 +27,7 @@ def matrix(
 
 
 def played(asked: Matrix, jobs: int, judge: Judge, directory: Path | None = None) -> Finished:
-    """Into `directory`, or one that nobody looks into."""
+    """Play the matrix into `directory`, or into a temporary one."""
 
     def plays(scenario: Scenario, seed: int) -> tuple[RunOutcome, Result]:
         return RunOutcome(mission_s=scenario.duration_s + 100, settled=True), judge(scenario, seed)

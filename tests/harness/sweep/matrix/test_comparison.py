@@ -31,7 +31,7 @@ WORSE = {
 
 
 def cell(loss: float = 0.15, **estimates: Estimate) -> Cell:
-    """With every figure at 0.5, from 0.4 to 0.6, but for those given."""
+    """Return a cell in which each figure is 0.5 (0.4 to 0.6), except for the given ones."""
     usual = Estimate(n=10, mean=0.5, low=0.4, high=0.6)
     known = {name: estimates.get(name, usual) for name in BY_NAME}
     return Cell(loss=loss, agents=5, backend="sim", runs=10, failed=0, estimates=known, verdicts={}, violated={})
@@ -71,7 +71,7 @@ def test_cells_are_compared_at_the_same_point_only() -> None:
 
 
 def busier(scenario: Scenario, seed: int) -> Result:
-    """As `judge`, with more reconciles under loss."""
+    """Judge as `judge` does, with more reconciles under loss."""
     result = judge(scenario, seed)
     result.figures["reconciles"] += 30 if scenario.network.loss else 0  # type: ignore[operator]
     return result

@@ -1,4 +1,4 @@
-"""The matrix file: what it says, and what is said about its mistakes."""
+"""The matrix file: its contents, and the messages about mistakes in it."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""report.html: what it says of each cell, of its runs and of the nights, and that it stays one small, safe file."""
+"""report.html: cells, runs and nights in one small, safe file."""
 
 import html
 import json
@@ -31,7 +31,7 @@ def breaks(scenario: Scenario, seed: int) -> Result:
 
 
 def tiles(finished: Finished, name: str) -> dict[str, _heatmap.Tile]:
-    """Of one figure, by where their runs are."""
+    """Return the tiles of one figure, by the page section of their runs."""
     (figure,) = [one for one in known_figures(finished.record.cells) if one.metric.name == name]
     grids = _heatmap.heatmap(finished.record, figure).grids
     return {str(tile.href): tile for grid in grids for _, row in grid.rows for tile in row}

@@ -1,4 +1,4 @@
-"""results.jsonl: what has ended is played once, however often the matrix is broken off."""
+"""results.jsonl: each run is played once, even if the matrix is interrupted several times."""
 
 import json
 import re
@@ -18,7 +18,7 @@ Count = list[tuple[object, int]]
 
 
 def counting(seen: Count, until: int | None = None) -> Callable[[Scenario, int], Result]:
-    """A judge that notes what it plays, and is interrupted after so many."""
+    """Return a judge that records its runs, and is interrupted after a number of them."""
 
     def counted(scenario: Scenario, seed: int) -> Result:
         if len(seen) == until:
