@@ -13,7 +13,6 @@
 #include <cstring>
 #include <iostream>
 #include <map>
-#include <numbers>
 #include <sstream>
 
 using namespace ns3;
@@ -110,17 +109,16 @@ class Network
     uint32_t m_size;
 
   private:
-    // Place the stations on a circle of diameter `metres`, or on a line with `metres` between neighbours.
+    // Place the stations at `places`, which are pairs of metres: "0:0,300:0".
     void Place(const NodeContainer& nodes, const Cell& cell)
     {
         auto places = CreateObject<ListPositionAllocator>();
-        double metres = cell.Number("metres");
-        for (uint32_t station = 0; station < m_size; ++station)
+        std::istringstream pairs(cell.Word("places"));
+        double east;
+        double north;
+        for (char colon, comma; pairs >> east >> colon >> north; pairs >> comma)
         {
-            double angle = 2 * std::numbers::pi * station / m_size;
-            places->Add(cell.Word("layout") == "line"
-                            ? Vector(metres * station, 0, 0)
-                            : Vector(metres / 2 * std::cos(angle), metres / 2 * std::sin(angle), 0));
+            places->Add(Vector(east, north, 0));
         }
         MobilityHelper mobility;
         mobility.SetPositionAllocator(places);
@@ -211,7 +209,7 @@ class Beacons : public Network
           m_wanted(static_cast<uint32_t>(cell.Number("messages"))),
           m_warmUp(static_cast<uint32_t>(cell.Number("warm_up"))),
           m_after(static_cast<uint32_t>(cell.Number("after"))),
-          m_line(cell.Word("layout") == "line"),
+          m_line(cell.Word("family") == "hidden"),
           m_gap(CreateObject<ExponentialRandomVariable>())
     {
         m_gap->SetAttribute("Mean", DoubleValue(1 / cell.Number("per_second")));
