@@ -2,6 +2,7 @@
 
 import pytest
 
+from harness.archive.lag import LagLine, MeasuredLag
 from harness.archive.traces import Header, Trace
 from harness.checker.timer_lag import ENOUGH, timer_lag
 from ucp.trace import HandlerRun, StateSummary
@@ -41,6 +42,18 @@ def test_one_late_timer_of_many_is_nothing_to_speak_of() -> None:
     found = timer_lag([_votes(*[0.01] * 99, 5.0)])
     assert found is not None
     assert found.tolerable
+
+
+@pytest.mark.parametrize(("machine_s", "tolerable"), [(0.001, True), (1.0, False)])
+def test_lateness_that_the_measured_lag_does_not_explain_is_not_of_the_machine(
+    machine_s: float, tolerable: bool
+) -> None:
+    votes = _votes(*[5.0] * 40)
+    votes.header.clock["speedup"] = 20
+    line = {"from_s": 0, "until_s": 10_000, "machine_s": machine_s, "busy_s": {"1": 0.0}}
+    found = timer_lag([votes], MeasuredLag([LagLine.model_validate(line)]))
+    assert found is not None
+    assert found.tolerable is tolerable
 
 
 def test_too_few_votes_tell_nothing() -> None:
