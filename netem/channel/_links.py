@@ -18,6 +18,7 @@ import sys
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from random import Random
 
 from netem._distributions import SCALE, table
@@ -33,6 +34,7 @@ _MANTISSA = [round(10 ** (6 + step / 1000)) for step in range(1000)]
 _LIGHT_M_PER_S = 299_792_458.0
 
 
+@cache
 def linear(centibels: int) -> float:
     """Return the power of this level in 0.01 dB, relative to 10^-6 of level 0."""
     tens, step = divmod(centibels, 1000)
@@ -72,7 +74,9 @@ class Links:
         self._quantiles = table("normal", _TABLE_SIZE)
         self._group = [0] * count
         self._places = [Place(0.0, 0.0, 0.0)] * count
-        self._loss = [[self._path_loss(self._places[0], self._places[0])] * count for _ in range(count)]
+        self._first_metre_db = 20 * math.log10(4 * math.pi * MIN_DISTANCE_M * radio.frequency_hz / _LIGHT_M_PER_S)
+        self._loss: list[list[int] | None] = [None] * count
+        """Path loss from each sender to all receivers, computed when the sender sends."""
         self._moved_m = [0.0] * count
         """Metres since the last change of the shadowing."""
         self._shadow = [[0] * count for _ in range(count)]
@@ -93,11 +97,7 @@ class Links:
         if self._correlated and 2 * max(self._moved_m) > STEP * self._radio.shadowing_m:
             self._ages_at = 0
         self._places = list(places)
-        for number in moved:
-            row = self._loss[number]
-            for other, place in enumerate(places):
-                if other != number:
-                    row[other] = self._loss[other][number] = self._path_loss(places[number], place)
+        self._loss = [None] * self._count
         self._reaches = [None] * self._count
 
     def tune(self, groups: Sequence[int]) -> None:
@@ -121,7 +121,10 @@ class Links:
         powers = [0.0] * self._count
         heard = energetic = faded = far = cut = 0
         group, own = self._group, self._group[sender]
-        for receiver, loss in enumerate(self._loss[sender]):
+        losses = self._loss[sender]
+        if losses is None:
+            losses = self._loss[sender] = [self._path_loss(self._places[sender], place) for place in self._places]
+        for receiver, loss in enumerate(losses):
             if receiver == sender:
                 continue
             bit = 1 << receiver
@@ -148,8 +151,7 @@ class Links:
         """
         radio = self._radio
         metres = max(one.distance_m(other), MIN_DISTANCE_M)
-        first_metre_db = 20 * math.log10(4 * math.pi * MIN_DISTANCE_M * radio.frequency_hz / _LIGHT_M_PER_S)
-        loss_db = first_metre_db + 10 * radio.exponent * math.log10(metres)
+        loss_db = self._first_metre_db + 10 * radio.exponent * math.log10(metres)
         if radio.ground == "two_ray":
             heights = [max(place.up_m, 0.0) + radio.antenna_m for place in (one, other)]
             if min(heights) <= 0:
@@ -166,25 +168,20 @@ class Links:
 
     def _shift(self, exponent: float | None) -> None:
         """Draw the shadowing again. Without an exponent, nothing of the old shadowing remains."""
-        count, shadow, moved_m = self._count, self._shadow, self._moved_m
-        known: dict[float, tuple[int, float]] = {}
-        words = self._words(count * (count - 1) // 2)
-        at = 0
-        for one in range(count):
-            row = shadow[one]
+        shadow, moved_m = self._shadow, self._moved_m
+        known: dict[float, tuple[float, float]] = {}
+        words = iter(self._words(self._count * (self._count - 1) // 2))
+        for one, row in enumerate(shadow):
             for other in range(one):
                 moved = moved_m[one] + moved_m[other]
                 if moved not in known:
                     share = 0.0 if exponent is None else math.exp(-exponent - moved / self._radio.shadowing_m)
-                    kept = round(share * _KEPT_STEPS)
-                    known[moved] = kept, math.sqrt(1 - (kept / _KEPT_STEPS) ** 2)
+                    kept = round(share * _KEPT_STEPS) / _KEPT_STEPS
+                    known[moved] = kept, math.sqrt(1 - kept * kept)
                 kept, rest = known[moved]
-                row[other] = shadow[other][one] = round(
-                    row[other] * kept / _KEPT_STEPS + rest * self._deviate(words[at])
-                )
-                at += 1
-        self._moved_m = [0.0] * count
-        self._reaches = [None] * count
+                row[other] = shadow[other][one] = round(row[other] * kept + rest * self._deviate(next(words)))
+        self._moved_m = [0.0] * self._count
+        self._reaches = [None] * self._count
 
     def _deviate(self, word: int) -> int:
         """Return a normal deviation in 0.01 dB from a word of 16 bits."""

@@ -58,11 +58,14 @@ class ChannelTraffic(Generic[Message]):
                 self.totals.dropped(sender, number)
             else:
                 self._queued[number] = message
-        ended = [(frame, self._queued.pop(frame.number)) for frame in self._channel.advance(now)]
-        for frame, _ in ended:
+        ended = []
+        for frame in self._channel.advance(now):
+            ended.append((frame, self._queued.pop(frame.number)))
             self.totals.ended(frame)
         event = self._channel.next_event()
-        self.next_s = min(NEVER if event is None else event, processed[0][0] if processed else NEVER)
+        self.next_s = NEVER if event is None else event
+        if processed and processed[0][0] < self.next_s:
+            self.next_s = processed[0][0]
         return ended
 
     def move(self, places: Sequence[Place], now: float) -> None:
@@ -122,7 +125,7 @@ class ChannelTotals:
             "lost": lost,
             "dropped": {fate.value: self._by_id(counts) for fate, counts in sorted(self._drops.items())},
             "load_interval_s": LOAD_S,
-            "load": [round(busy_s / LOAD_S, 4) for busy_s in self._load],
+            "load": [busy_s and round(busy_s / LOAD_S, 4) for busy_s in self._load],
         }
 
     def _by_id(self, counts: "dict[int, int] | Counter[int]") -> dict[str, int]:
