@@ -46,7 +46,7 @@ def row(agents: int, duration_s: float, preset: str, rounds: int) -> None:
     print_row(
         str(agents),
         preset,
-        *(str(round(statistics.median(messages[number]))) for what in (ideal, shared)),
+        *(str(round(statistics.median(messages[number]))) for number in (0, 1)),
         *(ms(statistics.median(times[number])) for number in (0, 1)),
         f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})",
     )

@@ -8,6 +8,7 @@ capture/7.pcapng    all frames that vehicle 7 sent or received, if captures were
 network.jsonl       each change of conditions as the kernel applied it, and the kernel's counters at the end
 tracks.jsonl        positions of the vehicles, in metres north, east and up from the centre of the field
 replay.yaml         the scenario with the changes that the user made by hand (harness.play.interventions)
+channel.jsonl       each message on a shared channel, and the vehicles that lost it
 rogue.jsonl         datagrams that the rogue node sent, if the timeline injects any; rogue.log is its output
 lag.jsonl           delays of programs that the machine woke late, and the load of each agent (harness.archive.lag)
 lab.log             output of the lab
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
 
 ROGUE_FILE = "rogue.jsonl"
+CHANNEL_FILE = "channel.jsonl"
 PUBLIC_KEYS_FILE = "public.json"
 ROGUE_CONTROL = "rogue.control"
 
@@ -126,6 +128,10 @@ class RunDirectory:
     def append_injected(self, record: Mapping[str, Any]) -> None:
         """Append a datagram of the rogue node, or the number of several, sent at mission second `at_s`."""
         self._append(ROGUE_FILE, record)
+
+    def append_channel(self, record: Mapping[str, Any]) -> None:
+        """Append the line of a message on a shared channel."""
+        self._append(CHANNEL_FILE, record)
 
     def append_tracks(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Append the positions of vehicles at mission second `at_s`."""

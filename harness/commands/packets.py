@@ -11,6 +11,7 @@ from rich.console import Console
 from harness.archive.packets import packets_text
 from harness.archive.packets.block_names import BlockNames, run_directories
 from harness.archive.packets.capture_files import Captures, capture_files, read_captures
+from harness.archive.packets.channel_losses import channel_losses
 from harness.archive.packets.exchanges import Exchanges, count_losses, loss_matrix
 from harness.archive.packets.packets_document import document
 from harness.archive.packets.packets_text import Paint, TransmissionText
@@ -70,7 +71,7 @@ def _output_lines(
             captures, count_losses(selected), shown if chapters is None else in_order(chapters), exchanges, names
         )
         return
-    wording = TransmissionText(names, _paint())
+    wording = TransmissionText(names, _paint(), channel_losses(runs))
     yield packets_text.header(captures)
     if chapters is not None:
         yield from packets_text.exchange_lines(chapters, exchanges, wording)

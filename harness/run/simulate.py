@@ -139,6 +139,9 @@ class InMemory:
     def injected(self, record: dict[str, Any]) -> None:
         self._injected.take_down([InjectedDatagram.model_validate(record)])
 
+    def transmitted(self, record: dict[str, Any]) -> None:
+        """Do nothing: the record of the run has the totals."""
+
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Do nothing: the checker needs no positions."""
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import Captures
 from harness.archive.packets.capture_reader import ListenerName
+from harness.archive.packets.channel_losses import DROPS, ChannelLosses
 from harness.archive.packets.datagram import MessageSummary
 from harness.archive.packets.exchanges import Exchanges, Outcome, RequestOutcome
 from harness.archive.packets.selection import Exchange, block_arrivals
@@ -32,16 +33,17 @@ Paint = Callable[[str], str]
 class TransmissionText:
     """The text of transmissions and outcomes. `paint` highlights losses."""
 
-    def __init__(self, names: BlockNames, paint: Paint) -> None:
+    def __init__(self, names: BlockNames, paint: Paint, losses: ChannelLosses) -> None:
         self._names = names
         self._paint = paint
+        self._losses = losses
 
     def transmission(self, transmission: Transmission) -> str:
         """Return the line of a transmission: time, sender, message and receivers."""
         what = f"{transmission.summary.message:<26}  {self.content(transmission.summary):<46}"
         parts = [f"{transmission.at_s:>12.3f}  {transmission.sender:>5}  {what}  -> {_receivers(transmission)}"]
         if transmission.lost_by:
-            parts.append(self._paint(f"lost by {_list(transmission.lost_by)}"))
+            parts.append(self._paint(f"lost by {_list(transmission.lost_by)}{self._reasons(transmission)}"))
         if transmission.absent:
             parts.append(f"not listening: {_list(transmission.absent)}")
         parts += [
@@ -55,6 +57,20 @@ class TransmissionText:
         elif transmission.origin == "inferred":
             parts.append(f"seen by others: {transmission.sender} was not captured")
         return "  ".join(parts)
+
+    def _reasons(self, transmission: Transmission) -> str:
+        """Return why the channel lost the message, if there was a channel and it lost it."""
+        reasons = self._losses.get((transmission.sender, transmission.sequence), {})
+        named = {
+            reason: vehicles if reason in DROPS else [name for name in transmission.lost_by if name in vehicles]
+            for reason, vehicles in reasons.items()
+        }
+        words = [
+            reason.replace("_", " ") + (f": {_list(names)}" if names else "")
+            for reason, names in named.items()
+            if names or reason in DROPS
+        ]
+        return f" ({'; '.join(words)})" if words else ""
 
     def content(self, summary: MessageSummary) -> str:
         if summary.is_sealed:

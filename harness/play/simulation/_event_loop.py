@@ -117,7 +117,10 @@ class Clockwork:
 
     def _shared_channel(self) -> ChannelTraffic[InFlight | StrayDatagram] | None:
         asked = self.scenario.network.channel
-        return ChannelTraffic(self.roster, asked.radio(), asked.processing_s, self.seed) if asked else None
+        if asked is None:
+            return None
+        journal = self._recorder.transmitted if self._tracing else None
+        return ChannelTraffic(self.roster, asked.radio(), asked.processing_s, self.seed, journal)
 
     def _foreign_agents(self, programs: "Programs | None") -> "Foreigners":
         from harness.play.simulation.foreign._foreigners import Foreigners  # most scenarios have none

@@ -5,13 +5,16 @@ frame ends. `ChannelTraffic` connects the messages with their frames, and counts
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from heapq import heappop, heappush
 from random import Random
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from netem.channel import Channel, Fate, Radio, Transmission, numbers
 from netem.radio import Place
+
+Journal = Callable[[dict[str, Any]], None]
+"""A function that records a message: when its radio got it, when it was sent, and which vehicles lost it."""
 
 NEVER = float("inf")
 LOAD_S = 1.0
@@ -20,16 +23,26 @@ LOAD_S = 1.0
 _WORD_BITS = 32
 
 
-Message = TypeVar("Message")
+class _Sent(Protocol):
+    @property
+    def sequence(self) -> int | None:
+        """The number of the message, if it is one of an agent."""
+
+
+Message = TypeVar("Message", bound=_Sent)
 
 
 class ChannelTraffic(Generic[Message]):
     """The channel of `roster`, with its messages on the way."""
 
-    def __init__(self, roster: Sequence[int], radio: Radio, processing_s: float, seed: int) -> None:
+    def __init__(
+        self, roster: Sequence[int], radio: Radio, processing_s: float, seed: int, journal: Journal | None
+    ) -> None:
         self.next_s = NEVER
         """When a message reaches its radio, or a frame begins or ends."""
         self.totals = ChannelTotals(roster)
+        self._roster = roster
+        self._journal = journal
         self._channel = Channel(roster, radio, seed)
         self._processing_s = processing_s / (1 << _WORD_BITS)
         self._draws = [Random(f"{seed}/processing/{agent_id}") for agent_id in roster]
@@ -56,17 +69,31 @@ class ChannelTraffic(Generic[Message]):
             number = self._channel.send(sender, at, data_bytes)
             if isinstance(number, Fate):
                 self.totals.dropped(sender, number)
+                if self._journal is not None:
+                    self._journal({**self._line(at, sender, message, data_bytes), "dropped": number.value})
             else:
                 self._queued[number] = message
         ended = []
         for frame in self._channel.advance(now):
-            ended.append((frame, self._queued.pop(frame.number)))
+            message = self._queued.pop(frame.number)
+            ended.append((frame, message))
             self.totals.ended(frame)
+            if self._journal is not None:
+                self._journal(self._line_of(frame, message))
         event = self._channel.next_event()
         self.next_s = NEVER if event is None else event
         if processed and processed[0][0] < self.next_s:
             self.next_s = processed[0][0]
         return ended
+
+    def _line(self, at: float, sender: int, message: Message, data_bytes: int) -> dict[str, Any]:
+        whose = {"sender": self._roster[sender], "sequence": message.sequence, "bytes": data_bytes}
+        return {"at_s": round(at, 6), **whose}
+
+    def _line_of(self, frame: Transmission, message: Message) -> dict[str, Any]:
+        lost = {fate.value: [self._roster[number] for number in numbers(bits)] for fate, bits in frame.lost().items()}
+        times = {"began_s": round(frame.began_at, 6), "ended_s": round(frame.ended_at, 6)}
+        return {**self._line(frame.queued_at, frame.sender, message, frame.data_bytes), **times, "lost": lost}
 
     def move(self, places: Sequence[Place], now: float) -> None:
         self._channel.move(places, now)

@@ -100,6 +100,7 @@ class StrayDatagram:
 
     source: int
     datagram: bytes
+    sequence: None = None
 
 
 class _Copies:

@@ -37,6 +37,9 @@ class OnDisk:
     def injected(self, record: dict[str, Any]) -> None:
         self._rundir.append_injected(record)
 
+    def transmitted(self, record: dict[str, Any]) -> None:
+        self._rundir.append_channel(record)
+
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         self._rundir.append_tracks(at_s, places)
 
@@ -90,6 +93,9 @@ class Recorder(Protocol):
 
     def injected(self, record: dict[str, Any]) -> None:
         """The rogue node has sent something; see `harness.play.rogue._journal`."""
+
+    def transmitted(self, record: dict[str, Any]) -> None:
+        """Record a message that left the shared channel, or that a radio dropped. Called only while tracing."""
 
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Here are the vehicles now, if any fly."""

@@ -56,7 +56,7 @@ def _show(paths: list[Path]) -> None:
         sound(sentence)
     transmissions = join(captures)
     exchanges, names = Exchanges(transmissions), BlockNames(transmissions, [])
-    list(packets_text.transmission_lines(transmissions, exchanges, TransmissionText(names, str), None))
+    list(packets_text.transmission_lines(transmissions, exchanges, TransmissionText(names, str, {}), None))
     packets_text.header(captures)
     list(packets_text.totals(captures, transmissions))
     list(document(captures, count_losses(transmissions), transmissions, exchanges, names))

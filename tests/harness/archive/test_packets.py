@@ -218,7 +218,8 @@ def test_answered_request_arrived_although_the_capture_lacks_it(tmp_path: Path) 
 def test_outcomes_are_listed_from_answers_to_losses() -> None:
     answers = [RequestOutcome(2, "request lost"), RequestOutcome(3, "no answer"), RequestOutcome(4, "request lost")]
     assert (
-        TransmissionText(BlockNames([], []), str.upper).answers(answers) == "answers: no answer: 3; REQUEST LOST: 2 4"
+        TransmissionText(BlockNames([], []), str.upper, {}).answers(answers)
+        == "answers: no answer: 3; REQUEST LOST: 2 4"
     )
 
 

@@ -1,12 +1,14 @@
 """A channel that all vehicles share, in virtual time."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario
+from tests.harness.command import harness
 
 DISTURBED = [
     {"at_s": 100, "partition": [[1, 2]], "for_s": 50},
@@ -99,3 +101,24 @@ def test_record_has_the_load_and_every_loss() -> None:
 
 def test_run_without_a_channel_has_no_record_of_it() -> None:
     assert simulate(Scenario.model_validate({"name": "Ideal", "duration_s": 60}), 1).played.channel is None
+
+
+CROWD = """
+name: Crowd
+agents: 12
+duration_s: 120
+capture: true
+network: {channel: {preset: wifi_1, processing_s: 0, queue_frames: 1}}
+"""
+
+
+def test_packets_prints_the_reason_of_each_loss(tmp_path: Path) -> None:
+    scenario, run = tmp_path / "crowd.yaml", tmp_path / "run"
+    scenario.write_text(CROWD)
+    assert harness("run", scenario, "--backend", "sim", "--seed", 1, "--out", run).returncode == 0
+    lines = [json.loads(line) for line in (run / "channel.jsonl").read_text().splitlines()]
+    collided = [line for line in lines if line.get("lost", {}).get("collision")]
+    assert collided
+    assert all(line["at_s"] <= line["began_s"] < line["ended_s"] for line in collided)
+    printed = harness("packets", run, "--lost").stdout
+    assert printed.count("(collision: ") + printed.count("half duplex: ") >= len(collided)
