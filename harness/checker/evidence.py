@@ -1,4 +1,8 @@
-"""What the checker looks at: exports, traces where there are any, and what the run's record says of the network."""
+"""The evidence of the checker: exports, traces, the record of the run, and records of network and captures.
+
+Checks read an `Evidence` and nothing else. It caches values that several checks derive from the files. All its parts
+except the exports may be missing.
+"""
 
 import math
 import re
@@ -39,18 +43,19 @@ if TYPE_CHECKING:
 Derived = TypeVar("Derived")
 
 Sending = tuple[tuple[float, Sent], ...]
-"""What an agent sent when with one type and sequence number: one message in each of its lives, at most."""
+"""Mission seconds and messages of one agent with one type and sequence number: at most one in each incarnation."""
 Sendings = dict[Any, dict[Any, Sending]]
-"""Of an agent, by type and sequence number."""
+"""The messages that one agent sent: type -> sequence number -> sendings."""
 
 Watch = Callable[[State, HandlerRun | None], None]
-"""Is given the state of an agent after a handler has run, and that run; None where a life of it begins."""
+"""A function that gets the state of an agent after each handler run, and the run. The run is None at the start of an
+incarnation."""
 
 _HASH = re.compile(f"[0-9a-f]{{{2 * HASH_BYTES}}}")
 
 
 class InjectedDatagram(BaseModel):
-    """A line of `rogue.jsonl`: a message, a datagram that is none, or several that are only counted."""
+    """A line of `rogue.jsonl`: a message, a malformed datagram, or a number of datagrams without details."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -76,22 +81,22 @@ class Condition(BaseModel):
     asked: dict[str, Any] | None = None
     """The conditions that the scenario asks for, as `NetworkConditions.to_json` writes them."""
     counters: Counters | None = None
-    """What the kernel had counted at the end."""
+    """The counters of the kernel at the end."""
 
 
 @dataclass
 class RogueTraffic:
-    """What a rogue node sent, as far as traces can tell it from what agents sent."""
+    """The messages of a rogue node, as far as traces distinguish them from messages of agents."""
 
     messages: set[tuple[Any, Any, Any]] = field(default_factory=set)
     """Sender, sequence number and type."""
     counted: bool = False
-    """There are more, of which only the number is on record."""
+    """True if only the number of some messages is on record."""
     heard_of: set[int] = field(default_factory=set)
-    """Agents of which the scenario has datagrams that they sent elsewhere: what they did there is not on record."""
+    """Agents whose datagrams from another place the scenario delivers. The records of that place are missing."""
 
     def take_down(self, datagrams: Iterable[InjectedDatagram]) -> "RogueTraffic":
-        """Add what the rogue node sent; returns itself."""
+        """Add datagrams of the rogue node. Return this object."""
         for datagram in datagrams:
             self.messages.add((datagram.sender, datagram.sequence, datagram.message))
             self.counted |= datagram.count is not None
@@ -100,7 +105,7 @@ class RogueTraffic:
         return self
 
     def may_be(self, trigger: MessageTrigger) -> bool:
-        """Whether the rogue may have sent the message that triggered a handler."""
+        """Return true if the rogue node may have sent the message that triggered a handler."""
         if not self.messages:
             return False
         return self.counted or (trigger.sender, trigger.sequence, trigger.message) in self.messages
@@ -108,9 +113,10 @@ class RogueTraffic:
 
 @dataclass
 class Evidence:
-    """`record` is the run's `run.json`, None for exports that came without one.
+    """The evidence of one run.
 
-    `before_final_reconcile` are the exports as the mission left them, if a final reconcile followed.
+    `record` is the content of `run.json`. None for exports without a record. `before_final_reconcile` has the exports
+    before the final reconcile, if there was one.
     """
 
     exports: dict[int, Export]
@@ -120,16 +126,16 @@ class Evidence:
     before_final_reconcile: dict[int, Export] = field(default_factory=dict)
     injected: RogueTraffic = field(default_factory=RogueTraffic)
     conditions: list[Condition] | None = None
-    """What was taken down of network and faults as it was made; None if nothing was."""
+    """The lines of `network.jsonl`. None without this file."""
     captures: Captures | None = None
     lag: MeasuredLag | None = None
-    """How late machine and agents were; None if it was not measured."""
+    """The measured lag of machine and agents. None if it was not measured."""
     public_keys: "PublicKeys | None" = None
-    """Of a secured mission, by which blocks are told to be their makers'."""
+    """The keys of a secured mission, which verify the signatures of blocks."""
     verified: "Callable[[Signed], bool] | None" = None
-    """Whether a signature is good, of who knows it better than by verifying it: a swarm played in this process."""
+    """A function that returns true for a valid signature without verifying it, for a swarm played in this process."""
     watch: Watch | None = None
-    """Is shown each step that the step judge follows."""
+    """A function that gets each step of the step judge."""
     scenario: Scenario | None = None
     """The recorded scenario. None without a record, and for a run in memory, whose scenario nothing can alter."""
     link_losses: list[tuple[float, dict[Link, float]]] = field(default_factory=list)
@@ -142,21 +148,21 @@ class Evidence:
 
     @cached_property
     def names(self) -> dict[str, str]:
-        """Block hash -> the block's name for people."""
+        """Block hash -> name of the block, such as 4.11."""
         return name_blocks(self.exports)
 
     def name(self, block_hash: str) -> str:
-        """The block's name for people, such as 4.11, or the beginning of its hash."""
+        """Return the name of the block, such as 4.11, or the first 12 digits of its hash."""
         return self.names.get(block_hash, block_hash[:12])
 
     @cached_property
     def unknown(self) -> dict[int, UnknownNames]:
-        """Words in traces that the harness does not know, of each agent whose trace has any."""
+        """The unknown names in traces, by agent. Agents without unknown names are omitted."""
         words = {agent_id: unknown_names(trace.runs) for agent_id, trace in self.traces.items()}
         return {agent_id: unknown for agent_id, unknown in words.items() if unknown}
 
     def unknown_word(self, *kinds: Kind, agent_id: int | None = None) -> str | None:
-        """The first unknown word of these kinds, in words, in this agent's trace or in any; None if there is none."""
+        """Describe the first unknown name of these kinds in the trace of the agent, or in any trace. Else None."""
         for named, unknown in self.unknown.items():
             if agent_id in (None, named) and (words := first_unknown(unknown, kinds)):
                 return f"{words} in the trace of agent {named}"
@@ -164,7 +170,7 @@ class Evidence:
 
     @cached_property
     def lives(self) -> dict[int, list[Life]]:
-        """Each life of each agent that has a trace, replayed."""
+        """The replayed incarnations of each agent with a trace."""
         inception = next((export.inception.chain_hash for export in self.exports.values()), None)
         if inception is None:
             states = (run.state for trace in self.traces.values() for run in trace.runs)
@@ -173,7 +179,7 @@ class Evidence:
 
     @cached_property
     def sendings(self) -> dict[Any, Sendings]:
-        """What each agent sent, by its trace."""
+        """Agent -> the messages that it sent according to its trace."""
         sendings: dict[Any, Sendings] = {}
         for agent_id, trace in self.traces.items():
             of_agent: Sendings = defaultdict(dict)
@@ -186,7 +192,7 @@ class Evidence:
         return sendings
 
     def once(self, derive: Callable[["Evidence"], Derived]) -> Derived:
-        """Return `derive(self)`, computed at the first call and remembered afterwards."""
+        """Return `derive(self)`. The value is computed at the first call."""
         if derive not in self._derived:
             self._derived[derive] = derive(self)
         derived: Derived = self._derived[derive]
@@ -194,7 +200,7 @@ class Evidence:
 
     @property
     def roster(self) -> list[int] | None:
-        """All agents of the mission, as far as a run's record or a trace tells."""
+        """The IDs of all agents of the mission, from the record or a trace. None without both."""
         if self.record is not None:
             return self.record.roster
         for trace in self.traces.values():
@@ -203,25 +209,25 @@ class Evidence:
 
     @property
     def missing(self) -> list[int]:
-        """Living agents of the mission whose export is not here."""
+        """The agents without an export, except killed agents."""
         return [agent for agent in self.roster or [] if agent not in self.exports and not self.was_killed(agent)]
 
     def was_killed(self, agent_id: int) -> bool:
-        """Whether the scenario killed the agent for good, and with it all that it held."""
+        """Return true if the scenario killed the agent, with all its data, and did not restart it."""
         agent = self.recorded(agent_id)
         return agent is not None and agent.outcome == "killed"
 
     def was_restarted(self, agent_id: int) -> bool:
-        """Whether the scenario killed and restarted the agent: its export knows its last life only."""
+        """Return true if the scenario restarted the agent. Its export then covers only its last incarnation."""
         agent = self.recorded(agent_id)
         return agent is not None and agent.restarts > 0
 
     def recorded(self, agent_id: int) -> AgentRecord | None:
-        """What the run's record says of the agent."""
+        """Return the entry of the agent in the record. None without one."""
         return self.record.agents.get(str(agent_id)) if self.record else None
 
     def was_paused(self, agent_id: int, from_s: float, until_s: float) -> bool:
-        """Whether the scenario had the agent stand still at any time between the two."""
+        """Return true if the scenario paused the agent at any time between these mission seconds."""
         since: float | None = None
         for fault in self.record.faults if self.record else ():
             if agent_id not in (fault.agents or ()):
@@ -236,47 +242,47 @@ class Evidence:
 
     @property
     def paused_at_end(self) -> list[int]:
-        """Agents that stand still at the end of the run."""
+        """The agents that are paused at the end of the run."""
         end_s = self.ended_at_s
         return [agent_id for agent_id in self.exports if end_s is not None and self.was_paused(agent_id, end_s, end_s)]
 
     @cached_property
     def switched_off(self) -> dict[int, float]:
-        """Agents that ended in order before the run did, and when, in mission seconds."""
+        """Agent -> mission second at which it was switched off before the end of the run."""
         return self.record.switched_off if self.record else {}
 
     @property
     def present(self) -> dict[int, Export]:
-        """Exports of whoever was there to the end; of all, if everybody was switched off."""
+        """The exports of agents that were not switched off. If all were switched off, all exports."""
         there = {agent_id: export for agent_id, export in self.exports.items() if agent_id not in self.switched_off}
         return there or self.exports
 
     @property
     def all_there_s(self) -> tuple[float, float]:
-        """From when to when, in mission seconds, those who are `present` had only each other, and all of them."""
+        """The mission seconds between which exactly the `present` agents ran: start and end."""
         off_s = self.switched_off.values()
         if set(self.exports) <= set(self.switched_off):
             return 0.0, min(off_s, default=math.inf)
         return max(off_s, default=0.0), math.inf
 
     def end_of(self, agent_id: int) -> float | None:
-        """When the run ended for this agent; None if it is not on record."""
+        """Return the mission second of the end of this agent. None if it is not on record."""
         return self.record.end_of(agent_id) if self.record else None
 
     @property
     def busy(self) -> list[int]:
-        """Agents that are not idle at the end, and neither stand still nor are switched off."""
+        """The agents that are not idle at the end, without paused and switched-off agents."""
         gone = {*self.paused_at_end, *self.switched_off}
         return [agent_id for agent_id, export in self.exports.items() if not export.idle and agent_id not in gone]
 
     @property
     def ended_at_s(self) -> float | None:
-        """When the run ended, in mission seconds; None if it is not on record."""
+        """The mission second of the end of the run. None if it is not on record."""
         return self.record.mission_s if self.record else None
 
     @property
     def connected_since_s(self) -> float | None:
-        """Mission time since when every agent has heard every other without loss; None if not, or not on record."""
+        """The mission second since which the network is fully connected. None if it is not, or not on record."""
         since: float | None = None
         for state in self.record.network if self.record else ():
             if not state.fully_connected:
@@ -287,7 +293,7 @@ class Evidence:
 
     @property
     def network_at_end(self) -> str | None:
-        """The conditions at the end of the run, in words; None if not on record."""
+        """The network conditions at the end of the run in words. None if they are not on record."""
         return self.record.network[-1].detail if self.record and self.record.network else None
 
     @cached_property
@@ -317,12 +323,12 @@ class Evidence:
         return self.record is not None and self.record.channel is not None
 
     def not_told_completed(self) -> set[int]:
-        """Agents of which nothing tells all that they completed, for their traces have operations that nobody knows."""
+        """Return the agents whose completed blocks are unknown because their traces contain unknown operations."""
         unknown = {agent_id for agent_id, words in self.unknown.items() if "operation" in words}
         return {agent for agent in unknown if agent not in self.exports or self.was_restarted(agent)}
 
     def completed_blocks(self) -> dict[str, int]:
-        """Hash -> agent of every block known to have been completed."""
+        """Return the hash of each completed block on record, with the agent that completed it."""
         return self._completed_blocks
 
     @cached_property
@@ -376,7 +382,7 @@ def check_variant(archive: RunArchive) -> None:
 
 
 def _captures(archive: RunArchive) -> Captures | None:
-    """What the vehicles of a run captured; None if they did not."""
+    """Return the captures of a run. None without captures."""
     if archive.directory is None or not (archive.directory / DIRECTORY).is_dir():
         return None
     try:

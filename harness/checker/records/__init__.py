@@ -50,21 +50,21 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
 
 @dataclass(frozen=True)
 class Examination:
-    """What held each record against the others has come to."""
+    """The result of all comparisons."""
 
     contradictions: list[Contradiction]
     short: dict[int, str]
-    """Agents whose trace is not whole -> how one knows."""
+    """Agent with an incomplete trace -> reason."""
     unsent: dict[int, int]
     """Agent -> number of messages that it could not send, by its own count."""
 
     def touching(self, number: str) -> list[Finding]:
-        """What puts this characteristic in doubt."""
+        """Return the findings that concern this characteristic."""
         return [contradiction.finding for contradiction in self.contradictions if contradiction.touches == number]
 
 
 def cross_examine(evidence: Evidence) -> Examination:
-    """All comparisons, in their order."""
+    """Run all comparisons in their order."""
     contradictions = [contradiction for compare in COMPARISONS for contradiction in compare(evidence)]
     short = {agent_id: trace.problem for agent_id, trace in evidence.traces.items() if trace.problem}
     for contradiction in contradictions:
@@ -78,7 +78,7 @@ def cross_examine(evidence: Evidence) -> Examination:
 
 
 def _untold(evidence: Evidence) -> Iterator[int]:
-    """Agents of a run that was broken off before it had taken down how much they had run."""
+    """Yield the agents of an interrupted run whose number of handler runs is not on record."""
     if evidence.record is None or evidence.record.outcome != "running":
         return
     for agent_id in evidence.traces:
@@ -88,7 +88,7 @@ def _untold(evidence: Evidence) -> Iterator[int]:
 
 
 def check(evidence: Evidence) -> Judgement:
-    """`contradict` at the first contradiction; `not applicable` where a trace is missing or not whole."""
+    """Return `contradict` for any contradiction, `not applicable` if a trace is missing or incomplete, else `agree`."""
     examination = evidence.once(cross_examine)
     findings = [contradiction.finding for contradiction in examination.contradictions]
     if findings:
@@ -116,7 +116,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def not_whole(examination: Examination) -> str:
-    """Whose trace is not whole, and how one knows; there is one at least."""
+    """Describe the incomplete traces. At least one must exist."""
     agent_id, why = next(iter(examination.short.items()))
     others = len(examination.short) - 1
     more = f"; so are the traces of {others} more" if others else ""

@@ -1,6 +1,6 @@
-"""What crossed the air against the traces: captures of every vehicle, and what the kernel counted on the way.
+"""Compare captures and kernel counters with the traces.
 
-A message is in its agent's trace before it is sent, and an agent that was killed in between has not sent it.
+An agent writes a message to its trace before it sends the message. An agent that is killed in between does not send it.
 """
 
 from collections import Counter, defaultdict
@@ -14,14 +14,14 @@ from harness.checker.records.contradiction import Contradiction, of_agent, slack
 from ucp.trigger import MessageTrigger
 
 COUNTS_DATAGRAMS = "nftables"
-"""The engine whose counters are of what was broadcast; others also count what they doubled."""
+"""The engine that counts each broadcast once. Other engines also count duplicates."""
 
 Datagrams = Counter[tuple[object, object]]
-"""How often which sender's sequence number was seen."""
+"""(sender, sequence number) -> number of datagrams."""
 
 
 def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
-    """A whole capture has what its vehicle's trace says was sent and handled, and nothing else of that vehicle."""
+    """A complete capture has the sent and handled messages of the trace, and no further ones of this vehicle."""
     captures = evidence.captures
     if captures is None:
         return
@@ -32,7 +32,7 @@ def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
         if agent_id is None or trace is None or trace.problem or capture.comment is None:
             continue
         if capture.dropped != 0 or capture.problems:
-            continue  # only a whole capture can be held against anything
+            continue  # an incomplete capture proves nothing
         sent: Datagrams = Counter((agent_id, message.seq) for run in trace.runs for message in run.sent)
         unsent = sum((sent - left[agent_id]).values()) - _not_sent(evidence, agent_id)
         if unsent > 0:
@@ -49,7 +49,7 @@ def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams]]:
-    """What left each vehicle and what reached it."""
+    """Return the datagrams that left each vehicle, and those that reached it."""
     left: dict[int, Datagrams] = defaultdict(Counter)
     reached: dict[int, Datagrams] = defaultdict(Counter)
     by_number = {capture.number: capture for capture in captures.used}
@@ -67,7 +67,7 @@ def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams
 
 
 def _not_sent(evidence: Evidence, agent_id: int) -> int:
-    """How many messages of its trace an agent may not have sent: the radio refused them, or it was killed before."""
+    """Return the number of messages in its trace that an agent may not have sent, because of an error or its kill."""
     recorded = evidence.recorded(agent_id)
     lives = evidence.lives[agent_id]
     killed = lives if recorded is None or recorded.outcome != "exported" else lives[:-1]
@@ -76,12 +76,12 @@ def _not_sent(evidence: Evidence, agent_id: int) -> int:
 
 
 def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
-    """As many datagrams were on their way to each vehicle as the others sent, and as many got there as it handled."""
+    """The kernel counted at least the datagrams that other agents sent, and those that the agent handled."""
     record = evidence.record
     if record is None or record.engine != COUNTS_DATAGRAMS or record.mission_s is None:
         return
     if set(record.roster) - set(evidence.traces):
-        return  # nobody knows how much the others sent
+        return  # the messages of these agents are not on record
     sent = {agent_id: _sent_by(evidence, agent_id, record.mission_s) for agent_id in evidence.traces}
     for agent_id, trace in evidence.traces.items():
         counted = record.counters.receivers.get(str(agent_id)) if record.counters else None
@@ -101,7 +101,7 @@ def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _sent_by(evidence: Evidence, agent_id: int, mission_s: float) -> int:
-    """How many messages an agent has sent, at least, when the kernel's counters were read."""
+    """Return the least number of messages that an agent had sent when the kernel's counters were read."""
     trace = evidence.traces[agent_id]
     by = mission_s - slack_s(trace)
     return sum(len(run.sent) for run in trace.runs if run.t < by) - _not_sent(evidence, agent_id)

@@ -1,6 +1,6 @@
-"""What run.json says of the network and of faults against network.jsonl, where each was taken down as it was made.
+"""Compare the network changes and faults in run.json with network.jsonl.
 
-Of what flight changes run.json has only what changed who is connected to whom.
+Of the changes by flight, run.json has only those that change which vehicles are connected.
 """
 
 from collections import Counter
@@ -21,7 +21,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     if record is None or log is None or record.mission_s is None:
         return
     of_all = min(record.roster, default=0)
-    # While fates are scripted nobody counts as connected, whatever the conditions.
+    # While fates are scripted, the network does not count as fully connected.
     fated_until = max((state.at_s for state in record.network if state.what == NO_MORE_FATES), default=0.0)
     network = [state for state in record.network if state.what != NO_MORE_FATES]
     faults = [fault for fault in record.faults if fault.agents]

@@ -21,7 +21,7 @@ ROUNDED_S = 5e-4
 
 
 def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
-    """What an agent counted is what its trace has, as far as it had been written by then."""
+    """Yield each count of an agent that differs from its trace at that time."""
     for agent_id, trace in evidence.traces.items():
         recorded = evidence.recorded(agent_id)
         if recorded is None or trace.problem:
@@ -65,7 +65,7 @@ def _lives(agent_id: int, recorded: AgentRecord, lives: list[Life]) -> Iterator[
 
 
 def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Life]) -> Iterator[Contradiction]:
-    """As many as it counted have a line, of those that ran until it was asked."""
+    """The trace has a line for each handler run that the agent had counted."""
     expected = 1 + recorded.restarts + recorded.reboots
     if len(recorded.handler_runs) not in (0, expected):
         counts = _count(len(recorded.handler_runs), "count")
@@ -73,7 +73,7 @@ def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: lis
             agent_id, f"run.json has {counts} of its handler runs, but it started {_count(expected, 'time')}"
         )
     if len(recorded.handler_runs) != len(lives):
-        return  # of agents that count none, and where lives are lacking anyway
+        return  # the agent counts none, or incarnations are missing
     for life, counted in zip(lives, recorded.handler_runs, strict=True):
         if counted is None:
             continue
@@ -88,7 +88,7 @@ def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: lis
 
 
 def _lines_by(life: Life, counted: HandlerRuns) -> tuple[int, int]:
-    """How many lines there are, at least and at most, of what had run when the agent was asked."""
+    """Return the least and the greatest number of lines that the trace had when the agent reported its count."""
     if in_virtual_time(life.trace):
         return len(life.runs), len(life.runs)
     slack = ROUNDED_S + (slack_s(life.trace) if counted.from_s < counted.until_s else 0.0)
@@ -101,7 +101,7 @@ def _lines_by(life: Life, counted: HandlerRuns) -> tuple[int, int]:
 def _counted(
     evidence: Evidence, agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Life]
 ) -> Iterator[Contradiction]:
-    """What it counted itself over all its lives."""
+    """Compare the sums over all incarnations of the agent."""
     sent = sum(life.sent for life in lives)
     if recorded.messages_sent is not None and recorded.messages_sent != sent:
         detail = (
@@ -138,7 +138,7 @@ def _counted(
 
 
 def _bytes_sent(trace: Trace) -> int | None:
-    """In datagrams as they were on the air; revocations, which an agent tells of beside the protocol, are not known."""
+    """Return the bytes of all sent datagrams. None if the agent sent revocations, which the trace lacks."""
     if any(isinstance(aside, Commanded) and aside.command == "revoke" for _, aside in trace.asides):
         return None
     added = ADDED_BYTES if trace.header.secured else {}
@@ -147,14 +147,14 @@ def _bytes_sent(trace: Trace) -> int | None:
 
 
 def _bytes(datagram: Recorded) -> int:
-    """Of base64 four characters are three bytes."""
+    """Return the size of a datagram. In base64, four characters are three bytes."""
     if isinstance(datagram.content, Datagram):
         return datagram_bytes(datagram.content.message)
     return len(datagram.text) // 4 * 3 - datagram.text.count("=", -2)
 
 
 def _dropped(agent_id: int, recorded: AgentRecord, trace: Trace) -> Iterator[Contradiction]:
-    """What it counted as dropped has a line; it may have dropped more since it was asked."""
+    """The trace has a line for each counted drop. The agent may have dropped further datagrams since its report."""
     if recorded.dropped is None or not trace.header.has_inputs:
         return
     traced = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, Dropped))
@@ -179,7 +179,7 @@ def _count(number: int, what: str) -> str:
 
 
 def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
-    """What an agent completed is the same, in the same order, wherever it is told."""
+    """Trace, export and run.json have the same completed blocks, in the same order."""
     for agent_id, lives in evidence.lives.items():
         if evidence.traces[agent_id].problem or any(life.unknown for life in lives):
             continue
@@ -208,7 +208,7 @@ def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _over_brown_outs(evidence: Evidence, agent_id: int, lives: list[Life]) -> Iterator[Contradiction]:
-    """What it had completed is found on its disk; it may have been killed over a line that its trace lacks."""
+    """A reboot restores all completed blocks from the disk. The trace may lack the last line before the kill."""
     for before, after in pairwise(lives):
         if not after.runs or not isinstance(after.runs[0].trigger, BootTrigger):
             continue
@@ -220,7 +220,7 @@ def _over_brown_outs(evidence: Evidence, agent_id: int, lives: list[Life]) -> It
 
 
 def _out_of_order(exported: list[str], traced: list[str]) -> bool:
-    """Whether the blocks that both name, as a life goes on, are not in the same order, or not once each."""
+    """Return true if the common blocks have different order in the two lists, or occur twice."""
     both = {*exported} & {*traced}
     return [block for block in exported if block in both] != [block for block in traced if block in both]
 

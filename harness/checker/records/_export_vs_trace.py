@@ -1,7 +1,7 @@
 """Compare a trace with itself, and an export with the trace that must have led to it.
 
-An export says when that was. What a trace has until then ends in a state, whose top chain hash stands for all blocks of
-the chain and their order.
+An export contains its time. The trace until this time ends in a state. The top chain hash of this state covers all
+blocks of the chain and their order.
 """
 
 from bisect import bisect_left, bisect_right
@@ -27,7 +27,7 @@ FIELDS = {
 
 
 def compare_export(evidence: Evidence) -> Iterator[Contradiction]:
-    """An export is a state to which its trace has led, in all that it holds and in its order."""
+    """Yield each export that differs from the state at the end of its trace, in its blocks or their order."""
     for agent_id, export in evidence.exports.items():
         trace = evidence.traces.get(agent_id)
         if trace is None or trace.problem:
@@ -69,7 +69,7 @@ def _state(export: Export) -> StateSummary:
 
 
 def _states_when(export: Export, trace: Trace) -> list[StateSummary]:
-    """The states that the agent may have been in when it was exported: more than one if runs fall into that instant."""
+    """Return the possible states of the agent at its export: several if handlers ran at the same instant."""
     at_s = mission_s(export.exported_at_us, trace.header)
     if at_s is None:
         return []
@@ -82,7 +82,7 @@ def _states_when(export: Export, trace: Trace) -> list[StateSummary]:
 
 
 def _completed_when(export: Export, lives: list[Life]) -> list[list[str]]:
-    """What each life of the agent had completed when it was exported."""
+    """Return the blocks that each incarnation of the agent had completed at the export."""
     at_s = mission_s(export.exported_at_us, lives[0].trace.header)
     if at_s is None:
         return [export.completed]
@@ -115,7 +115,7 @@ def _value(value: object) -> str:
 
 
 def _contents(agent_id: int, export: Export, life: Life) -> Iterator[Contradiction]:
-    """The blocks of an export that the whole trace has led to, as far as its lengths and its top tell."""
+    """Compare the blocks of an export with those of the trace, whose lengths and top chain hash agree."""
     if life.otherwise or life.another_top or life.impossible or life.unknown:
         return
     for place, exported, traced, touches in (
@@ -132,7 +132,7 @@ def _contents(agent_id: int, export: Export, life: Life) -> Iterator[Contradicti
 
 
 def compare_with_itself(evidence: Evidence) -> Iterator[Contradiction]:
-    """What does not fit in each life of an agent, and from one life to the next."""
+    """Yield contradictions within each incarnation of an agent, and between incarnations."""
     for agent_id, lives in evidence.lives.items():
         for life in lives:
             yield from _in_life(evidence, agent_id, life)
@@ -153,7 +153,7 @@ def _in_life(evidence: Evidence, agent_id: int, life: Life) -> Iterator[Contradi
 
 
 def finding(evidence: Evidence, agent_id: int, sight: Sight) -> Finding:
-    """The sight as evidence, with the block's name for people."""
+    """Return the observation as evidence, with the name of the block."""
     block = sight.block_hash
     return Finding(agent_id, f"{sight.where}: {sight.what}", evidence.name(block) if block else None, block)
 

@@ -1,6 +1,6 @@
 """Compare the headers of all traces, and the number of each handler's Algorithm with its name.
 
-Timers differ between agents as far as the scenario staggers them: they are compared less what an agent's place adds.
+The scenario may stagger timers. The comparison therefore subtracts the stagger of each agent from its timers.
 """
 
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ MAX_VALUE = 40
 
 
 def compare_headers(evidence: Evidence) -> Iterator[Contradiction]:
-    """All name one mission: its roster, settings, clock and inception block."""
+    """All headers have the same roster, settings, clock and inception block."""
     first: dict[str, tuple[object, str]] = {}
     if evidence.record is not None:
         first["roster"] = sorted(evidence.record.roster), "run.json"
@@ -37,7 +37,7 @@ def compare_headers(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _in_common(evidence: Evidence, agent_id: int) -> dict[str, object]:
-    """The agent's settings, less what it was told for itself."""
+    """Return the settings of the agent without its stagger."""
     settings: dict[str, Any] = {**evidence.traces[agent_id].header.settings}
     record = evidence.record
     if record is None or not record.stagger or agent_id not in record.roster:
@@ -58,7 +58,7 @@ ALGORITHM = {name: handler.algorithm for name, handler in HANDLERS.items()}
 
 
 def compare_algorithms(evidence: Evidence) -> Iterator[Contradiction]:
-    """A handler that is known has its number. What it did is judged by its name."""
+    """Each known handler has the number of its Algorithm. The step judge uses only the name."""
     for agent_id, trace in evidence.traces.items():
         said = dict.fromkeys((run.handler, run.algorithm) for run in trace.runs)
         for handler, number in said:

@@ -19,7 +19,7 @@ CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """What was heard of a message is what its sender sent, and after it was sent."""
+    """Yield each handled message that differs from the sent one, was handled too early, or was handled again."""
     slack = max(map(slack_s, evidence.traces.values()), default=0.0)
     sendings = evidence.sendings
     once = not _may_duplicate(evidence)
@@ -32,7 +32,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                     continue
                 sent = sendings.get(trigger.sender, {}).get(trigger.message, {}).get(trigger.sequence)
                 if sent is None:
-                    continue  # what nobody sent is characteristic 1's to say
+                    continue  # characteristic 1 reports messages that no agent sent
                 if once:
                     key = trigger.sender, trigger.message, trigger.sequence
                     handled[key] += 1
@@ -58,7 +58,7 @@ def _may_duplicate(evidence: Evidence) -> bool:
 def _unlike(
     line: int, run: HandlerRun, trigger: MessageTrigger, sent: Sending, earliest_s: float
 ) -> Iterator[tuple[Sight, str]]:
-    """What was heard otherwise than it was sent, and the characteristic that it touches."""
+    """Yield each difference between the handled and the sent message, and the characteristic that it concerns."""
     if run.t < earliest_s:
         yield Sight(line, run, f"handled {_named(trigger)} before it was sent at {sent[0][0]:g} s"), "1"
     if run.input is not None and not _as_it_went(run.input, sent):
@@ -80,7 +80,7 @@ def _as_it_went(datagram: Recorded, sent: Sending) -> bool:
 
 
 def _another_block(run: HandlerRun, trigger: MessageTrigger, sent: Sending) -> str | None:
-    """The block that the agent took onto its chain from a message that did not carry it."""
+    """Return the block that the agent added to its chain although the message did not carry it. None without one."""
     if trigger.message not in CARRY_A_BLOCK:
         return None
     carried = {message.block for _, message in sent}

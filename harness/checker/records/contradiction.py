@@ -10,9 +10,10 @@ from ucp.clock import MICROSECONDS
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """`touches` is the number of the characteristic that is in doubt by it; None if none is.
+    """A contradiction between two records.
 
-    `short`: the agent's trace is not whole by it, so whoever looks at the trace has not seen all.
+    `touches` is the number of the characteristic that depends on these records, or None. `short` is true if the trace
+    of the agent lacks lines.
     """
 
     finding: Finding
@@ -21,21 +22,21 @@ class Contradiction:
 
 
 def of_agent(agent_id: int, detail: str, touches: str | None = None, *, short: bool = False) -> Contradiction:
-    """One that is about no block."""
+    """Return a contradiction that concerns no block."""
     return Contradiction(Finding(agent_id, detail), touches, short)
 
 
 ROUNDED_S = 2e-6
-"""Traces have microseconds."""
+"""Rounding error in seconds of the times in traces, which have microseconds."""
 
 
 def in_virtual_time(trace: Trace) -> bool:
-    """Where mission second 0 is the Unix epoch."""
+    """Return true if mission second 0 is the Unix epoch, as in virtual time."""
     return trace.header.clock.get("epoch_us") == 0
 
 
 def slack_s(trace: Trace) -> float:
-    """Two processes on one machine do not start their clocks in the same instant; virtual time has one clock."""
+    """Return the tolerance, in mission seconds, for the clocks of two processes. Virtual time has one clock."""
     speedup = trace.header.clock.get("speedup")
     if in_virtual_time(trace) or not isinstance(speedup, int | float):
         return ROUNDED_S
@@ -43,7 +44,7 @@ def slack_s(trace: Trace) -> float:
 
 
 def mission_s(timestamp_us: int, header: Header) -> float | None:
-    """When the agent's clock showed this; None if its header does not tell."""
+    """Return the mission second at which the agent's clock showed this time. None if the header lacks the clock."""
     clock = header.clock
     told = [clock.get("epoch_us"), clock.get("offset_s", 0), clock.get("drift", 0)]
     epoch_us, offset_s, drift = (float(part) if isinstance(part, int | float) else None for part in told)
