@@ -126,7 +126,7 @@ def test_the_first_process_loads_little() -> None:
     assert not set(words.split()) & {"asyncio", "ssl", "logging", "pydantic", "scapy", "harness", "ucp"}
 
 
-def test_a_program_gets_exactly_the_environment_folder_and_files_it_was_given(tmp_path: Path) -> None:
+def test_program_gets_exactly_the_given_environment_folder_and_files(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         script = "pwd; env | sort; ls /proc/self/fd | tr '\\n' ' '; cat; echo wrong >&2"
         said = await output(lab, tmp_path, 1, "/bin/sh", "-c", script)

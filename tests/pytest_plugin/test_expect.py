@@ -10,7 +10,7 @@ from harness.scenario.expect import NUMBERS, Expect, FigureName
 from tests.harness.virtual import scenario
 
 
-def test_the_figures_and_characteristics_that_can_be_expected_are_those_that_there_are() -> None:
+def test_expect_accepts_all_figures_and_characteristics() -> None:
     simulated = simulate(scenario(agents=2, duration_s=60, final_reconcile=True), 1)
     assert list(get_args(FigureName)) == list(simulated.result.figures)
     assert NUMBERS.keys() == CHECKS.keys()
@@ -46,7 +46,7 @@ def test_a_scenario_says_what_it_expects_in_json_as_in_yaml() -> None:
     assert type(one).model_validate_json(one.model_dump_json()) == one
 
 
-def test_what_is_judged_beside_the_characteristics_can_be_expected_too() -> None:
+def test_expect_accepts_steps_records_and_liveness() -> None:
     expect = Expect.model_validate({"steps": "deviates", "liveness": "not finished"})
     assert expect.as_expected("steps", "deviates")
     assert not expect.as_expected("steps", "as specified")
@@ -82,7 +82,7 @@ def test_chains_are_compared_with_what_they_should_be(wanted: dict[str, Any], se
     assert list(Expect.model_validate(wanted).other_common(CHAINS)) == sentences
 
 
-def test_who_deviates_where_can_be_expected() -> None:
+def test_expect_accepts_deviating_agents_with_their_handlers() -> None:
     expect = Expect.model_validate({"deviations": {32: "reconcile_phase_3"}})
     assert expect.as_expected("steps", "deviates") and not expect.as_expected("steps", "as specified")
     assert list(expect.other_deviations([(32, "reconcile_phase_3"), (32, "reconcile_phase_2")])) == []

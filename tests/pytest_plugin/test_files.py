@@ -27,7 +27,7 @@ def test_a_file_is_a_test_for_each_backend_and_seed(pytester: pytest.Pytester) -
     assert collected(pytester, "loss.yaml", "--ucp-backend", "sim", "--ucp-seed", 3) == ["loss.yaml::sim-seed3"]
 
 
-def test_a_file_is_a_test_if_it_is_named_or_lies_in_a_testpath_and_expects_something(
+def test_selected_file_with_expectations_is_a_test(
     pytester: pytest.Pytester,
 ) -> None:
     for folder in ("a", "b"):
@@ -53,7 +53,7 @@ def test_a_run_as_expected_passes_and_leaves_nothing(pytester: pytest.Pytester) 
     assert not run_directories(pytester)
 
 
-def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester) -> None:
+def test_violation_is_reported_with_evidence_and_report_path(pytester: pytest.Pytester) -> None:
     scenario = yaml.safe_load((SCENARIOS / "forced_tie.yaml").read_text())
     scenario |= {"quirks": {"crash_on_tie": True}, "expect": {}}
     write_scenario(pytester, "tie.yaml", **scenario)
@@ -98,7 +98,7 @@ def test_a_violation_is_told_with_evidence_and_report(pytester: pytest.Pytester)
         ),
     ],
 )
-def test_a_mistake_is_one_sentence_at_collection(
+def test_mistake_in_a_file_is_one_sentence_at_collection(
     pytester: pytest.Pytester, expect: dict[str, object], sentence: str
 ) -> None:
     write_scenario(pytester, "s.yaml", expect=expect)
@@ -124,7 +124,7 @@ FOREIGN = {
 }
 
 
-def test_other_yaml_files_in_the_tree_are_left_alone(pytester: pytest.Pytester) -> None:
+def test_other_yaml_files_are_not_collected(pytester: pytest.Pytester) -> None:
     pytester.makeini("[pytest]\ntestpaths = .")
     for name, text in FOREIGN.items():
         (pytester.path / name).write_text(text, encoding="latin-1")

@@ -69,7 +69,7 @@ def test_without_user_mode_linux_processes_are_skipped_with_the_reason(
     )
 
 
-def test_containers_are_made_of_this_machine_s_files(pytester: pytest.Pytester) -> None:
+def test_containers_are_made_of_this_machines_files(pytester: pytest.Pytester) -> None:
     write_scenario(pytester, "s.yaml", expect={})
     pytester.makepyfile("def test_swarm(swarm): swarm.run_for(9)")
     run(pytester, "--ucp-image-from-host", "--ucp-keep", "kept", ".", "s.yaml").assert_outcomes(passed=2)
@@ -78,7 +78,7 @@ def test_containers_are_made_of_this_machine_s_files(pytester: pytest.Pytester) 
 
 
 @pytest.mark.docker
-def test_a_story_is_told_to_containers_of_this_machine_s_files(pytester: pytest.Pytester) -> None:
+def test_containers_of_this_machines_files_follow_a_story(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
     import pytest
 
