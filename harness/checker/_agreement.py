@@ -1,11 +1,12 @@
-"""What characteristics 5 and 6 share: whether agents that differ have had their chance to agree.
+"""Decide for characteristics 5 and 6 whether agents with different chains had the chance to agree.
 
-Two idle agents with different chains stay different, since only a vote or another's phase 2 query starts a reconcile.
-So a difference is a violation only where full connectivity is on record, and since then a completed reconcile of the
-differing agent that began after the others' chains had stopped changing. Else the characteristics do not apply.
+Two idle agents with different chains stay different, because only a vote or a query of another agent's phase 2 starts a
+reconcile. A difference is therefore a violation only if the network was fully connected, and the differing agent then
+completed a reconcile that began after the last change of any other chain. Otherwise the characteristics do not apply.
 
-The system is whoever was there to the end: an agent that was switched off before tells nobody what it holds, and learns
-nothing. Where everybody was switched off it is all of them, and a chance only one that nobody missed.
+The system consists of the agents that ran until the end. An agent that was switched off earlier neither sends nor
+receives blocks. If all agents were switched off, the system consists of all of them, and a reconcile is a chance only
+while all of them ran.
 """
 
 import math
@@ -18,7 +19,7 @@ from harness.checker.recurring_cycles import cycle_of
 
 
 def never(name: str, evidence: Evidence) -> Judgement | None:
-    """Violated, where everybody is there and hears everybody, and yet some are shown never to finish; else None.
+    """Return `violated` if all agents are present and connected, but some never finish. Otherwise return None.
 
     `harness.checker._liveness` has the evidence.
     """
@@ -28,12 +29,12 @@ def never(name: str, evidence: Evidence) -> Judgement | None:
     return Judgement(name, "violated", f"the system is fully connected, but {recurring_cycles.in_short(cycle)}")
 
 
-REASONS_TOLD = 3
-"""Of more agents nobody reads why they had no chance."""
+MAX_REASONS = 3
+"""Maximum number of agents in a reason."""
 
 
 def why_unknown(evidence: Evidence) -> str | None:
-    """Why equal or unequal exports say nothing about the whole system; None if all of it is there and idle."""
+    """Return the reason why the exports do not show the whole system in an idle state. None if they show it."""
     if not evidence.exports:
         return "the run has no chain exports"
     if evidence.missing:
@@ -51,7 +52,7 @@ def _idle(ids: list[int]) -> str:
 
 
 def why_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
-    """Why none of the differing agents has had the chance to agree; None if at least one has."""
+    """Return the reason why no differing agent had the chance to agree. None if at least one had it."""
     if evidence.record is None:
         return "exports do not show whether the system was fully connected"
     since = evidence.connected_since_s
@@ -70,15 +71,15 @@ def why_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
         return f"it is unknown whether there was a chance to reconcile: {unknown}"
     if not had_a_chance(evidence, differing):
         without = sorted(differing)
-        more = len(without) - REASONS_TOLD
-        told = [_why_none(evidence, since, agent_id) for agent_id in without[:REASONS_TOLD]]
+        more = len(without) - MAX_REASONS
+        told = [_why_none(evidence, since, agent_id) for agent_id in without[:MAX_REASONS]]
         without_chance = f"{more} more {'agents' if more > 1 else 'agent'} had no chance"
         return "; ".join([*told, *([without_chance] if more > 0 else [])])
     return None
 
 
 def _why_none(evidence: Evidence, since: float, agent_id: int) -> str:
-    """Why this agent, whose trace is there, has had no chance."""
+    """Return the reason why this agent, which has a trace, had no chance."""
     changed = {peer: trace.chain_changed_at() for peer, trace in evidence.traces.items() if peer != agent_id}
     peer = max(changed, key=lambda peer: changed[peer], default=agent_id)
     when = "the system became fully connected"
@@ -90,22 +91,22 @@ def _why_none(evidence: Evidence, since: float, agent_id: int) -> str:
     within = f"that began after {since:g} s, when {when}"
     if there_s[1] < math.inf:
         within += f", and ended before {there_s[1]:g} s, when the first agent was switched off"
-    if _somebody_stood_still(evidence, since, math.inf):
+    if _any_was_paused(evidence, since, math.inf):
         within += ", and during which all agents were running"
     sentence = f"agent {agent_id} completed no reconcile {within}, "
     return sentence + (f"and its vote at {proposed[-1]:g} s led to none" if proposed else "and proposed no block since")
 
 
 def without(evidence: Evidence) -> str:
-    """Of whom the exports that agree are not, for the end of a sentence."""
+    """Return the switched-off agents, whose exports do not count, for the end of a sentence."""
     away = set(evidence.exports) - set(evidence.present)
     return f"; without {agents(away)}, which {'was' if len(away) == 1 else 'were'} switched off" if away else ""
 
 
 def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
-    """Those of `differing` that completed a reconcile since full connectivity and the others' last change.
+    """Return the agents of `differing` that completed a reconcile after full connectivity and the others' last change.
 
-    One during which nobody was missing or stood still whose export is judged, and nobody else was there.
+    During this reconcile all judged agents ran, none was paused, and no other agent was present.
     """
     since = evidence.connected_since_s
     if since is None:
@@ -125,12 +126,12 @@ def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
                     and run.t <= until_s
                     and run.handler == "reconcile_finalize"
                     and not run.state.reconciling
-                    and not _somebody_stood_still(evidence, began_s, run.t)
+                    and not _any_was_paused(evidence, began_s, run.t)
                 ):
                     had.add(agent_id)
     return had
 
 
-def _somebody_stood_still(evidence: Evidence, from_s: float, until_s: float) -> bool:
-    """Whether one of those who are judged neither heard nor answered for a while: who asks then asks not all."""
+def _any_was_paused(evidence: Evidence, from_s: float, until_s: float) -> bool:
+    """Return true if a judged agent was paused, because a query then does not reach all agents."""
     return any(evidence.was_paused(agent_id, from_s, until_s) for agent_id in evidence.present)

@@ -8,7 +8,7 @@ NAME = "all committed everywhere"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """By the exports at the end. Blocks that only killed or switched off agents held are left out (Section 3.3).
+    """Judge the exports. Blocks that only killed or switched off agents held are left out (Section 3.3).
 
     `not applicable` where an export is missing, an agent was not idle, or those that lack a block had no chance.
     """

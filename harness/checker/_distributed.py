@@ -31,7 +31,7 @@ _LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
 
 
 def check(evidence: Evidence) -> Judgement:
-    """By the traces, every line of them; `not applicable` where one is missing, damaged or incomplete."""
+    """Judge every line of all traces. The result is `not applicable` if a trace is missing, damaged or incomplete."""
     if not evidence.traces:
         return Judgement(
             NAME, "not applicable", "the run has no traces, and exports do not show the triggers of handlers"
@@ -48,7 +48,7 @@ def check(evidence: Evidence) -> Judgement:
             for line, run in life:
                 ran.add(run.handler)
                 if _is_plainly_right(run, ran, sent):
-                    continue  # most runs are like this, and patterns take long
+                    continue  # a fast path for most runs
                 sender = run.trigger.sender if isinstance(run.trigger, MessageTrigger) else None
                 if sender is not None and sender not in sent:
                     untraced.add(sender)
@@ -80,7 +80,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _is_plainly_right(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings]) -> bool:
-    """Whether its own timer, an event, a handler that ran, or a message that its sender sent triggered the run."""
+    """Return true if the trigger is its own timer, an event, an earlier handler, or a message that its sender sent."""
     trigger, handler = run.trigger, run.handler
     if isinstance(trigger, MessageTrigger):
         name = trigger.message
@@ -93,7 +93,7 @@ def _is_plainly_right(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings])
 
 
 def _is_in_known_words(run: HandlerRun) -> bool:
-    """Whether handler and trigger are named as CONTRACT.md names them, as far as they are named at all."""
+    """Return true if the agent contract defines the names of handler and trigger."""
     if run.handler not in HANDLERS:
         return False
     match run.trigger:
@@ -109,7 +109,7 @@ def _is_in_known_words(run: HandlerRun) -> bool:
 
 
 def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) -> str | None:
-    """What is wrong with the run's trigger, completing "the handler ..."; None if nothing is."""
+    """Return the error of the trigger, to complete "the handler ...". None if the trigger is valid."""
     match run.trigger:
         case MessageTrigger(name, sender, sequence):
             if _OF_MESSAGE.get(name) != run.handler:

@@ -1,4 +1,4 @@
-"""Figures beyond the verdicts: how far the chains agree, and what it cost."""
+"""Compute the figures of a run: the agreement of the chains, and its cost."""
 
 from collections import Counter
 
@@ -8,7 +8,7 @@ from harness.checker.uniform_chain import common_prefix
 
 
 def figures(evidence: Evidence) -> dict[str, float | int | None]:
-    """Counts of blocks and messages; None where nothing tells. `copies` are of each completed block, per agent.
+    """Return the figures by name. None means not known. `copies` are of each completed block, per agent.
 
     `uniform_at_s` is when the chains became what they all are in the end, in mission seconds; None if they differ.
     """

@@ -1,4 +1,4 @@
-"""Characteristic 4: every block was made by the agent of the mission that it names, and is as it was made."""
+"""Characteristic 4: the agent that a block names completed this block, and the block is unchanged."""
 
 import base64
 from dataclasses import dataclass, field, replace
@@ -21,18 +21,18 @@ NAME = "genuine"
 _Content = tuple[int, int, str, str]
 """Agent, timestamp, event data and block hash of a block, as exported."""
 _Link = tuple[str, str, str | None]
-"""Of a block in a chain: the chain hash below it, its block hash, and its chain hash."""
+"""The chain hash below a block, its block hash, and its chain hash."""
 
 
 @dataclass
 class _Recomputed:
-    """Hashes that are right: of what many agents hold they are worked out once."""
+    """Verified hashes. A block that many agents hold is hashed once."""
 
     blocks: set[_Content] = field(default_factory=set)
     links: set[_Link] = field(default_factory=set)
 
     def is_block(self, block: ExportedBlock) -> bool:
-        """Whether it hashes to its block hash."""
+        """Return true if the block has its block hash."""
         content = block.agent_id, block.timestamp_us, block.event_data, block.block_hash
         if content not in self.blocks:
             if Block(block.agent_id, block.timestamp_us, block.event_bytes).block_hash.hex() != block.block_hash:
@@ -41,7 +41,7 @@ class _Recomputed:
         return True
 
     def is_link(self, link: _Link) -> bool:
-        """Whether the chain hash is that of the two others (eq. 3.2)."""
+        """Return true if the chain hash follows from the other two hashes (eq. 3.2)."""
         if link not in self.links:
             below, block_hash, chain_hash = link
             if next_chain_hash(bytes.fromhex(below), bytes.fromhex(block_hash)).hex() != chain_hash:
@@ -51,7 +51,7 @@ class _Recomputed:
 
 
 class _Signatures:
-    """Signatures of blocks, each of which is checked once."""
+    """Signatures of blocks. Each is verified once."""
 
     def __init__(self, keys: "PublicKeys", verified: "Callable[[Signed], bool] | None") -> None:
         from ucp.secure.crypto_suite import verify
@@ -61,7 +61,7 @@ class _Signatures:
         self._checked: dict[tuple[_Content, str | None], str | None] = {}
 
     def what_is_wrong(self, block: ExportedBlock) -> str | None:
-        """The end of a sentence on the block; None if its maker signed it."""
+        """Return the end of a sentence about a block without a valid signature, else None."""
         claim = (block.agent_id, block.timestamp_us, block.event_data, block.block_hash), block.signature
         if claim not in self._checked:
             self._checked[claim] = self._look(block)
@@ -82,12 +82,12 @@ class _Signatures:
 
 
 def check(evidence: Evidence) -> Judgement:
-    """By the exports, whose hashes are computed anew, and by what every agent says to have completed.
+    """Recompute the hashes of all exports, and compare their blocks with the blocks that each agent completed.
 
-    In a secured mission signatures decide, so that a maker need not have come home. A block that is signed and that its
-    maker is known not to have completed is not genuine all the same: others have its key.
+    In a secured mission signatures decide, so that the records of the agent that made a block may be missing. A signed
+    block that this agent did not complete is not genuine either, because an attacker has its key.
 
-    `not applicable` where there is no export, or nothing tells what a maker of blocks completed.
+    The result is `not applicable` without an export, or if the blocks that an agent completed are unknown.
     """
     findings: list[Finding] = []
     roster = evidence.roster
@@ -144,7 +144,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _since(trace: Trace | None, block_hash: str) -> str:
-    """When and by what the block came to the agent, as far as its trace tells: the end of a sentence."""
+    """Return the time and the handler of the block's arrival, for the end of a sentence."""
     came = ("chain+", block_hash)
     for run in trace.runs if trace else ():
         if came in map(tuple, run.changes):

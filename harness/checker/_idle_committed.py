@@ -7,7 +7,7 @@ NAME = "idle implies committed"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """By the exports at the end, and by the traces after every step.
+    """Judge the exports, and the traced state after each handler run.
 
     `not applicable` where an agent was not idle at the end, or left no export.
     """

@@ -1,4 +1,4 @@
-"""Liveness: once no more events come the swarm becomes idle, having committed what it completed.
+"""Liveness: after the last event the swarm becomes idle, and has committed all completed blocks.
 
 One that does not either never will, which has to be shown, or needs more time than it had: how much more is said where
 blocks are still being committed, and so tell how fast.
@@ -14,7 +14,7 @@ NAME = "liveness"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """`never finishes` if that is shown, `not finished` if the swarm was not idle; times are in mission seconds."""
+    """Return `never finishes` if the records show it, `not finished` if the swarm was not idle, else `finished`."""
     unknown = _why_unknown(evidence)
     if unknown:
         return Judgement(NAME, "not applicable", unknown)
@@ -67,7 +67,7 @@ def _not_finished(evidence: Evidence) -> str:
 
 
 def _needed(evidence: Evidence) -> str:
-    """How long it would still have taken, as far as anything tells: agents commit as fast as since the last block."""
+    """Estimate the remaining time from the rate of commits since the last completed block."""
     waiting = sum(len(export.blocks_to_be_committed) for export in evidence.exports.values())
     blocks = f"{waiting} block{'s' if waiting != 1 else ''} waited for their commit"
     if not waiting:

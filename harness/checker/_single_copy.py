@@ -9,7 +9,7 @@ NAME = "single copy"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """By the exports at the end, and by the traces after every step; `not applicable` where an export is missing."""
+    """Judge the exports and the traced states. The result is `not applicable` if an export is missing."""
     findings: list[Finding] = []
     for agent_id, export in evidence.exports.items():
         copies = Counter(block.block_hash for block in export.blocks())

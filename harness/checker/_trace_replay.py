@@ -21,7 +21,7 @@ COMPLETES = "build_data_block"
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What was seen at a line of a trace, lines counting from 1, and of which block."""
+    """An observation at a line of a trace. Lines count from 1."""
 
     line: int
     run: HandlerRun
@@ -30,13 +30,13 @@ class Sight:
 
     @property
     def where(self) -> str:
-        """Such as "trace line 7, t=12.5 s, receive_commit_block"."""
+        """The place in words, such as "trace line 7, t=12.5 s, receive_commit_block"."""
         return f"trace line {self.line}, t={self.run.t:g} s, {self.run.handler}"
 
 
 @dataclass(slots=True)
 class Life:
-    """One life of an agent: what it held at its end, and what was seen on the way.
+    """One incarnation of an agent: the blocks that it held at its end, and observations on the way.
 
     `chain` is oldest first, `deque` front first, `stack` top last; all are block hashes.
     """
@@ -51,28 +51,28 @@ class Life:
     completed: list[str] = field(default_factory=list)
     sent: int = 0
     unknown: bool = False
-    """Some changes are operations that nobody knows: what it holds is not known from the first of them on."""
+    """True if the trace has unknown operations. From the first on, the held blocks are unknown."""
     impossible: list[Sight] = field(default_factory=list)
-    """Changes that nobody can make."""
+    """Impossible changes, such as the removal of a block that is not there."""
     second_copies: list[Sight] = field(default_factory=list)
     idle_too_early: list[Sight] = field(default_factory=list)
-    """Idle, with blocks of its own that are not in its chain, or anything in the deque or on the stack."""
+    """Idle states with own blocks outside of the chain, or with blocks in the deque or on the stack."""
     otherwise: list[Sight] = field(default_factory=list)
-    """The first state that is not what the changes lead to: of lengths."""
+    """The first state whose lengths contradict the changes."""
     another_top: list[Sight] = field(default_factory=list)
-    """The first top chain hash that is not that of the blocks of the chain (eq. 3.2)."""
+    """The first top chain hash that differs from that of the chain (eq. 3.2)."""
     flags: list[Sight] = field(default_factory=list)
-    """Flags that cannot be."""
+    """Impossible flags."""
     back_in_time: list[Sight] = field(default_factory=list)
     out_of_sequence: list[Sight] = field(default_factory=list)
 
     def numbered(self) -> Iterator[tuple[int, HandlerRun]]:
-        """Its runs with their lines."""
+        """Return the runs with their lines."""
         return next(islice(self.trace.incarnations(), self.number, None))
 
 
 def replay(trace: Trace, inception: str | None) -> list[Life]:
-    """Each life of the agent. `inception` is the mission's chain hash CH_0; None if nobody knows it."""
+    """Return each incarnation of the agent. `inception` is the chain hash CH_0 of the mission, or None if unknown."""
     bounds = [0, *trace.starts, len(trace.runs)]
     return [
         _replayed(Life(trace, number, trace.runs[start:end]), inception)
@@ -119,14 +119,14 @@ def _replayed(life: Life, inception: str | None) -> Life:
 
 
 class _Holds:
-    """What an agent holds, step by step."""
+    """The blocks of an agent, step by step."""
 
     def __init__(self, life: Life, inception: str | None) -> None:
         self._life = life
         self._copies: dict[str, int] = {}
         self._places = {"chain": life.chain, "deque": life.deque, "stack": life.stack}
         self._chain_hashes = [bytes.fromhex(inception)] if inception is not None else None
-        """Of the chain, the inception block's first; None if they are not known."""
+        """Chain hashes of the chain, from the inception block on. None if they are not known."""
         self._completed: set[str] = set()
         self._not_in_chain: dict[str, None] = {}
         self.anything_aside = False

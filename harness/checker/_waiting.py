@@ -1,4 +1,4 @@
-"""Part of characteristic 1: nothing waits for anybody. A vote ends with its timer, as does each step of a reconcile.
+"""Part of characteristic 1: no agent waits for another. A vote and each step of a reconcile end with a timer.
 
 An agent that waits longer than its own timers say, waits for what will never happen.
 """
@@ -14,7 +14,7 @@ from harness.checker.judgement import Finding
 from ucp.trace import HandlerRun
 
 SLACK_WALL_S = 1.0
-"""How late a loaded machine may run a timer before it counts as not run, in wall seconds."""
+"""Seconds of wall time by which a busy machine may delay a timer."""
 
 RECONCILE_STEPS = frozenset(
     (
@@ -30,7 +30,7 @@ RECONCILE_STEPS = frozenset(
     )
 )
 NO_STEP = frozenset(("already in progress", "not in phase 3", "another block"))
-"""Branches of these handlers with which a reconcile does not go on."""
+"""Branches of these handlers in which a reconcile does not continue."""
 
 
 def _goes_on(run: HandlerRun) -> bool:
@@ -46,13 +46,13 @@ ALL_TIMERS = (*VOTE_TIMERS, *RECONCILE_TIMERS)
 
 @dataclass(slots=True)
 class _Wait:
-    """What must go on within `longest` mission seconds, and since when, from which trace line on, it has not."""
+    """A vote or reconcile that must continue within `longest` mission seconds, and the place of its last step."""
 
     what: str
     longest: float
     line: int = 0
     since: float = math.inf
-    """Infinity while nothing waits."""
+    """Infinity without a vote or reconcile."""
 
     def finding(self, agent_id: int) -> Finding:
         where = f"trace line {self.line}, t={self.since:g} s"
@@ -60,7 +60,7 @@ class _Wait:
 
 
 def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
-    """Every wait that lasted longer than the agent's own timers, while it was not paused."""
+    """Yield each wait that lasted longer than the timers of an agent that was not paused."""
     for agent_id, trace in evidence.traces.items():
         if evidence.unknown_word("handler", "branch", agent_id=agent_id):
             continue  # what goes on, and what waits, is told by these
@@ -100,7 +100,7 @@ def _overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Wait) -> It
 
 
 def longest(trace: Trace, timers: tuple[str, ...]) -> float:
-    """The longest of these timers in mission seconds, with slack for the machine; infinity if that is not known."""
+    """Return the longest of these timers in mission seconds, plus slack. Infinity if it is not known."""
     settings: list[Any] = [trace.header.settings.get(timer) for timer in timers]
     if not all(isinstance(setting, int | float) for setting in settings):
         return math.inf

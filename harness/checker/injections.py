@@ -1,12 +1,12 @@
-"""What the agents did with what the rogue node sent: its journal beside their traces.
+"""Count how the agents handled the messages of the rogue node, from its journal and the traces.
 
-A forged message has a sequence number that no agent uses, so every run of a handler that it triggered is the rogue's. A
-copy looks as its original does: of the runs that agent and message have in common, the last are the copies', as many as
-were sent before them.
+A forged message has a sequence number that no agent uses, so each handler run with this number belongs to the rogue
+node. A copy is equal to its original. Of the handler runs of one agent for this message, the last ones therefore count
+for the copies, at most as many as were sent before.
 
-A secured agent handles a datagram once, and none that was altered. So nobody handled what was corrupted, whatever the
-traces have of its original; a copy that is sent at once is not told from it; and one that is sent later was handled by
-whom the original had not reached.
+A secured agent handles a datagram once, and no altered datagram. Corrupted messages therefore count as not handled. A
+copy that is sent at once is not distinguished from the original. A later copy was handled by the agents that the
+original had not reached.
 """
 
 from collections import Counter, defaultdict
@@ -27,14 +27,14 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 SKEW_S = 0.05
-"""Mission seconds by which clocks of two processes may differ."""
+"""Greatest difference between the clocks of two processes, in mission seconds."""
 BRANCHES_NAMED = 6
 
 Count = Annotated[int, Field(ge=0, le=10**9)]
 
 
 class _Line(BaseModel):
-    """A datagram, or several that are only counted."""
+    """A line of `rogue.jsonl`: a datagram, or a number of datagrams without details."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -50,7 +50,7 @@ class _Line(BaseModel):
 
 
 _Key = tuple[Any, Any, Any]
-"""Sender, sequence number, type: what a trace tells of a message."""
+"""Sender, sequence number and type of a message, as in a trace."""
 
 
 @dataclass
@@ -62,11 +62,11 @@ class _Tally:
     handled: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     changed: Counter[str] = field(default_factory=Counter)
     reached: dict[str, set[tuple[_Key, int]]] = field(default_factory=lambda: defaultdict(set))
-    """The messages that some agent has handled."""
+    """The messages that at least one agent handled."""
 
 
 def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
-    """Of each injection of the scenario, in order; what no trace tells is not known."""
+    """Return the effect of each injection of the scenario, in order."""
     injections = injections_of(scenario)
     if not injections:
         return []
@@ -93,7 +93,7 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
 
 
 def in_words(injection: RogueInjection) -> str:
-    """One line for people."""
+    """Return the effect of an injection in one line."""
     branches = sum((Counter(of.handled) for of in injection.messages), Counter()).most_common()
     done = [f"{branch} {count}" for branch, count in branches[:BRANCHES_NAMED]]
     if len(branches) > BRANCHES_NAMED:
@@ -107,7 +107,7 @@ def in_words(injection: RogueInjection) -> str:
 
 
 def done_with(messages: InjectedMessages) -> str:
-    """What the agents did: "held already 4, committed 1"."""
+    """Return the branches of the handler runs, such as "held already 4, committed 1"."""
     done = [f"{branch} {count}" for branch, count in messages.handled.items()]
     return (
         ", ".join([*done, *([f"{messages.unhandled} handled by no agent"] if messages.unhandled else [])]) or "unknown"
@@ -131,7 +131,7 @@ def _take_down(line: _Line, tally: _Tally, copies: dict[_Key, list[tuple[float, 
 
 
 def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[HandlerRun]]:
-    """The handler runs that these messages triggered, or forged ones."""
+    """Return the handler runs that these messages or forged messages triggered, by message."""
     triggered: dict[_Key, list[HandlerRun]] = defaultdict(list)
     for run in trace.runs:
         trigger = run.trigger
@@ -145,7 +145,7 @@ def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[H
 def _paired(
     copies: Sequence[tuple[float, int]] | None, key: _Key, runs: list[HandlerRun]
 ) -> Iterator[tuple[int, int, HandlerRun]]:
-    """(number of the injection, which of the copies, run) of the runs that copies triggered, the last with the last."""
+    """Yield (number of the injection, index of the copy, run). The last run belongs to the last copy."""
     forged = injection_of(key[1])
     if copies is None and forged is not None:
         yield from ((forged, 0, run) for run in runs)
@@ -157,7 +157,7 @@ def _paired(
 
 
 def _told(at_s: float, what: str, detail: str, tally: _Tally, named_otherwise: bool) -> RogueInjection:
-    """With `named_otherwise` there are agents that handled messages of which nobody knows which they were."""
+    """Return the effect of an injection. With `named_otherwise`, traces contain unknown names of messages."""
     messages = [
         InjectedMessages(
             message=message,

@@ -1,4 +1,4 @@
-"""What reached an agent, out of its record: what is there of it, decoded."""
+"""Decode the recorded inputs of an agent: datagrams, events, sealed data and stores."""
 
 import base64
 from collections.abc import Iterable, Iterator
@@ -12,17 +12,17 @@ from ucp.store import StoredState
 from ucp.trace import Recorded
 
 KEPT = 4096
-"""A datagram reaches many agents: so many are kept decoded."""
+"""Number of decoded datagrams in the cache. One datagram reaches many agents."""
 
 LENGTH_BYTES = 2
 
 
 class NotOnRecordError(Exception):
-    """What would be needed to go on is not in the records: one sentence."""
+    """A required value is not in the records. The message is one sentence."""
 
 
 def decoded(record: Recorded | None) -> Datagram:
-    """What a datagram says. Raises MalformedDatagramError."""
+    """Return the decoded datagram. Raises MalformedDatagramError."""
     if record is None:
         return _decoded("")
     content = record.content
@@ -39,7 +39,7 @@ def _decoded(text: str) -> Datagram:
 
 
 def event_of(record: Recorded | None) -> LoggableEvent:
-    """An event as a block has it. Raises MalformedEventsError."""
+    """Return the decoded event. Raises MalformedEventsError."""
     if record is not None and isinstance(record.content, LoggableEvent):
         return record.content
     try:
@@ -53,7 +53,7 @@ def event_of(record: Recorded | None) -> LoggableEvent:
 
 
 def sealed_of(record: Recorded | None) -> bytes | None:
-    """What an agent sealed; None if it tells of nothing that it can be."""
+    """Return the sealed data of an agent. None if the record has none, or is not base64."""
     try:
         return None if record is None else base64.b64decode(record.text, validate=True)
     except ValueError:
@@ -61,7 +61,7 @@ def sealed_of(record: Recorded | None) -> bytes | None:
 
 
 def stored_blocks(record: Recorded | None) -> Iterator[Block]:
-    """The blocks of a store, each after its length. Raises ValueError."""
+    """Yield the blocks of a store. Each follows its length. Raises ValueError."""
     if record is not None and isinstance(record.content, StoredState):
         yield from record.content.blocks()
         return
@@ -78,23 +78,23 @@ def stored_blocks(record: Recorded | None) -> Iterator[Block]:
 
 
 class Blocks:
-    """Blocks by hash, wherever on record: in an export, or in a message that an agent received or sent."""
+    """All blocks on record by hash, from exports and from messages that agents received or sent."""
 
     def __init__(self, exported: Iterable[ExportedBlock]) -> None:
         self._exported = {block.block_hash: block for block in exported}
         self._blocks: dict[str, Block] = {}
 
     def add(self, block: Block) -> None:
-        """A block that was seen whole."""
+        """Add a complete block."""
         self._blocks[block.block_hash.hex()] = block
 
     def add_from(self, message: Message) -> None:
-        """The block that a message carries, if it carries one."""
+        """Add the block in a message, if it contains one."""
         if isinstance(message, CommitBlock | BlockResponse):
             self.add(message.block)
 
     def get(self, block_hash: str) -> Block:
-        """Raises NotOnRecordError."""
+        """Return the block with this hash. Raises NotOnRecordError."""
         block = self._blocks.get(block_hash)
         if block is None and (exported := self._exported.get(block_hash)) is not None:
             block = Block(exported.agent_id, exported.timestamp_us, exported.event_bytes)

@@ -1,8 +1,8 @@
-"""What agents that never finish go round in: as virtual time has shown it, or as it shows in their traces.
+"""Find the cycle in which agents never finish, from a proof in virtual time or from the traces.
 
-A trace shows a cycle where it ends in the same handler runs several times in a row, each time with the same chain and
-as many blocks aside; and a standstill where an agent that is not idle has run nothing for longer than its timers take.
-Agents that only have a lot left to do are in neither: their chains change.
+A trace shows a cycle if it ends in the same sequence of handler runs several times in a row, each time with the same
+chain and the same numbers of blocks in deque and stack. It shows a standstill if an agent is not idle, and ran no
+handler for longer than its longest timer. The chains of agents that still have work change, so they show neither.
 """
 
 from collections import defaultdict
@@ -18,32 +18,32 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 SEVERAL = 5
-"""So often in a row is no coincidence."""
+"""Number of repetitions in a row that count as a cycle."""
 LAST_RUNS = 20_000
-"""In so many handler runs of an agent, its last, a cycle is looked for."""
+"""Number of last handler runs of an agent that are searched for a cycle."""
 COUNTED = {
     "receive_phase_1_response": ("yes", "no"),
     "receive_response_next_in_sequence": ("new candidate", "counted"),
 }
 """Handler of an answer in a reconcile -> the branches in which the answer counts."""
 ALREADY = "already in progress"
-"""Branch of Algorithm 7 in an agent that reconciles as it is."""
+"""Branch of Algorithm 7 in an agent that already reconciles."""
 REFUSED = ("receive_vote_add_block", "no")
 ASKS = ("reconcile_phase_1", "reconcile_phase_2")
 MAX_NAMED = 10
 PERIOD_TOLERANCE_S = 0.01
 SHORTEST_PAUSE_S = 0.05
-"""What follows sooner follows at once, for people."""
+"""A shorter pause between two handler runs is not mentioned."""
 
 
 def cycle_of(evidence: Evidence) -> Cycle | None:
-    """What agents go round in, some of which are not idle at the end; None if that is not shown."""
+    """Return the cycle of agents that are not idle at the end. None if the records show no cycle."""
     busy = evidence.busy
     if not busy:
         return None
     recorded = evidence.record.cycle if evidence.record else None
     if recorded is not None and not recorded.proven:
-        recorded = None  # that was found in the traces, where it must be found again
+        recorded = None  # it came from the traces, which are searched again
     if recorded is not None and recorded.period_s is None:
         return recorded.model_copy(update={"since_s": _last_ran_s(evidence, recorded)})
     traced = _in_traces(evidence, busy, times=2 if recorded else SEVERAL)
@@ -57,7 +57,7 @@ def cycle_of(evidence: Evidence) -> Cycle | None:
 
 
 def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
-    """When the last of the agents that hang ran anything of its own."""
+    """Return the mission second of the last handler run of the hanging agents, without received messages."""
     traces = [evidence.traces.get(agent_id) for agent_id in standstill.agents]
     ran_at = [runs[-1].t for trace in traces if trace is not None and (runs := _own_runs(trace))]
     return max(ran_at) if len(ran_at) == len(traces) else standstill.since_s
@@ -65,7 +65,7 @@ def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Round:
-    """One agent's part: its runs, once round, since when it goes round, and how often it has."""
+    """The part of one agent in a cycle: the runs of one period, its start, length and number of repetitions."""
 
     runs: list[HandlerRun]
     since_s: float
@@ -119,14 +119,14 @@ def _in_traces(evidence: Evidence, busy: Sequence[int], times: int) -> Cycle | N
 
 
 def _own_runs(trace: Trace) -> list[HandlerRun]:
-    """The last runs with which the agent went on or that changed something, in its last life."""
+    """Return the last runs of the last incarnation that changed data, or that no message triggered."""
     start = max(trace.starts[-1] if trace.starts else 0, len(trace.runs) - LAST_RUNS)
     runs = (run for run in trace.runs[start:] if run.changes or not isinstance(run.trigger, MessageTrigger))
     return [run for run in runs if run.branch != ALREADY]
 
 
 def _round(runs: Sequence[HandlerRun], times: int) -> _Round | None:
-    """The shortest round in which `runs` end so many times in a row."""
+    """Return the shortest period in which `runs` end at least `times` times in a row. None without one."""
     keys = [_key(run) for run in reversed(runs)]
     for length, matching in enumerate(_matches(keys)):
         if length and length + matching >= times * length:
@@ -143,7 +143,7 @@ def _key(run: HandlerRun) -> tuple[object, ...]:
 
 
 def _matches(keys: Sequence[object]) -> list[int]:
-    """For each place how many keys from there on are those from the first on (the Z-function)."""
+    """Return the Z-function: for each place, the length of the common prefix of the keys from there and all keys."""
     matching = [0] * len(keys)
     left = right = 0
     for place in range(1, len(keys)):
@@ -157,7 +157,7 @@ def _matches(keys: Sequence[object]) -> list[int]:
 
 
 def _waits(evidence: Evidence, rounds: dict[int, _Round], period_s: float) -> Iterator[CycleWait]:
-    """Whom each agent asks in its reconciles without ever counting an answer, and who refuses it, in the last round."""
+    """Yield for each agent the peers whose answers never count in the last period, and those that refuse its blocks."""
     for agent_id, each in rounds.items():
         heard, refused_by = set[int](), set[int]()
         for run in reversed(evidence.traces[agent_id].runs):
@@ -179,14 +179,14 @@ def _waits(evidence: Evidence, rounds: dict[int, _Round], period_s: float) -> It
 
 
 def in_short(cycle: Cycle) -> str:
-    """Who never finishes, and since when."""
+    """Return the agents that never finish, and the start of the cycle."""
     many = len(cycle.agents) > 1
     goes = "repeated the same cycle" if cycle.period_s is not None else "hung"
     return f"{named(cycle.agents)} {'have' if many else 'has'} {goes} since {cycle.since_s:.0f} s"
 
 
 def in_words(cycle: Cycle) -> str:
-    """Who goes round since when, what shows it, and who waits for whom."""
+    """Return the agents of the cycle, its start, the evidence for it, and the waiting agents."""
     if cycle.period_s is None:
         return f"{in_short(cycle)}: not idle, and no running timer can change this"
     every = f"every {cycle.period_s:.4g} s"
@@ -218,7 +218,7 @@ def _each_other(peers: Mapping[int, tuple[int, ...]]) -> bool:
 
 
 def _alike(peers: Mapping[int, tuple[int, ...]]) -> Iterator[tuple[tuple[int, ...], list[int]]]:
-    """Peers, and the agents that all have these."""
+    """Yield each tuple of peers with all agents that have it."""
     alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
     for agent_id, whom in peers.items():
         alike[whom].append(agent_id)
@@ -226,12 +226,12 @@ def _alike(peers: Mapping[int, tuple[int, ...]]) -> Iterator[tuple[tuple[int, ..
 
 
 def named(ids: Collection[int]) -> str:
-    """Which agents, or how many if that would be a long list."""
+    """Return the agents, or only their number if the list is long."""
     return agents(tuple(ids)) if len(ids) <= MAX_NAMED else f"{len(ids)} agents"
 
 
 def findings(cycle: Cycle) -> list[Finding]:
-    """What agents run in one round; of those that run the same the first stands for all."""
+    """Return the handler runs of one period for each agent. Agents with the same runs share a finding."""
     alike: dict[str, list[int]] = defaultdict(list)
     for agent_id in cycle.agents:
         alike[_round_in_words(cycle, agent_id)].append(agent_id)
@@ -242,7 +242,7 @@ def findings(cycle: Cycle) -> list[Finding]:
 
 
 def _round_in_words(cycle: Cycle, agent_id: int) -> str:
-    """From what follows the longest pause on, so that those that do the same one after another are told alike."""
+    """Return the runs of one period, starting after the longest pause, so that shifted cycles have the same text."""
     steps = [step for step in cycle.steps if step.agent_id == agent_id]
     if not steps or cycle.period_s is None:
         return f"not idle, and inactive since {cycle.since_s:.0f} s"

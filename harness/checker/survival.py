@@ -1,8 +1,7 @@
-"""Does the data survive the loss of vehicles? The question with which the thesis begins (Chapter 1, Section 3.3).
+"""Decide which blocks survive the loss of vehicles (thesis, Chapter 1 and Section 3.3).
 
-A block survives where anybody holds it, in the chain, waiting to be committed, or on the reconcile stack: whoever comes
-home with it brings it home. What was where when vehicles were lost, the traces tell; what is where at the end, the
-exports do.
+A block survives if any remaining vehicle holds it, in the chain, in the deque or on the reconcile stack. Traces show the
+blocks of each vehicle at the time of a loss, and the exports show them at the end.
 """
 
 import math
@@ -19,7 +18,7 @@ LOSSES_TOLD = 5
 
 
 def survival(evidence: Evidence) -> Survival:
-    """What became of the completed blocks with each loss of vehicles, and what the next loss could take."""
+    """Return the blocks that each loss of vehicles affected, and the smallest further loss that would lose a block."""
     at_end = _holders(evidence.exports)
     completed = None if evidence.not_told_completed() else evidence.completed_blocks()
     lost = [fault for fault in (evidence.record.faults if evidence.record else ()) if fault.loses_data]
@@ -33,7 +32,7 @@ def survival(evidence: Evidence) -> Survival:
 
 
 def _holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
-    """Block hash -> who holds the block, wherever."""
+    """Return the vehicles that hold each block in any place, by block hash."""
     holders: dict[str, list[int]] = {}
     for agent_id, export in sorted(exports.items()):
         for block_hash in dict.fromkeys(block.block_hash for block in export.blocks()):
@@ -42,7 +41,7 @@ def _holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def _least_held(evidence: Evidence, exports: Mapping[int, Export]) -> LeastHeld | None:
-    """The block that the fewest vehicles hold, the oldest of several; None if there is no block."""
+    """Return the block with the fewest holders, the oldest if there are several. None without a block."""
     holders = _holders(exports)
     if not holders:
         return None
@@ -109,7 +108,7 @@ def _losses(evidence: Evidence, lost: list[FaultRecord], at_end: Mapping[str, li
 
 
 def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) -> list[set[str]]:
-    """The blocks that an agent held at each of the instants, the moment before it was lost itself."""
+    """Return the blocks that an agent held directly before each instant, none after its own loss."""
     waiting, blocks_held = deque(instants), []
     held, at_s = HeldBlocks(), -math.inf
 
@@ -131,7 +130,7 @@ def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) 
 
 
 def in_words(survived: Survival) -> list[str]:
-    """A sentence for each of the first losses, one for the end, and one for what the next loss could take."""
+    """Return a sentence for each of the first losses, for the end, and for the smallest further loss."""
     sentences = [_loss_in_words(loss) for loss in survived.losses[:LOSSES_TOLD]]
     if len(survived.losses) > LOSSES_TOLD:
         sentences.append(f"{len(survived.losses) - LOSSES_TOLD} more losses of vehicles are in run.json")

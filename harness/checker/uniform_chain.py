@@ -10,7 +10,7 @@ NAME = "one uniform chain"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """By the exports at the end.
+    """Judge the exports.
 
     `not applicable` where an export is missing, an agent was not idle, or those that differ had no chance.
     """
@@ -46,7 +46,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def common_prefix(chains: list[tuple[str, ...]]) -> int:
-    """Length of the mutual chain: how many blocks from the inception block on are the same in all."""
+    """Return the length of the mutual chain: the number of blocks that all chains have in common from the start."""
     length = 0
     for level in zip(*chains, strict=False):
         if len(set(level)) > 1:

@@ -1,4 +1,4 @@
-"""What the first line of a trace says of the agent's mission, checked."""
+"""Check the header of a trace, and derive the mission of the agent from it."""
 
 import base64
 import math
@@ -13,15 +13,15 @@ from ucp.core import Seal
 from ucp.settings import Settings
 
 EARLY_WALL_S = 0.001
-"""How early a timer may end, in wall seconds: an agent reads its clock more than once."""
+"""Seconds of wall time by which a timer may end early, because an agent reads its clock more than once."""
 ROUNDING_S = 2e-3
-"""A trace may have its times to the millisecond."""
+"""Rounding error of times in a trace, which may have milliseconds."""
 
 _SETTINGS = {setting.name for setting in fields(Settings)}
 
 
 class ImpossibleHeaderError(Exception):
-    """No agent can have these settings, or this clock: a sentence."""
+    """Settings or a clock that no agent can have. The message is one sentence."""
 
 
 class UnknownSettingError(ImpossibleHeaderError):
@@ -30,7 +30,7 @@ class UnknownSettingError(ImpossibleHeaderError):
 
 @dataclass(frozen=True)
 class CheckedHeader:
-    """`early_s` and `late_s` are how far from its end a timer may be handled, in mission seconds."""
+    """The mission of a trace. A timer may be handled `early_s` before to `late_s` after its end, in mission seconds."""
 
     agent_id: int
     roster: frozenset[int]
@@ -42,10 +42,10 @@ class CheckedHeader:
     late_s: float
     secured: bool = False
     seal: Seal | None = field(default=None, repr=False, compare=False)
-    """How the agent sealed its event data, as far as that is on record, if it did."""
+    """A function that seals event data as the agent did, as far as it is on record. None without sealing."""
 
     def local(self, mission_s: float) -> float:
-        """What the agent's clock shows at `mission_s`."""
+        """Return the timestamp that the agent's clock shows at this mission second."""
         return self.offset_s + self.rate * mission_s
 
 
