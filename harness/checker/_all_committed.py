@@ -54,9 +54,9 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _gone_and_left(evidence: Evidence) -> tuple[int, list[str]]:
-    """How many completed blocks nobody has who is there, and the others, which anybody can have.
+    """Return the number of completed blocks that no present agent holds, and the hashes of the other ones.
 
-    Some were lost with killed agents (Section 3.3), and some are at home with one that was switched off.
+    The former were lost with killed agents (Section 3.3), or an agent that was switched off has them.
     """
     completed = evidence.completed_blocks()
     exports = evidence.present.values()

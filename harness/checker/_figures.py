@@ -67,9 +67,9 @@ def _of_all_agents(evidence: Evidence, counter: str) -> int | None:
 
 
 def uniform_at_s(evidence: Evidence) -> float | None:
-    """When the chains became what they all are in the end, in mission seconds; None if they differ, or nothing tells.
+    """Return the mission second since which all chains are equal: that of the last change of any chain.
 
-    That is when the last of them changed last.
+    None if the chains differ at the end, or if their changes are not on record.
     """
     if len({export.chain_of_block_hashes for export in evidence.exports.values()}) != 1:
         return None

@@ -1,7 +1,7 @@
 """Liveness: after the last event the swarm becomes idle, and has committed all completed blocks.
 
-One that does not either never will, which has to be shown, or needs more time than it had: how much more is said where
-blocks are still being committed, and so tell how fast.
+A swarm that is not idle at the end may never finish, which the records must show, or may only need more time. If agents
+still commit blocks, the rate of these commits gives an estimate of the remaining time.
 """
 
 from harness.checker import recurring_cycles

@@ -1,7 +1,7 @@
 """Decide which blocks survive the loss of vehicles (thesis, Chapter 1 and Section 3.3).
 
-A block survives if any remaining vehicle holds it, in the chain, in the deque or on the reconcile stack. Traces show the
-blocks of each vehicle at the time of a loss, and the exports show them at the end.
+A block survives if any remaining vehicle holds it, in the chain, in the deque or on the reconcile stack. Traces show
+the blocks of each vehicle at the time of a loss. Exports show them at the end.
 """
 
 import math
