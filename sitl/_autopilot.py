@@ -1,12 +1,12 @@
-"""The embedded vehicle's autopilot: modes, arming, flight and missions; no socket, no clock, no parser.
+"""The autopilot of the embedded vehicle: modes, arming, flight and missions. It has no socket, clock or parser.
 
-`Autopilot` is the vehicle. Who talks to it does so through a `Channel` (serial_channel.py), and what it says about
-itself at intervals is in streams.py. Times are simulated seconds since boot.
+`Autopilot` is the vehicle. A client talks to it through a `Channel` (serial_channel.py). The messages that it sends at
+intervals are in streams.py. Times are simulated seconds since boot.
 
-It answers as ArduPilot does where a client can tell the difference: arming is refused until the position is known, a
-mode set in the first seconds after boot is acknowledged and then undone, a copter begins a mission when it is told to,
-a plane and a rover as soon as they are armed in AUTO. What moves it is a course of closed formulas, and whatever begins
-where something ends begins at that very second, however coarse the steps of `advance`.
+The autopilot answers like ArduPilot wherever a client can see a difference. It refuses to arm until its position is
+known. It acknowledges a mode that is set in the first seconds after boot, and then undoes it. A copter begins a mission
+on command, a plane and a rover as soon as they are armed in AUTO mode. A course of closed formulas moves the vehicle. A
+new movement begins at the exact second at which the previous one ends, whatever the step size of `advance` is.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ ACCEPTED, FAILED = int(mavlink.MAV_RESULT_ACCEPTED), int(mavlink.MAV_RESULT_FAIL
 
 
 class Listener(Protocol):
-    """One who hears what the vehicle says unasked."""
+    """A receiver of the messages that the vehicle sends without a request."""
 
     def send(self, message: Any) -> None: ...
 
 
 class Autopilot:
-    """One vehicle. `epoch_us` is the time of its boot, microseconds since the Unix epoch."""
+    """One vehicle. `epoch_us` is the time of its boot in microseconds since the Unix epoch."""
 
     takes_missions = True
 
@@ -59,13 +59,13 @@ class Autopilot:
         self.used_mah = 0.0
         self.take_off_altitude_m = TKOFF_ALT_M
         self.listeners: list[Listener] = []
-        self.mission: Sequence[Any] = ()  # MISSION_ITEM_INTs; the first is home, as ArduPilot has it
+        self.mission: Sequence[Any] = ()  # MISSION_ITEM_INTs; the first is home, as in ArduPilot
         self.current_item = 0
         self.failsafes = Failsafes(vehicle_type)
         self._speed_ms = self._model.cruise_ms
         self._in_mission = False
         self._then: Callable[[], None] = self._stand
-        self._goal: tuple[Point, float] | None = None  # in GUIDED: where it was sent, and how fast
+        self._goal: tuple[Point, float] | None = None  # in GUIDED: target and speed
         self._course = Course(0.0, [Rest(Motion(yaw_rad=math.radians(home.heading_deg)))])
 
     @property
@@ -78,12 +78,12 @@ class Autopilot:
 
     @property
     def ready(self) -> bool:
-        """It knows where it is, and can be armed."""
+        """True if the position is known, so that the vehicle can be armed."""
         return self.has_booted and self.failsafes.has_gps
 
     @property
     def battery_used(self) -> float:
-        """0 to 1."""
+        """The used share of the battery, 0 to 1."""
         return self.used_mah / BATTERY_FULL_MAH
 
     @property
@@ -95,7 +95,7 @@ class Autopilot:
         return self._course.at(self.now_s)
 
     def advance(self, now_s: float) -> None:
-        """Let the time until `now_s` pass."""
+        """Advance the time to `now_s`."""
         before_s, until_s = self.now_s, max(self.now_s, now_s)
         current_a = CURRENT_ARMED_A if self.armed else CURRENT_IDLE_A
         self.used_mah = min(BATTERY_FULL_MAH, self.used_mah + current_a * (until_s - before_s) / 3.6)
@@ -113,14 +113,14 @@ class Autopilot:
             self._lose_thrust()
 
     def say(self, severity: int, text: str) -> None:
-        """Tell every client: a STATUSTEXT."""
+        """Send a STATUSTEXT to all clients."""
         self._tell(mavlink.MAVLink_statustext_message(severity, text.encode()))
 
     def _tell(self, message: Any) -> None:
         for listener in self.listeners:
             listener.send(message)
 
-    # Commands: each answers with a MAV_RESULT, and says why when it refuses
+    # Commands: each returns a MAV_RESULT, and sends the reason of a refusal
 
     def arm(self) -> int:
         if self.armed:
@@ -138,7 +138,10 @@ class Autopilot:
         return ACCEPTED
 
     def disarm(self, force: bool = False) -> int:
-        """With `force` (MAV_CMD_COMPONENT_ARM_DISARM, param2 21196) in flight, too: then it falls."""
+        """Disarm.
+
+        `force` (MAV_CMD_COMPONENT_ARM_DISARM, param2 21196) also works in flight, and the vehicle then falls.
+        """
         if self.airborne and self.armed and not force:
             return self._refuse("Disarm refused: in flight")
         if self.armed:
@@ -151,7 +154,7 @@ class Autopilot:
         return ACCEPTED
 
     def take_off(self, altitude_m: float) -> int:
-        """MAV_CMD_NAV_TAKEOFF of a copter."""
+        """Execute MAV_CMD_NAV_TAKEOFF of a copter."""
         if self.vehicle_type != "copter":
             return self._refuse(f"Take-off refused: a {self.vehicle_type} does not take off in GUIDED")
         if not self.armed:
@@ -182,7 +185,7 @@ class Autopilot:
         return ACCEPTED
 
     def start_mission(self) -> int:
-        """MAV_CMD_MISSION_START."""
+        """Execute MAV_CMD_MISSION_START."""
         if not self.armed or len(self.mission) < 2:
             return self._refuse("Mission start refused: not armed, or no mission")
         if self.mode != "AUTO":
@@ -192,25 +195,25 @@ class Autopilot:
         return ACCEPTED
 
     def set_speed(self, speed_ms: float) -> int:
-        """MAV_CMD_DO_CHANGE_SPEED: from the next place on."""
+        """Execute MAV_CMD_DO_CHANGE_SPEED. The speed applies from the next place on."""
         if not 0 < speed_ms <= MAX_SPEED_MS:
             return FAILED
         self._speed_ms = speed_ms
         return ACCEPTED
 
     def go_to(self, place: Point) -> int:
-        """In GUIDED: go there and stay."""
+        """Go to a place and stay there, in GUIDED mode."""
         if self.mode != "GUIDED" or not self.armed or not (self.airborne or self.vehicle_type == "rover"):
             return FAILED
         if not all(map(math.isfinite, place)) or abs(place.up_m) > MAX_ALTITUDE_M:
             return FAILED
-        if (goal := (place, self._speed_ms)) != self._goal:  # else it is on its way, however often it is told
+        if (goal := (place, self._speed_ms)) != self._goal:  # a repeated command changes nothing
             self._begin(self._model.loiter(self.motion, place, self._speed_ms, math.inf), self._stand)
             self._goal = goal
         return ACCEPTED
 
     def load(self, mission: Sequence[Any]) -> None:
-        """Replace the mission; one that is being flown goes on with the items that have the same numbers."""
+        """Replace the mission. A mission in progress continues with the items of the same numbers."""
         self.mission = mission
         if not self._in_mission:
             self.current_item = 0
@@ -219,10 +222,10 @@ class Autopilot:
         self.say(mavlink.MAV_SEVERITY_CRITICAL, text)
         return FAILED
 
-    # What befalls it
+    # Faults and failsafes
 
     def simulate(self, name: str, value: float) -> None:
-        """Have a parameter of the simulation be so from now on; wind is felt on the way to a place."""
+        """Set a parameter of the simulation. A change of wind takes effect during a leg, too."""
         self.failsafes.parameters[name] = value
         if name in (WIND, WIND_FROM) and self._in_mission and self.current_item < len(self.mission):
             item = self.mission[self.current_item]
@@ -230,7 +233,7 @@ class Autopilot:
                 self._go_on_to(self.place(item.frame, item.x, item.y, item.z), self.current_item)
 
     def _save(self, failsafe: Failsafe) -> None:
-        """Do what ArduPilot does by itself: a copter without a position lands, a rover holds."""
+        """Act as ArduPilot does by itself: without a position a copter lands, and a rover holds."""
         can_land = self.vehicle_type == "copter"
         if failsafe == "ekf":
             self.say(mavlink.MAV_SEVERITY_CRITICAL, "EKF variance")
@@ -252,19 +255,19 @@ class Autopilot:
             self.set_mode(MODES[self.vehicle_type][mode])
 
     def _lose_thrust(self) -> None:
-        """Of its four motors one is gone, and nothing keeps it level."""
+        """Fall, because one of the four motors has failed and the vehicle cannot stay level."""
         self.say(mavlink.MAV_SEVERITY_EMERGENCY, "Potential Thrust Loss (2)")
         self.say(mavlink.MAV_SEVERITY_EMERGENCY, "Crash: Disarming")
         self.disarm(force=True)
 
-    # What it is doing
+    # Movements
 
     def _begin(self, segments: Sequence[Segment], then: Callable[[], None]) -> None:
-        """Move like this from now on, and do `then` where it ends."""
+        """Begin a movement, and call `then` at its end."""
         self._course, self._then, self._goal = Course(self.now_s, segments), then, None
 
     def _act(self) -> None:
-        """Do, armed, what the mode has just been set for."""
+        """Begin the movement of the current mode. The vehicle is armed."""
         self._in_mission = False
         match self.mode:
             case "AUTO" if self.airborne or self.vehicle_type != "copter":
@@ -310,7 +313,7 @@ class Autopilot:
         self.say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
 
     def _return_home(self, then: Callable[[], None]) -> None:
-        """RTL: up, home, and, a copter, down."""
+        """Return home at RTL altitude. A copter then lands."""
         if not self.airborne and self.vehicle_type != "rover":
             self._stand()
             return
@@ -325,7 +328,7 @@ class Autopilot:
     # The mission
 
     def _begin_item(self, number: int) -> None:
-        """Fly the mission from this item on; what takes no time is done at once."""
+        """Continue the mission from this item on. Items that take no time are executed at once."""
         self._in_mission = True
         while number < len(self.mission) and self.mission[number].command == mavlink.MAV_CMD_DO_CHANGE_SPEED:
             self.set_speed(self.mission[number].param2)
@@ -359,14 +362,14 @@ class Autopilot:
                 self._land(place, self._place_before(number))
 
     def _go_on_to(self, place: Point, number: int) -> None:
-        """From here, in the wind that there is now."""
+        """Fly to a place from the current position, in the current wind."""
         here = self.motion.point
         bearing_rad = math.atan2(place.east_m - here.east_m, place.north_m - here.north_m)
         speed_ms = self.failsafes.over_ground(self._speed_ms, bearing_rad)
         self._begin(self._model.go_to(self.motion, place, speed_ms, self._place_before(number)), self._item_reached)
 
     def _place_before(self, number: int) -> Point | None:
-        """Where the item before this one was, if it was a place."""
+        """Return the place of the previous item. None if it is no place."""
         for item in reversed(self.mission[1:number]):
             match item.command:
                 case mavlink.MAV_CMD_NAV_WAYPOINT | mavlink.MAV_CMD_NAV_LOITER_TIME:
@@ -377,7 +380,7 @@ class Autopilot:
         return None
 
     def _place_after(self, number: int) -> Point | None:
-        """Where the next item after this one that is a place leads."""
+        """Return the place of the next item, without speed changes. None if there is none."""
         places = (item for item in self.mission[number + 1 :] if item.command != mavlink.MAV_CMD_DO_CHANGE_SPEED)
         item = next(places, None)
         return None if item is None else self.place(item.frame, item.x, item.y, item.z)
@@ -389,7 +392,7 @@ class Autopilot:
         self._begin_item(number + 1)
 
     def _end_mission(self) -> None:
-        """A copter and a rover stay, a plane goes home."""
+        """End the mission. A copter and a rover stay, and a plane flies home."""
         self._in_mission, self.current_item = False, 0
         if self.vehicle_type == "plane":
             self.set_mode(MODES["plane"]["RTL"])
@@ -397,7 +400,10 @@ class Autopilot:
             self._stay()
 
     def place(self, frame: int, lat_e7: int, lon_e7: int, alt_m: float) -> Point:
-        """A place as MAVLink names it, in one of `FRAMES`; latitude and longitude 0 are where the vehicle is."""
+        """Return a place in one of `FRAMES`, in metres from home.
+
+        Latitude and longitude 0 mean the current position.
+        """
         up_m = alt_m - self.home.alt_m if frame in ABSOLUTE_FRAMES else alt_m
         if lat_e7 == lon_e7 == 0:
             return self.motion.point._replace(up_m=up_m)
@@ -417,4 +423,4 @@ ITEM_NAMES: dict[int, str] = {
     mavlink.MAV_CMD_NAV_TAKEOFF: "Takeoff",
     mavlink.MAV_CMD_DO_CHANGE_SPEED: "ChangeSpeed",
 }
-"""The mission items that it can fly, as ArduPilot names them in its texts."""
+"""The supported mission items, with their names in ArduPilot's texts."""

@@ -1,6 +1,6 @@
-"""A plan flown leg by leg in GUIDED: the pilot names each place when the one before is reached.
+"""Fly a plan leg by leg in GUIDED mode: the pilot sends the next place when the vehicle has reached the previous one.
 
-A plane takes off in its mode TAKEOFF and has no landing in GUIDED: that is a mission of its own, flown in AUTO.
+A plane takes off in its mode TAKEOFF. It cannot land in GUIDED mode, so its landing is a separate mission in AUTO mode.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ POSITION_ONLY = (
 
 
 class GuidedFlight:
-    """Take off, then make one waypoint after another."""
+    """Take off, then fly to one waypoint after another."""
 
     purpose = "fly its plan"
 
@@ -107,7 +107,10 @@ class GuidedFlight:
         return is_near(place, waypoint, self._to.vehicle_type)
 
     def _on_its_way(self) -> bool:
-        """Whether the vehicle has taken the place that it was sent; a plane says so, of others one sees it."""
+        """Return whether the vehicle has accepted its target.
+
+        A plane acknowledges it, and other vehicles begin to move.
+        """
         if self._to.vehicle_type == "plane":
             return self._to.accepted(mavlink.MAV_CMD_DO_REPOSITION)
         position = self._to.state.position

@@ -1,4 +1,4 @@
-"""A plan flown by the vehicle itself: uploaded as a mission, flown in AUTO."""
+"""Fly a plan as a mission: upload it, and let the vehicle fly it in AUTO mode."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ STARTS = (mavlink.MAV_CMD_MISSION_START, mavlink.MAV_CMD_DO_SET_MODE)
 
 
 class MissionFlight:
-    """Upload, arm, start, and follow the waypoints. A copter is armed in GUIDED, the others in AUTO.
+    """Upload, arm, start, and follow the waypoints. A copter is armed in GUIDED mode, the other types in AUTO mode.
 
-    `under_way`: it flies already, so a disarming is not the wait for a start but the end.
+    `under_way` means that the vehicle flies already. It then disarms at the end of its flight, and not before a start.
     """
 
     purpose = "fly its plan"
@@ -62,7 +62,7 @@ class MissionFlight:
         return self._legs[self._done]
 
     def _count(self) -> None:
-        """See which waypoints are done: what is landed on is done when the vehicle disarms."""
+        """Count the completed waypoints. A landing is complete when the vehicle disarms."""
         state = self._to.state
         reached, heading_for = state.reached or 0, state.item or 0
         while self._done < len(self._waypoints):

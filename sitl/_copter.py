@@ -1,4 +1,4 @@
-"""How a copter moves. The figures are ArduCopter's defaults, parameters by name, or measured with ArduCopter 4.7."""
+"""The motion of a copter. The figures are ArduCopter's default parameters, or measurements with ArduCopter 4.7."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ SPIN_UP_S = 3.0  # from arming to the first movement, measured
 
 @dataclass(frozen=True)
 class Copter:
-    """The `MotionModel` of a copter: it stops at every place, and goes straight from one to the next.
+    """The `MotionModel` of a copter: it stops at each place, and flies straight to the next one.
 
-    `turning_s` goes by before it leaves a place, and `settling_s` before it comes down; what is given is measured, in
-    AUTO, where it smooths its way (WPNAV_JERK).
+    It waits `turning_s` before it leaves a place, and `settling_s` before it descends. The default values were measured
+    in AUTO mode, in which ArduCopter smooths the path (WPNAV_JERK).
     """
 
     turning_s: float = 3.0
@@ -68,6 +68,6 @@ class Copter:
         return [*segments, Rest(end_of(segments), 0.0)]
 
     def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
-        """It stays where it took off."""
+        """Take off, and stay above that place."""
         climb = self.take_off(start, altitude_m)
         return [*climb, Rest(end_of(climb), math.inf)]

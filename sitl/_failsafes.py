@@ -1,7 +1,7 @@
-"""What the embedded vehicle's surroundings and parts are, and when its failsafes act: no flight, no clock, no MAVLink.
+"""The environment and the parts of the embedded vehicle, and the conditions of its failsafes.
 
-Parameters as in ArduPilot and its simulation, as far as a vehicle of closed formulas can have them: it has a GPS, a
-battery and, a copter, motors, and a plane feels wind; it has no compass. What it lacks it does not know as a parameter.
+Parameters have the names of ArduPilot and its simulation. The vehicle has a GPS, a battery and, if it is a copter,
+motors. A plane is affected by wind. There is no compass. Parameters of missing parts are unknown to the vehicle.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ WIND, WIND_FROM = "SIM_WIND_SPD", "SIM_WIND_DIR"
 LOW_AT, CRITICAL_AT, LOW_FOR = "BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_TIMER"
 WHEN_LOW, WHEN_CRITICAL = "BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"
 BATTERY = {LOW_AT: 0.0, CRITICAL_AT: 0.0, LOW_FOR: 10.0, WHEN_LOW: 0.0, WHEN_CRITICAL: 0.0}
-"""ArduPilot's defaults: a battery is never low, and a copter's is, but nothing is done about it."""
+"""ArduPilot's defaults: the battery is never low. A copter's battery can be low, but that has no effect."""
 COPTER_LOW_V = 10.5
 
 ACTIONS: dict[VehicleType, dict[float, str]] = {
@@ -30,13 +30,13 @@ ACTIONS: dict[VehicleType, dict[float, str]] = {
     "plane": {1: "RTL", 2: "RTL"},
     "rover": {1: "RTL", 2: "HOLD", 3: "RTL", 4: "HOLD"},
 }
-"""The modes that BATT_FS_..._ACT asks for, where no smarter way home is known; others ask for none."""
+"""The modes that BATT_FS_..._ACT selects if no better way home is known. Other values select none."""
 
 Failsafe = Literal["ekf", "battery low", "battery critical"]
 
 
 class Failsafes:
-    """Of one vehicle; times are its own seconds."""
+    """The failsafes of one vehicle. Times are its own seconds."""
 
     def __init__(self, vehicle_type: VehicleType) -> None:
         self.parameters = {GPS: 1.0, VOLTS: BATTERY_FULL_V, **BATTERY}
@@ -47,9 +47,9 @@ class Failsafes:
         if vehicle_type == "plane":
             self.parameters |= {WIND: 0.0, WIND_FROM: 180.0}
         self.acting: list[Failsafe] = []
-        """That have acted, and whose cause is still there."""
+        """Failsafes that have acted, and whose cause still exists."""
         self._since_s: dict[Failsafe, float] = {}
-        """When the cause of one that has not acted yet began."""
+        """The time at which the cause of a pending failsafe began."""
 
     @property
     def has_gps(self) -> bool:
@@ -60,21 +60,21 @@ class Failsafes:
         return self.parameters.get(THRUST, 1.0) < 0.5
 
     def over_ground(self, speed_ms: float, bearing_rad: float) -> float:
-        """How fast it goes in that direction, clockwise from north, which flies so fast through the air."""
+        """Return the ground speed for an air speed and a bearing, clockwise from north."""
         from_rad = math.radians(self.parameters.get(WIND_FROM, 0.0))
         head_ms = self.parameters.get(WIND, 0.0) * math.cos(bearing_rad - from_rad)
         return max(SLOWEST_MS, speed_ms - head_ms) if head_ms else speed_ms
 
     def volts(self, used: float) -> float:
-        """What a battery has of which so much is used, 0 to 1."""
+        """Return the voltage of the battery after use of this share of it, 0 to 1."""
         return max(0.0, self.parameters[VOLTS] - BATTERY_USED_V * used)
 
     def action(self, failsafe: Failsafe) -> str | None:
-        """The mode that a battery's failsafe asks for, if any."""
+        """Return the mode that a battery failsafe selects, or None."""
         return self._actions.get(self.parameters[WHEN_LOW if failsafe == "battery low" else WHEN_CRITICAL])
 
     def look(self, now_s: float, used: float) -> Failsafe | None:
-        """What acts now, if anything does; ask again until nothing does."""
+        """Return the next failsafe that acts now, or None. The caller repeats the call until it returns None."""
         volts = self.volts(used)
         low_for_s = self.parameters[LOW_FOR]
         causes: dict[Failsafe, tuple[bool, float]] = {

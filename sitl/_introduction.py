@@ -1,6 +1,6 @@
-"""What a vehicle says of itself once it has booted: its version, and all of its parameters.
+"""Request the version and all parameters of a vehicle after its boot.
 
-A vehicle that leaves some of it out flies all the same; what it was given beyond its defaults it has to know.
+A vehicle that leaves out some of them can still fly. It must know the parameters that the user has set.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sitl._pilot_link import Link
 from sitl.procedure import HEARTBEAT, Step
 
 PATIENCE = 10
-"""So many heartbeats in which nothing comes mean that nothing will."""
+"""Number of heartbeats without an answer after which a request is given up."""
 MOST_AT_ONCE = 50
 
 _VERSION = Step("its version")
@@ -25,7 +25,7 @@ _GIVEN = Step("the parameters that it was given")
 
 
 class Introduction:
-    """The `Procedure` of asking for it. `given` are parameters that it was started with, or is to have from now on."""
+    """The `Procedure` of these requests. `given` are parameters that the vehicle was started with, or must set now."""
 
     purpose = "introduce itself"
 
@@ -60,7 +60,7 @@ class Introduction:
                 link.request_parameter(name)  # ArduPilot lists none of a group that is switched off
 
     def _ask_for_list(self) -> None:
-        """All at first, then, once no more come by themselves, those that are missing."""
+        """Request all parameters at first, and later those that are missing."""
         link = self._link
         if link.parameter_count is None:
             link.request_parameters()
@@ -74,5 +74,5 @@ class Introduction:
 
 
 def _as_float(value: float) -> float:
-    """As 32 bits have it, which is what a vehicle says."""
+    """Return the value as a 32-bit float, which is the precision of MAVLink."""
     return float(struct.unpack("<f", struct.pack("<f", value))[0])

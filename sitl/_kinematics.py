@@ -1,8 +1,8 @@
-"""How things move: segments, each a closed formula of the time since it began, and courses made of them.
+"""The motion of vehicles as courses of segments, each a closed formula of the time since its beginning.
 
-There are no dynamics and no steps: where a vehicle is at some second does not depend on how often anybody looked. A
-process that wakes once in twenty simulated seconds and a simulation in virtual time see the same track. What a copter,
-a plane or a rover makes of these segments is in _copter.py, _plane.py and _rover.py.
+There are no dynamics and no time steps, so a position does not depend on how often it is computed. A process that wakes
+once in twenty simulated seconds and a simulation in virtual time compute the same track. The motions of copters, planes
+and rovers are in _copter.py, _plane.py and _rover.py.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Motion:
-    """Where a vehicle is relative to home, and how it moves: metres, metres per second, radians, all finite."""
+    """The position of a vehicle relative to home, and its movement, in metres, metres per second and radians, all
+    finite.
+    """
 
     north_m: float = 0.0
     east_m: float = 0.0
@@ -46,23 +48,23 @@ class Motion:
 
     @property
     def halted(self) -> Motion:
-        """The same place and heading, without any movement."""
+        """The same place and heading without movement."""
         return Motion(self.north_m, self.east_m, self.up_m, yaw_rad=self.yaw_rad)
 
 
 class Segment(Protocol):
-    """A piece of a course."""
+    """A part of a course."""
 
     @property
     def duration_s(self) -> float:
-        """How long it takes; math.inf: it never ends by itself."""
+        """The duration in seconds. math.inf for a segment without an end."""
 
     def at(self, since_s: float) -> Motion:
-        """The motion so many seconds after the beginning, 0 to `duration_s`."""
+        """Return the motion at a time since the beginning, 0 to `duration_s`."""
 
 
 class Rest:
-    """Stay here."""
+    """A segment without movement."""
 
     def __init__(self, start: Motion, duration_s: float = math.inf) -> None:
         self.duration_s = duration_s
@@ -73,10 +75,11 @@ class Rest:
 
 
 class Line:
-    """A straight line at a trapezoidal speed: `accel_ms2` from `from_ms` to at most `speed_ms`, then down to `to_ms`.
+    """A straight line with a trapezoidal speed profile: from `from_ms` up to `speed_ms`, then down to `to_ms`, both at
+    `accel_ms2`.
 
-    A line too short to reach `speed_ms` has a triangular one. It must be long enough to get from `from_ms` to `to_ms`.
-    The vehicle looks where it goes; on a vertical line, where it looked before.
+    On a short line the profile is triangular. The line must be long enough for the change from `from_ms` to `to_ms`.
+    The vehicle heads along the line. On a vertical line it keeps its heading.
     """
 
     def __init__(
@@ -113,7 +116,7 @@ class Line:
 
 
 class Arc:
-    """Part of a level circle at constant speed; `turn_rad` clockwise is positive, and may be infinite."""
+    """A part of a level circle at constant speed. `turn_rad` is positive clockwise, and may be infinite."""
 
     def __init__(self, start: Motion, centre: tuple[float, float], turn_rad: float, speed_ms: float) -> None:
         north, east = start.north_m - centre[0], start.east_m - centre[1]
@@ -140,7 +143,7 @@ class Arc:
 
 
 class Climbing:
-    """A level segment flown while climbing, or sinking, at `rate_ms` to `up_m`, and level from there."""
+    """A level segment with a climb or descent at `rate_ms` to `up_m`, and level after that."""
 
     def __init__(self, level: Segment, up_m: float, rate_ms: float) -> None:
         self._level, self._up_m = level, up_m
@@ -157,7 +160,7 @@ class Climbing:
 
 
 class Fall:
-    """Fall to the ground without power and without drag."""
+    """A fall to the ground without power and drag."""
 
     def __init__(self, start: Motion) -> None:
         self._start = start
@@ -165,7 +168,7 @@ class Fall:
 
     @property
     def impact_ms(self) -> float:
-        """How fast it hits the ground, downwards."""
+        """The downward speed at the ground."""
         return GRAVITY_MS2 * self.duration_s - self._start.up_ms
 
     def at(self, since_s: float) -> Motion:
@@ -181,27 +184,27 @@ class Fall:
 
 
 class Course:
-    """Segments one after another from `begin_s` on; times are seconds on any one clock."""
+    """A sequence of segments from `begin_s` on. Times are seconds of any one clock."""
 
     def __init__(self, begin_s: float, segments: Sequence[Segment]) -> None:
-        """There is at least one segment, and only the last may be without end."""
+        """Make a course of at least one segment. Only the last segment may be infinite."""
         self._segments = segments
         *self._begin_s, self.end_s = itertools.accumulate((part.duration_s for part in segments), initial=begin_s)
 
     @property
     def rests_from_s(self) -> float:
-        """The time after which the place does not change any more; infinite if it always does."""
+        """The time from which the place is constant. Infinite if there is none."""
         return self._begin_s[-1] if isinstance(self._segments[-1], Rest) else self.end_s
 
     def at(self, now_s: float) -> Motion:
-        """The motion at `now_s`; before the beginning that of the beginning, after the end that of the end."""
+        """Return the motion at `now_s`. Before the beginning and after the end, this is the motion there."""
         index = max(0, bisect.bisect_right(self._begin_s, now_s) - 1)
         segment = self._segments[index]
         return segment.at(min(max(0.0, now_s - self._begin_s[index]), segment.duration_s))
 
 
 class Part:
-    """A part of a course, from `begin_s` to `end_s` on its clock."""
+    """A part of a course, from `begin_s` to `end_s` on the clock of the course."""
 
     def __init__(self, course: Course, begin_s: float, end_s: float) -> None:
         self._course, self._begin_s = course, begin_s
@@ -212,5 +215,5 @@ class Part:
 
 
 def end_of(segments: Sequence[Segment]) -> Motion:
-    """The motion where the last of these segments ends."""
+    """Return the motion at the end of the last segment."""
     return segments[-1].at(segments[-1].duration_s)

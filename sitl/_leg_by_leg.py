@@ -1,4 +1,4 @@
-"""The course of a plan that is flown in GUIDED: each leg ends where the pilot sees that it is made (_by_guided.py)."""
+"""The course of a plan in GUIDED mode: each leg ends when the pilot notices its end (_by_guided.py)."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from sitl._models import AT_ONCE
 from sitl._route import CLIMBED, Waypoint, is_near, limit_s, to_go_m
 from sitl.vehicle import VehicleType
 
-LOOK_S = 0.25  # so often the pilot hears where the vehicle is
-FAST = 4.0  # no vehicle goes so many times as fast as it was told to
+LOOK_S = 0.25  # interval of the positions that the pilot receives
+FAST = 4.0  # limit of a vehicle's speed as a multiple of the commanded one
 
 
 def leg_by_leg(
     waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion
 ) -> tuple[list[Segment], Segment]:
-    """The segments until the last waypoint is made, and what the vehicle does after them when it is told nothing.
+    """Return the segments up to the last completed waypoint, and the motion after them without further commands.
 
-    A waypoint that is not made in the time that a pilot gives it is the last.
+    A waypoint that takes longer than the pilot's time limit is the last one.
     """
     model, motion, goal = AT_ONCE[vehicle_type], start, None
     flown: list[Segment] = []
@@ -41,7 +41,7 @@ def leg_by_leg(
 
 
 def _made_s(course: Course, since_s: float, waypoint: Waypoint, vehicle_type: VehicleType, limit_s: float) -> float:
-    """The second of a course at which a waypoint is made; infinite if it is not made until `limit_s`."""
+    """Return the time at which the course completes a waypoint. Infinite if it does not do so before `limit_s`."""
     now_s = since_s
     while now_s < limit_s:
         place = course.at(now_s).point
@@ -51,6 +51,6 @@ def _made_s(course: Course, since_s: float, waypoint: Waypoint, vehicle_type: Ve
             now_s += LOOK_S
         elif is_near(place, waypoint, vehicle_type):
             return now_s + waypoint.seconds
-        else:  # no need to look while it cannot be there yet
+        else:  # skip the time in which it cannot arrive
             now_s += max(LOOK_S, to_go_m(place, waypoint, vehicle_type) / (FAST * waypoint.speed_ms))
     return math.inf

@@ -1,20 +1,23 @@
-"""MAVLink frames of a stream, without a look into them: as fast as they come, of any dialect."""
+"""Split a byte stream into MAVLink frames of any dialect, without decoding them, for speed."""
 
 from __future__ import annotations
 
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01
-_HEADER_BYTES = 3  # what it takes to know how long a frame is
+_HEADER_BYTES = 3  # bytes that determine the length of a frame
 
 
 class FrameSplitter:
-    """Splits what one vehicle sends into whole frames; bytes that begin no frame are skipped."""
+    """A splitter for the bytes of one vehicle. Bytes that begin no frame are skipped."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The frames that end in these bytes. Keeps less than one frame: at most 292 bytes."""
+        """Return the frames that end in these bytes.
+
+        The splitter keeps less than one frame, which is at most 292 bytes.
+        """
         stream, at, frames = self._rest + data, 0, []
         while len(stream) - at >= _HEADER_BYTES:
             length = _length(stream, at)
@@ -30,7 +33,7 @@ class FrameSplitter:
 
 
 def _length(stream: bytes, at: int) -> int | None:
-    """Of the frame that begins here: header, payload, checksum, and of a signed one 13 bytes more."""
+    """Return the length of the frame that begins here: header, payload, checksum, and 13 more bytes if it is signed."""
     if stream[at] == _V2:
         return 12 + stream[at + 1] + 13 * (stream[at + 2] & _SIGNED)
     return 8 + stream[at + 1] if stream[at] == _V1 else None

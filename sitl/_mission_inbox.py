@@ -1,8 +1,8 @@
-"""The vehicle's side of the MAVLink mission protocol, for one client: takes missions, and gives back the one it has.
+"""The vehicle's side of the MAVLink mission protocol, for one client: receive a mission, and send the current one.
 
-A mission arrives item by item, each asked for, and replaces the old one when it is whole. There are no timers: who is
-not answered sends MISSION_COUNT again, which begins anew. Results are those that ArduPilot gives
-(https://mavlink.io/en/services/mission.html; MAV_MISSION_RESULT). Item 0 is home: the vehicle keeps its own.
+The vehicle requests a mission item by item. The mission replaces the old one when it is complete. There are no timers:
+a client without an answer sends MISSION_COUNT again, which restarts the transfer. Results equal those of ArduPilot
+(https://mavlink.io/en/services/mission.html; MAV_MISSION_RESULT). Item 0 is home, and the vehicle keeps its own.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAX_ITEMS = 1000
 
 
 class MissionInbox:
-    """`receive` takes a message of the protocol and yields what is to be answered."""
+    """The state of one client's transfers. `receive` takes a message of the protocol and returns the answers."""
 
     def __init__(self, vehicle: Autopilot) -> None:
         self._vehicle = vehicle
@@ -85,23 +85,23 @@ class MissionInbox:
 
 
 def _sender(message: Any) -> tuple[int, int]:
-    """To whom the answer goes: system and component."""
+    """Return system and component of the sender, to which the answer goes."""
     return message.get_srcSystem(), message.get_srcComponent()
 
 
 def _with_integers(item: Any) -> Any:
-    """A MISSION_ITEM, whose degrees are floats, as a MISSION_ITEM_INT; no number is out of range."""
+    """Convert a MISSION_ITEM, which has degrees as floats, to a MISSION_ITEM_INT. Large values are limited."""
     x, y = (round(degrees * 1e7) if abs(degrees) <= 180 else 2**31 - 1 for degrees in (item.x, item.y))
     fields = (item.param1, item.param2, item.param3, item.param4, x, y, item.z)
     converted = mavlink.MAVLink_mission_item_int_message(
         item.target_system, item.target_component, item.seq, item.frame, item.command, 0, 1, *fields
     )
-    converted._header = item._header  # its sender is asked for the next one
+    converted._header = item._header  # the next request goes to its sender
     return converted
 
 
 def _check(item: Any) -> int:
-    """The MAV_MISSION_RESULT of one item."""
+    """Return the MAV_MISSION_RESULT of one item."""
     if item.command not in ITEM_NAMES:
         return int(mavlink.MAV_MISSION_UNSUPPORTED)
     if item.frame not in FRAMES and item.command != mavlink.MAV_CMD_DO_CHANGE_SPEED:

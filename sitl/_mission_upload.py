@@ -1,6 +1,6 @@
-"""A route as a MAVLink mission, and its upload: the pilot's side of the mission protocol.
+"""Convert a route to a MAVLink mission, and upload it: the pilot's side of the mission protocol.
 
-https://mavlink.io/en/services/mission.html. Item 0 is home, as ArduPilot has it, which puts its own in that place.
+https://mavlink.io/en/services/mission.html. Item 0 is home. ArduPilot replaces it by its own.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from sitl._pilot_link import Link
 from sitl._route import Waypoint
 from sitl.vehicle import Home, VehicleType
 
-RESEND_S = 1.0  # of our time: an upload of which nothing has been heard for so long is begun anew
+RESEND_S = 1.0  # wall time without an answer after which an upload restarts
 
-TAKE_OFF_PITCH_DEG = 15.0  # of a plane, which climbs with 4 degrees if nobody says; a copter does not ask
+TAKE_OFF_PITCH_DEG = 15.0  # for a plane, whose default is 4 degrees; a copter ignores it
 
-PASSING = (  # what an upload that is begun anew may mend
+PASSING = (  # results that a restart of the upload may change
     mavlink.MAV_MISSION_ERROR,
     mavlink.MAV_MISSION_DENIED,
     mavlink.MAV_MISSION_OPERATION_CANCELLED,
@@ -41,15 +41,16 @@ _COMMANDS = {
 
 
 def on_earth(place: Point, home: Home) -> tuple[int, int]:
-    """Latitude and longitude of a place in metres from home, in 1e-7 degrees."""
+    """Return latitude and longitude in 1e-7 degrees of a place in metres from home."""
     there = home.offset(place.north_m, place.east_m)
     return round(there.lat_deg * 1e7), round(there.lon_deg * 1e7)
 
 
 class Mission:
-    """The MISSION_ITEM_INTs of a route, and which of them is which waypoint.
+    """The MISSION_ITEM_INTs of a route, and the item number of each waypoint.
 
-    A plane's mission that does not land ends with a circle round its last place: ArduPlane would fly home.
+    If a plane's plan does not end with a landing, the mission ends with a circle around the last place. Without it,
+    ArduPlane would fly home.
     """
 
     def __init__(self, waypoints: Sequence[Waypoint], home: Home, sysid: int, vehicle_type: VehicleType) -> None:
@@ -87,10 +88,10 @@ class Mission:
 
 
 class Upload:
-    """Brings a mission to a vehicle: the vehicle asks for each item and says at the end whether it takes them.
+    """The upload of a mission. The vehicle requests each item, and finally accepts or refuses the mission.
 
-    `ask` begins it, and again when nothing has been heard of it for RESEND_S. `refused` is the MAV_MISSION_RESULT of a
-    vehicle that will never take it.
+    `ask` begins the upload, and restarts it after RESEND_S without an answer. `refused` is the MAV_MISSION_RESULT of a
+    vehicle that rejects the mission.
     """
 
     def __init__(self, link: Link, mission: Mission) -> None:
@@ -121,9 +122,9 @@ class Upload:
         state = self._link.state
         if result == mavlink.MAV_MISSION_ACCEPTED:
             self.accepted = True
-            state.item = state.reached = None  # those of a mission before
+            state.item = state.reached = None  # they belong to the previous mission
         elif result in PASSING:
             self._heard_at = None
-        elif result != mavlink.MAV_MISSION_INVALID_SEQUENCE:  # an item that came twice: the transfer goes on
+        elif result != mavlink.MAV_MISSION_INVALID_SEQUENCE:  # a duplicated item; the transfer continues
             known = mavlink.enums["MAV_MISSION_RESULT"].get(result)
             self.refused = known.name if known else str(result)

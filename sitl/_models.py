@@ -1,4 +1,4 @@
-"""How each type of vehicle moves: a `MotionModel` turns a wish and the present motion into segments."""
+"""The motion models by type of vehicle. A `MotionModel` converts a goal and the current motion into segments."""
 
 from __future__ import annotations
 
@@ -13,41 +13,41 @@ from sitl.vehicle import VehicleType
 
 
 class MotionModel(Protocol):
-    """Speeds are metres per second over the ground, places metres from home. Nothing jumps: what begins, begins here.
+    """A motion model. Speeds are ground speeds in metres per second, and places are in metres from home.
 
-    Every answer has at least one segment.
+    A movement begins at the current motion, without jumps. Each method returns at least one segment.
     """
 
     @property
     def cruise_ms(self) -> float:
-        """The speed of one who was given none."""
+        """The default speed."""
 
     def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]: ...
 
     def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
-        """A plane comes back to the line that leads there from `before`, the place that it was sent to before."""
+        """Go to a place. A plane first returns to the line from `before`, its previous place, to this place."""
 
     def loiter(
         self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
     ) -> Sequence[Segment]:
-        """Stay at `place` for so many seconds after having come there, which may be infinite.
+        """Go to `place` and stay there for `seconds`, which may be infinite.
 
-        A plane circles on until it heads for `after`, the place that it is sent to then.
+        A plane continues its circle until it heads for `after`, its next place.
         """
 
     def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
-        """Come down at `place`, and stand there; `before` as in `go_to`."""
+        """Land at `place`, and stop there. `before` is used as in `go_to`."""
 
     def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
-        """Take off by itself, without a mission, and do what it does then when it is told nothing, for ever."""
+        """Take off without a mission, and continue with the default behaviour for an unlimited time."""
 
 
 MODELS: dict[VehicleType, MotionModel] = {"copter": Copter(), "plane": Plane(), "rover": Rover()}
-"""As they fly missions, in AUTO."""
+"""Motion in missions, in AUTO mode."""
 
 AT_ONCE: dict[VehicleType, MotionModel] = {
     "copter": Copter(turning_s=1.2, settling_s=0.0),
     "plane": Plane(),
     "rover": Rover(start_s=0.0, corner_rads=TURN_RATE_RADS),
 }
-"""As they do what they are told outside of a mission: in GUIDED, and when they are to land."""
+"""Motion outside of missions: in GUIDED mode, and during a commanded landing."""

@@ -1,4 +1,4 @@
-"""What an operator at a ground station commanded, in a few words each, and no more than fit."""
+"""A bounded log of the commands that an operator sends from a ground station."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 MOST_COMMANDS = 1000
-"""So many are kept; of those that follow it is said how many they were."""
+"""Maximum number of recorded commands. Further ones are only counted."""
 
 _ASKS_ONLY = re.compile(r"MAV_CMD_(REQUEST_|GET_|SET_MESSAGE_INTERVAL$|RUN_PREARM_CHECKS$|DO_SEND_BANNER$)")
-"""Commands that make a vehicle answer, and do nothing else: a ground station sends them by itself."""
+"""Commands that only make a vehicle answer. Ground stations send them by themselves."""
 
 _AT_THE_STICKS = frozenset({"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"})
-"""Sent many times a second: one entry for as long as nothing else comes."""
+"""Messages that are sent many times per second. Consecutive ones make one entry."""
 
 _COMMANDS = frozenset(
     {
@@ -35,22 +35,22 @@ _COMMANDS = frozenset(
     }
 )
 _SETTINGS = frozenset({"PARAM_SET"})
-"""What changes a vehicle, and does not fly it."""
+"""Messages that change a vehicle, but do not fly it."""
 
 _ADDRESS = frozenset({"target_system", "target_component", "command", "mavpackettype"})
 
 
 class CommandLog:
-    """Commands in the order in which they came; equal ones in a row are one, with how often and until when."""
+    """The commands in order. Equal consecutive commands make one entry with their number and end time."""
 
     def __init__(self) -> None:
         self.left_out = 0
         self._commands: list[dict[str, Any]] = []
 
     def note(self, message: Any, vehicle_ids: Iterable[int], at_s: float) -> bool:
-        """Take a message down, if it commands anything, that went to these vehicles at this mission second.
+        """Record a message to these vehicles at mission second `at_s`, if it is a command.
 
-        Returns whether somebody else flies them from now on.
+        Returns whether the operator flies the vehicles from now on.
         """
         kind = message.get_type()
         if kind not in _COMMANDS | _SETTINGS or _ASKS_ONLY.match(_command(message) or ""):
@@ -76,7 +76,7 @@ class CommandLog:
 
 
 def _command(message: Any) -> str | None:
-    """The name of a COMMAND_LONG's or COMMAND_INT's command."""
+    """Return the name of the command in a COMMAND_LONG or COMMAND_INT."""
     number = getattr(message, "command", None)
     if number is None:
         return None
@@ -85,7 +85,7 @@ def _command(message: Any) -> str | None:
 
 
 def _values(message: Any) -> dict[str, Any]:
-    """Its fields but for the address, as JSON has them; none of what moves all the time."""
+    """Return the fields of the message without its address, as JSON values. Empty for stick messages."""
     if message.get_type() in _AT_THE_STICKS:
         return {}
     values = {name: getattr(message, name) for name in message.get_fieldnames() if name not in _ADDRESS}

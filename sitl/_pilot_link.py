@@ -1,6 +1,6 @@
-"""The connection of a pilot to its vehicle: bytes in, state and telemetry log out, and messages the other way.
+"""The connection of a pilot to its vehicle: it keeps the vehicle's state, writes the telemetry log, and sends messages.
 
-One process has a link for every vehicle of a run, so a link is an asyncio protocol and a timer, nothing more.
+One process has a link for each vehicle of a run. Therefore a link has no thread, only an asyncio protocol and a timer.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from sitl._vehicle_state import Battery, Position, VehicleState, Version
 from sitl.parameters import MAX_PARAMETERS
 from sitl.vehicle import Home
 
-GCS_SYSTEM = 255  # what ArduPilot takes for its ground station unless told otherwise
-HEARTBEAT_INTERVAL_S = 1.0  # of our time
+GCS_SYSTEM = 255  # ArduPilot's default for the ground station
+HEARTBEAT_INTERVAL_S = 1.0  # wall time
 MAX_HEARTBEAT_INTERVAL_S = 2.0  # simulated: ArduPilot's ground station failsafe acts after 5 (FS_GCS_TIMEOUT)
 TELEMETRY_INTERVAL_S = 0.25  # simulated
-MIN_TELEMETRY_INTERVAL_S = 0.1  # of our time, per message: what a link costs must not grow with the speedup
-PATIENCE_INTERVALS = 4  # who asks too often postpones what he asks for
+MIN_TELEMETRY_INTERVAL_S = 0.1  # wall time per message: the cost of a link must not grow with the speedup
+PATIENCE_INTERVALS = 4  # a repeated request postpones the messages
 MIN_RATE_SPAN_S = 1.0
 HEIGHTS_DIFFER_M = 10.0
 
@@ -38,16 +38,16 @@ TELEMETRY = (
 
 
 class Link(asyncio.Protocol):
-    """Talks to one vehicle over a connected socket. Not a thread's friend: use it in one event loop.
+    """A connection to one vehicle over a connected socket. It may be used in one event loop only.
 
-    `heard` is set whenever anything came, and when the connection has ended; `closed` only then. Times of `heard_at`,
-    `heartbeat_at` and `position_at` are those of time.monotonic().
+    `heard` is set when data arrives and when the connection ends. `closed` is set only when it ends. Times in
+    `heard_at`, `heartbeat_at` and `position_at` come from time.monotonic().
     """
 
     def __init__(self, sysid: int, sock: socket.socket, tlog: Path, speedup: float, home: Home) -> None:
-        """Take over `sock`, already connected to the vehicle, which was started at `home`.
+        """Take over `sock`, which is connected to the vehicle that was started at `home`.
 
-        Raises OSError when `tlog` cannot be opened.
+        Raises OSError if `tlog` cannot be opened.
         """
         self.sysid = sysid
         self.home = home
@@ -64,10 +64,10 @@ class Link(asyncio.Protocol):
         self.acks: dict[int, int] = {}  # MAV_CMD: the last MAV_RESULT
         self.parameters: dict[str, float] = {}
         self.parameter_count: int | None = None
-        self.listed: set[int] = set()  # the places in the vehicle's list of those that have been heard
+        self.listed: set[int] = set()  # list indices of the received parameters
         self._asked_mode: int | None = None
         self._was_in_asked_mode = self._was_armed = False
-        self.on_mission: Callable[[Any], None] | None = None  # hears the messages of the mission protocol
+        self.on_mission: Callable[[Any], None] | None = None  # receives the messages of the mission protocol
         self._socket = sock
         self._tlog: TelemetryLog | None = TelemetryLog(tlog)
         self._mav = mavlink.MAVLink(None, srcSystem=GCS_SYSTEM, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
@@ -95,7 +95,7 @@ class Link(asyncio.Protocol):
         self._knows_its_height: bool | None = None  # above its home: whether it did when its estimate got good
 
     async def start(self) -> None:
-        """Begin to read, to log and to send heartbeats."""
+        """Start to read, to log and to send heartbeats."""
         self._socket.setblocking(False)
         self.heard_at = time.monotonic()
         await asyncio.get_running_loop().create_connection(lambda: self, sock=self._socket)
@@ -106,12 +106,15 @@ class Link(asyncio.Protocol):
             self._socket.close()
             self._end_log()
             return
-        self._transport.abort()  # a vehicle that is stopped would never take what is left to send
+        self._transport.abort()  # a stopped vehicle would never read the remaining data
         await self.closed.wait()
 
     @property
     def real_time_factor(self) -> float | None:
-        """Simulated seconds per second over the speedup, since first heard: 1.0 is a machine fast enough."""
+        """Simulated seconds per second, divided by the speedup, since the first message.
+
+        1.0 means a fast enough machine.
+        """
         if self._first_time is None or self._last_time is None:
             return None
         wall_s = self._last_time[0] - self._first_time[0]
@@ -120,7 +123,7 @@ class Link(asyncio.Protocol):
         return (self._last_time[1] - self._first_time[1]) / wall_s / self.speedup
 
     def request_telemetry(self) -> None:
-        """Ask for the messages of TELEMETRY, unless that was a moment ago and the first of them may yet come."""
+        """Request the messages of TELEMETRY, unless they were requested a moment ago."""
         interval_s = max(TELEMETRY_INTERVAL_S, MIN_TELEMETRY_INTERVAL_S * self.speedup)
         now, patience_s = time.monotonic(), max(1.0, PATIENCE_INTERVALS * interval_s / self.speedup)
         if self._asked_at is not None and now - self._asked_at < patience_s:
@@ -130,12 +133,12 @@ class Link(asyncio.Protocol):
             self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_s * 1e6)
 
     def command(self, command: int, *params: float) -> None:
-        """Send a COMMAND_LONG; what is not given is 0."""
+        """Send a COMMAND_LONG. Missing parameters are 0."""
         padded = [*params, *[0.0] * (7 - len(params))]
         self.send(mavlink.MAVLink_command_long_message(self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1, command, 0, *padded))
 
     def ask_for_mode(self, number: int) -> None:
-        """Have the vehicle change its mode (custom_mode), if it does."""
+        """Request a change of the mode (custom_mode)."""
         kind = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         if number != self._asked_mode:
             self._asked_mode, self._was_in_asked_mode = number, False
@@ -145,7 +148,7 @@ class Link(asyncio.Protocol):
 
     @property
     def has_left_its_mode(self) -> bool:
-        """Whether it was in the mode that it was last asked for, and is no more."""
+        """True if the vehicle was in the mode that was requested last, and has left it."""
         return self._was_in_asked_mode and self.state.mode != self._asked_mode
 
     @property
@@ -153,22 +156,25 @@ class Link(asyncio.Protocol):
         return self._was_armed and not self.state.armed
 
     def set_parameter(self, name: str, value: float) -> None:
-        """What the vehicle answers is in `parameters`."""
+        """Set a parameter. The answer of the vehicle appears in `parameters`."""
         target = (self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1)
         self.send(mavlink.MAVLink_param_set_message(*target, name.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32))
 
     def request_parameter(self, name: str) -> None:
-        """As `set_parameter`; a vehicle without it may answer nothing."""
+        """Request a parameter.
+
+        The answer appears in `parameters`. A vehicle without the parameter may send no answer.
+        """
         target = (self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1)
         self.send(mavlink.MAVLink_param_request_read_message(*target, name.encode(), -1))
 
     def request_parameter_at(self, index: int) -> None:
-        """That of a place in its list."""
+        """Request the parameter at an index of the vehicle's list."""
         target = (self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1)
         self.send(mavlink.MAVLink_param_request_read_message(*target, b"", index))
 
     def request_parameters(self) -> None:
-        """All of them: some 1,300 messages."""
+        """Request all parameters, about 1,300 messages."""
         self.send(mavlink.MAVLink_param_request_list_message(self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1))
 
     @property
@@ -242,13 +248,13 @@ class Link(asyncio.Protocol):
             self._tlog = None
 
     def _give_up_log(self, error: OSError) -> None:
-        """A full disk ends the log, not the flight."""
+        """End the log after an error, such as a full disk. The flight continues."""
         self.state.log_error = f"telemetry log {self.tlog_path}: {error.strerror}"
         if self._tlog is not None:
             self._tlog.abandon()
             self._tlog = None
 
-    # What the autopilot says
+    # Messages of the autopilot
 
     def _on_heartbeat(self, message: Any) -> None:
         if message.get_srcSystem() != self.sysid:
@@ -278,9 +284,9 @@ class Link(asyncio.Protocol):
         if not self._estimate_is_good or (message.lat == 0 and message.lon == 0):
             return  # ArduPlane 4.7 says after its boot that it is near 0 N, 0 E, and a rover that its altitude is 0
         height_m, says_m = message.alt / 1e3 - self.home.alt_m, message.relative_alt / 1e3
-        if self._knows_its_height is None:  # a rover of 4.7 has set its home, and is 584 m above it ever after
+        if self._knows_its_height is None:  # a rover of 4.7 reports 584 m above its home all the time
             self._knows_its_height = abs(says_m - height_m) < HEIGHTS_DIFFER_M
-        if self._knows_its_height:  # what it says above the sea stands still once a copter of 4.7 has lost its GPS
+        if self._knows_its_height:  # the altitude above the sea is frozen once a copter of 4.7 has lost its GPS
             height_m = says_m
         self.state.position = Position(
             message.lat / 1e7,
@@ -311,7 +317,7 @@ class Link(asyncio.Protocol):
         if message.param_id not in self.parameters and len(self.parameters) >= MAX_PARAMETERS:
             return
         self.parameters[message.param_id] = message.param_value
-        if message.param_index < message.param_count <= MAX_PARAMETERS:  # not one that was asked for by its name
+        if message.param_index < message.param_count <= MAX_PARAMETERS:  # not requested by name
             self.parameter_count = message.param_count
             self.listed.add(message.param_index)
 

@@ -1,8 +1,8 @@
-"""How a plane moves: never slower than it flies, in arcs and straight lines.
+"""The motion of a plane in arcs and straight lines, never slower than its minimum flying speed.
 
-The figures are those of ArduPlane's SITL (plane.parm, parameters by name), or, where it says so, measured with
-ArduPlane 4.7. Its paths are shortest turns, as those of Dubins (1957), not those of ArduPlane's L1 controller: turns
-may differ from that by some tens of metres.
+The figures are those of ArduPlane's SITL (plane.parm), or measurements with ArduPlane 4.7 where noted. Turns are the
+shortest ones, as in the paths of Dubins (1957). ArduPlane's L1 controller flies turns that differ by some tens of
+metres.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ OVER_GROUND = (
 )
 CLIMB_MS = 5.0  # TECS_CLMB_MAX
 LOITER_RADIUS_M = 96.4  # clockwise, at CRUISE_MS; measured, of WP_LOITER_RAD 80, which grows in thin air
-LOITER_RADIUS_M_PER_MS = 0.95  # measured: so much smaller for each metre per second less
+LOITER_RADIUS_M_PER_MS = 0.95  # measured: change of the radius per metre per second
 ROLL_S = 1.4  # measured: before it turns to a circle
 SWING_M = 120.0  # measured: how far before a place it begins to swing out for its circle
 JOIN_RAD = 1.1  # measured: how far to the left of straight ahead it leaves a place that it is to circle
 REACHED_M = 40.0  # measured: 20 to 28, and 52 before it turns round
 TURN_RADIUS_M = 55.0  # measured
 WIDE_TURN_RADIUS_M, WIDE_TURN_RAD = 110.0, 1.0  # measured: small turns are flown less tightly
-RATHER_LEFT_M = 60.0  # measured: who is to circle a place to the right swings out to the left before
-STILL_RIGHT_M = 80.0  # measured: who turns to the right goes on to, unless the other way is so much shorter
+RATHER_LEFT_M = 60.0  # measured: before a circle to the right it swings out to the left
+STILL_RIGHT_M = 80.0  # measured: a right turn continues unless the other way is shorter by this
 SWAY_M = 2.0  # measured: it comes to that line from outside its turn, sways over it, and turns round to where it was
 LINE_AHEAD_M = 147.0  # how far ahead, on the line between two places, it aims at to come back to it
 HEADING_RAD = math.radians(10.0)  # as near as it heads for the next place when it leaves a circle
@@ -48,7 +48,7 @@ ROLL_OUT_ACCEL_MS2 = LANDING_MS**2 / (2 * (ROLL_OUT_M + PAST_M))
 
 
 class Plane:
-    """The `MotionModel` of a plane: it flies by the places of a plan and circles where it is to stay."""
+    """The `MotionModel` of a plane: it passes the places of a plan, and circles where it must stay."""
 
     cruise_ms = CRUISE_MS
 
@@ -58,7 +58,7 @@ class Plane:
         return [*run, *path.segments]
 
     def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
-        """As in its mode TAKEOFF: to the left side of a circle ahead, and round that for ever."""
+        """Take off as in mode TAKEOFF: fly to the left side of a circle ahead, and circle without end."""
         run, path = _lift_off(start, altitude_m, min(LEVEL_M, altitude_m))
         place = _ahead(start, AHEAD_M)._replace(up_m=altitude_m)
         path.straight_to(_on_circle(place, LOITER_RADIUS_M, start.yaw_rad - math.pi / 2))
@@ -72,9 +72,10 @@ class Plane:
     def loiter(
         self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
     ) -> Sequence[Segment]:
-        """Clockwise round the place, for so many seconds from when it begins to swing out for the circle.
+        """Circle clockwise around the place for `seconds`, counted from the turn onto the circle.
 
-        From inside it crosses the circle straight; from outside it flies towards the place, and passes it on its left.
+        From inside, the plane crosses the circle straight. From outside, it flies towards the place and passes it on
+        its left.
         """
         path, radius_m = _Path(start, speed_ms * OVER_GROUND, place.up_m, CLIMB_MS), loiter_radius_m(speed_ms)
         if math.dist(start.point[:2], place[:2]) < radius_m:
@@ -92,7 +93,10 @@ class Plane:
         return path.segments
 
     def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
-        """Glide straight to the ground before the place, and roll to a stand; who is too high circles down before."""
+        """Glide straight to the ground before the place, and roll to a stop.
+
+        A plane that is too high circles down first.
+        """
         touchdown = _towards(place, start.point, ROLL_OUT_M)._replace(up_m=0.0)
         glide_s = _duration_s(_back_and_on(start, touchdown, before, LANDING_MS, 0.0, 0.0))
         if start.up_m > CLIMB_MS * glide_s:
@@ -106,9 +110,10 @@ class Plane:
 
 
 def _until_heading_for(there: Point, centre: Point, here: Motion) -> float:
-    """How far, in radians, to go on round a circle until it heads for a place, as near as ArduPlane wants it.
+    """Return the angle, in radians, to continue on a circle until the plane heads for a place within ArduPlane's
+    tolerance.
 
-    The place may be so near that it never does, which is as good at once.
+    0 if the place is so near that the plane never heads for it.
     """
     away_m, radius_m = math.dist(centre[:2], there[:2]), math.dist(centre[:2], here.point[:2])
     if away_m < 1.05 * radius_m:
@@ -119,7 +124,7 @@ def _until_heading_for(there: Point, centre: Point, here: Motion) -> float:
 
 
 def loiter_radius_m(speed_ms: float) -> float:
-    """Of the circle that it flies round a place at this speed through the air."""
+    """Return the radius of the circle around a place at this airspeed."""
     return LOITER_RADIUS_M + LOITER_RADIUS_M_PER_MS * (speed_ms - CRUISE_MS)
 
 
@@ -128,7 +133,7 @@ def _duration_s(segments: Sequence[Segment]) -> float:
 
 
 class _Path:
-    """Segments in the making, at one speed, climbing or sinking to one altitude at one rate."""
+    """A path under construction, at one speed, with a climb or descent to one altitude at one rate."""
 
     def __init__(self, start: Motion, speed_ms: float, up_m: float, rate_ms: float) -> None:
         self.segments: list[Segment] = []
@@ -146,9 +151,9 @@ class _Path:
         self._add(Arc(self._end, centre, turn_rad, self.speed_ms))
 
     def fly_by(self, place: Point, reached_m: float, rather_left_m: float = 0.0) -> None:
-        """Turn towards `place`, whichever way is shorter, and go straight until it is `reached_m` away.
+        """Turn towards `place` by the shorter turn, and fly straight until the distance is `reached_m`.
 
-        To the right if that is shorter by more than `rather_left_m`.
+        The right turn must be shorter by more than `rather_left_m`.
         """
         here = self._end
         if math.dist(here.point[:2], place[:2]) <= max(reached_m, NEAR_M):
@@ -166,7 +171,7 @@ class _Path:
         self.straight(max(0.0, turn.ahead_m - reached_m))
 
     def bearing_rad(self, place: Point) -> float:
-        """Of a place as seen from the end of the path."""
+        """Return the bearing of a place from the end of the path."""
         return _bearing_rad(self._end.point, place)
 
     def _add(self, level: Segment) -> None:
@@ -176,7 +181,7 @@ class _Path:
 
 
 def _lift_off(start: Motion, altitude_m: float, straight_to_m: float) -> tuple[Sequence[Segment], _Path]:
-    """The run, and the climb to `altitude_m` begun: straight on up to `straight_to_m`."""
+    """Return the take-off run, and a path that climbs to `altitude_m`, straight up to `straight_to_m`."""
     run = Line(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
     path = _Path(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
     path.straight(TAKE_OFF_MS * max(0.0, straight_to_m - start.up_m) / TAKE_OFF_CLIMB_MS)
@@ -186,7 +191,7 @@ def _lift_off(start: Motion, altitude_m: float, straight_to_m: float) -> tuple[S
 def _back_and_on(
     start: Motion, place: Point, before: Point | None, speed_ms: float, rate_ms: float, reached_m: float
 ) -> Sequence[Segment]:
-    """Back to the line that leads to `place` from `before`, and on it until it is `reached_m` away."""
+    """Return to the line from `before` to `place`, and follow it until the distance is `reached_m`."""
     aim = None if before is None else _back_on_line(start.point, before, place)
     if before is None or aim is None:
         return _fly_by(start, place, speed_ms, rate_ms, reached_m)
@@ -205,7 +210,7 @@ def _fly_by(start: Motion, place: Point, speed_ms: float, rate_ms: float, reache
 
 
 class _Turn(NamedTuple):
-    """A turn after which a place is straight ahead: centre, angle clockwise, and how far ahead it is then."""
+    """A turn to a heading on which a place is straight ahead: centre, clockwise angle, and remaining distance."""
 
     centre: tuple[float, float]
     turn_rad: float
@@ -213,7 +218,7 @@ class _Turn(NamedTuple):
 
 
 def _turn_towards(start: Motion, place: Point, radius_m: float, rather_left_m: float) -> _Turn | None:
-    """The turn that makes the shorter way; None: the place is inside both circles."""
+    """Return the turn of the shorter path. None if the place is inside both circles."""
     ways = []
     for side in (1, -1):  # to the right, to the left
         centre = _beside(start, side * radius_m)
@@ -237,7 +242,7 @@ def _turn_towards(start: Motion, place: Point, radius_m: float, rather_left_m: f
 
 
 def _back_on_line(here: Point, before: Point, place: Point) -> Point | None:
-    """Where on the line between two places to aim at from beside it; None: the place itself is as near."""
+    """Return the point to aim at on the line between two places. None if the place itself is as near."""
     north, east = place.north_m - before.north_m, place.east_m - before.east_m
     length_m = math.hypot(north, east)
     if length_m < NEAR_M:
@@ -254,13 +259,13 @@ def _bearing_rad(here: Point, there: Point) -> float:
 
 
 def _on_circle(place: Point, radius_m: float, bearing_rad: float) -> Point:
-    """The point of the circle round a place in this direction from it."""
+    """Return the point of the circle around a place in this direction from the place."""
     north_m, east_m = radius_m * math.cos(bearing_rad), radius_m * math.sin(bearing_rad)
     return Point(place.north_m + north_m, place.east_m + east_m, place.up_m)
 
 
 def _towards(place: Point, other: Point, length_m: float) -> Point:
-    """So far from a place, on the way to the other."""
+    """Return the point at this distance from a place, in the direction of the other place."""
     away_m = max(math.dist(place[:2], other[:2]), NEAR_M)
     part = min(1.0, length_m / away_m)
     north_m, east_m = (a + part * (b - a) for a, b in zip(place[:2], other[:2], strict=True))
@@ -276,5 +281,5 @@ def _ahead(start: Motion, length_m: float) -> Point:
 
 
 def _beside(start: Motion, right_m: float) -> tuple[float, float]:
-    """North and east of the point so far to the right."""
+    """Return north and east of the point at this distance to the right."""
     return start.north_m - right_m * math.sin(start.yaw_rad), start.east_m + right_m * math.cos(start.yaw_rad)

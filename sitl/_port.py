@@ -1,7 +1,7 @@
-"""One TCP port of the embedded vehicle: a listener and at most one client, never blocking, never growing.
+"""One TCP port of the embedded vehicle: a listener with at most one client. It never blocks, and its memory is bounded.
 
-A client that reads too slowly loses telemetry; the vehicle does not wait for it (an ArduPilot at a speedup above 1
-does). A second client connects and hears nothing until the first has gone, as with ArduPilot.
+A client that reads too slowly loses telemetry, and the vehicle does not wait for it. ArduPilot does wait at a speedup
+above 1. A second client can connect, but receives nothing until the first disconnects, as with ArduPilot.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MAX_UNSENT_BYTES = 65_536
 
 
 class Port:
-    """Listens on 127.0.0.1. Raises OSError when the port cannot be had."""
+    """A listener on 127.0.0.1. Raises OSError if the port is not available."""
 
     def __init__(self, number: int, autopilot: Autopilot, selector: selectors.BaseSelector) -> None:
         self._autopilot = autopilot
@@ -64,9 +64,9 @@ class Port:
             self._drop_client()
 
     def send(self) -> None:
-        """Send what the channel has to say, or forget it when the client is too far behind.
+        """Send the pending messages of the channel, or discard them if the client is too slow.
 
-        Whole batches are forgotten, so what the client does get is never half a message.
+        Only complete batches are discarded, so the client never receives part of a message.
         """
         if self._client is None or self.channel is None:
             return

@@ -1,6 +1,6 @@
-"""A plan with nothing left open: every leg has its place, altitude and speed, and a plane its approach.
+"""The route of a plan: each leg has a place, an altitude and a speed, and a plane has an approach.
 
-Who flies a plan (the pilot) and who computes its track (track.py) both go by the route, so they cannot disagree.
+The pilot, which flies a plan, and track.py, which computes its track, both use the route. Therefore they agree.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from sitl._models import MODELS
 from sitl.plan import GoTo, Land, Loiter, Plan, TakeOff
 from sitl.vehicle import VehicleType
 
-SLOWEST = 0.25  # who is this much slower than asked for will not come
+SLOWEST = 0.25  # share of the commanded speed below which a vehicle never arrives
 SLOWEST_CLIMB_MS = 0.25
 GRACE_S = 120.0
 
-CLIMBED = 0.95  # of the altitude asked for is up there, as ArduPilot's own tests have it
+CLIMBED = 0.95  # share of the commanded altitude that counts as reached, as in ArduPilot's tests
 NEAR_M: dict[VehicleType, float] = {"copter": 2.0, "plane": 120.0, "rover": 5.0}
-"""How close is there, in GUIDED: WPNAV_RADIUS, a circle of WP_LOITER_RAD and half as much, and about WP_RADIUS."""
+"""Distance at which a place is reached in GUIDED mode: WPNAV_RADIUS, 1.5 times WP_LOITER_RAD, and about WP_RADIUS."""
 NEAR_UP_M = 10.0
 
 APPROACH_SLOPE = 0.1  # of a plane: it begins to land ten times as far away as it is high
@@ -31,7 +31,7 @@ Kind = Literal["take_off", "go_to", "loiter", "land"]
 
 @dataclass(frozen=True)
 class Waypoint:
-    """One thing to do at `place`, at `speed_ms` on the way there, for `seconds` if it is a loiter."""
+    """One action at `place`, at `speed_ms` on the way there, and for `seconds` if it is a loiter."""
 
     leg: str  # of the plan, in words: "leg 2 of 5 (...)"
     kind: Kind
@@ -41,7 +41,7 @@ class Waypoint:
 
 
 def route(plan: Plan, vehicle_type: VehicleType, heading_deg: float) -> tuple[Waypoint, ...]:
-    """The waypoints of `plan` for a vehicle whose home heads `heading_deg`. Raises PlanError."""
+    """Return the waypoints of `plan` for a vehicle whose home has the heading `heading_deg`. Raises PlanError."""
     plan.check(vehicle_type)
     cruise_ms = MODELS[vehicle_type].cruise_ms
     place, speed_ms = Point(0.0, 0.0, 0.0), cruise_ms
@@ -66,7 +66,7 @@ def route(plan: Plan, vehicle_type: VehicleType, heading_deg: float) -> tuple[Wa
 
 
 def limit_s(waypoints: Sequence[Waypoint], index: int) -> float:
-    """How many of the vehicle's seconds one waypoint may take, coming from the one before."""
+    """Return the time limit, in simulated seconds, of one waypoint after the previous one."""
     waypoint = waypoints[index]
     start = waypoints[index - 1].place if index else Point(0.0, 0.0, 0.0)
     way_s = math.dist(start[:2], waypoint.place[:2]) / (SLOWEST * waypoint.speed_ms)
@@ -75,22 +75,25 @@ def limit_s(waypoints: Sequence[Waypoint], index: int) -> float:
 
 
 def is_near(place: Point, waypoint: Waypoint, vehicle_type: VehicleType) -> bool:
-    """Whether who is led in GUIDED has come to the waypoint."""
+    """Return whether a vehicle in GUIDED mode has reached the waypoint."""
     level = vehicle_type == "rover" or abs(place.up_m - waypoint.place.up_m) <= NEAR_UP_M
     return level and to_go_m(place, waypoint, vehicle_type) <= 0
 
 
 def to_go_m(place: Point, waypoint: Waypoint, vehicle_type: VehicleType) -> float:
-    """How far over the ground it is until there; less than 0 is past that."""
+    """Return the remaining distance over the ground. Negative inside the tolerance."""
     return math.dist(place[:2], waypoint.place[:2]) - NEAR_M[vehicle_type]
 
 
 def landing_begins(waypoints: Sequence[Waypoint], vehicle_type: VehicleType) -> int | None:
-    """Which waypoint begins a plane's landing, which is a mission even where the rest is flown in GUIDED."""
+    """Return the index of the waypoint at which a plane's landing begins. The landing is always a mission."""
     return len(waypoints) - 2 if vehicle_type == "plane" and waypoints[-1].kind == "land" else None
 
 
 def _approach(place: Point, heading_deg: float) -> Point:
-    """Where a plane begins to land at `place`: before it on the runway, which has the heading of home."""
+    """Return the place at which a plane begins to land at `place`.
+
+    It lies before it on the runway, along home's heading.
+    """
     before_m, heading = place.up_m / APPROACH_SLOPE, math.radians(heading_deg)
     return Point(place.north_m - before_m * math.cos(heading), place.east_m - before_m * math.sin(heading), place.up_m)

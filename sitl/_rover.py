@@ -1,4 +1,4 @@
-"""How a rover moves. The figures are those of ArduRover's SITL (rover.parm) and its defaults, parameters by name."""
+"""The motion of a rover. The figures are those of ArduRover's SITL (rover.parm) and its default parameters."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from sitl._kinematics import Line, Motion, Point, Rest, Segment, end_of
 
 CRUISE_MS = 5.0  # CRUISE_SPEED
 ACCEL_MS2 = 1.0  # ATC_ACCEL_MAX
-TURN_RATE_RADS = math.radians(45.0)  # what it takes who stands to turn round first, as measured with 4.7
-CORNER_MS = 0.5  # at a corner it does not quite stand
+TURN_RATE_RADS = math.radians(45.0)  # rate of a standing rover, measured with 4.7
+CORNER_MS = 0.5  # it does not stop completely at a corner
 
 
 @dataclass(frozen=True)
 class Rover:
-    """The `MotionModel` of a rover: straight from place to place on level ground, almost with a stop at each.
+    """The `MotionModel` of a rover: straight lines on level ground, with almost a stop at each place.
 
-    `start_s` goes by before one that stands moves, and at corners it turns at `corner_rads`, radians per second; what
-    is given is measured with 4.7, in AUTO, where it makes up for its corners by smoothing them.
+    A standing rover waits `start_s` before it moves. At corners it turns at `corner_rads`, in radians per second. The
+    default values were measured with ArduRover 4.7 in AUTO mode, in which it smooths corners.
     """
 
     start_s: float = 1.5
@@ -28,7 +28,7 @@ class Rover:
     cruise_ms = CRUISE_MS
 
     def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
-        """It cannot, and stays."""
+        """Stay, because a rover cannot take off."""
         return [Rest(start, 0.0)]
 
     def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
@@ -49,7 +49,7 @@ class Rover:
         return [*there, Rest(end_of(there), seconds)]
 
     def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
-        """It never left the ground, and stays."""
+        """Stay, because a rover is always on the ground."""
         return [Rest(start, 0.0)]
 
     def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:

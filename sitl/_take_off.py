@@ -1,7 +1,7 @@
-"""Taking off without a plan, and to begin a plan that is flown in GUIDED; and falling down.
+"""Procedures that take off, without a plan or before a plan in GUIDED mode, and that end a flight by force.
 
-The commands are those of ArduPilot's developer documentation, "Copter Commands in Guided Mode". A plane has no take-off
-in GUIDED: it takes off in its mode TAKEOFF, to the altitude of its parameter TKOFF_ALT. A rover only gets ready.
+The commands are those of ArduPilot's developer documentation, "Copter Commands in Guided Mode". A plane cannot take off
+in GUIDED mode. It takes off in its mode TAKEOFF, to the altitude in its parameter TKOFF_ALT. A rover only arms.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from sitl.procedure import ARM, HEARTBEAT, Commander, Step
 from sitl.vehicle import VehicleType
 
 SLOWEST_CLIMB_MS = 0.5
-LOW_M = 2.0  # who is not higher lies on the ground
+LOW_M = 2.0  # a vehicle below this lies on the ground
 
 PARAMETER = Step("parameter TKOFF_ALT")
 TAKE_OFF = Step("the take-off command")
@@ -26,7 +26,7 @@ TKOFF_ALT = "TKOFF_ALT"
 
 
 class TakeOff:
-    """Set the mode, arm, take off, and climb to `altitude_m` above home; a rover arms in GUIDED, and that is all."""
+    """Set the mode, arm, take off, and climb to `altitude_m` above home. A rover only arms in GUIDED mode."""
 
     purpose = "take off"
 
@@ -69,7 +69,7 @@ class TakeOff:
 
 
 class Termination:
-    """Disarm in flight, by force, and fall to the ground."""
+    """Disarm in flight by force, and fall to the ground."""
 
     purpose = "end its flight"
 

@@ -1,4 +1,4 @@
-"""Text files that a user names: bounded, and regular ones only."""
+"""Read text files that a user names: regular files of limited size only."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MAX_SHOWN = 200
 
 
 def text_of(path: Path, limit: int) -> str:
-    """What a regular file of at most `limit` bytes says. Raises VehicleError."""
+    """Return the text of a regular file of at most `limit` bytes. Raises VehicleError."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):

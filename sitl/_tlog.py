@@ -1,7 +1,7 @@
-"""The telemetry log: every MAVLink frame as received, each behind the time of its arrival.
+"""The telemetry log: each received MAVLink frame, after the time of its arrival.
 
-The format of MAVProxy, Mission Planner and pymavlink (`.tlog`): microseconds since the Unix epoch as a big-endian u64
-whose two lowest bits number the link, then the raw frame.
+The format is that of MAVProxy, Mission Planner and pymavlink (`.tlog`). The time is in microseconds since the Unix
+epoch as a big-endian u64, and its two lowest bits number the link.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _LINK_BITS = 3
 
 
 class TelemetryLog:
-    """Appends to a .tlog: a vehicle that is restarted goes on in the same file. Raises OSError as files do."""
+    """A .tlog file that is appended to. A restarted vehicle continues its file. Methods raise OSError."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("ab")
@@ -30,6 +30,6 @@ class TelemetryLog:
         self._file.close()
 
     def abandon(self) -> None:
-        """Close what can no longer be written to."""
+        """Close the file after a write error."""
         with contextlib.suppress(OSError):
             self._file.close()

@@ -1,4 +1,4 @@
-"""What a vehicle last said about itself, as its pilot keeps it."""
+"""The last reported state of a vehicle, as its pilot keeps it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Position:
-    """Where a vehicle says it is: degrees, metres above sea level, metres above home.
+    """The reported position: degrees, metres above sea level, and metres above home.
 
-    And how it moves: metres per second north, east and up, and the heading in degrees clockwise from north, if known.
+    The movement is in metres per second north, east and up. The heading is in degrees clockwise from north, None if
+    unknown.
     """
 
     lat_deg: float
@@ -25,7 +26,7 @@ class Position:
 
 @dataclass(frozen=True)
 class Battery:
-    """Volts, and what is left, 0 to 1; None: it does not know."""
+    """Voltage and remaining share, 0 to 1. None means unknown."""
 
     voltage_v: float | None
     left: float | None
@@ -33,14 +34,16 @@ class Battery:
 
 @dataclass(frozen=True)
 class Version:
-    """As people write it ("4.7.0-dev"), and the first digits of the git commit that it was built from, if it says."""
+    """The version in its usual form ("4.7.0-dev"), and the first digits of the git commit of the build, if reported."""
 
     number: str
     commit: str | None = None
 
     @classmethod
     def of(cls, number: int, custom: bytes) -> Version:
-        """From an AUTOPILOT_VERSION: three numbers and a FIRMWARE_VERSION_TYPE, a byte each, and 8 characters."""
+        """Return the version in an AUTOPILOT_VERSION: three numbers and a FIRMWARE_VERSION_TYPE, one byte each, and
+        8 characters.
+        """
         major, minor, patch, kind = number.to_bytes(4, "big")
         stages = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc"}
         stage = next((word for least, word in sorted(stages.items(), reverse=True) if kind >= least), "")
@@ -51,7 +54,7 @@ class Version:
 
 @dataclass
 class VehicleState:
-    """None is "not yet"."""
+    """The state. None means that it was not reported yet."""
 
     mode: int | None = None  # ArduPilot's custom_mode
     mav_type: int | None = None  # MAV_TYPE

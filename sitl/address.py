@@ -1,4 +1,4 @@
-"""Where a ground station listens, in words, and whether there is a way to it."""
+"""The address of a ground station, and a socket to it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from sitl.vehicle import VehicleError
 
 @dataclass(frozen=True)
 class Address:
-    """Where a ground station listens."""
+    """The address at which a ground station listens."""
 
     host: str
     port: int
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """HOST:PORT, of IPv6 [HOST]:PORT. Raises VehicleError."""
+        """Return the address in HOST:PORT, or [HOST]:PORT for IPv6. Raises VehicleError."""
         host, _, port = text.rpartition(":")
         bracketed = host.startswith("[") and host.endswith("]")
         host = host[1:-1] if bracketed else host
@@ -37,9 +37,9 @@ class Address:
 
 
 def connected(address: Address) -> socket.socket:
-    """A UDP socket that is for this address alone; nothing is sent. Raises VehicleError if there is no way to it.
+    """Return a UDP socket for this address only. Nothing is sent. Raises VehicleError if the address cannot be reached.
 
-    Of a name that has both, the address of IPv4: that is what ground stations listen on.
+    If a name has both, the IPv4 address is used, because ground stations listen on it.
     """
     try:
         ways = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM)
@@ -56,7 +56,7 @@ def connected(address: Address) -> socket.socket:
 
 
 def _no_way_to(address: Address, error: OSError | UnicodeError) -> VehicleError:
-    """The error, for people, that nothing can be sent there."""
+    """Return the error for an unreachable address."""
     reason = "it is no name" if isinstance(error, UnicodeError) else error.strerror or str(error)
     return VehicleError(
         f"datagrams to the ground station at {address} cannot be sent ({reason}): name an address that this machine "

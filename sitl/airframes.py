@@ -1,7 +1,7 @@
-"""ArduPilot's frames: the type of vehicle that each is, what its program calls it, and the defaults that it needs.
+"""ArduPilot's frames: the type of vehicle, the model name in its program, and the default parameters of each.
 
-These are parameter files of ArduPilot's Tools/autotest, one over the other, as its sim_vehicle.py stacks them. A frame
-that is not in this table is passed on as it is, if the program offers it, with the defaults of its type.
+The default parameters are files of ArduPilot's Tools/autotest, which are applied in order, as in its sim_vehicle.py. A
+frame that is missing in this table is passed on unchanged, if the program offers it, with the defaults of its type.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from sitl.vehicle import VehicleType
 
 BINARIES: dict[VehicleType, str] = {"copter": "arducopter", "plane": "arduplane", "rover": "ardurover"}
 DEFAULTS: dict[VehicleType, str] = {"copter": "copter.parm", "plane": "plane.parm", "rover": "rover.parm"}
-"""Parameters of ArduPilot's Tools/autotest (default_params, models), beside the binary."""
+"""Parameter files of ArduPilot's Tools/autotest (default_params, models), in the directory of the binary."""
 
 HELI = "arducopter-heli"
 
 
 @dataclass(frozen=True)
 class Airframe:
-    """`model` is what the option --model of `program` is given, `defaults` the names of files in their order."""
+    """A frame. `model` is the value of the option --model of `program`. `defaults` has the names of files in order."""
 
     vehicle_type: VehicleType
     model: str
@@ -28,7 +28,7 @@ class Airframe:
 
 
 def airframe(name: str | None, vehicle_type: VehicleType) -> Airframe:
-    """That of a name, or of the type where it is None."""
+    """Return the frame with this name. None selects the default frame of the type."""
     if name is None:
         name = USUAL[vehicle_type]
     own = (DEFAULTS[vehicle_type],)
@@ -36,7 +36,7 @@ def airframe(name: str | None, vehicle_type: VehicleType) -> Airframe:
 
 
 def type_of(name: str) -> VehicleType | None:
-    """Which type of vehicle has this frame; None if that is not known."""
+    """Return the type of vehicle with this frame. None if unknown."""
     known = _TABLE.get(_ALIASES.get(name, name))
     return known.vehicle_type if known else None
 
@@ -48,7 +48,7 @@ NOT_FLOWN = {
     "blimp": "Blimp",
     "tracker": "AntennaTracker",
 }
-"""Frames of programs that no pilot here flies, though every ArduPilot binary offers them."""
+"""Frames of programs that this pilot cannot fly, although each ArduPilot binary offers them."""
 
 _ALIASES = {"helicopter": "heli", "boat": "motorboat", "quad": "+"}
 
@@ -128,7 +128,7 @@ _TABLE = _table()
 
 
 def stacked(vehicle_type: VehicleType) -> list[str]:
-    """The names of all files of default parameters that frames of the type's usual program need beyond its own."""
+    """Return the names of all parameter files that frames of the type's usual program need in addition to its own."""
     program, own = BINARIES[vehicle_type], DEFAULTS[vehicle_type]
     frames = (frame for frame in _TABLE.values() if frame.program == program)
     return sorted({name for frame in frames for name in frame.defaults} - {own})

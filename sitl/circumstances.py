@@ -1,9 +1,9 @@
-"""What befalls a simulated vehicle: parameters of ArduPilot's simulation (SIM_...), whose names changed over versions.
+"""Faults and weather of a simulated vehicle: parameters of ArduPilot's simulation (SIM_...).
 
-A circumstance is several ways to bring it about, the present one first; of these the first counts of which the vehicle
-has all parameters. ArduPilot answers nothing to a question for a parameter that it does not have, and answers in the
-order of the questions: who has answered to a later way does not have an earlier one. What is set has come about when
-the vehicle says that value back.
+The names of these parameters differ between versions. A circumstance therefore has several alternatives, the current
+one first. The first alternative whose parameters all exist is used. ArduPilot does not answer a request for an unknown
+parameter, and it answers in order. So an answer to a later alternative shows that the earlier ones do not exist. A
+value is set when the vehicle reports it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ if TYPE_CHECKING:  # a scenario names circumstances, and imports no MAVLink for 
     from sitl._pilot_link import Link
 
 ANSWER_S = 3.0
-"""Of our time, and at a speedup below 1 of simulated time: a vehicle answers within one turn of its main loop."""
+"""Time limit for an answer in seconds, divided by the speedup if that is below 1. A vehicle answers in one main
+loop."""
 ASK_AGAIN_S = 0.5
 LOOK_S = 0.01
 
@@ -31,12 +32,12 @@ _COMPASSES = tuple(f"SIM_MAG{number}_FAIL" for number in (1, 2, 3))
 
 
 class NotSimulatedError(VehicleError):
-    """The vehicle does not simulate it, or did not say that it does."""
+    """The vehicle cannot simulate the circumstance, or did not confirm it."""
 
 
 @dataclass(frozen=True)
 class Circumstance:
-    """`what` in words, after "simulate"; each of `ways` is parameters and their values."""
+    """A circumstance. `what` completes "simulate ...". Each of `ways` has parameters with their values."""
 
     what: str
     ways: tuple[Mapping[str, float], ...]
@@ -47,21 +48,21 @@ GPS_REGAINED = Circumstance("a GPS that is back", GPS_ON)
 COMPASS_LOST = Circumstance("the loss of its compasses", (dict.fromkeys(_COMPASSES, 1.0), {_COMPASSES[0]: 1.0}))
 COMPASS_REGAINED = Circumstance("compasses that are back", (dict.fromkeys(_COMPASSES, 0.0), {_COMPASSES[0]: 0.0}))
 MOTOR_STOPPED = Circumstance("the failure of a motor", ({"SIM_ENGINE_MUL": 0.0, "SIM_ENGINE_FAIL": 1.0},))
-"""SIM_ENGINE_FAIL 1 is the second motor where that is an output's number, the first where it is a mask: one of them."""
+"""SIM_ENGINE_FAIL 1 stops one motor: the second if the value is an output number, the first if it is a mask."""
 
 
 def battery(volts: float) -> Circumstance:
-    """From now on it has so many volts, and goes on from there."""
+    """Return the circumstance that the battery has this voltage from now on."""
     return Circumstance(f"a battery of {volts:g} V", ({"SIM_BATT_VOLTAGE": volts},))
 
 
 def wind(speed_ms: float, from_deg: float) -> Circumstance:
-    """Wind of metres per second from a direction in degrees clockwise from north."""
+    """Return the circumstance of wind at this speed, from a direction in degrees clockwise from north."""
     return Circumstance(f"wind of {speed_ms:g} m/s", ({"SIM_WIND_SPD": speed_ms, "SIM_WIND_DIR": from_deg},))
 
 
 async def bring_about(link: Link, circumstance: Circumstance) -> Mapping[str, float]:
-    """Have the vehicle simulate it; which parameters now have which values. Raises NotSimulatedError."""
+    """Make the vehicle simulate a circumstance. Return the set parameters. Raises NotSimulatedError."""
     ways, limit_s = circumstance.ways, ANSWER_S / min(1.0, link.speedup)
     for way in ways:
         for name in way:
@@ -89,7 +90,7 @@ async def bring_about(link: Link, circumstance: Circumstance) -> Mapping[str, fl
     def set_all() -> None:
         for name, value in values.items():
             link.set_parameter(name, value)
-            link.request_parameter(name)  # who has that value already does not say it again
+            link.request_parameter(name)  # a vehicle does not report an unchanged value
 
     def came_about() -> Mapping[str, float] | None:
         return values if all(_same(link.parameters[name], value) for name, value in values.items()) else None
@@ -106,7 +107,7 @@ async def _heard(
     ask: Callable[[], None],
     limit_s: float,
 ) -> Mapping[str, float] | None:
-    """The answer, asked for again and again until the time is over or the connection has ended."""
+    """Return the answer. The request is repeated until the time limit or the end of the connection."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + limit_s
     while loop.time() < deadline and not link.closed.is_set():
@@ -120,5 +121,5 @@ async def _heard(
 
 
 def _same(said: float, meant: float) -> bool:
-    """As far as a float of 32 bits tells."""
+    """Return whether both values are equal as 32-bit floats."""
     return math.isclose(said, meant, rel_tol=1e-5, abs_tol=1e-5)

@@ -1,9 +1,9 @@
-"""Files over HTTP, bounded in size and in silence; a large one goes on where an earlier attempt broke off.
+"""Download files over HTTP, with limits on size and silence. An interrupted download is resumed.
 
-What has come of a file stands beside its place in `NAME.part`, and what the server said of it in `NAME.part.json`: its
-size, and the validator by which the server knows it again (ETag, or Last-Modified). The rest is asked for with Range
-and If-Range (RFC 9110, sections 13.1.5 and 14.2) and taken only if the answer fits what is there; otherwise all is
-fetched anew. Proxies are those of the environment (`https_proxy`, `no_proxy`: urllib.request.getproxies).
+The received part is stored in `NAME.part`. `NAME.part.json` has the total size, and the validator of the file (ETag or
+Last-Modified). The rest is requested with Range and If-Range (RFC 9110, sections 13.1.5 and 14.2). If the answer does
+not fit, the download restarts. Proxies come from the environment (`https_proxy`, `no_proxy`:
+urllib.request.getproxies).
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from urllib.parse import urlsplit
 from sitl.vehicle import VehicleError
 
 STALL_S = 20.0
-"""A server that sends nothing for so many seconds is given up."""
+"""Seconds without data after which a download fails."""
 
 CHUNK = 1 << 16  # bytes
 
 Progress = Callable[[int, int], None]
-"""Told bytes that are here, and bytes in all."""
+"""A function that receives the downloaded and the total number of bytes."""
 
 
 class DownloadError(VehicleError):
-    """A file could not be fetched."""
+    """The download of a file failed."""
 
 
 class NotThereError(DownloadError):
@@ -40,21 +40,21 @@ class NotThereError(DownloadError):
 
 
 class UnreachableError(DownloadError):
-    """There is no way to the server from here."""
+    """The server cannot be reached."""
 
 
 @dataclass(frozen=True)
 class _Origin:
-    """What the server said of the file whose beginning is here."""
+    """The size and validator that the server gave for a partly downloaded file."""
 
     size: int
     validator: str
 
 
 def download(url: str, target: Path, limit: int, progress: Progress, stall_s: float = STALL_S) -> None:
-    """Fetch `url`, of at most `limit` bytes, into `target`; a broken download is gone on with, if the file is the same.
+    """Download `url`, at most `limit` bytes, to `target`. An interrupted download of the same file is resumed.
 
-    Raises DownloadError, and OSError if the disk does not take it; `target` is written whole or not at all.
+    `target` is written completely or not at all. Raises DownloadError, or OSError on a disk error.
     """
     part, noted = target.with_name(f"{target.name}.part"), target.with_name(f"{target.name}.part.json")
     kept = _kept(part, noted)
@@ -87,7 +87,7 @@ def download(url: str, target: Path, limit: int, progress: Progress, stall_s: fl
 
 
 def fetch_text(url: str, limit: int, stall_s: float = STALL_S) -> str:
-    """The small text at `url`, of at most `limit` bytes. Raises DownloadError."""
+    """Return the text at `url`, at most `limit` bytes. Raises DownloadError."""
     content = bytearray()
     with _answer(url, {}, stall_s) as answer:
         for chunk in _chunks(url, answer, stall_s):
@@ -98,12 +98,12 @@ def fetch_text(url: str, limit: int, stall_s: float = STALL_S) -> str:
 
 
 def megabytes(number: int) -> str:
-    """Bytes for a reader: `7.0 MB`."""
+    """Return a size as text, such as `7.0 MB`."""
     return f"{number / 1e6:.1f} MB"
 
 
 class StayEncrypted(urllib.request.HTTPRedirectHandler):
-    """Follows redirects, but never from https to anything that a third party could have changed on the way."""
+    """A handler that follows redirects, but never from https to an unencrypted address."""
 
     def redirect_request(
         self, req: urllib.request.Request, fp: IO[bytes], code: int, msg: str, headers: Any, newurl: str
@@ -115,7 +115,7 @@ class StayEncrypted(urllib.request.HTTPRedirectHandler):
 
 @contextlib.contextmanager
 def _answer(url: str, headers: Mapping[str, str], stall_s: float) -> Iterator[Any]:
-    """The server's answer, a success or 416 (Range Not Satisfiable), while its body is read. Raises DownloadError."""
+    """Provide the server's answer, a success or 416 (Range Not Satisfiable). Raises DownloadError."""
     host = urlsplit(url).netloc
     request = urllib.request.Request(url, headers={"User-Agent": "ucp-harness", **headers})  # noqa: S310 - http(s) only
     opener = urllib.request.build_opener(StayEncrypted)
@@ -135,7 +135,7 @@ def _answer(url: str, headers: Mapping[str, str], stall_s: float) -> Iterator[An
 
 
 def _chunks(url: str, answer: Any, stall_s: float) -> Iterator[bytes]:
-    """The body as it comes. Raises DownloadError if it does not come, or not whole."""
+    """Yield the body in chunks. Raises DownloadError if it is missing or incomplete."""
     left: int | None = answer.length
     if left is None and not answer.chunked:
         raise _endless(url)
@@ -161,12 +161,12 @@ def _broken_off(url: str) -> DownloadError:
 
 
 def _endless(url: str) -> DownloadError:
-    """For an answer of which nobody could tell whether it was cut."""
+    """Return the error for an answer without a size, whose completeness cannot be checked."""
     return DownloadError(f"{urlsplit(url).netloc} does not say how large {url} is: use another --url")
 
 
 def _kept(part: Path, noted: Path) -> tuple[int, _Origin] | None:
-    """How many bytes an earlier attempt left, and of which file; None if there is nothing to go on with."""
+    """Return the size and origin of an earlier partial download. None if there is none."""
     try:
         have, origin = part.stat().st_size, _Origin(**json.loads(noted.read_text()))
         return (have, origin) if have else None
@@ -175,14 +175,14 @@ def _kept(part: Path, noted: Path) -> tuple[int, _Origin] | None:
 
 
 def _fits(answer: Any, have: int, origin: _Origin) -> bool:
-    """Whether a partial answer is the rest of the file whose first `have` bytes are here."""
+    """Return whether a partial answer is the rest of the file after its first `have` bytes."""
     match = re.fullmatch(r"bytes (\d+)-(\d+)/(\d+)", answer.headers.get("Content-Range", ""))
     wanted = (have, origin.size - 1, origin.size)
     return match is not None and tuple(map(int, match.groups())) == wanted and _validator(answer) == origin.validator
 
 
 def _validator(answer: Any) -> str | None:
-    """By what the server knows this file again: a strong ETag, else Last-Modified, else nothing."""
+    """Return the validator of the file: a strong ETag, else Last-Modified, else None."""
     etag: str = answer.headers.get("ETag", "")
     return etag if etag.startswith('"') else answer.headers.get("Last-Modified")
 

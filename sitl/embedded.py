@@ -1,10 +1,11 @@
-"""The embedded vehicle: what flies where no ArduPilot binary is at hand.
+"""The embedded vehicle, which flies without an ArduPilot binary.
 
     python -m sitl.embedded --type plane --sysid 3 --home -35.363262,149.165237,584,270 --speedup 20
 
-A small process (one thread, standard library and a MAVLink dialect) that listens on 127.0.0.1 on ArduPilot SITL's three
-ports and answers like one, so that the same pilot flies both. Its clock runs `speedup` times as fast as ours; what it
-sends in a second of ours is bounded all the same. SIGTERM ends it with exit status 0.
+A small process with one thread, which needs only the standard library and a MAVLink dialect. It listens on 127.0.0.1 on
+the three ports of ArduPilot SITL and answers like ArduPilot, so the same pilot flies both. Its clock runs `speedup`
+times as fast as wall time, but the data that it sends per second of wall time is bounded. SIGTERM ends it with exit
+status 0.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ class Embedded:
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """One sentence instead of a screenful of usage."""
+        """Print one sentence in place of the usage text."""
         self.exit(2, f"{self.prog}: {message}\n")
 
 
@@ -113,7 +114,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Fly until SIGTERM. Exit status 2 with one sentence when the arguments or the ports are of no use."""
+    """Fly until SIGTERM. Exits with status 2 and one sentence for wrong arguments or unavailable ports."""
     arguments = _arguments(argv)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -139,7 +140,7 @@ def _complain(sysid: int, port: int, reason: str) -> int:
 
 
 class _Clock:
-    """Simulated seconds since boot. They stand while the process is stopped (SIGSTOP), as ArduPilot's do."""
+    """Simulated seconds since boot. They stop while the process is stopped (SIGSTOP), as in ArduPilot."""
 
     def __init__(self, speedup: float) -> None:
         self._speedup = speedup
@@ -147,7 +148,10 @@ class _Clock:
         self.now_s = 0.0
 
     def read(self, slept_s: float) -> float:
-        """The time after a sleep that was to take `slept_s`; what it took far beyond that did not happen."""
+        """Return the time after a sleep of `slept_s`.
+
+        A much longer sleep means that the process was stopped, and is not counted.
+        """
         at = time.monotonic()
         self.now_s += min(at - self._read_at, slept_s + MAX_DELAY_S) * self._speedup
         self._read_at = at

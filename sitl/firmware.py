@@ -1,17 +1,16 @@
-"""Installing ArduPilot's own SITL binaries for Linux into the cache (sitl/installed.py).
+"""Install ArduPilot's SITL binaries for Linux into the cache (sitl/installed.py).
 
-What the firmware server has, at VEHICLE/RELEASE/BOARD/: the binary, statically linked, and `git-version.txt`, which
-names the commit and the version that it was built from. RELEASE is stable, beta, latest, or stable-4.6.3; BOARD is
-SITL_x86_64_linux_gnu or SITL_arm_linux_gnueabihf, and there are no others (ArduPilot's Tools/scripts/board_list.py): an
-aarch64 takes the latter, if it runs programs of 32 bits. The vehicle's default parameters are taken from ArduPilot's
-source tree at that very commit, and those that its frames stack on top: a tag would not do, for `latest` has none, and
-the binary of 4.6.3 was built from the commit before its tag. A mirror (`base`) replaces both hosts; the paths stay as
-they are.
+The firmware server has a statically linked binary at VEHICLE/RELEASE/BOARD/, and `git-version.txt` with its commit and
+version. RELEASE is stable, beta, latest, or for example stable-4.6.3. BOARD is SITL_x86_64_linux_gnu or
+SITL_arm_linux_gnueabihf. There are no other boards (ArduPilot's Tools/scripts/board_list.py). An aarch64 machine uses
+the latter if it runs 32-bit programs. The default parameters of the vehicle and its frames come from ArduPilot's source
+tree at the same commit. A tag would not suffice: `latest` has none, and the binary of 4.6.3 was built from the commit
+before its tag. A mirror (`base`) replaces both hosts, with the same paths.
 
-This was written without a way to the server, from ArduPilot's build scripts and from files and listings of the server
-that others have published. Not verified, hence not relied on: which validators the server sends (a download is resumed
-if it sends any), whether it answers ranges (it is begun anew otherwise), and the exact form of its listings (they only
-help to name versions when one is not there). It publishes no checksum.
+This module was written without access to the server, from ArduPilot's build scripts and from published listings. It
+therefore does not rely on the following properties. The server may send no validators, and then a download is not
+resumed. It may not support ranges, and then a download restarts. The form of its listings may differ, and then an error
+message does not list the versions. The server publishes no checksums.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ SOURCE = "https://raw.githubusercontent.com"
 LIMIT = 100_000_000  # bytes; a binary has about 7 MB
 TEXT_LIMIT = 1_000_000  # bytes
 HELP_S = 10.0
-"""A program that has begun to say its help runs, however long it takes."""
+"""Time limit for `--help`. A program that is still running after it is able to run."""
 
 # Where the source tree keeps a vehicle's defaults; the plane's have moved.
 _AUTOTEST = "Tools/autotest"
@@ -58,7 +57,7 @@ _NUMBER = re.compile(r"\d+\.\d+\.\d+")
 
 @dataclass(frozen=True)
 class _Board:
-    """For which processor a binary is built: its directory on the server, and how its ELF header begins."""
+    """The processor that a binary is built for: its directory on the server, and the beginning of its ELF header."""
 
     directory: str
     processor: str
@@ -68,12 +67,12 @@ class _Board:
 _X86_64 = _Board("SITL_x86_64_linux_gnu", "x86_64", re.compile(rb"\x7fELF\x02\x01.{12}\x3e\x00", re.DOTALL))
 _ARM = _Board("SITL_arm_linux_gnueabihf", "32-bit ARM", re.compile(rb"\x7fELF\x01\x01.{12}\x28\x00", re.DOTALL))
 _BOARDS = {"x86_64": _X86_64, "aarch64": _ARM, "armv7l": _ARM}
-"""By what platform.machine() says; 64 and 32 bits, little endian, e_machine 62 and 40."""
+"""Boards by platform.machine(). Both are little endian, with 64 and 32 bits and e_machine 62 and 40."""
 _FROM_SOURCE = "build ArduPilot SITL from source and set ARDUPILOT_SITL to its directory"
 
 
 class RequestError(VehicleError):
-    """There is no such version, or no such address."""
+    """The version or the address does not exist."""
 
 
 class CacheError(VehicleError):
@@ -81,18 +80,18 @@ class CacheError(VehicleError):
 
 
 class Watcher(Protocol):
-    """Somebody who looks on."""
+    """An observer of an installation."""
 
     def waits(self) -> None:
-        """Another install of this vehicle is under way, and has to end first."""
+        """Report that another installation of this vehicle must end first."""
 
     def downloads(self, done: int, total: int) -> None:
-        """So many bytes of the binary are here."""
+        """Report the number of downloaded bytes of the binary, and its size."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What is installed now, and whether it was before."""
+    """The installed version, and whether it was installed before."""
 
     installed: Installed
     already: bool
@@ -100,14 +99,14 @@ class Outcome:
 
 @dataclass(frozen=True)
 class _Build:
-    """What `git-version.txt` says of a binary."""
+    """The version and commit in `git-version.txt`."""
 
     version: str
     commit: str
 
     @property
     def name(self) -> str:
-        """Its directory: two development builds may bear the same version."""
+        """The name of the directory. Development builds may share a version, so it contains the commit."""
         return self.version if _NUMBER.fullmatch(self.version) else f"{self.version}-{self.commit[:8]}"
 
 
@@ -119,15 +118,13 @@ def install(
     base: str | None = None,
     stall_s: float = STALL_S,
 ) -> Outcome:
-    """Fetch a vehicle's binary and default parameters into the cache, unless they are there, and make them current.
+    """Install the binary and the default parameters of a vehicle, unless they are in the cache, and make them current.
 
-    What its frames need goes with it, as far as that version has it.
+    `version` is `stable`, `beta`, `latest` or a number such as 4.6.3. A number that is installed needs no server. An
+    interrupted installation is resumed. Parameter files of frames are included if the version has them.
 
-    `version` is `stable`, `beta`, `latest` or a number such as 4.6.3, which asks no server if it is here. An install
-    that was interrupted, in whatever way, goes on where it stopped.
-
-    Raises RequestError for a version or a `base` that does not exist, DownloadError if it cannot be fetched,
-    CacheError if it cannot be written, VehicleError if this machine could not run it.
+    Raises RequestError for a version or a `base` that does not exist, DownloadError if a download fails, CacheError if
+    the cache cannot be written, and VehicleError if this machine cannot run the binary.
     """
     if not re.fullmatch(r"[a-z0-9][\w.-]*", version, re.ASCII):
         raise RequestError(f"{version!r} is no version: give stable, beta, latest or a number such as 4.6.3")
@@ -159,7 +156,7 @@ def install(
 
 
 class _Server:
-    """One release of one vehicle, as ArduPilot or a mirror publishes it. Raises RequestError for a bad `base`."""
+    """One release of one vehicle on ArduPilot's server or a mirror. Raises RequestError for an invalid `base`."""
 
     def __init__(self, vehicle: VehicleType, version: str, board: _Board, base: str | None, stall_s: float) -> None:
         self._vehicle, self._version, self._board, self._stall_s = vehicle, version, board, stall_s
@@ -168,7 +165,7 @@ class _Server:
         self._release = f"{self._releases}{f'stable-{version}' if version[0].isdigit() else version}/{board.directory}/"
 
     def build(self) -> _Build:
-        """What the release is at present."""
+        """Return the current build of the release."""
         url = f"{self._release}git-version.txt"
         try:
             text = fetch_text(url, TEXT_LIMIT, self._stall_s)
@@ -181,7 +178,7 @@ class _Server:
         return _Build(version[1], commit[1])
 
     def fetch_binary(self, directory: Path, watcher: Watcher) -> File:
-        """The binary, fetched or found whole in `directory`, executable."""
+        """Download the binary to `directory`, unless it is there, and make it executable."""
         path = directory / BINARIES[self._vehicle]
         url = self._release + path.name
         if not path.exists():
@@ -203,7 +200,9 @@ class _Server:
         return File.of(path, url)
 
     def fetch_parameters(self, directory: Path, build: _Build) -> dict[str, File]:
-        """The vehicle's default parameters at the commit of the binary, and those of its frames that there are."""
+        """Download the default parameters of the vehicle at the commit of the binary, and the existing ones of its
+        frames.
+        """
         own = DEFAULTS[self._vehicle]
         places = {own: _PARAMETERS[self._vehicle]}
         for name in stacked(self._vehicle):
@@ -218,7 +217,7 @@ class _Server:
         return f"{self._source}/ArduPilot/ardupilot/{build.commit}/{_AUTOTEST}"
 
     def _fetch_parameters(self, path: Path, build: _Build, places: tuple[str, ...]) -> File | None:
-        """A file of parameters, from the first place where it is; None if it is in none."""
+        """Download a parameter file from the first place that has it. None if no place has it."""
         for place in places:
             url = f"{self._tree(build)}/{place}"
             try:
@@ -232,7 +231,7 @@ class _Server:
         return None
 
     def _no_such_version(self) -> RequestError:
-        """The error for a release that is not there, with those that are if the server lists them."""
+        """Return the error for a missing release, with the existing ones if the server lists them."""
         try:
             listing = fetch_text(self._releases, TEXT_LIMIT, self._stall_s)
         except DownloadError:
@@ -246,7 +245,7 @@ class _Server:
 
 
 def _refuse_what_does_not_run(program: Path) -> None:
-    """Not every aarch64 runs programs of 32 bits. Raises VehicleError."""
+    """Raise VehicleError if this aarch64 machine does not run 32-bit programs."""
     try:
         subprocess.run([program, "--help"], capture_output=True, timeout=HELP_S, stdin=subprocess.DEVNULL, check=False)
     except subprocess.TimeoutExpired:
@@ -261,7 +260,7 @@ def _refuse_what_does_not_run(program: Path) -> None:
 
 
 def _checked(base: str) -> str:
-    """A mirror's address without its last slash. Raises RequestError."""
+    """Return the address of a mirror without a trailing slash. Raises RequestError."""
     try:
         parts = urlsplit(base)
         plain = re.fullmatch(r"[!-~]+", base) and parts.username is None
@@ -277,7 +276,7 @@ def _intact(vehicle: VehicleType, directory: Path) -> bool:
 
 
 def _use(installed: Installed, already: bool) -> Outcome:
-    """Make it the current one, and remove what other installs left unfinished."""
+    """Make this version the current one, and remove unfinished installations."""
     home = installed.directory.parent
     link = home / f".{CURRENT}"
     link.unlink(missing_ok=True)
@@ -290,7 +289,7 @@ def _use(installed: Installed, already: bool) -> Outcome:
 
 @contextlib.contextmanager
 def _locked(home: Path, watcher: Watcher) -> Iterator[None]:
-    """One install of a vehicle at a time (flock(2): a process that dies lets go)."""
+    """Allow one installation of a vehicle at a time. A process that ends releases the lock (flock(2))."""
     home.mkdir(parents=True, exist_ok=True)
     with (home / ".lock").open("w") as lock:
         try:
@@ -303,7 +302,7 @@ def _locked(home: Path, watcher: Watcher) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _ways_out(home: Path) -> Iterator[None]:
-    """Says what to do without a network, and raises CacheError for what the disk refuses."""
+    """Add the solution to network errors, and convert disk errors to CacheError."""
     try:
         yield
     except UnreachableError as error:

@@ -1,8 +1,8 @@
-"""Vehicles on one UDP port of a ground station: QGroundControl, Mission Planner, MAVProxy or any MAVLink client.
+"""Connect vehicles with one UDP port of a ground station: QGroundControl, Mission Planner, MAVProxy or another client.
 
-Each vehicle has a port for ground stations (STATION_PORT) beside its pilot's and its agent's, so that what an operator
-asks for disturbs neither. A `GroundStation` carries whole frames from all of these to one UDP address, and what comes
-back from there to the vehicle that it is for, both ways without changing a byte.
+Each vehicle has a port for ground stations (STATION_PORT), separate from the ports of its pilot and its agent. An
+operator therefore disturbs neither of them. A `GroundStation` forwards complete frames between these ports and one UDP
+address, in both directions and without changes.
 """
 
 from __future__ import annotations
@@ -20,35 +20,41 @@ from sitl._operator import CommandLog
 from sitl.address import Address, connected
 
 MOST_DATAGRAMS_PER_S = 1000
-"""From the ground station; more are dropped, and counted."""
+"""Maximum rate of datagrams from the ground station. Further ones are dropped and counted."""
 MOST_DATAGRAM_BYTES = 4096
 MOST_WAITING_BYTES = 64 * 1024
-"""That a vehicle does not take at the moment; more is dropped, and counted."""
+"""Maximum size of data waiting for a slow vehicle. Further data is dropped and counted."""
 DATAGRAM_BYTES = 1400
-"""Frames of one vehicle that come together go together, in datagrams of at most so many bytes."""
+"""Maximum size of a datagram, in which simultaneous frames of one vehicle are combined."""
 
 
 class GroundStation(asyncio.DatagramProtocol):
-    """Carries frames between vehicles and one ground station, which may come and go. Use it in one event loop."""
+    """A forwarder between vehicles and one ground station, which may come and go.
+
+    It may be used in one event loop only.
+    """
 
     def __init__(self, address: Address, now: Callable[[], float], taken_over: Callable[[list[int]], None]) -> None:
-        """`now` is the mission second when a command is taken down, `taken_over` hears whom it flies. Use `open`."""
+        """Make a station. Use `open` instead. `now` returns the mission second, for the log of commands.
+
+        `taken_over` receives the vehicles that the operator flies from now on.
+        """
         self._address = address
         self._now = now
         self._taken_over = taken_over
         self._transport: asyncio.DatagramTransport | None = None
         self._vehicles: dict[int, _Vehicle] = {}
-        """By MAVLink system ID."""
+        """The vehicles by MAVLink system ID."""
         self._mav = mavlink.MAVLink(None)
         self._commands = CommandLog()
         self._sent = self._received = self._dropped = 0
         self._second, self._in_second = 0, 0
         self._full = False
-        """The network takes nothing more at the moment."""
+        """True while the network accepts no more data."""
 
     @classmethod
     async def open(cls, address: Address, now: Callable[[], float], taken_over: Callable[[list[int]], None]) -> Self:
-        """As `GroundStation`. Raises VehicleError if there is no way to the address."""
+        """Return an open station. Raises VehicleError if the address cannot be reached."""
         station = cls(address, now, taken_over)
         sock = await asyncio.to_thread(connected, address)  # a name may have to be looked up
         sock.setblocking(False)
@@ -56,7 +62,10 @@ class GroundStation(asyncio.DatagramProtocol):
         return station
 
     async def attach(self, vehicle_id: int, sysid: int, sock: socket.socket) -> None:
-        """Take over `sock`, connected to the vehicle's port for ground stations, in the place of an earlier one's."""
+        """Take over `sock`, which is connected to the vehicle's port for ground stations.
+
+        It replaces an earlier connection.
+        """
         sock.setblocking(False)
         vehicle = _Vehicle(vehicle_id, self._forward)
         await asyncio.get_running_loop().create_connection(lambda: vehicle, sock=sock)
@@ -65,7 +74,7 @@ class GroundStation(asyncio.DatagramProtocol):
         self._vehicles[sysid] = vehicle
 
     def close(self) -> None:
-        """End all connections; may be called twice."""
+        """End all connections. May be called twice."""
         for vehicle in self._vehicles.values():
             vehicle.close()
         if self._transport is not None:
@@ -82,7 +91,7 @@ class GroundStation(asyncio.DatagramProtocol):
         }
 
     def _forward(self, frames: list[bytes]) -> None:
-        """From a vehicle to the ground station."""
+        """Forward frames from a vehicle to the ground station."""
         transport = self._transport
         if transport is None or transport.is_closing():
             return
@@ -103,7 +112,10 @@ class GroundStation(asyncio.DatagramProtocol):
         self._transport = cast(asyncio.DatagramTransport, transport)  # asyncio's own is not derived from it
 
     def datagram_received(self, data: bytes, addr: object) -> None:
-        """From the ground station, as only its address is listened to, to whom it is for."""
+        """Forward a datagram from the ground station to its vehicle.
+
+        The socket only accepts datagrams from its address.
+        """
         second = int(time.monotonic())
         if second != self._second:
             self._second, self._in_second = second, 0
@@ -133,11 +145,11 @@ class GroundStation(asyncio.DatagramProtocol):
         self._full = False
 
     def error_received(self, exc: Exception) -> None:
-        """Nobody listens there, at the moment."""
+        """Ignore the error: no program listens at the address at the moment."""
 
 
 class _Vehicle(asyncio.Protocol):
-    """The connection to one vehicle's port for ground stations."""
+    """The connection to the port of one vehicle for ground stations."""
 
     def __init__(self, vehicle_id: int, forward: Callable[[list[bytes]], None]) -> None:
         self.vehicle_id = vehicle_id

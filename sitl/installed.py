@@ -1,12 +1,13 @@
-"""The cache of ArduPilot SITL binaries: what `ucp-harness sitl install` left, and whether it is still that.
+"""The cache of ArduPilot SITL binaries, which `ucp-harness sitl install` fills, and the check of its integrity.
 
     $XDG_CACHE_HOME/ucp-harness/sitl/copter/4.6.3/arducopter      (XDG Base Directory Specification; else ~/.cache)
                                                   copter.parm     ArduPilot's default parameters of that commit
                                                   copter-hexa.parm, ...                    and those of its frames
                                                   manifest.json   `Manifest`
-                                           current -> 4.6.3       the one that runs use
+                                           current -> 4.6.3       the version that runs use
 
-ArduPilot's server publishes no checksums, so the SHA-256 of what came over TLS is recorded, and compared before use.
+ArduPilot's server publishes no checksums. Therefore the SHA-256 hash of each file is recorded after its download over
+TLS, and compared before use.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ CURRENT = "current"
 
 @dataclass(frozen=True)
 class File:
-    """One file as it was fetched; its size in bytes."""
+    """A downloaded file. Its size is in bytes."""
 
     url: str
     size: int
@@ -42,7 +43,7 @@ class File:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What was fetched, and when: ArduPilot's version and git commit, ISO 8601 time in UTC; files by name."""
+    """The downloaded files by name, with ArduPilot's version and git commit, and the time (ISO 8601, UTC)."""
 
     vehicle: str
     version: str
@@ -55,7 +56,10 @@ class Manifest:
 
     @classmethod
     def read(cls, directory: Path) -> Manifest:
-        """Raises OSError, ValueError, TypeError, LookupError or AttributeError if there is none that makes sense."""
+        """Return the manifest of a directory.
+
+        Raises OSError, ValueError, TypeError, LookupError or AttributeError if it is missing or damaged.
+        """
         document = json.loads((directory / MANIFEST).read_text())
         files = {
             name: File(str(file["url"]), int(file["size"]), str(file["sha256"]))
@@ -77,21 +81,21 @@ class Installed:
 
     @property
     def is_current(self) -> bool:
-        """Whether it is the one that runs use."""
+        """True if runs use this version."""
         with contextlib.suppress(OSError):
             return (self.directory.parent / CURRENT).readlink() == Path(self.directory.name)
         return False
 
     @cached_property
     def manifest(self) -> Manifest | None:
-        """None if it cannot be read."""
+        """The manifest. None if it cannot be read."""
         with contextlib.suppress(OSError, ValueError, TypeError, LookupError, AttributeError):
             return Manifest.read(self.directory)
         return None
 
     @cached_property
     def damage(self) -> str | None:
-        """What is no longer as it was fetched, or None. Reads every file."""
+        """A description of the first file that differs from its download, or None. This reads all files."""
         if self.manifest is None:
             return f"{MANIFEST} is missing or cannot be read"
         for name in dict.fromkeys((self.binary.name, DEFAULTS[self.vehicle], *self.manifest.files)):
@@ -105,7 +109,7 @@ class Installed:
 
 
 def cache(environ: Mapping[str, str]) -> Path:
-    """The directory with one directory per vehicle. Raises VehicleError if the environment names no place for it."""
+    """Return the directory with one directory per vehicle. Raises VehicleError if the environment determines none."""
     for base in (Path(environ.get("XDG_CACHE_HOME", "")), Path(environ.get("HOME", "")) / ".cache"):
         if base.is_absolute():
             return base / "ucp-harness" / "sitl"
@@ -113,7 +117,7 @@ def cache(environ: Mapping[str, str]) -> Path:
 
 
 def all_installed(vehicle: VehicleType, environ: Mapping[str, str]) -> list[Installed]:
-    """Every version in the cache, in the order of their names."""
+    """Return all versions in the cache, sorted by name."""
     try:
         directories = sorted(path for path in (cache(environ) / vehicle).iterdir() if not path.name.startswith("."))
     except (OSError, VehicleError):
@@ -122,7 +126,7 @@ def all_installed(vehicle: VehicleType, environ: Mapping[str, str]) -> list[Inst
 
 
 def current(vehicle: VehicleType, environ: Mapping[str, str]) -> Installed | None:
-    """The version that was installed last, or None. Raises UnusableBinaryError if it is damaged."""
+    """Return the version that was installed last, or None. Raises UnusableBinaryError if it is damaged."""
     try:
         directory = (cache(environ) / vehicle / CURRENT).resolve(strict=True)
     except (OSError, VehicleError):

@@ -1,6 +1,6 @@
-"""What ArduPilot calls its flight modes, and their numbers on the wire (HEARTBEAT.custom_mode), by type of vehicle.
+"""Names and numbers (HEARTBEAT.custom_mode) of ArduPilot's flight modes, by type of vehicle.
 
-As in the parameters FLTMODE1 of ArduCopter and ArduPlane and MODE1 of ArduRover.
+They equal the values of the parameter FLTMODE1 in ArduCopter and ArduPlane, and of MODE1 in ArduRover.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ MODES: dict[VehicleType, dict[str, int]] = {
     "rover": {"MANUAL": 0, "HOLD": 4, "AUTO": 10, "RTL": 11, "GUIDED": 15},
 }
 BOOT_MODES: dict[VehicleType, str] = {"copter": "STABILIZE", "plane": "MANUAL", "rover": "MANUAL"}
-"""What a vehicle is in when nobody has told it anything: somebody holds the sticks."""
+"""The mode after boot, without any command. In it a person flies by remote control."""
 
 
 def mode_name(vehicle_type: VehicleType, number: int | None) -> str:
-    """The mode's name; its number if it is none of those above."""
+    """Return the name of a mode. For an unknown mode, return its number."""
     return next((name for name, known in MODES[vehicle_type].items() if known == number), str(number))
 
 
 def mav_type(number: int) -> str:
-    """What a vehicle calls itself in its heartbeats (MAV_TYPE), in lower case: "quadrotor", "surface boat"."""
+    """Return the type that a vehicle reports in its heartbeats (MAV_TYPE) in lower case, such as "surface boat"."""
     known = mavlink.enums["MAV_TYPE"].get(number)
     return known.name.removeprefix("MAV_TYPE_").replace("_", " ").lower() if known else str(number)

@@ -1,6 +1,6 @@
-"""ArduPilot's parameters as files have them: `NAME VALUE` or `NAME,VALUE` in each line, or QGroundControl's columns.
+"""ArduPilot's parameter files: `NAME VALUE` or `NAME,VALUE` per line, or the columns of QGroundControl.
 
-Read from whoever wrote them, so bounded; written as any ground station reads them.
+The reader limits size and values, because files come from any source. Ground stations can read the written files.
 """
 
 from __future__ import annotations
@@ -21,18 +21,21 @@ MAX_LINE_SHOWN = 60
 LARGEST = 3.4028235e38  # of 32 bits
 
 OURS = frozenset({"SYSID_THISMAV", "MAV_SYSID"})
-"""Those that the harness sets itself, and nobody else may."""
+"""Parameters that the harness sets, and that a user must not set."""
 
 _NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}", re.ASCII)
 _COMMENTS = re.compile(r"#.*|//.*")
 
 
 class ParameterError(VehicleError):
-    """A parameter, or a file of them, that no vehicle can be given."""
+    """An invalid parameter, or an invalid file of parameters."""
 
 
 def read(path: Path) -> dict[str, float]:
-    """The parameters of a file but for `OURS`; what is there twice has its last value. Raises VehicleError."""
+    """Return the parameters in a file, without `OURS`.
+
+    Of a repeated parameter the last value is used. Raises VehicleError.
+    """
     values: dict[str, float] = {}
     for number, line in enumerate(text_of(path, MAX_BYTES).splitlines(), start=1):
         words = _COMMENTS.sub("", line).replace(",", " ").split()
@@ -51,7 +54,7 @@ def read(path: Path) -> dict[str, float]:
 
 
 def check(values: Mapping[str, float]) -> None:
-    """Raises ParameterError for a name or a value that no parameter can have, and for those of `OURS`."""
+    """Raise ParameterError for an invalid name or value, and for those of `OURS`."""
     if len(values) > MAX_PARAMETERS:
         raise ParameterError(f"there are more than {MAX_PARAMETERS} parameters")
     for name, value in values.items():
@@ -64,7 +67,10 @@ def check(values: Mapping[str, float]) -> None:
 
 
 def unknown(asked: Iterable[str], known: Iterable[str]) -> str | None:
-    """A phrase that names those asked for that a vehicle does not know, with the nearest that it does; None: none."""
+    """Return a phrase with the requested parameters that a vehicle lacks, and similar known ones.
+
+    None if all are known.
+    """
     names = set(known)
     missing = sorted(set(asked) - names)
     if not missing:
@@ -76,12 +82,12 @@ def unknown(asked: Iterable[str], known: Iterable[str]) -> str | None:
 
 
 def in_lines(values: Mapping[str, float]) -> str:
-    """The text of a parameter file, by name; what `read` makes of it is the same to the last bit of a float."""
+    """Return the text of a parameter file, sorted by name. `read` restores each 32-bit float exactly."""
     return "".join(f"{name} {shortest(values[name])}\n" for name in sorted(values))
 
 
 def shortest(value: float) -> str:
-    """The fewest digits that give the same 32-bit float."""
+    """Return the shortest decimal number that gives the same 32-bit float."""
     if not math.isfinite(value):
         return str(value)
     exact = struct.pack("<f", value)

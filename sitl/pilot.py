@@ -32,7 +32,7 @@ from sitl.vehicle import FlightError, Home, VehicleType
 
 SILENCE_S = 10.0  # of our time; a vehicle says something every simulated second
 LEAST_WAIT_S = 3.0  # of our time: however fast simulated time runs, a busy machine is given this long for a step
-ASK_AGAIN_S = 2.0  # of our time without a position, after which telemetry is asked for again
+ASK_AGAIN_S = 2.0  # wall time without a position after which telemetry is requested again
 
 
 class Pilot:

@@ -1,8 +1,8 @@
-"""What all flights have in common: steps, and the question which one comes next.
+"""Steps and procedures, which all flights share.
 
-A flight is not a script. At every heartbeat the pilot asks: what is the next step that this vehicle has not made? A
-vehicle that acknowledges a mode and undoes it, or disarms itself while the machine was busy, both of which ArduPilot
-does, is simply asked again.
+A flight is not a script. At each heartbeat the pilot determines the first step that is not complete, and requests it.
+ArduPilot may acknowledge a mode and undo it, or disarm by itself while the machine is busy. The pilot then simply
+requests the step again.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ READY_LIMIT_S = 180.0  # ArduPilot calibrates, and waits for its estimates to ag
 
 @dataclass(frozen=True)
 class Step:
-    """Something to wait for, as an error names it, and for how many simulated seconds, all attempts together."""
+    """A step, with its name in errors, and its time limit in simulated seconds over all attempts."""
 
     name: str
     limit_s: float = STEP_LIMIT_S
@@ -38,23 +38,23 @@ STAY_READY = Step("ready to arm, and not only for a moment", READY_LIMIT_S)
 
 
 class HopelessError(Exception):
-    """The flight cannot go on; the message says why."""
+    """The flight cannot continue. The message contains the reason."""
 
 
 class Procedure(Protocol):
-    """One thing that a pilot makes a vehicle do, `purpose` in words."""
+    """A procedure that a pilot executes. `purpose` completes "did not ..."."""
 
     purpose: str
 
     def next_step(self) -> Step | None:
-        """The first step that is not made, None when all are. Raises HopelessError."""
+        """Return the first incomplete step. None if all are complete. Raises HopelessError."""
 
     def ask(self, step: Step) -> None:
-        """Ask the vehicle for a step; called once at every heartbeat while it is not made."""
+        """Request a step from the vehicle. Called once per heartbeat until the step is complete."""
 
 
 class GettingReady:
-    """Of a flight all that comes before arming, until there has been nothing of that left for READY_FOR_S."""
+    """The steps of a flight before arming, until all of them have stayed complete for READY_FOR_S seconds."""
 
     purpose = "get ready"
 
@@ -80,7 +80,7 @@ class GettingReady:
 
 
 class Commander:
-    """The requests that every procedure makes."""
+    """The requests that all procedures share."""
 
     def __init__(self, link: Link, vehicle_type: VehicleType) -> None:
         self.link = link
@@ -94,7 +94,7 @@ class Commander:
         self.link.ask_for_mode(MODES[self.vehicle_type][name])
 
     def arming(self) -> Step | None:
-        """The step towards being armed that is not made."""
+        """Return the next step of arming. None if the vehicle is armed."""
         if self.state.armed:
             return None
         return ARM if self.state.ready_to_arm and self.state.position else READY
@@ -106,7 +106,7 @@ class Commander:
         return self.link.acks.get(command) == int(mavlink.MAV_RESULT_ACCEPTED)
 
     def refused(self, commands: Sequence[int]) -> bool:
-        """Whether one of these was answered with MAV_RESULT_FAILED; each answer counts once."""
+        """Return whether one of these commands was answered with MAV_RESULT_FAILED. Each answer counts once."""
         failed = [command for command in commands if self.link.acks.get(command) == int(mavlink.MAV_RESULT_FAILED)]
         for command in failed:
             del self.link.acks[command]

@@ -1,6 +1,6 @@
-"""One client's view of the embedded vehicle, as one serial port of an ArduPilot: MAVLink in, MAVLink out, no socket.
+"""The connection of one client to the embedded vehicle, like one serial port of an ArduPilot: MAVLink without a socket.
 
-A `Channel` has its own parser, sequence numbers, message intervals and half-received mission.
+Each `Channel` has its own parser, sequence numbers, message intervals and incomplete mission.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ class Channel:
         self._autopilot.listeners.remove(self)
 
     def receive(self, data: bytes) -> None:
-        """Take bytes from the client, in any pieces, with anything in them."""
+        """Process bytes from the client, in pieces of any size and with any content."""
         for message in self._mav.parse_buffer(data) or ():
             kind = message.get_type()
             if getattr(message, "target_system", None) not in (0, self._autopilot.sysid):
-                continue  # BAD_DATA and heartbeats, too, which name nobody
+                continue  # BAD_DATA and heartbeats have no target
             if getattr(message, "target_component", 0) not in (0, mavlink.MAV_COMP_ID_AUTOPILOT1):
                 continue
             if kind in ("COMMAND_LONG", "COMMAND_INT"):
@@ -74,7 +74,7 @@ class Channel:
         self._mav.seq = (self._mav.seq + 1) % 256
 
     def send_due(self) -> None:
-        """Send every message whose interval has passed, once: a client behind schedule gets the latest, not a burst."""
+        """Send each message whose interval has passed, once. A late client receives the latest state, not a burst."""
         now_s = self._autopilot.now_s
         for message_id, due_s in self._due_s.items():
             if due_s <= now_s:
@@ -85,7 +85,7 @@ class Channel:
         return min(self._due_s.values())
 
     def take(self) -> bytes:
-        """What is to be sent to the client."""
+        """Return the bytes to send to the client."""
         data = bytes(self._out)
         self._out.clear()
         return data
@@ -101,7 +101,7 @@ class Channel:
         )
 
     def _command(self, message: Any) -> int:
-        """Do what a COMMAND_LONG or COMMAND_INT asks; the MAV_RESULT."""
+        """Execute a COMMAND_LONG or COMMAND_INT. Returns the MAV_RESULT."""
         vehicle = self._autopilot
         match message.command:
             case mavlink.MAV_CMD_COMPONENT_ARM_DISARM if message.param1 == 1:
@@ -135,7 +135,9 @@ class Channel:
         return int(mavlink.MAV_RESULT_UNSUPPORTED) if number is None else self._autopilot.set_mode(number)
 
     def _reposition(self, message: Any) -> int:
-        """MAV_CMD_DO_REPOSITION: param1 is the speed, -1 or 0 the present one; with `MODE` in param2, go to GUIDED."""
+        """Execute MAV_CMD_DO_REPOSITION. param1 is the speed, -1 or 0 for the current one. param2 may request GUIDED
+        mode.
+        """
         vehicle = self._autopilot
         if message.get_type() != "COMMAND_INT":
             return int(mavlink.MAV_RESULT_COMMAND_INT_ONLY)
@@ -148,14 +150,14 @@ class Channel:
         return vehicle.go_to(vehicle.place(message.frame, message.x, message.y, message.z))
 
     def _position_target(self, message: Any) -> None:
-        """Only whole positions; a plane does not listen to these, as ArduPlane does not. Nothing is answered."""
+        """Accept complete positions without an answer. A plane ignores them, as ArduPlane does."""
         vehicle = self._autopilot
         whole = not message.type_mask & NO_POSITION and message.coordinate_frame in FRAMES
         if whole and vehicle.vehicle_type != "plane":
             vehicle.go_to(vehicle.place(message.coordinate_frame, message.lat_int, message.lon_int, message.alt))
 
     def _set_parameter(self, message: Any) -> None:
-        """One that it does not have is answered with nothing, as by ArduPilot."""
+        """Set a parameter. An unknown one gets no answer, as in ArduPilot."""
         vehicle, name, value = self._autopilot, message.param_id, message.param_value
         if name == TAKE_OFF_ALTITUDE and vehicle.vehicle_type == "plane":
             if 0 < value <= MAX_ALTITUDE_M:
@@ -167,7 +169,7 @@ class Channel:
         self.send(self._parameters()[name])
 
     def _parameters(self) -> dict[str, Any]:
-        """PARAM_VALUE of each: a ground station asks for all before it shows a vehicle."""
+        """Return the PARAM_VALUE of each parameter. A ground station requests all of them before it shows a vehicle."""
         values: dict[str, float] = {SYSTEM_ID: self._autopilot.sysid}
         if self._autopilot.vehicle_type == "plane":
             values[TAKE_OFF_ALTITUDE] = self._autopilot.take_off_altitude_m
@@ -190,14 +192,17 @@ class Channel:
                 self.send(value)
 
     def _set_rate(self, message: Any) -> None:
-        """REQUEST_DATA_STREAM, as older ground stations ask: of all messages but the heartbeat, so many a second."""
+        """Execute REQUEST_DATA_STREAM of older ground stations: set the rate of all messages except the heartbeat."""
         rate = message.req_message_rate if message.start_stop else 0
         for message_id in STREAMS:
             if message_id != mavlink.MAVLINK_MSG_ID_HEARTBEAT:
                 self._set_interval(message_id, 1e6 / rate if rate else -1)
 
     def _set_interval(self, message_id: float, interval_us: float) -> int:
-        """MAV_CMD_SET_MESSAGE_INTERVAL: microseconds; 0 is the default interval, -1 is never."""
+        """Execute MAV_CMD_SET_MESSAGE_INTERVAL in microseconds.
+
+        0 is the default interval, and -1 turns the message off.
+        """
         if message_id not in STREAMS or not math.isfinite(interval_us):
             return int(mavlink.MAV_RESULT_FAILED)
         if interval_us < 0:
@@ -220,5 +225,5 @@ class Channel:
 
 
 def _seventh(message: Any) -> float:
-    """Parameter 7, the altitude, which a COMMAND_INT calls z."""
+    """Return parameter 7, the altitude. In a COMMAND_INT its name is z."""
     return float(message.z if message.get_type() == "COMMAND_INT" else message.param7)

@@ -1,4 +1,4 @@
-"""What may differ between two vehicles of one type: frame, parameters, arguments, a debugger, how much they log."""
+"""Settings that may differ between vehicles of one type: frame, parameters, arguments, debugger and size of the log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ DEBUGGERS: tuple[Debugger, ...] = get_args(Debugger)
 
 @dataclass(frozen=True)
 class Setup:
-    """Of one vehicle. `frame` None is that of its type; `log_mib`, what its log may hold, is without bound if None."""
+    """The setup of one vehicle.
+
+    `frame` None is the default frame of its type. `log_mib` None means no limit of the log.
+    """
 
     frame: str | None = None
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -22,4 +25,4 @@ class Setup:
 
 
 USUAL = Setup()
-"""As the type comes."""
+"""The default setup."""

@@ -1,6 +1,6 @@
-"""A vehicle that nobody flies: a computed track, as a ground station sees it.
+"""A vehicle on a computed track, for display in a ground station.
 
-It speaks through the same `Channel` as the embedded vehicle, and refuses in words whatever an operator commands.
+It uses the same `Channel` as the embedded vehicle, and refuses each command of an operator with a text.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LOW_M = 0.1
 
 
 class ShownVehicle(Autopilot):
-    """One vehicle on its track, armed from second 0 on. It knows no parameters but its system ID."""
+    """A vehicle on its track, armed from second 0 on. Its only parameter is its system ID."""
 
     takes_missions = False
 
@@ -33,13 +33,13 @@ class ShownVehicle(Autopilot):
         self.failsafes.parameters.clear()
 
     def show(self, mission_s: float) -> None:
-        """From now on say where it is at this second of the mission, which began when it was ready."""
+        """Move the vehicle to its position at this mission second. The mission began when the vehicle was ready."""
         self.now_s = READY_S + mission_s
         self.airborne = self.vehicle_type != "rover" and self.motion.up_m > LOW_M
 
     @property
     def volts(self) -> float:
-        """Nobody asks it for current."""
+        """The voltage of a full battery, because no battery is simulated."""
         return BATTERY_FULL_V
 
     @property

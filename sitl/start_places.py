@@ -1,9 +1,9 @@
-"""Where vehicles begin, as ArduPilot's own files have it: named locations, and the offsets of a swarm.
+"""Start places in ArduPilot's file formats: named locations, and the offsets of a swarm.
 
     locations.txt      CMAC=-35.363261,149.165230,584,353     latitude, longitude, metres above sea level, heading
-    swarminit.txt      1=20,-20,0,90                          instance; metres east, north and up, heading or nothing
+    swarminit.txt      1=20,-20,0,90                          instance; metres east, north and up, optional heading
 
-Lines may end in a comment, `# ...`.
+Lines may end with a comment, `# ...`.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ MAX_SHOWN = 60
 
 
 class PlaceError(VehicleError):
-    """A place that is not there, or a file of places that cannot be read."""
+    """A missing place, or an unreadable file of places."""
 
 
 class Offset(NamedTuple):
-    """Metres from the first home; the heading in degrees is that of the first home where it is None."""
+    """An offset in metres from the first home. A heading of None means the heading of the first home."""
 
     east_m: float
     north_m: float
@@ -37,7 +37,7 @@ class Offset(NamedTuple):
     heading_deg: float | None = None
 
     def of(self, home: Home) -> Home:
-        """The place so far from `home`. Raises VehicleError where that is no place."""
+        """Return the place at this offset from `home`. Raises VehicleError if there is no such place."""
         if not all(math.isfinite(part) and abs(part) <= MAX_OFFSET_M for part in self[:3]):
             raise PlaceError(f"an offset in metres is at most {MAX_OFFSET_M:g} each way")
         there = home.offset(self.north_m, self.east_m)
@@ -46,7 +46,7 @@ class Offset(NamedTuple):
 
 
 def named(name: str, beside: Path | None, environ: Mapping[str, str]) -> Home:
-    """The location of that name in the first file of places that has it. Raises VehicleError."""
+    """Return the location with this name from the first file that has it. Raises VehicleError."""
     files = [path for path in _files(beside, environ) if path.is_file()]
     known: set[str] = set()
     for path in files:
@@ -63,7 +63,7 @@ def named(name: str, beside: Path | None, environ: Mapping[str, str]) -> Home:
 
 
 def swarm(path: Path) -> dict[int, Offset]:
-    """The offsets of a swarm by instance, from 0. Raises VehicleError."""
+    """Return the offsets of a swarm by instance, from 0. Raises VehicleError."""
     offsets: dict[int, Offset] = {}
     for number, key, values in _lines(path):
         where = f"{path}, line {number}"
@@ -79,7 +79,7 @@ def swarm(path: Path) -> dict[int, Offset]:
 
 
 def _files(beside: Path | None, environ: Mapping[str, str]) -> Iterator[Path]:
-    """Beside the scenario, the user's own as ArduPilot's sim_vehicle.py has it, and beside the binaries."""
+    """Yield the possible files: next to the scenario, the user's own as in sim_vehicle.py, and next to the binaries."""
     if beside is not None:
         yield beside / LOCATIONS
     home = Path(environ.get("HOME", "."))
@@ -90,14 +90,16 @@ def _files(beside: Path | None, environ: Mapping[str, str]) -> Iterator[Path]:
 
 
 def autotest(binaries: Path) -> Iterator[Path]:
-    """Where ArduPilot's files lie for a directory of its binaries: beside them, or in the tree that built them."""
+    """Yield the possible directories of ArduPilot's files: that of the binaries, and the source tree that built
+    them.
+    """
     yield binaries
     if binaries.parts[-3:] == ("build", "sitl", "bin"):
         yield binaries.parents[2] / "Tools" / "autotest"
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str, str]]:
-    """Number, key and values of each line that has any. Raises VehicleError."""
+    """Yield number, key and values of each line that has any. Raises VehicleError."""
     for number, line in enumerate(text_of(path, MAX_BYTES).splitlines(), start=1):
         content = line.partition("#")[0].strip()
         if not content:

@@ -1,4 +1,4 @@
-"""What the embedded vehicle says about itself at intervals: one function per message of `STREAMS`."""
+"""The messages that the embedded vehicle sends at intervals: one function per message of `STREAMS`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SENSORS = (
     | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 )
 NOT_ILL = mavlink.MAV_SYS_STATUS_GEOFENCE
-"""What a vehicle lacks is well, as ArduPilot has it, too: MAVProxy tells of a breach of the fence otherwise."""
+"""A missing sensor is reported as healthy, as in ArduPilot. Otherwise MAVProxy would report a breach of the fence."""
 NOT_YET = mavlink.MAV_SYS_STATUS_SENSOR_GPS | mavlink.MAV_SYS_STATUS_AHRS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 
 
@@ -54,7 +54,7 @@ def _state(vehicle: Autopilot) -> int:
 
 
 def _health(vehicle: Autopilot) -> int:
-    """The sensors that are well, and what depends on them."""
+    """Return the flags of the healthy sensors, and of functions that depend on them."""
     low = any(failsafe.startswith("battery") for failsafe in vehicle.failsafes.acting)
     unwell = mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if low else 0
     if not vehicle.ready:
@@ -116,7 +116,7 @@ def mission_current(vehicle: Autopilot) -> Any:
 
 
 def autopilot_version(vehicle: Autopilot) -> Any:
-    """Asked for, not sent at intervals: the version of this package, of which no commit is known."""
+    """Return the version of this package, without a commit. It is sent on request only."""
     parts = [min(int(part), 255) for part in version("ucp-harness").split(".")[:3]]
     number = int.from_bytes([*parts, mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL], "big")
     capabilities = mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
@@ -127,7 +127,7 @@ def autopilot_version(vehicle: Autopilot) -> Any:
 
 
 def _cms(speed_ms: float) -> int:
-    """Centimetres per second in a signed 16-bit number."""
+    """Return a speed in centimetres per second, limited to a signed 16-bit number."""
     return round(max(-327.68, min(327.67, speed_ms)) * 100)
 
 

@@ -1,6 +1,7 @@
-"""Where a vehicle is at which second of the mission, without flying it: for radio ranges in virtual time.
+"""The position of a vehicle at each mission second, computed without a flight, for radio ranges in virtual time.
 
-The same motion models that move the embedded vehicle, as a pure function: no MAVLink, no clock, no process.
+The motion models are those of the embedded vehicle. The computation is a pure function without MAVLink, clock or
+process.
 """
 
 from __future__ import annotations
@@ -19,18 +20,18 @@ from sitl.vehicle import VehicleType
 
 @dataclass(frozen=True)
 class Track:
-    """The course of one vehicle. Times are mission seconds, lengths metres; a track never ends."""
+    """The course of one vehicle, in mission seconds and metres. A track never ends."""
 
     course: Course
     home_offset: tuple[float, float, float]
 
     def at(self, t_s: float) -> tuple[float, float, float]:
-        """(north_m, east_m, up_m) relative to the vehicle's own home, at any second of the mission."""
+        """Return (north_m, east_m, up_m) relative to the vehicle's home, at any mission second."""
         motion = self.course.at(t_s)
         return motion.north_m, motion.east_m, motion.up_m
 
     def in_field(self, t_s: float) -> tuple[float, float, float]:
-        """(north_m, east_m, up_m) relative to the field's centre: `at` plus `home_offset`."""
+        """Return (north_m, east_m, up_m) relative to the centre of the field: `at` plus `home_offset`."""
         north_m, east_m, up_m = self.at(t_s)
         return north_m + self.home_offset[0], east_m + self.home_offset[1], up_m + self.home_offset[2]
 
@@ -45,12 +46,12 @@ def track(
     takeoff_altitude_m: float = 20.0,
     by: By = "mission",
 ) -> Track:
-    """The track of a vehicle that is ready at mission second `begin_s`, and begins to fly `plan` then, in that way.
+    """Return the track of a vehicle that begins to fly `plan` at mission second `begin_s`, in the way `by`.
 
-    It stands at home until then; after the plan it stays, a plane circling, unless it has landed. `home_offset` is the
-    home's place in the field (metres north, east and up from its centre), `heading_deg` the home's heading. A `plan`
-    of None is that of a vehicle in no plan: a copter takes off to `takeoff_altitude_m` and stays there, a plane
-    circles, a rover stands. Raises PlanError if the type cannot fly the plan.
+    Before that it stands at home. After the plan it stays, or circles if it is a plane, unless it has landed.
+    `home_offset` is the place of home in the field, in metres north, east and up from its centre. `heading_deg` is the
+    heading of home. Without a plan, a copter takes off to `takeoff_altitude_m` and stays, a plane circles, and a rover
+    stands. Raises PlanError if the type cannot fly the plan.
     """
     start = Motion(yaw_rad=math.radians(heading_deg))
     segments: Sequence[Segment]
@@ -63,7 +64,7 @@ def track(
 
 
 def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion) -> Sequence[Segment]:
-    """Waypoint after waypoint in AUTO, and what comes after the last, for ever."""
+    """Return the segments of the waypoints in AUTO mode, and of the unlimited stay after the last one."""
     model, last = MODELS[vehicle_type], waypoints[-1]
     segments: list[Segment] = [Rest(start, 0.0)]
     for before, waypoint, after in zip((None, *waypoints), waypoints, (*waypoints[1:], None), strict=False):
@@ -74,7 +75,7 @@ def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mo
 
 
 def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion) -> Sequence[Segment]:
-    """Leg by leg, but for the landing of a plane, which is a mission."""
+    """Return the segments in GUIDED mode. The landing of a plane is a mission."""
     begins = landing_begins(waypoints, vehicle_type)
     led, staying = leg_by_leg(waypoints[:begins], vehicle_type, start)
     if begins is None or len(led) < begins:
@@ -85,7 +86,7 @@ def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mot
 def _manoeuvre(
     model: MotionModel, waypoint: Waypoint, start: Motion, before: Waypoint | None, after: Waypoint | None
 ) -> Sequence[Segment]:
-    """How a vehicle does what one waypoint of a route asks for, from where it is, between two others."""
+    """Return the segments of one waypoint from the current motion, between its neighbours."""
     led = before.place if before is not None and before.kind in ("go_to", "loiter") else None
     match waypoint.kind:
         case "take_off":

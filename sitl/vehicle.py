@@ -26,7 +26,7 @@ SPACING_M = 5.0
 
 READY_S = 10.0  # simulated seconds from the boot of an embedded vehicle until it knows where it is and can be armed
 
-MAX_SYSID = 255  # MAVLink: u8 system ID, 0 is "everybody"
+MAX_SYSID = 255  # MAVLink: u8 system ID, 0 is a broadcast
 
 
 class VehicleError(Exception):
