@@ -1,4 +1,4 @@
-"""An embedded vehicle's autopilot in the test's own process, with one client and a clock that the test turns."""
+"""An autopilot of an embedded vehicle in the test's process, with one client and a clock that the test advances."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ACCEPTED, FAILED, UNSUPPORTED = (
 
 
 class Cockpit:
-    """`heard` is all that the vehicle said unasked or in answer, but for its telemetry."""
+    """A vehicle with one client. `heard` has all messages of the vehicle except its telemetry."""
 
     def __init__(self, vehicle_type: VehicleType = "copter") -> None:
         self.vehicle = Autopilot(3, HOME, 0, vehicle_type)

@@ -1,4 +1,4 @@
-"""A firmware server on loopback, with ArduPilot's paths, that serves well or misbehaves as told."""
+"""A firmware server on loopback with ArduPilot's paths. It serves files correctly, or fails as the test requests."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def git_version(version: str = "4.6.3", commit: str = COMMIT) -> bytes:
 
 @dataclass(frozen=True)
 class Resource:
-    """What is at one path, and how it is sent."""
+    """The content at one path, and the manner of sending it."""
 
     content: bytes
     status: int = 200
@@ -52,7 +52,10 @@ class Resource:
 
 @dataclass
 class FirmwareServer:
-    """`files` by path, to be changed at will; what was asked, (path, Range header), and answered, (path, status)."""
+    """A server of `files` by path, which a test may change.
+
+    It records requests (path, Range header) and answers (path, status).
+    """
 
     files: dict[str, Resource]
     url: str = ""

@@ -1,4 +1,4 @@
-"""What the tests of this folder share: an embedded vehicle in a process of its own, and a plain client for it."""
+"""Shared helpers of these tests: an embedded vehicle in a process of its own, and a simple client."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from pymavlink.dialects.v20 import common as mavlink
 from sitl.vehicle import Home, VehicleType
 
 HOME = Home(-35.363262, 149.165237, 584.0, 270.0)
-DEADLINE_S = 20.0  # generous, for a machine that does other things too; nobody waits that long
+DEADLINE_S = 20.0  # generous for a busy machine; tests do not wait that long
 
 
 T = TypeVar("T")
 
 
 def until(condition: Callable[[], T | None], what: str) -> T:
-    """Wait for a condition to be true, and return what it was."""
+    """Wait until a condition is true, and return its value."""
     deadline = time.monotonic() + DEADLINE_S
     while not (result := condition()):
         assert time.monotonic() < deadline, f"waited in vain: {what}"
@@ -39,7 +39,7 @@ def free_ports(count: int) -> list[int]:
 
 
 def connect(port: int) -> socket.socket:
-    """Connect as soon as somebody listens."""
+    """Connect as soon as a program listens."""
 
     def attempt() -> socket.socket | None:
         try:

@@ -1,4 +1,4 @@
-"""An embedded vehicle in the test's own event loop, whose every word the test may tamper with."""
+"""An embedded vehicle in the test's event loop, whose messages the test can change."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TURN_S = 0.005
 
 
 class Puppet:
-    """`tamper` makes of each frame what the pilot gets. Simulated time goes by at SPEEDUP."""
+    """An embedded vehicle whose frames `tamper` may change. Simulated time runs at SPEEDUP."""
 
     def __init__(self, vehicle_type: VehicleType, sock: socket.socket) -> None:
         self.vehicle = Autopilot(3, HOME, 0, vehicle_type)

@@ -1,4 +1,4 @@
-"""Finding and starting ArduPilot, with tiny stand-ins; the flight of a real one is in test_pilot.py."""
+"""Finding and starting ArduPilot, with small stand-ins for the binary."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def program(path: Path, content: str | bytes = SCRIPT, mode: int = 0o755) -> Pat
     return path
 
 
-def test_the_scenario_goes_before_the_environment_and_that_before_path(tmp_path: Path) -> None:
+def test_scenario_precedes_environment_and_path(tmp_path: Path) -> None:
     named = program(tmp_path / "named" / "my-copter")
     in_environment = program(tmp_path / "environment" / "arducopter")
     on_path = program(tmp_path / "path" / "arducopter")
@@ -32,12 +32,12 @@ def test_the_scenario_goes_before_the_environment_and_that_before_path(tmp_path:
     assert ArduPilot.find(None, {"PATH": str(on_path.parent)}).binary == on_path
 
 
-def test_no_binary_anywhere_is_its_own_error_so_that_a_run_may_go_on_without(tmp_path: Path) -> None:
+def test_missing_binary_raises_no_binary_error(tmp_path: Path) -> None:
     with pytest.raises(NoBinaryError, match="ARDUPILOT_SITL is not set"):
         ArduPilot.find(None, {"PATH": str(tmp_path)})
 
 
-def test_an_environment_that_names_no_directory_is_an_error_not_a_miss(tmp_path: Path) -> None:
+def test_wrong_directory_in_environment_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UnusableBinaryError, match=r"ARDUPILOT_SITL is .* no directory"):
         ArduPilot.find(None, {"ARDUPILOT_SITL": str(tmp_path / "gone"), "PATH": ""})
     with pytest.raises(UnusableBinaryError, match="does not exist"):
@@ -58,28 +58,30 @@ def elf(machine: int) -> bytes:
         (elf(8), 0o755, "another processor"),
     ],
 )
-def test_each_unusable_binary_is_told_apart(content: str | bytes, mode: int, problem: str, tmp_path: Path) -> None:
+def test_each_unusable_binary_has_its_own_message(
+    content: str | bytes, mode: int, problem: str, tmp_path: Path
+) -> None:
     binary = program(tmp_path / "arducopter", content, mode)
     with pytest.raises(UnusableBinaryError, match=problem) as error:
         ArduPilot.find(binary, {})
     assert str(binary) in str(error.value)
 
 
-def test_a_missing_binary_and_a_directory_are_told_apart(tmp_path: Path) -> None:
+def test_missing_binary_and_directory_have_different_messages(tmp_path: Path) -> None:
     with pytest.raises(UnusableBinaryError, match="does not exist"):
         ArduPilot.find(tmp_path / "arducopter", {})
     with pytest.raises(UnusableBinaryError, match="is a directory"):
         ArduPilot.find(tmp_path, {})
 
 
-def test_a_binary_for_another_processor_names_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_binary_for_another_processor_names_both_processors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     with pytest.raises(UnusableBinaryError, match="aarch64, this is x86_64"):
         ArduPilot.find(program(tmp_path / "arducopter", elf(183)), {})
     assert ArduPilot.find(program(tmp_path / "arducopter", elf(62)), {}).binary.name == "arducopter"
 
 
-def test_the_command_line_is_what_arducopter_understands(tmp_path: Path) -> None:
+def test_command_line_fits_arducopter(tmp_path: Path) -> None:
     binary = program(tmp_path / "arducopter")
     directory = tmp_path / "with, comma"
     directory.mkdir()
@@ -94,12 +96,12 @@ def test_the_command_line_is_what_arducopter_understands(tmp_path: Path) -> None
     assert (launch.pilot_port, launch.agent_port) == (5760, 5762)
 
 
-def test_the_system_id_is_a_default_under_both_its_names(tmp_path: Path) -> None:
+def test_system_id_is_set_under_both_names(tmp_path: Path) -> None:
     ArduPilot(program(tmp_path / "arducopter")).launch(7, HOME, 1.0, tmp_path)
     assert (tmp_path / "vehicle.parm").read_text().splitlines() == ["SYSID_THISMAV 7", "MAV_SYSID 7"]
 
 
-def test_parameters_beside_the_binary_come_along_and_ours_have_the_last_word(tmp_path: Path) -> None:
+def test_own_parameters_override_those_of_the_binary(tmp_path: Path) -> None:
     binary = program(tmp_path / "bin" / "arducopter")
     (binary.parent / "copter.parm").write_text("FRAME_CLASS 1\n")
     launch = ArduPilot.find(binary, {}).launch(7, HOME, 1.0, tmp_path)
@@ -107,12 +109,12 @@ def test_parameters_beside_the_binary_come_along_and_ours_have_the_last_word(tmp
     assert (tmp_path / "copter.parm").read_text() == "FRAME_CLASS 1\n"
 
 
-def test_a_directory_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+def test_unwritable_directory_is_named(tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match="cannot write its parameters into"):
         ArduPilot(program(tmp_path / "arducopter")).launch(7, HOME, 1.0, tmp_path / "gone")
 
 
-def test_each_type_has_its_binary_its_parameters_and_its_model(tmp_path: Path) -> None:
+def test_each_type_has_its_binary_parameters_and_model(tmp_path: Path) -> None:
     for name in ("arducopter", "arduplane", "ardurover"):
         program(tmp_path / "bin" / name)
         (tmp_path / "bin" / "plane.parm").write_text("AIRSPEED_CRUISE 22\n")
@@ -127,7 +129,7 @@ def test_each_type_has_its_binary_its_parameters_and_its_model(tmp_path: Path) -
     assert driven[driven.index("--defaults") + 1] == "vehicle.parm"
 
 
-def test_binaries_of_other_types_only_are_a_miss_not_a_mistake(tmp_path: Path) -> None:
+def test_binaries_of_other_types_raise_no_binary_error(tmp_path: Path) -> None:
     program(tmp_path / "arducopter")
     with pytest.raises(NoBinaryError, match=r"no ArduPilot plane: .* ARDUPILOT_SITL has none, no arduplane"):
         ArduPilot.find(None, {"ARDUPILOT_SITL": str(tmp_path), "PATH": ""}, "plane")

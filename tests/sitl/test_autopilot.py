@@ -1,4 +1,4 @@
-"""The embedded vehicle's modes and flights, in one process and without a clock."""
+"""Modes and flights of the embedded vehicle, in one process and without a clock."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def reposition(place: Point, speed_ms: float = -1.0) -> mavlink.MAVLink_command_
 
 
 @pytest.mark.parametrize("vehicle_type", ["copter", "plane"])
-def test_a_mission_is_flown_item_by_item_and_ends_disarmed_on_the_ground(vehicle_type: VehicleType) -> None:
+def test_mission_ends_disarmed_on_the_ground(vehicle_type: VehicleType) -> None:
     cockpit = Cockpit(vehicle_type)
     cockpit.begin(OUT_AND_BACK)
     cockpit.fly(600.0)
@@ -46,7 +46,7 @@ def test_a_mission_is_flown_item_by_item_and_ends_disarmed_on_the_ground(vehicle
     assert cockpit.texts()[-1] == "Disarming motors"
 
 
-def test_a_rover_drives_its_mission_and_stays_at_its_end() -> None:
+def test_rover_stays_at_the_end_of_its_mission() -> None:
     cockpit = Cockpit("rover")
     cockpit.begin(Plan((GoTo(100, 0), Loiter(10), GoTo(0, 50))))
     cockpit.fly(300.0)
@@ -55,7 +55,7 @@ def test_a_rover_drives_its_mission_and_stays_at_its_end() -> None:
 
 
 @pytest.mark.parametrize("step_s", [0.07, 1.0, 23.0])
-def test_the_track_does_not_depend_on_how_often_anybody_looks(step_s: float) -> None:
+def test_track_is_independent_of_the_step_size(step_s: float) -> None:
     fine, coarse = Cockpit(), Cockpit()
     for cockpit, step in ((fine, 0.5), (coarse, step_s)):
         began_s = cockpit.begin(OUT_AND_BACK)
@@ -64,7 +64,7 @@ def test_the_track_does_not_depend_on_how_often_anybody_looks(step_s: float) -> 
     assert coarse.reached() == fine.reached()
 
 
-def test_a_copter_waits_for_the_start_of_its_mission_and_a_plane_for_nothing() -> None:
+def test_only_a_copter_waits_for_the_mission_start() -> None:
     copter = Cockpit()
     copter.ready()
     copter.load(OUT_AND_BACK)
@@ -79,7 +79,7 @@ def test_a_copter_waits_for_the_start_of_its_mission_and_a_plane_for_nothing() -
     assert copter.place.up_m > 5
 
 
-def test_auto_needs_a_mission_that_begins_with_a_take_off() -> None:
+def test_auto_mode_needs_a_mission_with_take_off() -> None:
     cockpit = Cockpit("plane")
     cockpit.ready()
     assert cockpit.mode("AUTO") == FAILED
@@ -93,7 +93,7 @@ def test_auto_needs_a_mission_that_begins_with_a_take_off() -> None:
     assert cockpit.place == (0, 0, 0)
 
 
-def test_a_mission_that_was_broken_off_goes_on_where_it_was() -> None:
+def test_interrupted_mission_resumes_at_its_item() -> None:
     cockpit = Cockpit()
     began_s = cockpit.begin(OUT_AND_BACK)
     cockpit.fly(began_s + 25)
@@ -107,7 +107,7 @@ def test_a_mission_that_was_broken_off_goes_on_where_it_was() -> None:
     assert cockpit.reached() == [1, 3, 4, 5]
 
 
-def test_a_copter_is_sent_to_places_in_guided_and_stays() -> None:
+def test_copter_in_guided_mode_flies_to_places_and_stays() -> None:
     cockpit = Cockpit()
     cockpit.take_off()
     assert cockpit.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, 1, 5) == ACCEPTED
@@ -115,7 +115,7 @@ def test_a_copter_is_sent_to_places_in_guided_and_stays() -> None:
     cockpit.tell(position_target(there))
     cockpit.fly(45.0)
     assert 10 < math.dist(cockpit.place, here) < 20
-    for _ in range(5):  # whoever is told again is on its way
+    for _ in range(5):  # a repeated command changes nothing
         cockpit.tell(position_target(there))
         cockpit.fly(cockpit.vehicle.now_s + 0.5)
     assert math.dist(cockpit.place, here) > 20
@@ -127,7 +127,7 @@ def test_a_copter_is_sent_to_places_in_guided_and_stays() -> None:
     assert cockpit.place == pytest.approx((0, 0, 25), abs=0.02)
 
 
-def test_a_plane_takes_off_in_its_own_mode_and_circles_where_it_is_sent() -> None:
+def test_plane_takes_off_in_its_mode_and_circles_at_its_target() -> None:
     cockpit = Cockpit("plane")
     (answer,) = cockpit.tell(mavlink.MAVLink_param_set_message(3, 1, b"TKOFF_ALT", 60, 9))
     assert (answer.param_id, answer.param_value) == ("TKOFF_ALT", 60)
@@ -146,7 +146,7 @@ def test_a_plane_takes_off_in_its_own_mode_and_circles_where_it_is_sent() -> Non
 
 
 @pytest.mark.parametrize("hostile", [math.nan, math.inf, -math.inf, 1e30])
-def test_places_that_are_nowhere_are_refused(hostile: float) -> None:
+def test_impossible_places_are_refused(hostile: float) -> None:
     cockpit = Cockpit()
     cockpit.take_off()
     assert cockpit.tell(reposition(Point(10, 10, 0)._replace(up_m=hostile)))[0].result == FAILED
@@ -162,7 +162,7 @@ def test_places_that_are_nowhere_are_refused(hostile: float) -> None:
     [(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (0, FORCE)), (mavlink.MAV_CMD_DO_FLIGHTTERMINATION, (1,))],
 )
 @pytest.mark.parametrize("vehicle_type", ["copter", "plane"])
-def test_without_motors_it_falls_and_says_how_hard(
+def test_vehicle_without_motors_falls_and_reports_the_impact(
     vehicle_type: VehicleType, command: int, params: tuple[float, ...]
 ) -> None:
     cockpit = Cockpit(vehicle_type)
@@ -180,7 +180,7 @@ def test_without_motors_it_falls_and_says_how_hard(
     assert cockpit.place == there
 
 
-def test_a_rover_that_is_disarmed_stops() -> None:
+def test_disarmed_rover_stops() -> None:
     cockpit = Cockpit("rover")
     began_s = cockpit.begin(Plan((GoTo(100, 0),)))
     cockpit.fly(began_s + 10)
@@ -191,7 +191,7 @@ def test_a_rover_that_is_disarmed_stops() -> None:
     assert cockpit.place == there
 
 
-def test_return_to_launch_brings_each_type_home_in_its_own_way() -> None:
+def test_return_to_launch_brings_each_type_home() -> None:
     copter = Cockpit()
     copter.take_off(10)
     copter.tell(position_target(Point(100, 0, 10)))
@@ -215,7 +215,7 @@ def test_return_to_launch_brings_each_type_home_in_its_own_way() -> None:
     assert rover.place == pytest.approx((0, 0, 0), abs=0.02)
 
 
-def test_modes_that_a_type_does_not_have_are_refused() -> None:
+def test_unknown_modes_of_a_type_are_refused() -> None:
     assert Cockpit("plane").command(mavlink.MAV_CMD_NAV_LAND) == UNSUPPORTED
     assert Cockpit("rover").command(mavlink.MAV_CMD_DO_SET_MODE, 1, 13) == FAILED
     rover = Cockpit("rover")

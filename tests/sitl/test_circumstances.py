@@ -1,4 +1,4 @@
-"""What befalls a vehicle: asked for by parameters, as far as it has them, and what its failsafes make of it."""
+"""Circumstances of a vehicle: they are set by parameters, as far as the vehicle has them, and cause failsafes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def mode_of(vehicle: Autopilot) -> str:
     return vehicle.mode
 
 
-def test_without_gps_a_copter_lands_and_says_so() -> None:
+def test_copter_without_gps_lands_and_reports_it() -> None:
     vehicle, texts = airborne()
     vehicle.failsafes.parameters["SIM_GPS1_ENABLE"] = 0.0
     assert not sys_status(vehicle).onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_SENSOR_GPS
@@ -74,9 +74,7 @@ def test_without_gps_a_copter_lands_and_says_so() -> None:
 @pytest.mark.parametrize(
     ("vehicle_type", "mode", "said"), [("plane", "TAKEOFF", []), ("rover", "HOLD", ["EKF variance"])]
 )
-def test_without_gps_a_plane_flies_on_and_a_rover_stops_whose_position_does_not_count(
-    vehicle_type: VehicleType, mode: str, said: list[str]
-) -> None:
+def test_plane_without_gps_flies_on_and_rover_stops(vehicle_type: VehicleType, mode: str, said: list[str]) -> None:
     vehicle, texts = airborne(vehicle_type)
     vehicle.failsafes.parameters["SIM_GPS1_ENABLE"] = 0.0
     vehicle.advance(61.0)
@@ -94,7 +92,7 @@ def test_without_gps_a_plane_flies_on_and_a_rover_stops_whose_position_does_not_
         (9.5, {"BATT_CRT_VOLT": 10.0, "BATT_FS_CRT_ACT": 1.0}, "LAND", "Battery 1 is critical 9"),
     ],
 )
-def test_a_low_battery_does_what_its_parameters_say(
+def test_low_battery_triggers_the_action_of_its_parameters(
     volts: float, given: dict[str, float], mode: str, said: str
 ) -> None:
     vehicle, texts = airborne()
@@ -109,7 +107,7 @@ def test_a_low_battery_does_what_its_parameters_say(
     assert not status.onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
 
 
-def test_without_a_motor_a_copter_falls() -> None:
+def test_copter_without_a_motor_falls() -> None:
     vehicle, texts = airborne()
     vehicle.failsafes.parameters["SIM_ENGINE_MUL"] = 0.0
     vehicle.advance(61.0)
@@ -119,7 +117,7 @@ def test_without_a_motor_a_copter_falls() -> None:
     assert texts[:2] == ["Potential Thrust Loss (2)", "Crash: Disarming"]
 
 
-def test_a_flight_that_a_failsafe_ends_is_no_failure(tmp_path: Path) -> None:
+def test_flight_ended_by_a_failsafe_is_no_failure(tmp_path: Path) -> None:
     async def fly() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):
             flying = asyncio.create_task(pilot.fly(pilot.flight(FAR, "mission")))
@@ -137,7 +135,7 @@ def test_a_flight_that_a_failsafe_ends_is_no_failure(tmp_path: Path) -> None:
     asyncio.run(fly())
 
 
-def test_the_name_of_an_earlier_version_is_used_where_the_vehicle_has_that(tmp_path: Path) -> None:
+def test_parameter_name_of_an_earlier_version_is_used(tmp_path: Path) -> None:
     async def ask() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):
             parameters = puppet.vehicle.failsafes.parameters
@@ -158,7 +156,7 @@ def test_the_name_of_an_earlier_version_is_used_where_the_vehicle_has_that(tmp_p
         (battery(float("nan")), "copter", "did not take a battery of nan V: .* it says SIM_BATT_VOLTAGE 16.8"),
     ],
 )
-def test_what_a_vehicle_does_not_simulate_is_a_sentence(
+def test_unsupported_circumstance_gives_one_sentence(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     circumstance: Circumstance,
@@ -176,7 +174,7 @@ def test_what_a_vehicle_does_not_simulate_is_a_sentence(
 
 
 @pytest.mark.parametrize("leaves", [True, False])
-def test_a_vehicle_that_does_not_answer_is_not_said_to_lack_anything(
+def test_silent_vehicle_is_not_reported_as_unsupported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, leaves: bool
 ) -> None:
     monkeypatch.setattr(sitl.circumstances, "ANSWER_S", 0.2)
@@ -184,7 +182,7 @@ def test_a_vehicle_that_does_not_answer_is_not_said_to_lack_anything(
     async def ask() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):
             puppet.tamper = lambda frame: b""
-            await asyncio.sleep(0.1)  # what was under way has come by then
+            await asyncio.sleep(0.1)  # messages under way arrive in this time
             if leaves:
                 puppet.leave()
             with pytest.raises(NotSimulatedError, match="ended its connection before" if leaves else "was silent when"):
@@ -193,7 +191,7 @@ def test_a_vehicle_that_does_not_answer_is_not_said_to_lack_anything(
     asyncio.run(ask())
 
 
-def test_a_plane_is_slower_against_the_wind_and_faster_with_it() -> None:
+def test_plane_is_slower_against_the_wind_and_faster_with_it() -> None:
     arrivals = {}
     for from_deg in (None, 0.0, 180.0):
         vehicle, _ = airborne("plane")

@@ -44,7 +44,7 @@ def altitude(client: Client) -> float:
     return float(client.wait_for("GLOBAL_POSITION_INT").relative_alt / 1e3)
 
 
-def test_it_says_what_an_arducopter_says_without_being_asked() -> None:
+def test_vehicle_sends_the_same_streams_as_arducopter() -> None:
     with embedded() as vehicle:
         client = Client(vehicle.pilot_port)
         heartbeat = client.wait_for("HEARTBEAT")
@@ -54,7 +54,7 @@ def test_it_says_what_an_arducopter_says_without_being_asked() -> None:
             client.wait_for(kind)
 
 
-def test_arming_is_refused_before_it_is_ready_and_then_succeeds() -> None:
+def test_arming_succeeds_only_after_the_vehicle_is_ready() -> None:
     with embedded(speedup=20) as vehicle:
         client = Client(vehicle.pilot_port)
         assert client.command(ARM, 1) == FAILED
@@ -63,14 +63,14 @@ def test_arming_is_refused_before_it_is_ready_and_then_succeeds() -> None:
         until(lambda: client.wait_for("HEARTBEAT").base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED, "armed")
 
 
-def test_it_says_why_it_refuses() -> None:
+def test_vehicle_reports_the_reason_of_a_refusal() -> None:
     with embedded(speedup=1) as vehicle:
         client = Client(vehicle.pilot_port)
         client.sock.sendall(mavlink.MAVLink_command_long_message(3, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0).pack(client.mav))
         assert client.wait_for("STATUSTEXT").text.startswith("PreArm")
 
 
-def test_takeoff_needs_arming_and_guided() -> None:
+def test_take_off_needs_arming_and_guided_mode() -> None:
     with embedded() as vehicle:
         client = Client(vehicle.pilot_port)
         wait_until_ready(client)
@@ -84,7 +84,7 @@ def test_takeoff_needs_arming_and_guided() -> None:
         assert client.command(TAKE_OFF, 0, 0, 0, 0, 0, 0, 20) == ACCEPTED
 
 
-def test_a_mode_set_right_after_boot_is_acknowledged_and_undone_as_by_ardupilot() -> None:
+def test_mode_set_directly_after_boot_is_undone() -> None:
     with embedded(speedup=10) as vehicle:
         client = Client(vehicle.pilot_port)
         assert client.command(SET_MODE, 1, GUIDED) == ACCEPTED
@@ -92,7 +92,7 @@ def test_a_mode_set_right_after_boot_is_acknowledged_and_undone_as_by_ardupilot(
         client.wait_for("HEARTBEAT", custom_mode=0)
 
 
-def test_it_flies_up_and_stays_and_down_and_disarms() -> None:
+def test_vehicle_climbs_hovers_lands_and_disarms() -> None:
     with embedded() as vehicle:
         client = Client(vehicle.pilot_port)
         take_off(client)
@@ -105,7 +105,7 @@ def test_it_flies_up_and_stays_and_down_and_disarms() -> None:
         assert altitude(client) == 0.0
 
 
-def test_commands_it_does_not_know_are_unsupported_and_those_for_others_unanswered() -> None:
+def test_unknown_commands_are_unsupported_and_foreign_ones_ignored() -> None:
     with embedded() as vehicle:
         client = Client(vehicle.pilot_port)
         assert client.command(mavlink.MAV_CMD_DO_PARACHUTE) == UNSUPPORTED
@@ -115,7 +115,7 @@ def test_commands_it_does_not_know_are_unsupported_and_those_for_others_unanswer
         assert client.command(SET_MODE, 1, 99) == FAILED
 
 
-def test_messages_come_at_the_interval_asked_for_or_when_asked_for() -> None:
+def test_messages_arrive_at_the_requested_interval() -> None:
     with embedded(speedup=10) as vehicle:
         client = Client(vehicle.pilot_port)
         assert client.command(SET_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE, 2e6) == ACCEPTED
@@ -129,7 +129,7 @@ def test_messages_come_at_the_interval_asked_for_or_when_asked_for() -> None:
         assert client.command(SET_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE, math.nan) == FAILED
 
 
-def test_a_client_that_turns_everything_off_is_still_answered() -> None:
+def test_client_without_streams_still_gets_answers() -> None:
     with embedded() as vehicle:
         client = Client(vehicle.pilot_port)
         for message_id in (0, 1, 2, 30, 33, 42):
@@ -137,7 +137,7 @@ def test_a_client_that_turns_everything_off_is_still_answered() -> None:
         assert client.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_HEARTBEAT) == ACCEPTED
 
 
-def test_simulated_time_runs_as_fast_as_asked() -> None:
+def test_simulated_time_runs_at_the_speedup() -> None:
     with embedded(speedup=50) as vehicle:
         client = Client(vehicle.pilot_port)
         boot, began = client.wait_for("SYSTEM_TIME").time_boot_ms, time.monotonic()
@@ -146,7 +146,7 @@ def test_simulated_time_runs_as_fast_as_asked() -> None:
         assert factor == pytest.approx(50, rel=0.3)
 
 
-def test_what_it_sends_in_a_second_is_bounded_however_fast_time_runs() -> None:
+def test_data_rate_is_bounded_at_any_speedup() -> None:
     with embedded(speedup=1000) as vehicle:
         client = Client(vehicle.pilot_port)
         client.wait_for("HEARTBEAT")
@@ -157,7 +157,7 @@ def test_what_it_sends_in_a_second_is_bounded_however_fast_time_runs() -> None:
         assert messages <= 20 * passed_s + 2
 
 
-def test_garbage_and_half_messages_are_tolerated() -> None:
+def test_vehicle_tolerates_garbage_and_partial_messages() -> None:
     with embedded() as vehicle:
         client = Client(vehicle.pilot_port)
         rng = random.Random(1)
@@ -167,7 +167,7 @@ def test_garbage_and_half_messages_are_tolerated() -> None:
         assert client.command(ARM, 0) == ACCEPTED
 
 
-def test_a_slow_reader_stalls_neither_the_vehicle_nor_the_other_client() -> None:
+def test_slow_client_delays_neither_vehicle_nor_other_clients() -> None:
     with embedded(speedup=200) as vehicle:
         slow = socket.socket()
         slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
@@ -181,7 +181,7 @@ def test_a_slow_reader_stalls_neither_the_vehicle_nor_the_other_client() -> None
         until(lambda: altitude(client) == pytest.approx(20.0), "flying all the same")
 
 
-def test_a_second_client_hears_nothing_until_the_first_has_gone() -> None:
+def test_second_client_waits_until_the_first_disconnects() -> None:
     with embedded() as vehicle:
         first = Client(vehicle.pilot_port)
         first.wait_for("HEARTBEAT")
@@ -196,7 +196,7 @@ def test_a_second_client_hears_nothing_until_the_first_has_gone() -> None:
         assert second.recv(1) == b"\xfd"
 
 
-def test_clients_that_vanish_are_forgotten() -> None:
+def test_vanished_clients_are_forgotten() -> None:
     with embedded() as vehicle:
         for _ in range(10):
             sock = connect(vehicle.agent_port)
@@ -205,7 +205,7 @@ def test_clients_that_vanish_are_forgotten() -> None:
         Client(vehicle.agent_port).wait_for("HEARTBEAT")
 
 
-def test_simulated_time_stands_while_the_process_is_stopped() -> None:
+def test_simulated_time_stops_with_the_process() -> None:
     with embedded(speedup=20) as vehicle:
         client = Client(vehicle.pilot_port)
         before_ms = client.wait_for("SYSTEM_TIME").time_boot_ms
@@ -216,7 +216,7 @@ def test_simulated_time_stands_while_the_process_is_stopped() -> None:
         assert after.time_boot_ms - before_ms < 15_000
 
 
-def test_sigterm_ends_it_with_status_0() -> None:
+def test_sigterm_ends_the_vehicle_with_status_0() -> None:
     with embedded() as vehicle:
         Client(vehicle.pilot_port).wait_for("HEARTBEAT")
         vehicle.process.send_signal(signal.SIGTERM)
@@ -231,7 +231,7 @@ def refusal(*argv: str) -> str:
     return sentence
 
 
-def test_a_port_in_use_is_one_sentence_and_status_2() -> None:
+def test_port_in_use_gives_one_sentence_and_status_2() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         sentence = refusal(*embedded_argv("--pilot-port", port, "--agent-port", "0", "--station-port", "0"))
@@ -251,13 +251,13 @@ def test_a_port_in_use_is_one_sentence_and_status_2() -> None:
         ("--pilot-port", "99999", "65535"),
     ],
 )
-def test_a_bad_argument_is_one_sentence_and_status_2(option: str, value: str, problem: str) -> None:
+def test_wrong_argument_gives_one_sentence_and_status_2(option: str, value: str, problem: str) -> None:
     assert problem in refusal(
         *embedded_argv("--pilot-port", "0", "--agent-port", "0", "--station-port", "0", option, value)
     )
 
 
-def test_who_asks_again_and_again_postpones_nothing() -> None:
+def test_repeated_interval_requests_do_not_postpone_messages() -> None:
     cockpit = Cockpit()
     attitudes = 0
     for second in range(20):

@@ -1,4 +1,4 @@
-"""Installing ArduPilot's binaries from a server on loopback that serves well, and that misbehaves."""
+"""Installing ArduPilot's binaries from a server on loopback that works correctly, or fails in various ways."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def server() -> Iterator[FirmwareServer]:
 
 
 class Onlooker:
-    """Notes what a watcher is told, and may end a download as Ctrl-C or a full disk does."""
+    """A watcher that records its calls, and can end a download like Ctrl-C or a full disk."""
 
     def __init__(self, end: BaseException | None = None) -> None:
         self.waited = threading.Event()
@@ -100,9 +100,7 @@ def the_binary(environ: dict[str, str]) -> bytes:
     return found.binary.read_bytes()
 
 
-def test_an_install_leaves_an_executable_its_parameters_and_where_they_came_from(
-    server: FirmwareServer, environ: dict[str, str]
-) -> None:
+def test_install_leaves_executable_parameters_and_manifest(server: FirmwareServer, environ: dict[str, str]) -> None:
     watcher = Onlooker()
     outcome = install_copter(server, environ, watcher=watcher)
     directory = outcome.installed.directory
@@ -120,7 +118,7 @@ def test_an_install_leaves_an_executable_its_parameters_and_where_they_came_from
     assert current("copter", environ) == outcome.installed
 
 
-def test_a_second_install_fetches_nothing_again_and_says_so(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_second_install_downloads_nothing(server: FirmwareServer, environ: dict[str, str]) -> None:
     install_copter(server, environ)
     server.asked.clear()
     assert install_copter(server, environ).already
@@ -128,21 +126,19 @@ def test_a_second_install_fetches_nothing_again_and_says_so(server: FirmwareServ
 
 
 @pytest.mark.parametrize("version", ["4.6.3", "stable-4.6.3"])
-def test_a_number_that_is_here_asks_nobody(version: str, server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_installed_number_needs_no_server(version: str, server: FirmwareServer, environ: dict[str, str]) -> None:
     install_copter(server, environ)
     server.asked.clear()
     assert install_copter(server, environ, version).already
     assert server.asked == []
 
 
-def test_a_number_is_looked_for_among_the_stable_releases(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_number_selects_a_stable_release(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.files = {path.replace("/stable/", "/stable-4.6.3/"): file for path, file in server.files.items()}
     assert install_copter(server, environ, "4.6.3").installed.directory.name == "4.6.3"
 
 
-def test_when_stable_has_moved_on_the_new_one_is_current_and_the_old_one_stays(
-    server: FirmwareServer, environ: dict[str, str]
-) -> None:
+def test_new_stable_release_is_current_and_the_old_one_is_kept(server: FirmwareServer, environ: dict[str, str]) -> None:
     old = install_copter(server, environ).installed
     server.change(f"{RELEASE}git-version.txt", content=git_version("4.7.0"))
     server.change(BINARY_PATH, content=BINARY + b"new")
@@ -154,14 +150,12 @@ def test_when_stable_has_moved_on_the_new_one_is_current_and_the_old_one_stays(
     assert the_binary(environ) == BINARY
 
 
-def test_two_development_builds_of_one_version_are_two(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_development_builds_of_one_version_are_separate(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(f"{RELEASE}git-version.txt", content=git_version("4.8.0-dev"))
     assert install_copter(server, environ).installed.directory.name == f"4.8.0-dev-{COMMIT[:8]}"
 
 
-def test_a_plane_takes_its_parameters_from_where_they_were_before(
-    server: FirmwareServer, environ: dict[str, str]
-) -> None:
+def test_plane_parameters_are_found_in_the_old_place(server: FirmwareServer, environ: dict[str, str]) -> None:
     release = RELEASE.replace("Copter", "Plane")
     server.files = {
         f"{release}git-version.txt": Resource(git_version("4.0.9")),
@@ -175,7 +169,7 @@ def test_a_plane_takes_its_parameters_from_where_they_were_before(
 # What breaks off goes on, if it is the same file.
 
 
-def test_a_broken_download_goes_on_where_it_stopped(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_interrupted_download_is_resumed(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, cut_after=HALF)
     with pytest.raises(DownloadError, match="broke off before its end: run the same command again"):
         install_copter(server, environ)
@@ -189,7 +183,7 @@ def test_a_broken_download_goes_on_where_it_stopped(server: FirmwareServer, envi
 
 
 @pytest.mark.parametrize("end", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full")], ids=["Ctrl-C", "full disk"])
-def test_ctrl_c_and_a_full_disk_keep_what_came(
+def test_interrupt_and_full_disk_keep_the_received_part(
     end: BaseException, server: FirmwareServer, environ: dict[str, str]
 ) -> None:
     with pytest.raises((KeyboardInterrupt, CacheError)):
@@ -202,7 +196,7 @@ def test_ctrl_c_and_a_full_disk_keep_what_came(
     assert the_binary(environ) == BINARY
 
 
-def test_a_server_that_ignores_ranges_sends_all_of_it_again(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_download_restarts_if_the_server_ignores_ranges(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, cut_after=HALF, ranges=False)
     with pytest.raises(DownloadError):
         install_copter(server, environ)
@@ -213,7 +207,7 @@ def test_a_server_that_ignores_ranges_sends_all_of_it_again(server: FirmwareServ
 
 @pytest.mark.parametrize("heeds_if_range", [True, False])
 @pytest.mark.parametrize("new", [BINARY[::-1], BINARY + b"more", BINARY[: HALF - 1]], ids=["same size", "more", "less"])
-def test_a_file_that_changed_in_between_is_fetched_anew(
+def test_download_restarts_if_the_file_has_changed(
     new: bytes, heeds_if_range: bool, server: FirmwareServer, environ: dict[str, str]
 ) -> None:
     new = BINARY[:64] + new[64:]
@@ -225,7 +219,7 @@ def test_a_file_that_changed_in_between_is_fetched_anew(
     assert the_binary(environ) == new
 
 
-def test_a_part_that_was_not_asked_for_is_not_taken(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_unrequested_range_is_rejected(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, cut_after=HALF)
     with pytest.raises(DownloadError):
         install_copter(server, environ)
@@ -235,7 +229,7 @@ def test_a_part_that_was_not_asked_for_is_not_taken(server: FirmwareServer, envi
     assert the_binary(environ) == BINARY
 
 
-def test_a_part_that_is_not_all_of_the_rest_is_not_the_end(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_incomplete_range_does_not_end_the_download(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, cut_after=HALF)
     with pytest.raises(DownloadError):
         install_copter(server, environ)
@@ -248,7 +242,7 @@ def test_a_part_that_is_not_all_of_the_rest_is_not_the_end(server: FirmwareServe
     assert the_binary(environ) == BINARY
 
 
-def test_without_a_validator_nothing_is_resumed(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_download_without_validator_is_not_resumed(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, cut_after=HALF, etag=False)
     with pytest.raises(DownloadError):
         install_copter(server, environ)
@@ -258,7 +252,7 @@ def test_without_a_validator_nothing_is_resumed(server: FirmwareServer, environ:
     assert the_binary(environ) == BINARY
 
 
-def test_a_date_will_do_where_there_is_no_strong_etag(server: FirmwareServer, tmp_path: Path) -> None:
+def test_last_modified_replaces_a_weak_etag(server: FirmwareServer, tmp_path: Path) -> None:
     dated = {"Last-Modified": "Mon, 03 Nov 2025 03:38:46 GMT", "ETag": 'W/"weak"'}
     server.change(BINARY_PATH, cut_after=HALF, etag=False, headers=dated)
     with pytest.raises(DownloadError):
@@ -267,7 +261,7 @@ def test_a_date_will_do_where_there_is_no_strong_etag(server: FirmwareServer, tm
 
 
 @pytest.mark.parametrize("note", ["", "[]", "{}", '{"size": 1, "validator": "x"}', '{"size": "a", "validator": 3}'])
-def test_a_partial_file_with_a_damaged_note_is_not_built_on(note: str, server: FirmwareServer, tmp_path: Path) -> None:
+def test_partial_file_with_damaged_note_is_not_resumed(note: str, server: FirmwareServer, tmp_path: Path) -> None:
     (tmp_path / "b.part").write_bytes(b"rubbish")
     (tmp_path / "b.part.json").write_text(note)
     download(server.url + BINARY_PATH, tmp_path / "b", 10**9, Onlooker().downloads)
@@ -277,7 +271,7 @@ def test_a_partial_file_with_a_damaged_note_is_not_built_on(note: str, server: F
 # Servers that misbehave.
 
 
-def test_a_version_that_is_not_there_names_those_that_are(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_unknown_version_lists_the_existing_ones(server: FirmwareServer, environ: dict[str, str]) -> None:
     with pytest.raises(RequestError, match=r"there are stable, latest, 4\.10\.0, 4\.6\.3$"):
         install_copter(server, environ, "4.5.1")
     del server.files["/Copter/"]
@@ -286,7 +280,7 @@ def test_a_version_that_is_not_there_names_those_that_are(server: FirmwareServer
 
 
 @pytest.mark.parametrize("version", ["", "..", "../..", "a/b", "4.6.3?", "ä", "-4"])
-def test_what_can_be_no_version_asks_nobody(version: str, server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_invalid_version_sends_no_request(version: str, server: FirmwareServer, environ: dict[str, str]) -> None:
     with pytest.raises(RequestError, match="is no version"):
         install_copter(server, environ, version)
     assert server.asked == []
@@ -295,12 +289,14 @@ def test_what_can_be_no_version_asks_nobody(version: str, server: FirmwareServer
 @pytest.mark.parametrize(
     "base", ["ftp://x", "x", "http://", "http://u:secret@x", "http://x:0", "http://x:y", "http://ä x"]
 )
-def test_what_can_be_no_mirror_is_refused(base: str, environ: dict[str, str]) -> None:
+def test_invalid_mirror_is_refused(base: str, environ: dict[str, str]) -> None:
     with pytest.raises(RequestError, match="is no address of a mirror"):
         install("copter", "stable", environ, Onlooker(), base)
 
 
-def test_a_server_that_falls_silent_is_given_up_and_resumed(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_silent_server_ends_the_download_which_is_resumed_later(
+    server: FirmwareServer, environ: dict[str, str]
+) -> None:
     server.change(BINARY_PATH, silent_after=HALF)
     with pytest.raises(DownloadError, match=r"127\.0\.0\.1:\d+ sent nothing for 0\.2 s"):
         install_copter(server, environ, stall_s=0.2)
@@ -310,14 +306,14 @@ def test_a_server_that_falls_silent_is_given_up_and_resumed(server: FirmwareServ
     assert the_binary(environ) == BINARY
 
 
-def test_a_redirect_is_followed(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_redirect_is_followed(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.files["/elsewhere"] = server.files[BINARY_PATH]
     server.files[BINARY_PATH] = Resource(b"", 302, {"Location": "/elsewhere"})
     install_copter(server, environ)
     assert the_binary(environ) == BINARY
 
 
-def test_a_redirect_never_leaves_encryption() -> None:
+def test_redirect_to_an_unencrypted_address_is_refused() -> None:
     request, headers = urllib.request.Request("https://a.example/x"), Message()
     with pytest.raises(DownloadError, match=r"leads to http://b\.example/x, which is not encrypted"):
         StayEncrypted().redirect_request(request, io.BytesIO(), 302, "Found", headers, "http://b.example/x")
@@ -325,7 +321,7 @@ def test_a_redirect_never_leaves_encryption() -> None:
     assert followed is not None
 
 
-def test_a_web_page_is_not_taken_for_a_binary_nor_kept(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_web_page_is_not_accepted_as_a_binary(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, content=b"<!DOCTYPE html><html>Please log in</html>")
     with pytest.raises(DownloadError, match="is no program for Linux on x86_64, it begins with b'<!DOCTYPE"):
         install_copter(server, environ)
@@ -334,47 +330,47 @@ def test_a_web_page_is_not_taken_for_a_binary_nor_kept(server: FirmwareServer, e
     assert the_binary(environ) == BINARY
 
 
-def test_a_program_for_another_processor_is_refused(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_program_for_another_processor_is_refused(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, content=BINARY[:18] + b"\xb7" + BINARY[19:])
     with pytest.raises(DownloadError, match="is no program for Linux on x86_64"):
         install_copter(server, environ)
 
 
 @pytest.mark.parametrize("path", [f"{RELEASE}git-version.txt", PARAMETERS_PATH])
-def test_a_web_page_is_not_taken_for_a_text_either(path: str, server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_web_page_is_not_accepted_as_a_text(path: str, server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(path, content=b"<!DOCTYPE html>\n<html>Please log in\n</html>")
     with pytest.raises(DownloadError, match=r"does not name a commit|has no ArduPilot parameters"):
         install_copter(server, environ)
 
 
-def test_parameters_that_break_off_are_an_error(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_truncated_parameters_are_an_error(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(PARAMETERS_PATH, cut_after=30)
     with pytest.raises(DownloadError, match="broke off"):
         install_copter(server, environ)
     assert current("copter", environ) is None
 
 
-def test_parameters_that_are_nowhere_name_the_last_place(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_missing_parameters_name_the_last_place(server: FirmwareServer, environ: dict[str, str]) -> None:
     del server.files[PARAMETERS_PATH]
     with pytest.raises(DownloadError, match=r"default_params/copter\.parm does not exist: install another --version"):
         install_copter(server, environ)
 
 
-def test_a_file_that_is_too_large_is_refused_before_it_comes(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_too_large_file_is_refused_before_the_download(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, announced=100_000_001)
     with pytest.raises(DownloadError, match=r"has 100\.0 MB, more than 100\.0 MB"):
         install_copter(server, environ)
     assert not list(cache(environ).glob("**/arducopter*"))
 
 
-def test_a_text_without_end_is_given_up(server: FirmwareServer) -> None:
+def test_endless_text_is_aborted(server: FirmwareServer) -> None:
     server.files["/text"] = Resource(b"x" * 3000)
     with pytest.raises(DownloadError, match="is larger than"):
         fetch_text(f"{server.url}/text", 2000)
 
 
 @pytest.mark.parametrize("how", [{"sized": False}, {"chunked": True}], ids=["until closed", "chunked"])
-def test_a_binary_of_unknown_size_is_refused(
+def test_binary_of_unknown_size_is_refused(
     how: dict[str, bool], server: FirmwareServer, environ: dict[str, str]
 ) -> None:
     server.change(BINARY_PATH, **how)
@@ -382,7 +378,7 @@ def test_a_binary_of_unknown_size_is_refused(
         install_copter(server, environ)
 
 
-def test_a_text_may_come_in_chunks_but_not_without_an_end(server: FirmwareServer) -> None:
+def test_text_may_be_chunked_but_needs_an_end(server: FirmwareServer) -> None:
     server.files["/text"] = Resource(PARAMETERS, chunked=True)
     assert fetch_text(f"{server.url}/text", 1000).encode() == PARAMETERS
     server.change("/text", cut_after=20)
@@ -393,20 +389,20 @@ def test_a_text_may_come_in_chunks_but_not_without_an_end(server: FirmwareServer
         fetch_text(f"{server.url}/text", 1000)
 
 
-def test_an_error_of_the_server_is_said(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_server_error_is_reported(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, status=503)
     with pytest.raises(DownloadError, match=r"answers 503 \(Service Unavailable\)"):
         install_copter(server, environ)
 
 
-def test_a_file_that_is_gone_is_its_own_error(server: FirmwareServer, tmp_path: Path) -> None:
+def test_missing_file_raises_not_there_error(server: FirmwareServer, tmp_path: Path) -> None:
     with pytest.raises(NotThereError):
         download(f"{server.url}/nowhere", tmp_path / "b", 1000, Onlooker().downloads)
 
 
-def test_without_a_network_the_way_out_is_another_machine(environ: dict[str, str]) -> None:
+def test_missing_network_suggests_another_machine(environ: dict[str, str]) -> None:
     with serving() as server:
-        pass  # nobody listens there any more
+        pass  # the server is closed
     with pytest.raises(UnreachableError, match=r"cannot be reached \(Connection refused\).*set ARDUPILOT_SITL to it$"):
         install_copter(server, environ)
 
@@ -414,13 +410,13 @@ def test_without_a_network_the_way_out_is_another_machine(environ: dict[str, str
 # The cache.
 
 
-def test_a_cache_that_cannot_be_made_names_the_way_out(server: FirmwareServer, tmp_path: Path) -> None:
+def test_impossible_cache_names_the_solution(server: FirmwareServer, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(CacheError, match=r"cannot be written \(Not a directory\).*set XDG_CACHE_HOME"):
         install_copter(server, {"XDG_CACHE_HOME": str(tmp_path / "file")})
 
 
-def test_a_read_only_cache_names_the_way_out(
+def test_read_only_cache_names_the_solution(
     server: FirmwareServer, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def read_only(path: Path, *_: object, **__: object) -> None:  # root may write anywhere, so it is played
@@ -431,7 +427,7 @@ def test_a_read_only_cache_names_the_way_out(
         install_copter(server, environ)
 
 
-def test_a_full_disk_is_said(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_full_disk_is_reported(server: FirmwareServer, environ: dict[str, str]) -> None:
     part = cache(environ) / "copter" / ".4.6.3.part"
     part.mkdir(parents=True)
     (part / "copter.parm").symlink_to("/dev/full")
@@ -442,7 +438,7 @@ def test_a_full_disk_is_said(server: FirmwareServer, environ: dict[str, str]) ->
     assert server.ranges_of("arducopter") == [None]  # the binary was there
 
 
-def test_no_home_is_no_place_for_a_cache() -> None:
+def test_missing_home_gives_no_cache() -> None:
     for environ in ({}, {"XDG_CACHE_HOME": "relative"}, {"HOME": ""}):
         with pytest.raises(VehicleError, match="set XDG_CACHE_HOME"):
             cache(environ)
@@ -452,7 +448,7 @@ def test_no_home_is_no_place_for_a_cache() -> None:
 
 @pytest.mark.parametrize("name", ["arducopter", "copter.parm", "manifest.json"])
 @pytest.mark.parametrize("harm", ["changed", "gone"])
-def test_what_is_not_as_it_was_fetched_is_not_used_and_is_mended(
+def test_changed_file_is_not_used_and_is_replaced(
     name: str, harm: str, server: FirmwareServer, environ: dict[str, str]
 ) -> None:
     directory = install_copter(server, environ).installed.directory
@@ -468,12 +464,12 @@ def test_what_is_not_as_it_was_fetched_is_not_used_and_is_mended(
 
 
 @pytest.mark.parametrize("manifest", ["3", "{}", '{"files": []}', '{"files": {"arducopter": 3}}', '{"files": {}}'])
-def test_a_manifest_that_makes_no_sense_is_damage(manifest: str, tmp_path: Path) -> None:
+def test_invalid_manifest_counts_as_damage(manifest: str, tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text(manifest)
     assert Installed("copter", tmp_path).damage == "manifest.json is missing or cannot be read"
 
 
-def test_a_file_that_the_manifest_does_not_vouch_for_is_damage(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_file_missing_in_the_manifest_counts_as_damage(server: FirmwareServer, environ: dict[str, str]) -> None:
     directory = install_copter(server, environ).installed.directory
     manifest = json.loads((directory / "manifest.json").read_text())
     del manifest["files"]["arducopter"]
@@ -481,15 +477,13 @@ def test_a_file_that_the_manifest_does_not_vouch_for_is_damage(server: FirmwareS
     assert Installed("copter", directory).damage == "arducopter is not the file that was fetched (SHA-256)"
 
 
-def test_a_binary_that_is_not_executable_is_damage(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_binary_without_execute_permission_counts_as_damage(server: FirmwareServer, environ: dict[str, str]) -> None:
     installed = install_copter(server, environ).installed
     installed.binary.chmod(0o644)
     assert Installed("copter", installed.directory).damage == "arducopter is not executable"
 
 
-def test_an_install_waits_for_another_one_and_finds_its_work_done(
-    server: FirmwareServer, environ: dict[str, str]
-) -> None:
+def test_install_waits_for_a_concurrent_install(server: FirmwareServer, environ: dict[str, str]) -> None:
     home = cache(environ) / "copter"
     install_copter(server, environ)
     server.asked.clear()
@@ -506,7 +500,7 @@ def test_an_install_waits_for_another_one_and_finds_its_work_done(
     assert outcomes[0].already
 
 
-def test_many_installs_at_once_fetch_the_binary_once(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_concurrent_installs_download_the_binary_once(server: FirmwareServer, environ: dict[str, str]) -> None:
     outcomes: list[Outcome] = []
     threads = [
         threading.Thread(target=lambda: outcomes.append(install_copter(server, environ)), daemon=True) for _ in range(5)
@@ -519,7 +513,7 @@ def test_many_installs_at_once_fetch_the_binary_once(server: FirmwareServer, env
     assert server.ranges_of("arducopter") == [None]
 
 
-def test_what_other_installs_left_unfinished_is_removed(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_unfinished_installs_are_removed(server: FirmwareServer, environ: dict[str, str]) -> None:
     left = cache(environ) / "copter" / ".4.8.0-dev-01234567.part"
     left.mkdir(parents=True)
     (left.parent / ".current").symlink_to("nowhere")
@@ -528,7 +522,7 @@ def test_what_other_installs_left_unfinished_is_removed(server: FirmwareServer, 
 
 
 @pytest.mark.parametrize("machine", ["riscv64", "ppc64le"])
-def test_another_machine_is_told_what_it_can_do(
+def test_unsupported_machine_gets_a_solution(
     machine: str, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(platform, "machine", lambda: machine)
@@ -536,7 +530,7 @@ def test_another_machine_is_told_what_it_can_do(
         install("copter", "stable", environ, Onlooker(), "http://127.0.0.1:1")
 
 
-def test_on_32_bit_arm_its_own_binary_is_fetched(
+def test_32_bit_arm_gets_its_own_binary(
     server: FirmwareServer, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(platform, "machine", lambda: "armv7l")
@@ -550,7 +544,7 @@ def test_on_32_bit_arm_its_own_binary_is_fetched(
     assert the_binary(environ) == ARM_BINARY
 
 
-def test_an_aarch64_that_runs_no_32_bit_programs_is_told_so(
+def test_aarch64_without_32_bit_support_is_refused(
     server: FirmwareServer, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As the machine of the test does not."""
@@ -561,7 +555,7 @@ def test_an_aarch64_that_runs_no_32_bit_programs_is_told_so(
     assert current("copter", environ) is None
 
 
-def test_an_aarch64_that_runs_them_has_them(
+def test_aarch64_with_32_bit_support_is_accepted(
     server: FirmwareServer, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
@@ -571,10 +565,10 @@ def test_an_aarch64_that_runs_them_has_them(
     assert the_binary(environ) == ARM_BINARY
 
 
-# Flying what is installed.
+# Flights with installed binaries
 
 
-def test_what_is_installed_flies_where_nothing_else_is_named(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_installed_binary_is_the_default(server: FirmwareServer, environ: dict[str, str]) -> None:
     with pytest.raises(NoBinaryError, match="none is installed; run `ucp-harness sitl install --vehicle copter`"):
         ArduPilot.find(None, environ)
     directory = install_copter(server, environ).installed.directory
@@ -583,7 +577,7 @@ def test_what_is_installed_flies_where_nothing_else_is_named(server: FirmwareSer
     assert [path.name for path in found.defaults] == ["copter.parm"]
 
 
-def test_the_environment_and_path_go_before_what_is_installed(
+def test_environment_and_path_precede_the_installed_binary(
     server: FirmwareServer, environ: dict[str, str], tmp_path: Path
 ) -> None:
     install_copter(server, environ)
@@ -594,15 +588,13 @@ def test_the_environment_and_path_go_before_what_is_installed(
         assert ArduPilot.find(None, {**environ, variable: str(tmp_path)}).binary == other
 
 
-def test_what_is_installed_and_damaged_does_not_fly(server: FirmwareServer, environ: dict[str, str]) -> None:
+def test_damaged_installed_binary_is_not_used(server: FirmwareServer, environ: dict[str, str]) -> None:
     install_copter(server, environ).installed.binary.write_bytes(BINARY[:-1])
     with pytest.raises(UnusableBinaryError, match="is damaged, arducopter is not the file that was fetched"):
         ArduPilot.find(None, environ)
 
 
-def test_what_frames_need_comes_along_as_far_as_that_version_has_it(
-    server: FirmwareServer, environ: dict[str, str]
-) -> None:
+def test_parameters_of_frames_are_downloaded_if_they_exist(server: FirmwareServer, environ: dict[str, str]) -> None:
     tree = PARAMETERS_PATH.removesuffix("default_params/copter.parm")
     for name in ("default_params/copter-hexa.parm", "models/copter-single.parm"):
         server.files[f"{tree}{name}"] = Resource(b"FRAME_CLASS 2\n")

@@ -1,4 +1,4 @@
-"""Plans flown by the real pilot: embedded vehicles over TCP, and puppets that do what no vehicle should."""
+"""Plans flown by the real pilot: embedded vehicles over TCP, and puppets that misbehave."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def places(tlog: Path) -> Iterator[tuple[float, tuple[float, float, float]]]:
 
 
 @pytest.mark.parametrize("vehicle_type", TYPES)
-def test_a_mission_flown_in_auto_is_the_computed_track(vehicle_type: VehicleType, tmp_path: Path) -> None:
+def test_mission_in_auto_mode_follows_the_computed_track(vehicle_type: VehicleType, tmp_path: Path) -> None:
     """Within a metre at every second, once the starts are laid on one another."""
     tlog = tmp_path / "3.tlog"
     pilot = flown(vehicle_type, "mission", tlog)
@@ -79,7 +79,7 @@ def test_a_mission_flown_in_auto_is_the_computed_track(vehicle_type: VehicleType
 
 
 @pytest.mark.parametrize("vehicle_type", TYPES)
-def test_a_plan_flown_in_guided_gets_to_its_places(vehicle_type: VehicleType, tmp_path: Path) -> None:
+def test_plan_in_guided_mode_reaches_its_places(vehicle_type: VehicleType, tmp_path: Path) -> None:
     tlog = tmp_path / "3.tlog"
     pilot = flown(vehicle_type, "guided", tlog)
     assert pilot.state.armed is (vehicle_type == "rover")
@@ -91,7 +91,7 @@ def test_a_plan_flown_in_guided_gets_to_its_places(vehicle_type: VehicleType, tm
     assert math.dist(way[-1][:2], (0, 0)) < (100 if vehicle_type == "plane" else 6)
 
 
-def test_a_plan_that_the_type_cannot_fly_is_refused_before_anything_is_asked(tmp_path: Path) -> None:
+def test_impossible_plan_is_refused_before_any_request(tmp_path: Path) -> None:
     async def fly() -> None:
         async with on_strings(tmp_path, "rover") as (pilot, _):
             with pytest.raises(PlanError, match="a rover neither takes off"):
@@ -156,7 +156,7 @@ def without(monkeypatch: pytest.MonkeyPatch, *ids: int) -> Callable[[Puppet], No
         ((mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,), "it has sent no position for "),
     ],
 )
-def test_a_vehicle_that_stops_talking_in_flight_is_given_up(
+def test_silent_vehicle_ends_the_flight_with_an_error(
     lost: tuple[int, ...], said: str, by: By, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     message = failure(tmp_path, without(monkeypatch, *lost), by=by)
@@ -164,23 +164,23 @@ def test_a_vehicle_that_stops_talking_in_flight_is_given_up(
     assert said in message and "its last words: '" in message
 
 
-def test_a_vehicle_that_leaves_in_flight_is_given_up_at_once(tmp_path: Path) -> None:
+def test_disconnected_vehicle_ends_the_flight_at_once(tmp_path: Path) -> None:
     assert "it ended the connection" in failure(tmp_path, Puppet.leave)
 
 
 @pytest.mark.parametrize("by", ["mission", "guided"])
-def test_a_vehicle_that_loses_its_motors_is_given_up_with_the_leg(by: By, tmp_path: Path) -> None:
+def test_vehicle_without_motors_ends_the_flight_with_its_leg(by: By, tmp_path: Path) -> None:
     message = failure(tmp_path, lambda puppet: puppet.vehicle.disarm(force=True) and None, after_m=39.0, by=by)
     assert "it disarmed on leg" in message and "of 6 (" in message
 
 
-def test_a_vehicle_that_hangs_on_a_leg_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vehicle_stuck_on_a_leg_ends_the_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sitl.pilot, "LEAST_WAIT_S", 0.1)
     message = failure(tmp_path, lambda puppet: puppet.vehicle._stay(), after_m=5.0)
     assert "waiting for leg 1 of 6 (take off to 30 m), 240 simulated seconds were not enough" in message
 
 
-def test_garbage_in_the_stream_is_survived_and_counted(tmp_path: Path) -> None:
+def test_garbage_in_the_stream_is_counted(tmp_path: Path) -> None:
     rng = random.Random(1)
 
     def strings(puppet: Puppet) -> None:
@@ -191,7 +191,7 @@ def test_garbage_in_the_stream_is_survived_and_counted(tmp_path: Path) -> None:
     assert not pilot.state.armed
 
 
-def test_a_mode_that_is_undone_in_flight_is_asked_for_again(tmp_path: Path) -> None:
+def test_undone_mode_is_requested_again(tmp_path: Path) -> None:
     async def fly() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):
             flight = asyncio.create_task(pilot.fly(pilot.flight(PLAN, "mission")))
@@ -204,8 +204,8 @@ def test_a_mode_that_is_undone_in_flight_is_asked_for_again(tmp_path: Path) -> N
     asyncio.run(fly())
 
 
-def test_a_mission_that_is_acknowledged_and_forgotten_is_uploaded_again(tmp_path: Path) -> None:
-    """As by ArduCopter 3.5 while it boots."""
+def test_forgotten_mission_is_uploaded_again(tmp_path: Path) -> None:
+    """Act like ArduCopter 3.5 during its boot."""
     forgotten: list[int] = []
 
     def strings(puppet: Puppet) -> None:
@@ -221,7 +221,7 @@ def test_a_mission_that_is_acknowledged_and_forgotten_is_uploaded_again(tmp_path
     assert len(forgotten) == 2
 
 
-def test_a_request_that_is_lost_begins_the_upload_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lost_request_restarts_the_upload(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sitl._mission_upload, "RESEND_S", 0.1)
     lost: list[bytes] = []
 
@@ -238,15 +238,13 @@ def test_a_request_that_is_lost_begins_the_upload_anew(tmp_path: Path, monkeypat
     assert len(lost) == 3
 
 
-def test_a_mission_that_is_refused_ends_the_flight_with_the_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refused_mission_ends_the_flight_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sitl._mission_inbox, "MAX_ITEMS", 2)
     with pytest.raises(FlightError, match="it refused its mission with MAV_MISSION_NO_SPACE"):
         puppet_flown(tmp_path, lambda puppet: None)
 
 
-def test_a_vehicle_that_spins_and_never_gets_ready_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vehicle_that_never_becomes_ready_ends_the_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sitl._autopilot, "READY_S", math.inf)
     monkeypatch.setattr(sitl.pilot, "LEAST_WAIT_S", 0.1)
     with pytest.raises(FlightError, match="ready to arm, 180 simulated seconds were not enough; it never said why"):
@@ -254,7 +252,7 @@ def test_a_vehicle_that_spins_and_never_gets_ready_is_given_up(tmp_path: Path, m
 
 
 @pytest.mark.parametrize("by", ["mission", "guided"])
-def test_a_flight_is_terminated_in_the_air_and_ends_without_an_error(by: By, tmp_path: Path) -> None:
+def test_terminated_flight_ends_without_an_error(by: By, tmp_path: Path) -> None:
     async def fly() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):
             flight = asyncio.create_task(pilot.fly(pilot.flight(PLAN, by)))
@@ -265,12 +263,12 @@ def test_a_flight_is_terminated_in_the_air_and_ends_without_an_error(by: By, tmp
             assert not puppet.vehicle.armed
             assert puppet.vehicle.motion.up_m == 0
             await until(lambda: any(text.startswith("SIM Hit ground") for text in pilot.state.texts))
-            await pilot.stay_in_touch()  # nobody is waited for any more
+            await pilot.stay_in_touch()  # returns at once
 
     asyncio.run(fly())
 
 
-def test_after_its_flight_a_vehicle_is_still_listened_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vehicle_is_monitored_after_its_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def listen() -> str:
         async with on_strings(tmp_path) as (pilot, puppet):
             await pilot.fly(pilot.ascent(10.0))
@@ -284,7 +282,7 @@ def test_after_its_flight_a_vehicle_is_still_listened_to(tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize("vehicle_type", TYPES)
 @pytest.mark.parametrize("by", ["mission", "guided"])
-def test_a_vehicle_that_is_ready_has_only_to_be_armed(by: By, vehicle_type: VehicleType, tmp_path: Path) -> None:
+def test_ready_vehicle_only_needs_arming(by: By, vehicle_type: VehicleType, tmp_path: Path) -> None:
     async def fly() -> None:
         async with on_strings(tmp_path, vehicle_type) as (pilot, puppet):
             flight = pilot.flight(plan_of(vehicle_type), by)
@@ -302,7 +300,7 @@ def test_a_vehicle_that_is_ready_has_only_to_be_armed(by: By, vehicle_type: Vehi
     asyncio.run(fly())
 
 
-def test_a_vehicle_that_takes_back_that_it_is_ready_is_not(tmp_path: Path) -> None:
+def test_vehicle_that_revokes_its_readiness_is_not_ready(tmp_path: Path) -> None:
     """ArduPilot 4.7 says for 2.4 s that a rover is ready, and then for 17 s that it is not."""
 
     async def fly() -> None:
@@ -322,7 +320,7 @@ def test_a_vehicle_that_takes_back_that_it_is_ready_is_not(tmp_path: Path) -> No
     asyncio.run(fly())
 
 
-def test_who_hands_over_lets_the_operator_fly(tmp_path: Path) -> None:
+def test_pilot_stops_after_handing_over(tmp_path: Path) -> None:
     """Else a pilot asks again for the mode that it set."""
 
     async def fly() -> None:

@@ -1,4 +1,4 @@
-"""A ground station on one UDP port: what it sees of vehicles, what it may tell them, and what it cannot break."""
+"""A ground station on one UDP port: the frames it receives, its commands, and its limits."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ async def in_field() -> AsyncIterator[Field]:
             vehicle.close()
 
 
-def test_whole_frames_of_every_vehicle_come_to_the_one_port() -> None:
+def test_frames_of_all_vehicles_reach_the_station() -> None:
     async def story() -> None:
         async with in_field() as field:
             frame = bytes(HEARTBEAT.pack(VEHICLE))
@@ -108,7 +108,7 @@ def test_whole_frames_of_every_vehicle_come_to_the_one_port() -> None:
     asyncio.run(story())
 
 
-def test_a_command_goes_to_whom_it_is_for_is_taken_down_and_takes_over() -> None:
+def test_command_reaches_its_vehicle_and_is_recorded() -> None:
     async def story() -> None:
         async with in_field() as field:
             field.tell(land(4))
@@ -122,7 +122,7 @@ def test_a_command_goes_to_whom_it_is_for_is_taken_down_and_takes_over() -> None
     asyncio.run(story())
 
 
-def test_who_only_asks_takes_nothing_over() -> None:
+def test_requests_do_not_take_over_a_vehicle() -> None:
     async def story() -> None:
         async with in_field() as field:
             parameter = mavlink.MAVLink_param_set_message(3, 1, b"RTL_ALT", 5.0, 9)
@@ -135,7 +135,7 @@ def test_who_only_asks_takes_nothing_over() -> None:
     asyncio.run(story())
 
 
-def test_a_ground_station_that_is_away_costs_nothing_and_may_come_back() -> None:
+def test_station_may_disappear_and_return() -> None:
     async def story() -> None:
         async with in_field() as field:
             address = field.ground.getsockname()
@@ -152,7 +152,7 @@ def test_a_ground_station_that_is_away_costs_nothing_and_may_come_back() -> None
     asyncio.run(story())
 
 
-def test_a_flood_and_junk_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_excess_and_invalid_datagrams_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sitl.ground_station, "MOST_DATAGRAMS_PER_S", 50)
     lots = random.Random(1)
 
@@ -173,7 +173,7 @@ def test_a_flood_and_junk_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatc
     asyncio.run(story())
 
 
-def test_a_stranger_is_not_listened_to() -> None:
+def test_datagrams_of_other_senders_are_ignored() -> None:
     async def story() -> None:
         async with in_field() as field:
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -186,7 +186,7 @@ def test_a_stranger_is_not_listened_to() -> None:
 
 
 @given(st.data())
-def test_frames_come_out_whole_however_the_stream_is_cut(data: st.DataObject) -> None:
+def test_splitter_yields_complete_frames_for_any_pieces(data: st.DataObject) -> None:
     frames = [bytes(HEARTBEAT.pack(VEHICLE)), land(3), bytes(HEARTBEAT.pack(VEHICLE, force_mavlink1=True))]
     stream = b"noise".join(frames)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=6)))
@@ -196,14 +196,14 @@ def test_frames_come_out_whole_however_the_stream_is_cut(data: st.DataObject) ->
 
 
 @given(st.lists(st.binary(max_size=700), max_size=8))
-def test_a_stream_of_anything_keeps_less_than_a_frame(pieces: list[bytes]) -> None:
+def test_splitter_keeps_less_than_one_frame(pieces: list[bytes]) -> None:
     splitter = FrameSplitter()
     for piece in pieces:
         splitter.feed(piece)
         assert len(splitter._rest) < 12 + 255 + 13
 
 
-def test_what_an_operator_does_at_the_sticks_is_one_entry_and_all_is_bounded() -> None:
+def test_stick_messages_make_one_entry_and_the_log_is_bounded() -> None:
     log = CommandLog()
     for tenth in range(100):
         log.note(mavlink.MAVLink_manual_control_message(3, tenth, 0, 0, 0, 0), [3], tenth / 10)
@@ -219,7 +219,7 @@ def test_what_an_operator_does_at_the_sticks_is_one_entry_and_all_is_bounded() -
     ("text", "host", "port"),
     [("127.0.0.1:14550", "127.0.0.1", 14550), ("[::1]:1", "::1", 1), ("base.local:65535", "base.local", 65535)],
 )
-def test_an_address_is_a_host_and_a_port(text: str, host: str, port: int) -> None:
+def test_address_has_host_and_port(text: str, host: str, port: int) -> None:
     assert Address.parse(text) == Address(host, port)
     assert str(Address.parse(text)) == text
 
@@ -228,17 +228,17 @@ def test_an_address_is_a_host_and_a_port(text: str, host: str, port: int) -> Non
     "text",
     ["", "14550", ":14550", "host", "host:", "host:0", "host:65536", "host:x", "a b:1", "::1:5", "h:" + "9" * 99],
 )
-def test_what_is_no_address_is_one_sentence(text: str) -> None:
+def test_invalid_address_gives_one_sentence(text: str) -> None:
     with pytest.raises(VehicleError, match=r"ground station|host"):
         Address.parse(text)
 
 
-def test_a_host_that_nobody_knows_is_one_sentence() -> None:
+def test_unknown_host_gives_one_sentence() -> None:
     with pytest.raises(VehicleError, match=r"the ground station at nobody\.invalid:14550 cannot be sent"):
         asyncio.run(GroundStation.open(Address("nobody.invalid", 14550), lambda: 0.0, lambda vehicles: None))
 
 
-def test_of_a_name_that_is_both_the_address_of_ipv4_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ipv4_address_of_a_name_is_preferred(monkeypatch: pytest.MonkeyPatch) -> None:
     ways = [
         (socket.AF_INET6, socket.SOCK_DGRAM, 17, "", ("::1", 14550, 0, 0)),
         (socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("127.0.0.1", 14550)),

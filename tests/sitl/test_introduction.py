@@ -1,4 +1,4 @@
-"""What a vehicle says of itself: its version, and its list of parameters, of which some get lost."""
+"""The introduction of a vehicle: its version and its parameters, with lost messages."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from tests.sitl.puppet import message_id, on_strings
         (0x04_06_00_80, b"abc\0\0\0\0\0", Version("4.6.0-beta", "abc")),
     ],
 )
-def test_a_version_is_as_people_write_it(number: int, custom: bytes, version: Version) -> None:
+def test_version_has_its_usual_form(number: int, custom: bytes, version: Version) -> None:
     assert Version.of(number, custom) == version
 
 
-def test_what_gets_lost_of_a_list_is_asked_for_again(tmp_path: Path) -> None:
+def test_lost_parameters_are_requested_again(tmp_path: Path) -> None:
     async def introduce() -> None:
         async with on_strings(tmp_path, "plane") as (pilot, puppet):
             lost: list[bytes] = []
@@ -46,7 +46,7 @@ def test_what_gets_lost_of_a_list_is_asked_for_again(tmp_path: Path) -> None:
     asyncio.run(introduce())
 
 
-def test_a_parameter_that_the_vehicle_does_not_know_is_named(tmp_path: Path) -> None:
+def test_unknown_parameter_is_named(tmp_path: Path) -> None:
     async def introduce() -> None:
         async with on_strings(tmp_path, "plane") as (pilot, _):
             await pilot.introduce({"TKOFF_ALT": 33.0, "TKOF_ALT": 30.0})
@@ -55,7 +55,7 @@ def test_a_parameter_that_the_vehicle_does_not_know_is_named(tmp_path: Path) -> 
         asyncio.run(introduce())
 
 
-def test_a_vehicle_that_says_nothing_of_itself_flies_all_the_same(tmp_path: Path) -> None:
+def test_vehicle_without_introduction_still_flies(tmp_path: Path) -> None:
     silent = {mavlink.MAVLINK_MSG_ID_PARAM_VALUE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION}
 
     async def introduce() -> None:

@@ -21,7 +21,7 @@ def distance(a: Motion, b: Motion) -> float:
     return math.dist(a.point, b.point)
 
 
-def test_a_line_speeds_up_keeps_its_speed_and_slows_down() -> None:
+def test_line_has_a_trapezoidal_speed() -> None:
     line = Line(Motion(), Point(100, 0, 0), speed_ms=10, accel_ms2=2)
     assert line.duration_s == pytest.approx(5 + 50 / 10 + 5)
     assert (line.at(5).north_m, line.at(5).north_ms) == pytest.approx((25, 10))
@@ -29,14 +29,16 @@ def test_a_line_speeds_up_keeps_its_speed_and_slows_down() -> None:
     assert line.at(15) == Motion(100, 0, 0)
 
 
-def test_a_short_line_never_gets_to_its_speed() -> None:
+def test_short_line_does_not_reach_its_speed() -> None:
     line = Line(Motion(), Point(0, 8, 0), speed_ms=10, accel_ms2=2)
     assert line.duration_s == pytest.approx(4)
     assert line.at(2).east_ms == pytest.approx(4)
 
 
 @given(places, st.floats(0.5, 30), st.floats(0.5, 5), st.floats(0, 1), st.floats(0, 1))
-def test_a_line_goes_as_fast_as_it_says(end: Point, speed: float, accel: float, begins: float, ends: float) -> None:
+def test_speed_of_a_line_is_the_derivative_of_its_position(
+    end: Point, speed: float, accel: float, begins: float, ends: float
+) -> None:
     line = Line(Motion(up_m=end.up_m), end._replace(north_m=2000), speed, accel, begins * speed, ends * speed)
     for part in (0.1, 0.5, 0.9):
         at_s = part * line.duration_s
@@ -47,7 +49,7 @@ def test_a_line_goes_as_fast_as_it_says(end: Point, speed: float, accel: float, 
 
 
 @pytest.mark.parametrize(("turn", "end"), [(math.pi, (0, 20)), (-math.pi, (0, -20))])
-def test_an_arc_clockwise_turns_right(turn: float, end: tuple[float, float]) -> None:
+def test_clockwise_arc_turns_right(turn: float, end: tuple[float, float]) -> None:
     heading_north = Motion()
     arc = Arc(heading_north, (0, math.copysign(10, turn)), turn, speed_ms=5)
     assert arc.at(0).yaw_rad % math.tau == pytest.approx(0, abs=1e-9)
@@ -56,19 +58,19 @@ def test_an_arc_clockwise_turns_right(turn: float, end: tuple[float, float]) -> 
     assert math.copysign(1, arc.at(1).roll_rad) == math.copysign(1, turn)
 
 
-def test_climbing_goes_on_level_at_its_altitude() -> None:
+def test_climb_ends_at_its_altitude() -> None:
     climb = Climbing(Line(Motion(up_m=10), Point(100, 0, 10), 10, 100), up_m=20, rate_ms=2)
     assert (climb.at(2).up_m, climb.at(2).up_ms) == (14, 2)
     assert (climb.at(9).up_m, climb.at(9).up_ms) == (20, 0)
 
 
-def test_a_fall_ends_on_the_ground_at_the_speed_of_free_fall() -> None:
+def test_fall_ends_at_the_speed_of_free_fall() -> None:
     fall = Fall(Motion(up_m=100, north_ms=3))
     assert fall.at(fall.duration_s).point == pytest.approx((3 * fall.duration_s, 0, 0))
     assert fall.impact_ms == pytest.approx(math.sqrt(2 * 9.81 * 100))
 
 
-def test_a_course_is_its_segments_one_after_another() -> None:
+def test_course_joins_its_segments() -> None:
     line = Line(Motion(), Point(10, 0, 0), 10, 10)
     course = Course(100, [Rest(Motion(), 5), line, Rest(end_of([line]))])
     assert course.at(0) == course.at(104.9) == Motion()
@@ -88,7 +90,7 @@ WISHES = ("go_to", "loiter", "land", "ascent")
     st.floats(0, 6.28),
     st.lists(st.tuples(st.sampled_from(WISHES), places, st.floats(0.1, 60)), max_size=6),
 )
-def test_nothing_jumps_nor_goes_underground(
+def test_motion_is_continuous_and_above_ground(
     vehicle_type: VehicleType, yaw: float, wishes: list[tuple[str, Point, float]]
 ) -> None:
     """Whatever is wished for, wherever it is broken off: what begins, begins where the vehicle is."""
@@ -116,7 +118,7 @@ def test_nothing_jumps_nor_goes_underground(
 
 
 @given(places, metres, metres, st.floats(0, 6.28))
-def test_a_plane_comes_close_to_every_place(place: Point, north: float, east: float, yaw: float) -> None:
+def test_plane_passes_close_to_every_place(place: Point, north: float, east: float, yaw: float) -> None:
     start = Motion(north, east, 50, 22 * math.cos(yaw), 22 * math.sin(yaw), yaw_rad=yaw)
     there = end_of(MODELS["plane"].go_to(start, place, 22))
     assert math.dist(there.point[:2], place[:2]) <= 50 + 1e-3

@@ -1,4 +1,4 @@
-"""The vehicle's side of the mission protocol, with a client that does not keep to it."""
+"""The vehicle's side of the mission protocol, with a client that violates it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def answer(cockpit: Cockpit, message: Any) -> tuple[str, int]:
     return kind, reply.type if kind == "MISSION_ACK" else reply.count if kind == "MISSION_COUNT" else reply.seq
 
 
-def test_items_are_asked_for_one_by_one_and_the_last_is_acknowledged() -> None:
+def test_items_are_requested_in_order_and_acknowledged() -> None:
     cockpit = Cockpit()
     assert answer(cockpit, count(2)) == ("MISSION_REQUEST_INT", 0)
     assert answer(cockpit, item(0)) == ("MISSION_REQUEST_INT", 1)
@@ -48,7 +48,7 @@ def test_items_are_asked_for_one_by_one_and_the_last_is_acknowledged() -> None:
     assert [one.seq for one in cockpit.vehicle.mission] == [0, 1]
 
 
-def test_an_item_out_of_order_is_refused_and_the_transfer_goes_on() -> None:
+def test_item_out_of_order_is_refused_without_ending_the_transfer() -> None:
     cockpit = Cockpit()
     answer(cockpit, count(3))
     assert answer(cockpit, item(1)) == ("MISSION_ACK", mavlink.MAV_MISSION_INVALID_SEQUENCE)
@@ -58,7 +58,7 @@ def test_an_item_out_of_order_is_refused_and_the_transfer_goes_on() -> None:
     assert answer(cockpit, item(2)) == ("MISSION_ACK", mavlink.MAV_MISSION_ACCEPTED)
 
 
-def test_an_item_that_nobody_asked_for_is_an_error() -> None:
+def test_unrequested_item_is_an_error() -> None:
     cockpit = Cockpit()
     assert answer(cockpit, item(0)) == ("MISSION_ACK", mavlink.MAV_MISSION_ERROR)
     cockpit.load(PLAN)
@@ -66,7 +66,7 @@ def test_an_item_that_nobody_asked_for_is_an_error() -> None:
     assert len(cockpit.vehicle.mission) > 2
 
 
-def test_too_many_items_have_no_space_and_none_clear_the_mission() -> None:
+def test_large_mission_is_refused_and_empty_one_clears_it() -> None:
     cockpit = Cockpit()
     cockpit.load(PLAN)
     assert answer(cockpit, count(MAX_ITEMS + 1)) == ("MISSION_ACK", mavlink.MAV_MISSION_NO_SPACE)
@@ -75,7 +75,7 @@ def test_too_many_items_have_no_space_and_none_clear_the_mission() -> None:
     assert list(cockpit.vehicle.mission) == []
 
 
-def test_a_new_count_begins_anew() -> None:
+def test_new_count_restarts_the_transfer() -> None:
     cockpit = Cockpit()
     answer(cockpit, count(3))
     answer(cockpit, item(0))
@@ -97,7 +97,7 @@ def test_a_new_count_begins_anew() -> None:
         ({"place": (0, 0, 1e9)}, mavlink.MAV_MISSION_INVALID_PARAM7),
     ],
 )
-def test_an_item_that_cannot_be_flown_ends_the_transfer_with_the_reason(bad: dict[str, Any], result: int) -> None:
+def test_impossible_item_ends_the_transfer_with_a_reason(bad: dict[str, Any], result: int) -> None:
     cockpit = Cockpit()
     cockpit.load(PLAN)
     before = cockpit.vehicle.mission
@@ -109,7 +109,7 @@ def test_an_item_that_cannot_be_flown_ends_the_transfer_with_the_reason(bad: dic
 
 
 @pytest.mark.parametrize("degrees", [math.nan, math.inf, 200.0])
-def test_coordinates_in_floats_that_are_nowhere_are_refused(degrees: float) -> None:
+def test_impossible_float_coordinates_are_refused(degrees: float) -> None:
     cockpit = Cockpit()
     answer(cockpit, count(2))
     answer(cockpit, item(0))
@@ -117,7 +117,7 @@ def test_coordinates_in_floats_that_are_nowhere_are_refused(degrees: float) -> N
     assert answer(cockpit, floats) == ("MISSION_ACK", mavlink.MAV_MISSION_INVALID_PARAM5_X)
 
 
-def test_items_with_floats_are_taken_too() -> None:
+def test_items_with_float_coordinates_are_accepted() -> None:
     cockpit = Cockpit()
     answer(cockpit, count(1))
     floats = mavlink.MAVLink_mission_item_message(3, 1, 0, 3, 22, 0, 1, 0, 0, 0, 0, -35.5, 149.25, 30.0)
@@ -125,12 +125,12 @@ def test_items_with_floats_are_taken_too() -> None:
     assert (cockpit.vehicle.mission[0].x, cockpit.vehicle.mission[0].y) == (-355_000_000, 1_492_500_000)
 
 
-def test_a_fence_is_not_a_mission() -> None:
+def test_fence_is_not_accepted_as_a_mission() -> None:
     cockpit = Cockpit()
     assert answer(cockpit, count(1, mavlink.MAV_MISSION_TYPE_FENCE)) == ("MISSION_ACK", mavlink.MAV_MISSION_UNSUPPORTED)
 
 
-def test_the_mission_can_be_read_back_with_home_in_front() -> None:
+def test_mission_is_read_back_with_home_as_first_item() -> None:
     cockpit = Cockpit()
     sent = cockpit.load(PLAN).items
     assert answer(cockpit, mavlink.MAVLink_mission_request_list_message(3, 1)) == ("MISSION_COUNT", len(sent))
@@ -152,7 +152,7 @@ words = st.integers(-(2**31), 2**31 - 1)
 @given(
     st.lists(st.tuples(st.sampled_from([16, 17, 19, 20, 21, 22, 178]), st.tuples(*[floats] * 4), words, words, floats))
 )
-def test_whatever_mission_it_takes_it_flies_without_harm(items: list[Any]) -> None:
+def test_any_accepted_mission_is_flown_without_error(items: list[Any]) -> None:
     cockpit = Cockpit("plane")
     cockpit.ready()
     accepted = [item(0), item(1)]

@@ -43,7 +43,7 @@ def messages_of(tlog: Path) -> Iterator[Any]:
         yield message
 
 
-def test_it_takes_an_embedded_vehicle_off_and_the_tlog_holds_the_flight(tmp_path: Path) -> None:
+def test_take_off_is_recorded_in_the_telemetry_log(tmp_path: Path) -> None:
     async def fly(port: int) -> Pilot:
         async with piloting(port, tmp_path / "3.tlog") as pilot:
             await pilot.fly(pilot.ascent(20.0))
@@ -62,7 +62,7 @@ def test_it_takes_an_embedded_vehicle_off_and_the_tlog_holds_the_flight(tmp_path
     assert times == sorted(times)
 
 
-def test_it_measures_the_real_time_factor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pilot_measures_the_real_time_factor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sitl._pilot_link, "MIN_RATE_SPAN_S", 0.3)
 
     async def factor(port: int, speedup: float) -> float:
@@ -85,9 +85,7 @@ async def failure(port: int, tlog: Path, sysid: int = 3) -> str:
     return str(error.value)
 
 
-def test_a_missed_deadline_names_the_vehicle_the_step_and_its_last_words(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missed_deadline_names_vehicle_step_and_last_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sitl._take_off, "SLOWEST_CLIMB_MS", 100.0)
     monkeypatch.setattr(sitl.pilot, "LEAST_WAIT_S", 0.5)
     with embedded(speedup=SPEEDUP) as vehicle:
@@ -97,20 +95,20 @@ def test_a_missed_deadline_names_the_vehicle_the_step_and_its_last_words(
     assert "3.tlog" in message
 
 
-def test_a_vehicle_with_another_system_id_is_not_flown(tmp_path: Path) -> None:
+def test_vehicle_with_another_system_id_is_refused(tmp_path: Path) -> None:
     with embedded(sysid=9) as vehicle:
         message = asyncio.run(failure(vehicle.pilot_port, tmp_path / "3.tlog", sysid=3))
     assert "vehicle 3" in message and "system ID is 9" in message
 
 
-def test_a_mute_vehicle_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_vehicle_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sitl.pilot, "SILENCE_S", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as mute:
         message = asyncio.run(failure(mute.getsockname()[1], tmp_path / "3.tlog"))
     assert "the first heartbeat" in message and "silent" in message
 
 
-def test_a_vehicle_that_dies_while_taking_off_is_given_up_at_once(tmp_path: Path) -> None:
+def test_vehicle_that_ends_during_take_off_is_given_up_at_once(tmp_path: Path) -> None:
     async def fly(port: int) -> None:
         async with piloting(port, tmp_path / "3.tlog") as pilot:
             flight = asyncio.create_task(pilot.fly(pilot.ascent(1000.0)))
@@ -136,7 +134,7 @@ def connected_pilot(tmp_path: Path) -> Iterator[tuple[Pilot, Channel]]:
         asyncio.run(pilot.close())
 
 
-def test_garbage_between_messages_is_counted_and_not_logged(tmp_path: Path) -> None:
+def test_garbage_is_counted_and_not_logged(tmp_path: Path) -> None:
     with connected_pilot(tmp_path) as (pilot, channel):
         channel.send_due()
         frames = channel.take()
@@ -148,7 +146,7 @@ def test_garbage_between_messages_is_counted_and_not_logged(tmp_path: Path) -> N
     assert len(list(messages_of(tmp_path / "3.tlog"))) == 12
 
 
-def test_only_the_autopilot_is_listened_to(tmp_path: Path) -> None:
+def test_messages_of_other_components_are_ignored(tmp_path: Path) -> None:
     with connected_pilot(tmp_path) as (pilot, _):
         gimbal = mavlink.MAVLink(None, srcSystem=3, srcComponent=mavlink.MAV_COMP_ID_GIMBAL)
         pilot.link.data_received(mavlink.MAVLink_heartbeat_message(26, 8, 0, 7, 4, 3).pack(gimbal))
@@ -156,7 +154,7 @@ def test_only_the_autopilot_is_listened_to(tmp_path: Path) -> None:
         assert pilot.state.messages == 1
 
 
-def test_messages_of_dialects_it_does_not_know_are_logged_all_the_same(tmp_path: Path) -> None:
+def test_messages_of_unknown_dialects_are_logged(tmp_path: Path) -> None:
     unknown = b"\xfd\x01\x00\x00\x00\x03\x01\xff\xff\x7f\x01\xaa\xbb"
     with connected_pilot(tmp_path) as (pilot, _):
         pilot.link.data_received(unknown)
@@ -164,7 +162,7 @@ def test_messages_of_dialects_it_does_not_know_are_logged_all_the_same(tmp_path:
     assert (tmp_path / "3.tlog").read_bytes()[8:] == unknown
 
 
-def test_a_full_disk_ends_the_log_and_not_the_flight(tmp_path: Path) -> None:
+def test_full_disk_ends_the_log_but_not_the_flight(tmp_path: Path) -> None:
     (tmp_path / "3.tlog").symlink_to("/dev/full")
     with connected_pilot(tmp_path) as (pilot, channel):
         for _ in range(1000):
@@ -174,7 +172,7 @@ def test_a_full_disk_ends_the_log_and_not_the_flight(tmp_path: Path) -> None:
         assert pilot.state.log_error is not None and "No space left" in pilot.state.log_error
 
 
-def test_a_restarted_vehicle_goes_on_in_the_same_tlog(tmp_path: Path) -> None:
+def test_restarted_vehicle_continues_its_telemetry_log(tmp_path: Path) -> None:
     for _ in range(2):
         with connected_pilot(tmp_path) as (pilot, channel):
             channel.send_due()
@@ -182,7 +180,7 @@ def test_a_restarted_vehicle_goes_on_in_the_same_tlog(tmp_path: Path) -> None:
     assert len(list(messages_of(tmp_path / "3.tlog"))) == 12
 
 
-def test_the_state_has_what_the_vehicle_says_of_its_motion_and_battery(tmp_path: Path) -> None:
+def test_state_has_the_reported_motion_and_battery(tmp_path: Path) -> None:
     with connected_pilot(tmp_path) as (pilot, channel):
         vehicle = channel._autopilot
         channel.send_due()

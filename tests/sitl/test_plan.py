@@ -34,14 +34,12 @@ from sitl.vehicle import VehicleType
         ("copter", [TakeOff(20), Loiter(math.inf)], "at most 65535 s"),
     ],
 )
-def test_a_plan_that_cannot_be_flown_is_refused_by_leg(
-    vehicle_type: VehicleType, legs: list[Leg], problem: str
-) -> None:
+def test_impossible_plan_is_refused_with_its_leg(vehicle_type: VehicleType, legs: list[Leg], problem: str) -> None:
     with pytest.raises(PlanError, match=problem):
         Plan(tuple(legs)).check(vehicle_type)
 
 
-def test_what_the_legs_leave_open_is_filled_in() -> None:
+def test_missing_values_of_legs_are_filled_in() -> None:
     plan = Plan((TakeOff(30), GoTo(100, 0, speed_ms=4), Loiter(5), GoTo(100, 50, altitude_m=40), GoTo(0, 0), Land()))
     waypoints = route(plan, "copter", 0.0)
     assert [(one.place, one.speed_ms) for one in waypoints] == [
@@ -56,7 +54,7 @@ def test_what_the_legs_leave_open_is_filled_in() -> None:
     assert waypoints[1].leg == "leg 2 of 6 (go to 100 m north, 0 m east)"
 
 
-def test_a_plane_approaches_its_runway_against_the_heading_of_home() -> None:
+def test_plane_approach_lies_before_the_runway() -> None:
     approach, landing = route(Plan((TakeOff(30), GoTo(0, 100), Land())), "plane", 90.0)[-2:]
     assert (approach.kind, landing.kind) == ("go_to", "land")
     assert approach.place == pytest.approx((0, 100 - 300, 30))

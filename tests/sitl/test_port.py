@@ -1,4 +1,4 @@
-"""The port's bounds, in one process, where nothing but the client's reading empties its buffer."""
+"""The limits of the port, in one process in which only the client empties the buffer."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def connected() -> Iterator[tuple[Port, selectors.BaseSelector, socket.socket]]:
         yield port, selector, client
 
 
-def test_a_client_that_reads_nothing_costs_bounded_memory_and_later_gets_whole_messages(
+def test_client_that_reads_late_gets_complete_messages(
     connected: tuple[Port, selectors.BaseSelector, socket.socket],
 ) -> None:
     port, selector, client = connected
@@ -62,7 +62,7 @@ def test_a_client_that_reads_nothing_costs_bounded_memory_and_later_gets_whole_m
     assert parser.total_receive_errors == 0
 
 
-def test_a_client_that_leaves_takes_its_unsent_bytes_along(
+def test_unsent_bytes_end_with_their_client(
     connected: tuple[Port, selectors.BaseSelector, socket.socket],
 ) -> None:
     port, selector, client = connected
@@ -70,4 +70,4 @@ def test_a_client_that_leaves_takes_its_unsent_bytes_along(
     turn(selector, DEADLINE_S)
     assert port.channel is None
     assert not port._unsent
-    port.send()  # nobody there, nothing to do
+    port.send()  # without a client

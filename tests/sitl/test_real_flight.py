@@ -23,8 +23,8 @@ PLANE_APART_M, PLANE_BESIDE_M = 80.0, 40.0  # planes: at the same second, and fr
 @pytest.mark.ardupilot
 @pytest.mark.parametrize("by", WAYS)
 @pytest.mark.parametrize("vehicle_type", VEHICLE_TYPES)
-def test_a_real_vehicle_flies_its_plan_as_it_is_computed(vehicle_type: VehicleType, by: By, tmp_path: Path) -> None:
-    """In a network namespace of its own: ArduPilot listens on every address and may send multicast."""
+def test_real_vehicle_follows_the_computed_track(vehicle_type: VehicleType, by: By, tmp_path: Path) -> None:
+    """Fly in a separate network namespace, because ArduPilot listens on every address and may send multicast."""
     program, directory = BINARIES[vehicle_type], os.environ.get("ARDUPILOT_SITL")
     if directory is None:
         pytest.skip(f"no ArduPilot: set ARDUPILOT_SITL to the directory that holds an {program}")

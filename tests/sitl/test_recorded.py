@@ -1,4 +1,6 @@
-"""What recorded telemetry of ArduPilot 4.7 becomes: where the pilot takes a vehicle to be, and what its agent logs."""
+"""Recorded telemetry of ArduPilot 4.7: the position that the pilot derives from it, and the events that an agent
+logs.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ def link(tmp_path: Path) -> Iterator[Link]:
 
 
 @pytest.mark.parametrize("name", GOOD_S)
-def test_a_vehicle_is_nowhere_until_its_estimate_is_good_and_then_where_it_is(name: Name, link: Link) -> None:
+def test_position_is_unknown_until_the_estimate_is_good(name: Name, link: Link) -> None:
     """A plane says for seconds that it is near 0 N, 0 E, and a rover that its altitude is 0."""
     for frame in frames(name):
         link.data_received(frame)
@@ -54,7 +56,7 @@ def test_a_vehicle_is_nowhere_until_its_estimate_is_good_and_then_where_it_is(na
         ([(584_090, 583_900), (585_090, 584_900)], 1.09),
     ],
 )
-def test_a_height_is_what_it_says_above_its_home_unless_its_home_was_never_right(
+def test_height_is_relative_to_home_unless_home_is_wrong(
     says: list[tuple[int, int]], height_m: float, link: Link
 ) -> None:
     """A copter that has lost its GPS says one altitude for ever; a rover set its home before it knew its altitude."""
@@ -80,7 +82,7 @@ def logged(name: Name, position_interval_s: float = 1.0) -> list[tuple[int, byte
 
 
 @pytest.mark.parametrize("name", GOOD_S)
-def test_positions_are_logged_from_then_on_with_heights_above_home(name: Name) -> None:
+def test_positions_are_logged_with_heights_above_home(name: Name) -> None:
     positions = [Position.unpack(data) for event_id, data in logged(name) if event_id == POSITION]
     assert GOOD_S[name] * 1e3 - 100 < positions[0].vehicle_ms < GOOD_S[name] * 1e3 + 3000
     for position in positions:
@@ -90,7 +92,7 @@ def test_positions_are_logged_from_then_on_with_heights_above_home(name: Name) -
     assert abs(positions[0].relative_alt_mm) < 1_000
 
 
-def test_an_agent_that_comes_when_a_rover_is_armed_knows_its_height_all_the_same() -> None:
+def test_late_agent_knows_the_height_of_an_armed_rover() -> None:
     source = TelemetryEvents(1.0, random.Random(1), ["position"])
     came, heights_mm = False, []
     for frame, message in messages("rover-mission"):
@@ -110,13 +112,13 @@ REACHED: dict[Name, list[int]] = {
 
 
 @pytest.mark.parametrize("name", REACHED)
-def test_the_item_that_was_reached_is_named_not_the_speed_command_behind_it(name: Name) -> None:
+def test_reached_item_is_named_and_not_the_speed_command(name: Name) -> None:
     """Of a take-off, a place, a loiter, and places again: 4.7 says 2, 3, 5, 6 of a copter."""
     reached = [int.from_bytes(data[4:6], "big") for event_id, data in logged(name) if event_id == WAYPOINT]
     assert reached == REACHED[name]
 
 
-def test_a_plane_that_has_landed_does_not_say_again_and_again_why_it_cannot_be_armed() -> None:
+def test_landed_plane_logs_its_arming_refusal_once() -> None:
     texts = [describe(event_id, data) for event_id, data in logged("plane-mission") if event_id == STATUS_TEXT]
     nagging = [text for text in texts if "PreArm: In landing sequence" in text]
     said = [

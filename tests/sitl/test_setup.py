@@ -1,4 +1,4 @@
-"""What may differ between vehicles: files of parameters and places, frames and their defaults, debuggers, logs."""
+"""Setups of vehicles: parameter and location files, frames and their defaults, debuggers and logs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def written(path: Path, text: str) -> Path:
     return path
 
 
-def test_parameters_are_read_as_ground_stations_write_them_but_for_the_system_id(tmp_path: Path) -> None:
+def test_parameters_of_ground_stations_are_read_without_system_id(tmp_path: Path) -> None:
     path = written(
         tmp_path / "x.parm", "# mine\nWPNAV_SPEED 500\nSIM_WIND_SPD,4.5 // gusty\n1\t1\tRTL_ALT\t30\t6\nMAV_SYSID 9\n\n"
     )
@@ -51,12 +51,12 @@ def test_parameters_are_read_as_ground_stations_write_them_but_for_the_system_id
         ("A" * 1_000_001, "larger than"),
     ],
 )
-def test_a_file_that_holds_something_else_is_refused_with_its_line(text: str, problem: str, tmp_path: Path) -> None:
+def test_invalid_parameter_file_is_refused_with_its_line(text: str, problem: str, tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match=problem):
         parameters.read(written(tmp_path / "x.parm", text))
 
 
-def test_what_is_no_file_is_told_apart(tmp_path: Path) -> None:
+def test_each_unreadable_path_has_its_own_message(tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match="No such file"):
         parameters.read(tmp_path / "gone.parm")
     with pytest.raises(VehicleError, match="is not a file"):
@@ -66,7 +66,7 @@ def test_what_is_no_file_is_told_apart(tmp_path: Path) -> None:
         parameters.read(tmp_path / "x.parm")
 
 
-def test_what_is_written_is_read_the_same_to_the_last_bit(tmp_path: Path) -> None:
+def test_written_parameters_are_read_back_exactly(tmp_path: Path) -> None:
     floats = [0.0, 1.0, -0.1, 1e-9, math.pi, 16777217.0, 3.4028234e38]
     values = {f"P{number}": struct.unpack("<f", struct.pack("<f", value))[0] for number, value in enumerate(floats)}
     again = parameters.read(written(tmp_path / "x.parm", parameters.in_lines(values)))
@@ -74,14 +74,14 @@ def test_what_is_written_is_read_the_same_to_the_last_bit(tmp_path: Path) -> Non
     assert parameters.in_lines({"A": values["P2"]}) == "A -0.1\n"
 
 
-def test_a_parameter_that_is_not_known_is_named_with_the_nearest() -> None:
+def test_unknown_parameter_is_named_with_a_similar_one() -> None:
     known = ["SIM_WIND_SPD", "SIM_WIND_DIR", "RTL_ALT"]
     assert parameters.unknown(["RTL_ALT"], known) is None
     assert parameters.unknown(["SIM_WIND_SPED"], known) == "no parameter SIM_WIND_SPED: did you mean SIM_WIND_SPD?"
     assert (parameters.unknown(["ZZ", "YY"], known) or "").startswith("no parameter YY (nor 1 more): its whole list")
 
 
-def test_named_locations_are_looked_for_beside_the_scenario_then_where_the_user_keeps_them(tmp_path: Path) -> None:
+def test_location_files_are_searched_in_order(tmp_path: Path) -> None:
     mine = written(tmp_path / "config" / "ardupilot" / "locations.txt", "#N=x\nAVC=40.07,-105.2,1583.7,366 # field\n")
     environ = {"XDG_CONFIG_DIR": str(mine.parents[1])}
     assert start_places.named("AVC", tmp_path, environ).heading_deg == 6
@@ -107,13 +107,13 @@ def test_named_locations_are_looked_for_beside_the_scenario_then_where_the_user_
         ("AVC=91,2,3,4\n", "line 1: home latitude 91.0 is not on Earth"),
     ],
 )
-def test_a_location_that_is_none_is_refused_with_its_line(text: str, problem: str, tmp_path: Path) -> None:
+def test_invalid_location_is_refused_with_its_line(text: str, problem: str, tmp_path: Path) -> None:
     written(tmp_path / "locations.txt", text)
     with pytest.raises(VehicleError, match=problem):
         start_places.named("AVC", tmp_path, {})
 
 
-def test_a_swarm_is_laid_out_by_instance(tmp_path: Path) -> None:
+def test_swarm_offsets_are_assigned_by_instance(tmp_path: Path) -> None:
     path = written(tmp_path / "swarm.txt", "#instance=East,North,Up,Heading\n1=20,30,4,90\n2=-20,0,0\n1=9,9,9,9\n")
     offsets = start_places.swarm(path)
     assert offsets.keys() == {1, 2}
@@ -134,7 +134,7 @@ def test_a_swarm_is_laid_out_by_instance(tmp_path: Path) -> None:
         ("of-tomorrow", "plane", "of-tomorrow", ["plane.parm"]),
     ],
 )
-def test_a_frame_has_its_stack_of_defaults(
+def test_frame_has_its_default_parameter_files(
     frame: str, vehicle_type: VehicleType, model: str, defaults: list[str]
 ) -> None:
     known = airframe(frame, vehicle_type)
@@ -142,7 +142,7 @@ def test_a_frame_has_its_stack_of_defaults(
     assert type_of(frame) in (None, vehicle_type)
 
 
-def test_the_stack_is_copied_in_its_order_with_the_users_parameters_last(tmp_path: Path) -> None:
+def test_parameter_files_are_copied_in_order_with_the_users_last(tmp_path: Path) -> None:
     binary = program(tmp_path / "bin" / "arducopter", LISTS_ITS_MODELS)
     setup = Setup("hexa", {"RTL_ALT": 30.0}, ("--rate", "400"))
     lacking = ArduPilot.find(binary, {}, setup=setup)
@@ -160,9 +160,7 @@ def test_the_stack_is_copied_in_its_order_with_the_users_parameters_last(tmp_pat
     assert (tmp_path / "7" / "vehicle.parm").read_text().splitlines()[-1] == "RTL_ALT 30"
 
 
-def test_a_frame_that_the_binary_lacks_and_a_debugger_that_is_not_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_frame_and_missing_debugger_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     binary = program(tmp_path / "arducopter", LISTS_ITS_MODELS)
     for name in ("copter.parm", "copter-octa.parm"):
         written(tmp_path / name, "")
@@ -175,7 +173,7 @@ def test_a_frame_that_the_binary_lacks_and_a_debugger_that_is_not_here(
         ArduPilot.find(binary, {}, setup=Setup(debugger="valgrind")).check()
 
 
-def test_a_log_is_left_out_or_bounded(tmp_path: Path) -> None:
+def test_log_can_be_disabled_or_limited(tmp_path: Path) -> None:
     binary = program(tmp_path / "arducopter", LISTS_ITS_MODELS)
     without = ArduPilot(binary, setup=Setup(log_mib=0)).launch(7, HOME, 1.0, tmp_path)
     assert without.argv[0] == str(binary) and "LOG_BACKEND_TYPE 0\n" in (tmp_path / "vehicle.parm").read_text()
@@ -186,7 +184,7 @@ def test_a_log_is_left_out_or_bounded(tmp_path: Path) -> None:
     assert (tmp_path / "vehicle.parm").read_text().endswith("\nLOG_BACKEND_TYPE 2\n")
 
 
-def test_embedded_vehicles_refuse_what_only_ardupilot_has() -> None:
+def test_embedded_vehicle_refuses_features_of_ardupilot() -> None:
     Embedded("plane", Setup("plane", {"TKOFF_ALT": 30.0})).check()
     with pytest.raises(VehicleError, match="embedded vehicles have no wind: fly ArduPilot, or leave it out"):
         Embedded("plane", Setup(parameters={"SIM_WIND_SPD": 3.0})).check()

@@ -1,4 +1,4 @@
-"""A computed track as a ground station sees it."""
+"""A computed track as a ground station receives it."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ def said(channel: Channel) -> list[Any]:
     return mavlink.MAVLink(None).parse_buffer(bytearray(channel.take())) or []
 
 
-def test_it_is_where_its_track_is() -> None:
+def test_shown_vehicle_follows_its_track() -> None:
     vehicle, channel = shown()
     places = []
     for mission_s in (0.0, 100.0):
@@ -35,7 +35,7 @@ def test_it_is_where_its_track_is() -> None:
     assert vehicle.airborne
 
 
-def test_whatever_is_commanded_is_refused_in_words() -> None:
+def test_shown_vehicle_refuses_every_command_with_a_text() -> None:
     vehicle, channel = shown()
     vehicle.show(100.0)
     ground = mavlink.MAVLink(None, srcSystem=255)

@@ -1,4 +1,4 @@
-"""The computed track beside the embedded vehicle's flight and beside recorded flights of a real ArduCopter."""
+"""The computed track, compared with flights of the embedded vehicle and recorded flights of a real ArduCopter."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ DRIVE = Plan((GoTo(100, 0, speed_ms=3), Loiter(45), GoTo(0, 200), GoTo(0, 0)))
         ("rover", DRIVE),
     ],
 )
-def test_the_track_is_what_the_embedded_vehicle_flies_in_auto(vehicle_type: VehicleType, plan: Plan) -> None:
+def test_track_equals_the_flight_of_the_embedded_vehicle(vehicle_type: VehicleType, plan: Plan) -> None:
     """Places go over the wire in 1e-7 degrees, about a centimetre; a plane makes some more of it in its turns."""
     cockpit = Cockpit(vehicle_type)
     began_s = cockpit.begin(plan)
@@ -47,7 +47,7 @@ def test_the_track_is_what_the_embedded_vehicle_flies_in_auto(vehicle_type: Vehi
         assert math.dist(cockpit.place, computed.at(began_s + second)) < 0.1, f"{second} s after the start"
 
 
-def test_it_stands_until_it_is_ready_and_stays_where_it_ends() -> None:
+def test_track_rests_before_its_start_and_after_its_end() -> None:
     square = track("copter", SQUARE, begin_s=5.0)
     assert square.at(0.0) == square.at(5.0) == (0, 0, 0)
     assert square.at(10.0)[2] > 0
@@ -57,18 +57,18 @@ def test_it_stands_until_it_is_ready_and_stays_where_it_ends() -> None:
     assert circling.at(5000) != circling.at(5001)
 
 
-def test_a_place_in_the_field_is_that_beside_home() -> None:
+def test_place_in_the_field_includes_the_home_offset() -> None:
     square = track("copter", SQUARE, home_offset=(7.0, -3.0, 0.0))
     assert square.in_field(30.0) == pytest.approx((square.at(30.0)[0] + 7, square.at(30.0)[1] - 3, square.at(30.0)[2]))
 
 
-def test_a_vehicle_in_no_plan_stays_where_it_took_off_and_a_plane_circles() -> None:
+def test_vehicle_without_plan_stays_and_a_plane_circles() -> None:
     assert track("copter", None, takeoff_altitude_m=15).at(300) == (0, 0, 15)
     assert track("plane", None, takeoff_altitude_m=15).at(300) != track("plane", None, takeoff_altitude_m=15).at(301)
     assert track("rover", None).at(300) == (0, 0, 0)
 
 
-def test_a_plan_that_the_type_cannot_fly_is_refused() -> None:
+def test_impossible_plan_is_refused() -> None:
     with pytest.raises(PlanError):
         track("rover", SQUARE)
 
@@ -100,7 +100,7 @@ def as_points(computed: Track) -> list[tuple[float, float, float, float]]:
 
 
 @pytest.mark.parametrize("by", ["mission", "guided"])
-def test_the_square_of_a_real_copter_is_the_computed_one(by: str) -> None:
+def test_recorded_square_of_a_copter_equals_the_track(by: str) -> None:
     """Within 2 m of the line everywhere; each side, and the landing, takes as long but for 4 s.
 
     Times count from the middle of the take-off. This copter is of 2018, and leaves each place sooner than 4.7 does.
@@ -121,9 +121,7 @@ WAYS: list[By] = ["mission", "guided"]
 
 @pytest.mark.parametrize("by", WAYS)
 @pytest.mark.parametrize("vehicle_type", OUT_AND_BACK)
-def test_a_vehicle_of_today_is_at_each_place_within_5_s_of_the_computed_one(
-    vehicle_type: Literal["copter", "rover"], by: By
-) -> None:
+def test_recorded_vehicle_is_within_5_s_of_the_track(vehicle_type: Literal["copter", "rover"], by: By) -> None:
     """Seconds count from arming. Whatever it is computed to be at some second, it is within 5 s of that, to 3 m."""
     flown = flight(f"{vehicle_type}-{by}")  # type: ignore[arg-type]
     computed = track(vehicle_type, Plan(OUT_AND_BACK[vehicle_type]), heading_deg=355.4, by=by)
@@ -133,7 +131,7 @@ def test_a_vehicle_of_today_is_at_each_place_within_5_s_of_the_computed_one(
 
 
 @pytest.mark.parametrize("by", WAYS)
-def test_a_plane_of_today_is_near_the_computed_one(by: By) -> None:
+def test_recorded_plane_is_near_the_track(by: By) -> None:
     """Within 80 m at the same second after arming, and within 30 m of the computed path over the ground."""
     plan = Plan((TakeOff(50), GoTo(600, 350, speed_ms=20), Loiter(120), GoTo(0, 0), Land()))
     computed = track("plane", plan, heading_deg=353.0, by=by)

@@ -16,7 +16,7 @@ def metres_apart(a: Home, b: Home) -> float:
     return math.hypot(a.lat_deg - b.lat_deg, east) * METRES_PER_DEGREE
 
 
-def test_a_hundred_homes_are_metres_apart_and_in_one_field() -> None:
+def test_hundred_homes_are_apart_and_in_one_field() -> None:
     homes = [home_in_field(index, HOME) for index in range(100)]
     assert homes[0] == HOME
     closest = min(metres_apart(a, b) for at, a in enumerate(homes) for b in homes[:at])
@@ -24,19 +24,19 @@ def test_a_hundred_homes_are_metres_apart_and_in_one_field() -> None:
     assert max(metres_apart(HOME, home) for home in homes) < 60.0
 
 
-def test_homes_are_as_far_apart_as_asked_and_where_the_field_says() -> None:
+def test_homes_follow_spacing_and_centre_of_the_field() -> None:
     homes = [home_in_field(index, HOME, 50.0) for index in range(20)]
     assert min(metres_apart(a, b) for at, a in enumerate(homes) for b in homes[:at]) > 40.0
     for index, home in enumerate(homes):
         assert HOME.metres_to(home.lat_deg, home.lon_deg, 584.0)[:2] == pytest.approx(place_in_field(index, 50.0))
 
 
-def test_a_home_that_is_nowhere_for_ardupilot_is_refused(tmp_path: Path) -> None:
+def test_home_at_zero_degrees_is_refused(tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match="vehicle 3: a home at 0,0 is ArduPilot's word for no position"):
         Embedded().launch(3, Home(0.0, 0.0), 1.0, tmp_path)
 
 
-def test_home_reads_what_it_writes() -> None:
+def test_home_parses_its_own_text() -> None:
     assert Home.parse(str(HOME)) == HOME
 
 
@@ -54,16 +54,16 @@ def test_home_reads_what_it_writes() -> None:
         ("1,2,inf,4", "finite"),
     ],
 )
-def test_a_bad_home_is_named(text: str, problem: str) -> None:
+def test_invalid_home_is_named(text: str, problem: str) -> None:
     with pytest.raises(VehicleError, match=problem):
         Home.parse(text)
 
 
-def test_a_home_at_the_date_line_stays_on_earth() -> None:
+def test_home_at_the_date_line_stays_valid() -> None:
     assert Home(0.0, 179.9999999).offset(0.0, 100.0).lon_deg < -179.9
 
 
-def test_the_embedded_kind_starts_this_interpreter(tmp_path: Path) -> None:
+def test_embedded_vehicle_starts_this_interpreter(tmp_path: Path) -> None:
     kind: VehicleKind = Embedded("plane")
     launch = kind.launch(7, HOME, 20.0, tmp_path)
     assert (kind.name, kind.vehicle_type) == ("embedded", "plane")
@@ -75,6 +75,6 @@ def test_the_embedded_kind_starts_this_interpreter(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("sysid", "speedup"), [(0, 1.0), (256, 1.0), (1, 0.0), (1, -1.0), (1, math.nan)])
-def test_a_vehicle_that_cannot_be_is_refused(sysid: int, speedup: float, tmp_path: Path) -> None:
+def test_impossible_vehicle_is_refused(sysid: int, speedup: float, tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match=f"vehicle {sysid}"):
         Embedded().launch(sysid, HOME, speedup, tmp_path)
