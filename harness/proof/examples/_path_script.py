@@ -270,6 +270,7 @@ class Script:
                 if flight.sender != agent.agent_id and number not in heard:
                     flight.lost_by.append(agent.agent_id)
                     self.losses += 1
+            order_matters = self._swarm.order_matters(agent.local, place, wave, heard)
             last_s = acted_s
             for number in heard:
                 heard_by_anybody.add(number)
@@ -278,7 +279,7 @@ class Script:
                 hurried = self._latency_s < LATENCY_S
                 if arrives_s <= last_s:
                     arrives_s = last_s + MOMENT_S
-                    hurried = hurried or self._swarm.order_matters(agent.local, place, wave, heard)
+                    hurried = hurried or order_matters
                 if hurried:
                     self._fate(flight, agent.agent_id, delay_s=round(arrives_s - flight.sent_s, 6))
                 last_s = arrives_s

@@ -57,6 +57,16 @@ def test_a_wrong_agent_is_found_and_its_scenario_shows_it(tmp_path: Path, quirk:
     assert key in proof.example.judged
 
 
+def test_scenario_forces_the_order_of_messages_that_cross(tmp_path: Path) -> None:
+    """Agent 3 hears a commit before a request of the same instant, and therefore refuses the block."""
+    bounds = Bounds(3, 2, "lossy", quirks={"disapproved_and_unmoved": True}, reduced=False, losses=1)
+    proof = prove(bounds, out=tmp_path / "wrong.yaml")
+    assert proof.flaw is not None
+    assert proof.flaw.kind == "2"
+    assert proof.example is not None
+    assert proof.example.judged["2"].verdict == "violated"
+
+
 @pytest.mark.parametrize(
     ("quirk", "handler"),
     [
