@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.errors import INTERRUPTED
-from harness.proof import INCOMPLETE, Bounds, BoundsError, Limits, Progress, in_words, prove
+from harness.errors import INCOMPLETE, INTERRUPTED
+from harness.proof import Bounds, BoundsError, Limits, Progress, in_words, prove
 from harness.proof._progress_bar import memory_bytes
 from harness.proof.graph._exploration import LOOK_EVERY, explore
 from harness.proof.graph._workers import Crew
