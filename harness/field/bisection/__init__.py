@@ -1,9 +1,10 @@
 """Find the commit, or compare agents, when a scenario or a record plays differently than before.
 
-A subject is a scenario, a run, or the records of a flight (`outcome`). `harness.run.code_state` checks out a commit in a separate
-clone, and runs processes with it. `_playing` plays the subject with it and returns the outcome. `_bisecting` searches
-for the first commit with a different outcome. Records are played by the core of another commit in a separate process
-(`_record_core`), or by another agent program over UDP with scripted peers (`_live_replay`, `_scripted_peers`).
+A subject is a scenario, a run, or the records of a flight (`outcome`). `harness.run.code_state` checks out a commit in
+a separate clone, and runs processes with it. `_playing` plays the subject with it and returns the outcome.
+`_bisecting` searches for the first commit with a different outcome. Records are played by the core of another commit in
+a separate process (`_record_core`), or by another agent program over UDP with scripted peers (`_live_replay`,
+`_scripted_peers`).
 """
 
 from harness.field.bisection._bisecting import BisectionResult, Trial, bisect
