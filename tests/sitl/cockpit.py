@@ -34,7 +34,7 @@ class Cockpit:
         self.heard: list[Any] = []
 
     def tell(self, message: Any) -> list[Any]:
-        """Send a message; what comes back at once."""
+        """Send a message, and return the direct answers."""
         self.channel.receive(message.pack(self._mav))
         return self.listen()
 
@@ -44,7 +44,7 @@ class Cockpit:
         return news
 
     def command(self, command: int, *params: float) -> int:
-        """Send a COMMAND_LONG; the MAV_RESULT."""
+        """Send a COMMAND_LONG, and return its MAV_RESULT."""
         padded = [*params, *[0.0] * (7 - len(params))]
         answers = self.tell(mavlink.MAVLink_command_long_message(3, 1, command, 0, *padded))
         (ack,) = [answer for answer in answers if answer.get_type() == "COMMAND_ACK"]
@@ -57,7 +57,7 @@ class Cockpit:
         return self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
 
     def fly(self, until_s: float, step_s: float = 1.0) -> None:
-        """Let time pass in steps."""
+        """Advance the time in steps."""
         while self.vehicle.now_s < until_s:
             self.vehicle.advance(min(until_s, self.vehicle.now_s + step_s))
             self.listen()
@@ -66,14 +66,14 @@ class Cockpit:
         self.fly(12.0)
 
     def take_off(self, altitude_m: float = 20.0) -> None:
-        """A copter, in GUIDED, to its altitude."""
+        """Let a copter take off in GUIDED mode to an altitude."""
         self.ready()
         assert (self.mode("GUIDED"), self.arm()) == (ACCEPTED, ACCEPTED)
         assert self.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) == ACCEPTED
         self.fly(40.0)
 
     def load(self, plan: Plan) -> Mission:
-        """Upload a plan, item for item as asked."""
+        """Upload a plan item by item, as requested."""
         vehicle_type = self.vehicle.vehicle_type
         mission = Mission(route(plan, vehicle_type, HOME.heading_deg), HOME, 3, vehicle_type)
         answers = self.tell(mavlink.MAVLink_mission_count_message(3, 1, len(mission.items)))
@@ -83,7 +83,7 @@ class Cockpit:
         return mission
 
     def begin(self, plan: Plan) -> float:
-        """Have a plan flown in AUTO; the second at which it began."""
+        """Start a plan in AUTO mode, and return the second of its start."""
         self.ready()
         self.load(plan)
         if self.vehicle.vehicle_type == "copter":

@@ -31,7 +31,7 @@ PLANS: dict[VehicleType, Plan] = {
 
 
 def fly(directory: Path, vehicle_type: VehicleType, by: By) -> float:
-    """When it was told to; `directory` has the telemetry log then."""
+    """Return the start of the plan on the vehicle's clock. `directory` has the telemetry log then."""
     launch = ArduPilot.find(None, os.environ, vehicle_type).launch(3, HOME, SPEEDUP, directory)
 
     async def flight() -> float:
@@ -59,7 +59,7 @@ def fly(directory: Path, vehicle_type: VehicleType, by: By) -> float:
 
 
 def track_of(tlog: Path, began_s: float) -> list[tuple[float, tuple[float, float, float]]]:
-    """Seconds since then, and metres from home."""
+    """Return seconds since the start, and metres from home."""
     log, points = mavutil.mavlink_connection(str(tlog)), []
     while (message := log.recv_match(type="GLOBAL_POSITION_INT")) is not None:
         if (second := message.time_boot_ms / 1e3 - began_s) >= 0:

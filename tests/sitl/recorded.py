@@ -30,18 +30,18 @@ EVENTS = {"STATUSTEXT", "MISSION_ITEM_REACHED", "HOME_POSITION"}
 
 
 def frames(name: Name) -> Iterator[bytes]:
-    """The frames of a recording, as the vehicle sent them."""
+    """Yield the frames of a recording, as the vehicle sent them."""
     for frame, _ in messages(name):
         yield frame
 
 
 def messages(name: Name) -> Iterator[tuple[bytes, Any]]:
-    """Each frame, and the message in it."""
+    """Yield each frame with its message."""
     yield from _messages(gzip.decompress((RECORDINGS / f"{name}.tlog.gz").read_bytes()))
 
 
 def flight(name: Name) -> list[tuple[float, float, float, float]]:
-    """From its arming on: seconds since then, metres north, east and up from where it stood."""
+    """Return seconds since arming, and metres north, east and up from the starting place."""
     points: list[tuple[float, float, float, float]] = []
     home, armed_s, now_s = Home(0.0, 0.0), None, 0.0
     for _, message in messages(name):
