@@ -52,9 +52,9 @@ def _in_exports(evidence: Evidence) -> list[Finding]:
 
 def _in_traces(evidence: Evidence) -> list[Finding]:
     findings = []
-    for agent_id, lives in evidence.lives.items():
-        for life in lives:
-            for sight in life.idle_too_early:
+    for agent_id, incarnations in evidence.incarnations.items():
+        for incarnation in incarnations:
+            for sight in incarnation.idle_too_early:
                 waiting, run = sight.block_hash, sight.run
                 detail = f"trace line {sight.line}, t={run.t:g} s: idle after {run.handler} with {sight.what}"
                 findings.append(Finding(agent_id, detail, evidence.name(waiting) if waiting else None, waiting))

@@ -17,9 +17,9 @@ def check(evidence: Evidence) -> Judgement:
             if count > 1:
                 name = evidence.name(block_hash)
                 findings.append(Finding(agent_id, f"exported {count} copies of block {name}", name, block_hash))
-    for agent_id, lives in evidence.lives.items():
-        for life in lives:
-            for sight in life.second_copies:
+    for agent_id, incarnations in evidence.incarnations.items():
+        for incarnation in incarnations:
+            for sight in incarnation.second_copies:
                 name = evidence.name(sight.block_hash or "")
                 detail = f"{sight.where}: a second copy of block {name}"
                 findings.append(Finding(agent_id, detail, name, sight.block_hash))

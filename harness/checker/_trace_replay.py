@@ -20,7 +20,7 @@ COMPLETES = "build_data_block"
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class Observation:
     """An observation at a line of a trace. Lines count from 1."""
 
     line: int
@@ -35,7 +35,7 @@ class Sight:
 
 
 @dataclass(slots=True)
-class Life:
+class Incarnation:
     """One incarnation of an agent: the blocks that it held at its end, and observations on the way.
 
     `chain` is oldest first, `deque` front first, `stack` top last; all are block hashes.
@@ -52,44 +52,44 @@ class Life:
     sent: int = 0
     unknown: bool = False
     """True if the trace has unknown operations. From the first on, the held blocks are unknown."""
-    impossible: list[Sight] = field(default_factory=list)
+    impossible: list[Observation] = field(default_factory=list)
     """Impossible changes, such as the removal of a block that is not there."""
-    second_copies: list[Sight] = field(default_factory=list)
-    idle_too_early: list[Sight] = field(default_factory=list)
+    second_copies: list[Observation] = field(default_factory=list)
+    idle_too_early: list[Observation] = field(default_factory=list)
     """Idle states with own blocks outside of the chain, or with blocks in the deque or on the stack."""
-    otherwise: list[Sight] = field(default_factory=list)
+    otherwise: list[Observation] = field(default_factory=list)
     """The first state whose lengths contradict the changes."""
-    another_top: list[Sight] = field(default_factory=list)
+    another_top: list[Observation] = field(default_factory=list)
     """The first top chain hash that differs from that of the chain (eq. 3.2)."""
-    flags: list[Sight] = field(default_factory=list)
+    flags: list[Observation] = field(default_factory=list)
     """Impossible flags."""
-    back_in_time: list[Sight] = field(default_factory=list)
-    out_of_sequence: list[Sight] = field(default_factory=list)
+    back_in_time: list[Observation] = field(default_factory=list)
+    out_of_sequence: list[Observation] = field(default_factory=list)
 
     def numbered(self) -> Iterator[tuple[int, HandlerRun]]:
         """Return the runs with their lines."""
         return next(islice(self.trace.incarnations(), self.number, None))
 
 
-def replay(trace: Trace, inception: str | None) -> list[Life]:
+def replay(trace: Trace, inception: str | None) -> list[Incarnation]:
     """Return each incarnation of the agent. `inception` is the chain hash CH_0 of the mission, or None if unknown."""
     bounds = [0, *trace.starts, len(trace.runs)]
     return [
-        _replayed(Life(trace, number, trace.runs[start:end]), inception)
+        _replayed(Incarnation(trace, number, trace.runs[start:end]), inception)
         for number, (start, end) in enumerate(pairwise(bounds))
     ]
 
 
-def _replayed(life: Life, inception: str | None) -> Life:
-    holds = _Holds(life, inception)
+def _replayed(incarnation: Incarnation, inception: str | None) -> Incarnation:
+    holds = _Holds(incarnation, inception)
     checked: StateSummary | None = None
     reconciling, compared, now, sequence = False, True, 0.0, 0
-    for line, run in life.numbered():
+    for line, run in incarnation.numbered():
         state = run.state
-        if run.changes and not life.unknown:
+        if run.changes and not incarnation.unknown:
             holds.change(line, run)
             checked = None
-            compared = compared and not life.unknown
+            compared = compared and not incarnation.unknown
         if state is not checked:
             checked = state
             if compared:
@@ -100,31 +100,31 @@ def _replayed(life: Life, inception: str | None) -> Life:
                     what = (
                         f"a reconcile {'begins' if reconciling else 'ends'} in a handler other than Algorithms 7 and 20"
                     )
-                    life.flags.append(Sight(line, run, what))
+                    incarnation.flags.append(Observation(line, run, what))
             if state.idle and reconciling:
-                life.flags.append(Sight(line, run, "idle and reconciling at once"))
-        if state.idle and holds.anything_aside and not life.unknown:
-            life.idle_too_early.append(holds.idle_too_early(line, run))
+                incarnation.flags.append(Observation(line, run, "idle and reconciling at once"))
+        if state.idle and holds.anything_aside and not incarnation.unknown:
+            incarnation.idle_too_early.append(holds.idle_too_early(line, run))
         if not now <= run.t <= LATEST_S:
-            life.back_in_time.append(Sight(line, run, f"the time goes back from {now:g} s to {run.t:g} s"))
+            incarnation.back_in_time.append(Observation(line, run, f"the time goes back from {now:g} s to {run.t:g} s"))
         now = run.t
         for message in run.sent:
             if message.seq != sequence:
                 what = f"sent message number {message.seq}, but the next number is {sequence}"
-                life.out_of_sequence.append(Sight(line, run, what))
+                incarnation.out_of_sequence.append(Observation(line, run, what))
                 sequence = message.seq
             sequence += 1
-            life.sent += 1
-    return life
+            incarnation.sent += 1
+    return incarnation
 
 
 class _Holds:
     """The blocks of an agent, step by step."""
 
-    def __init__(self, life: Life, inception: str | None) -> None:
-        self._life = life
+    def __init__(self, incarnation: Incarnation, inception: str | None) -> None:
+        self._life = incarnation
         self._copies: dict[str, int] = {}
-        self._places = {"chain": life.chain, "deque": life.deque, "stack": life.stack}
+        self._places = {"chain": incarnation.chain, "deque": incarnation.deque, "stack": incarnation.stack}
         self._chain_hashes = [bytes.fromhex(inception)] if inception is not None else None
         """Chain hashes of the chain, from the inception block on. None if they are not known."""
         self._completed: set[str] = set()
@@ -132,29 +132,29 @@ class _Holds:
         self.anything_aside = False
 
     def change(self, line: int, run: HandlerRun) -> None:
-        life = self._life
+        incarnation = self._life
         if not OPERATIONS.issuperset(operation for operation, _ in run.changes):
-            life.unknown = True
+            incarnation.unknown = True
             return
         for operation, block in run.changes:
             if operation == "complete":
-                life.completed.append(block)
+                incarnation.completed.append(block)
                 self._completed.add(block)
                 self._not_in_chain[block] = None
                 continue
             place = self._places[operation[:-1]]
             if operation[-1] == "-":
                 if impossible := self._take(operation[:-1], place, block):
-                    life.impossible.append(Sight(line, run, impossible, block))
+                    incarnation.impossible.append(Observation(line, run, impossible, block))
             else:
                 if run.handler == COMPLETES and block not in self._completed:
-                    life.impossible.append(
-                        Sight(line, run, "a block joins the deque before the agent completed it", block)
+                    incarnation.impossible.append(
+                        Observation(line, run, "a block joins the deque before the agent completed it", block)
                     )
                 self._put(operation[:-1], place, block)
                 if self._copies[block] > 1:
-                    life.second_copies.append(Sight(line, run, "", block))
-        self.anything_aside = bool(self._not_in_chain or life.deque or life.stack)
+                    incarnation.second_copies.append(Observation(line, run, "", block))
+        self.anything_aside = bool(self._not_in_chain or incarnation.deque or incarnation.stack)
 
     def _put(self, name: str, place: list[str], block: str) -> None:
         place.append(block)
@@ -186,24 +186,30 @@ class _Holds:
 
     def compare(self, line: int, run: HandlerRun) -> bool:
         """Whether the state is what the changes have led to."""
-        life, state = self._life, run.state
-        if (state.chain, state.deque, state.stack) != (len(life.chain), len(life.deque), len(life.stack)):
+        incarnation, state = self._life, run.state
+        if (state.chain, state.deque, state.stack) != (
+            len(incarnation.chain),
+            len(incarnation.deque),
+            len(incarnation.stack),
+        ):
             what = (
                 f"records that {_lengths(state.chain, state.deque, state.stack)}, but its changes so far lead to "
-                f"{_lengths(len(life.chain), len(life.deque), len(life.stack), '')}"
+                f"{_lengths(len(incarnation.chain), len(incarnation.deque), len(incarnation.stack), '')}"
             )
-            life.otherwise.append(Sight(line, run, what))
+            incarnation.otherwise.append(Observation(line, run, what))
             return False
         if self._chain_hashes is not None and state.top != self._chain_hashes[-1].hex():
             what = f"the top chain hash {state.top[:12]} does not match the {state.chain} blocks of the chain (eq. 3.2)"
-            life.another_top.append(Sight(line, run, what, life.chain[-1] if life.chain else None))
+            incarnation.another_top.append(
+                Observation(line, run, what, incarnation.chain[-1] if incarnation.chain else None)
+            )
             return False
         return True
 
-    def idle_too_early(self, line: int, run: HandlerRun) -> Sight:
-        life = self._life
-        what = f"{len(life.deque)} blocks to be committed and {len(life.stack)} on the reconcile stack"
-        return Sight(line, run, what, next(iter(self._not_in_chain), None))
+    def idle_too_early(self, line: int, run: HandlerRun) -> Observation:
+        incarnation = self._life
+        what = f"{len(incarnation.deque)} blocks to be committed and {len(incarnation.stack)} on the reconcile stack"
+        return Observation(line, run, what, next(iter(self._not_in_chain), None))
 
 
 def _digest(block_hash: str) -> bytes:

@@ -23,7 +23,7 @@ from harness.archive.packets.capture_files import DIRECTORY, Captures, capture_f
 from harness.archive.run_record import AgentRecord, Counters, JudgedRecord
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import Kind, UnknownNames, first_unknown, unknown_names
-from harness.checker._trace_replay import Life, replay
+from harness.checker._trace_replay import Incarnation, replay
 from harness.checker.reference.state import State
 from harness.errors import RunDirectoryError
 from harness.play.rogue.rogue_line import OF_NO_INJECTION
@@ -169,7 +169,7 @@ class Evidence:
         return None
 
     @cached_property
-    def lives(self) -> dict[int, list[Life]]:
+    def incarnations(self) -> dict[int, list[Incarnation]]:
         """The replayed incarnations of each agent with a trace."""
         inception = next((export.inception.chain_hash for export in self.exports.values()), None)
         if inception is None:

@@ -1,4 +1,4 @@
-"""Whether the machine kept the agents' time: how late their vote timers fired, from their own traces."""
+"""Measure how late the vote timers of agents expired, to warn about a machine that is too slow."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -8,20 +8,20 @@ from harness.archive.lag import MeasuredLag
 from harness.archive.traces import Trace
 
 ENOUGH = 20
-"""Fewer timers than this say nothing of the latest twentieth."""
+"""Minimum number of timers for an estimate."""
 TOLERATED = 0.05
 
 
 @dataclass(frozen=True)
 class TimerLag:
-    """Of twenty vote timers, set to `asked_s`, one fired more than `late_s` late. Mission seconds."""
+    """One in twenty vote timers, set to `asked_s`, expired more than `late_s` late. Times are mission seconds."""
 
     late_s: float
     asked_s: float
 
     @property
     def tolerable(self) -> bool:
-        """Whether that is at most a twentieth of what was asked."""
+        """True if the lateness is at most a twentieth of the duration."""
         return self.late_s <= TOLERATED * self.asked_s
 
 

@@ -11,7 +11,8 @@ from tests.harness.virtual import scenario
 
 
 def test_expect_accepts_all_figures_and_characteristics() -> None:
-    simulated = simulate(scenario(agents=2, duration_s=60, final_reconcile=True), 1)
+    asked = scenario(agents=2, duration_s=60, network={"channel": {"preset": "wifi_1"}}, final_reconcile=True)
+    simulated = simulate(asked, 1)
     assert list(get_args(FigureName)) == list(simulated.result.figures)
     assert NUMBERS.keys() == CHECKS.keys()
 

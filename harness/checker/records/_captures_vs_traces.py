@@ -69,9 +69,9 @@ def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams
 def _not_sent(evidence: Evidence, agent_id: int) -> int:
     """Return the number of messages in its trace that an agent may not have sent, because of an error or its kill."""
     recorded = evidence.recorded(agent_id)
-    lives = evidence.lives[agent_id]
-    killed = lives if recorded is None or recorded.outcome != "exported" else lives[:-1]
-    last = sum(len(run.sent) for life in killed for run in life.runs if run.t == life.runs[-1].t)
+    incarnations = evidence.incarnations[agent_id]
+    killed = incarnations if recorded is None or recorded.outcome != "exported" else incarnations[:-1]
+    last = sum(len(run.sent) for incarnation in killed for run in incarnation.runs if run.t == incarnation.runs[-1].t)
     return last + ((recorded.send_failures or 0) if recorded else 0)
 
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from harness.archive.run_record import AgentRecord, HandlerRuns
 from harness.archive.traces import Trace
-from harness.checker._trace_replay import Life
+from harness.checker._trace_replay import Incarnation
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import Contradiction, in_virtual_time, of_agent, slack_s
@@ -26,16 +26,16 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
         recorded = evidence.recorded(agent_id)
         if recorded is None or trace.problem:
             continue
-        lives = evidence.lives[agent_id]
-        yield from _lives(agent_id, recorded, lives)
-        yield from _handler_runs(agent_id, recorded, trace, lives)
-        yield from _counted(evidence, agent_id, recorded, trace, lives)
+        incarnations = evidence.incarnations[agent_id]
+        yield from _incarnations(agent_id, recorded, incarnations)
+        yield from _handler_runs(agent_id, recorded, trace, incarnations)
+        yield from _counted(evidence, agent_id, recorded, trace, incarnations)
         export = evidence.exports.get(agent_id)
         if (
             export is not None
             and recorded.outcome == "exported"
             and recorded.idle not in (None, export.idle)
-            and _ran_nothing_since(recorded, lives[-1])
+            and _ran_nothing_since(recorded, incarnations[-1])
         ):
             idle, not_idle = ("idle", "not idle") if recorded.idle else ("not idle", "idle")
             yield of_agent(
@@ -48,23 +48,25 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
             )
 
 
-def _ran_nothing_since(recorded: AgentRecord, life: Life) -> bool:
+def _ran_nothing_since(recorded: AgentRecord, incarnation: Incarnation) -> bool:
     """Return False if the agent ran handlers after its last report."""
     counted = recorded.handler_runs[-1] if recorded.handler_runs else None
-    return counted is None or counted.counted == len(life.runs)
+    return counted is None or counted.counted == len(incarnation.runs)
 
 
-def _lives(agent_id: int, recorded: AgentRecord, lives: list[Life]) -> Iterator[Contradiction]:
+def _incarnations(agent_id: int, recorded: AgentRecord, incarnations: list[Incarnation]) -> Iterator[Contradiction]:
     expected = 1 + recorded.restarts + recorded.reboots
-    if len(lives) != expected:
+    if len(incarnations) != expected:
         detail = (
-            f"its trace has {_count(len(lives), 'header')}, but it started {_count(expected, 'time')} according "
+            f"its trace has {_count(len(incarnations), 'header')}, but it started {_count(expected, 'time')} according "
             "to run.json"
         )
-        yield of_agent(agent_id, detail, short=len(lives) < expected)
+        yield of_agent(agent_id, detail, short=len(incarnations) < expected)
 
 
-def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Life]) -> Iterator[Contradiction]:
+def _handler_runs(
+    agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[Incarnation]
+) -> Iterator[Contradiction]:
     """The trace has a line for each handler run that the agent had counted."""
     expected = 1 + recorded.restarts + recorded.reboots
     if len(recorded.handler_runs) not in (0, expected):
@@ -72,12 +74,12 @@ def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: lis
         yield of_agent(
             agent_id, f"run.json has {counts} of its handler runs, but it started {_count(expected, 'time')}"
         )
-    if len(recorded.handler_runs) != len(lives):
+    if len(recorded.handler_runs) != len(incarnations):
         return  # the agent counts none, or incarnations are missing
-    for life, counted in zip(lives, recorded.handler_runs, strict=True):
+    for incarnation, counted in zip(incarnations, recorded.handler_runs, strict=True):
         if counted is None:
             continue
-        at_least, at_most = _lines_by(life, counted)
+        at_least, at_most = _lines_by(incarnation, counted)
         if not at_least <= counted.counted <= at_most:
             lines = at_most if counted.counted > at_most else at_least
             detail = (
@@ -87,22 +89,22 @@ def _handler_runs(agent_id: int, recorded: AgentRecord, trace: Trace, lives: lis
             yield of_agent(agent_id, detail, "1", short=counted.counted > at_most)
 
 
-def _lines_by(life: Life, counted: HandlerRuns) -> tuple[int, int]:
+def _lines_by(incarnation: Incarnation, counted: HandlerRuns) -> tuple[int, int]:
     """Return the least and the greatest number of lines that the trace had when the agent reported its count."""
-    if in_virtual_time(life.trace):
-        return len(life.runs), len(life.runs)
-    slack = ROUNDED_S + (slack_s(life.trace) if counted.from_s < counted.until_s else 0.0)
+    if in_virtual_time(incarnation.trace):
+        return len(incarnation.runs), len(incarnation.runs)
+    slack = ROUNDED_S + (slack_s(incarnation.trace) if counted.from_s < counted.until_s else 0.0)
     return (
-        bisect_left(life.runs, counted.from_s - slack, key=lambda run: run.t),
-        bisect_right(life.runs, counted.until_s + slack, key=lambda run: run.t),
+        bisect_left(incarnation.runs, counted.from_s - slack, key=lambda run: run.t),
+        bisect_right(incarnation.runs, counted.until_s + slack, key=lambda run: run.t),
     )
 
 
 def _counted(
-    evidence: Evidence, agent_id: int, recorded: AgentRecord, trace: Trace, lives: list[Life]
+    evidence: Evidence, agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[Incarnation]
 ) -> Iterator[Contradiction]:
     """Compare the sums over all incarnations of the agent."""
-    sent = sum(life.sent for life in lives)
+    sent = sum(incarnation.sent for incarnation in incarnations)
     if recorded.messages_sent is not None and recorded.messages_sent != sent:
         detail = (
             f"it sent {_count(recorded.messages_sent, 'message')} according to run.json, but {sent} according to "
@@ -127,8 +129,8 @@ def _counted(
                 "according to its trace"
             )
             yield of_agent(agent_id, detail)
-    if recorded.chain_changed_at_s is not None and not any(life.unknown for life in lives):
-        changed_at_s = _chain_changed_at(lives[-1])
+    if recorded.chain_changed_at_s is not None and not any(incarnation.unknown for incarnation in incarnations):
+        changed_at_s = _chain_changed_at(incarnations[-1])
         if abs(recorded.chain_changed_at_s - changed_at_s) > ROUNDED_S + slack_s(trace):
             detail = (
                 f"its chain changed last at {recorded.chain_changed_at_s:g} s according to run.json, but at "
@@ -167,8 +169,8 @@ def _dropped(agent_id: int, recorded: AgentRecord, trace: Trace) -> Iterator[Con
             yield of_agent(agent_id, detail, short=True)
 
 
-def _chain_changed_at(life: Life) -> float:
-    for run in reversed(life.runs):
+def _chain_changed_at(incarnation: Incarnation) -> float:
+    for run in reversed(incarnation.runs):
         if any(operation.startswith("chain") for operation, _ in run.changes):
             return run.t
     return 0.0
@@ -180,11 +182,11 @@ def _count(number: int, what: str) -> str:
 
 def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
     """Trace, export and run.json have the same completed blocks, in the same order."""
-    for agent_id, lives in evidence.lives.items():
-        if evidence.traces[agent_id].problem or any(life.unknown for life in lives):
+    for agent_id, incarnations in evidence.incarnations.items():
+        if evidence.traces[agent_id].problem or any(incarnation.unknown for incarnation in incarnations):
             continue
-        yield from _over_brown_outs(evidence, agent_id, lives)
-        traced = dict.fromkeys(block for life in lives for block in life.completed)
+        yield from _over_brown_outs(evidence, agent_id, incarnations)
+        traced = dict.fromkeys(block for incarnation in incarnations for block in incarnation.completed)
         export, recorded = evidence.exports.get(agent_id), evidence.recorded(agent_id)
         exported = export.completed if export else []
         before = recorded.completed_before if recorded else []
@@ -202,14 +204,14 @@ def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
                     f"it completed {_named(evidence, untold)} according to its trace, but not according to its export"
                 )
                 yield _of_block(evidence, agent_id, detail, untold[0])
-        if export is not None and _out_of_order(exported, lives[-1].completed):
+        if export is not None and _out_of_order(exported, incarnations[-1].completed):
             detail = "its export and its trace list its completed blocks in different order"
             yield _of_block(evidence, agent_id, detail, exported[0])
 
 
-def _over_brown_outs(evidence: Evidence, agent_id: int, lives: list[Life]) -> Iterator[Contradiction]:
+def _over_brown_outs(evidence: Evidence, agent_id: int, incarnations: list[Incarnation]) -> Iterator[Contradiction]:
     """A reboot restores all completed blocks from the disk. The trace may lack the last line before the kill."""
-    for before, after in pairwise(lives):
+    for before, after in pairwise(incarnations):
         if not after.runs or not isinstance(after.runs[0].trigger, BootTrigger):
             continue
         restored = [block for operation, block in after.runs[0].changes if operation == "complete"]

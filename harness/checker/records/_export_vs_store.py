@@ -17,10 +17,10 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     """Yield each store that is damaged, or whose content differs from the export."""
     for agent_id, path in evidence.stores.items():
         export, recorded = evidence.exports.get(agent_id), evidence.recorded(agent_id)
-        lives = evidence.lives.get(agent_id)
+        incarnations = evidence.incarnations.get(agent_id)
         if export is None or recorded is None or recorded.outcome != "exported" or recorded.trace_problem:
             continue
-        if lives is None or not any(run.changes for run in lives[-1].runs):
+        if incarnations is None or not any(run.changes for run in incarnations[-1].runs):
             continue  # its last incarnation wrote no store
         try:
             header, stored = read_store(path)

@@ -10,7 +10,7 @@ from dataclasses import astuple
 
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
-from harness.checker._trace_replay import Life, Sight
+from harness.checker._trace_replay import Incarnation, Observation
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import ROUNDED_S, Contradiction, mission_s, of_agent, slack_s
@@ -32,11 +32,11 @@ def compare_export(evidence: Evidence) -> Iterator[Contradiction]:
         trace = evidence.traces.get(agent_id)
         if trace is None or trace.problem:
             continue
-        state, lives = _state(export), evidence.lives[agent_id]
-        if lives[-1].runs and state == lives[-1].runs[-1].state:
-            yield from _contents(agent_id, export, lives[-1])
+        state, incarnations = _state(export), evidence.incarnations[agent_id]
+        if incarnations[-1].runs and state == incarnations[-1].runs[-1].state:
+            yield from _contents(agent_id, export, incarnations[-1])
         elif state not in _states_when(export, trace):
-            yield _otherwise(agent_id, "its export", state, _last_state(lives, export), short=True)
+            yield _otherwise(agent_id, "its export", state, _last_state(incarnations, export), short=True)
     for agent_id, export in evidence.before_final_reconcile.items():
         yield from _before_final_reconcile(evidence, agent_id, export)
 
@@ -51,9 +51,9 @@ def _before_final_reconcile(evidence: Evidence, agent_id: int, export: Export) -
     states = _states_when(export, trace)
     if states and _state(export) not in states:
         yield _otherwise(agent_id, what, _state(export), states[-1])
-    elif any(life.unknown for life in evidence.lives[agent_id]):
+    elif any(incarnation.unknown for incarnation in evidence.incarnations[agent_id]):
         return
-    elif export.completed not in _completed_when(export, evidence.lives[agent_id]):
+    elif export.completed not in _completed_when(export, evidence.incarnations[agent_id]):
         yield of_agent(agent_id, f"{what} and its trace list different completed blocks", "5")
 
 
@@ -81,17 +81,19 @@ def _states_when(export: Export, trace: Trace) -> list[StateSummary]:
     return states
 
 
-def _completed_when(export: Export, lives: list[Life]) -> list[list[str]]:
+def _completed_when(export: Export, incarnations: list[Incarnation]) -> list[list[str]]:
     """Return the blocks that each incarnation of the agent had completed at the export."""
-    at_s = mission_s(export.exported_at_us, lives[0].trace.header)
+    at_s = mission_s(export.exported_at_us, incarnations[0].trace.header)
     if at_s is None:
         return [export.completed]
-    by_then = [[run for run in life.runs if run.changes and run.t <= at_s + ROUNDED_S] for life in lives]
+    by_then = [
+        [run for run in incarnation.runs if run.changes and run.t <= at_s + ROUNDED_S] for incarnation in incarnations
+    ]
     return [[block for run in runs for operation, block in run.changes if operation == "complete"] for runs in by_then]
 
 
-def _last_state(lives: list[Life], export: Export) -> StateSummary:
-    runs = lives[-1].runs
+def _last_state(incarnations: list[Incarnation], export: Export) -> StateSummary:
+    runs = incarnations[-1].runs
     return (
         runs[-1].state if runs else StateSummary(0, 0, 0, reconciling=False, idle=True, top=export.inception.chain_hash)
     )
@@ -114,14 +116,14 @@ def _value(value: object) -> str:
     return value[:12] if isinstance(value, str) else str(value).lower()
 
 
-def _contents(agent_id: int, export: Export, life: Life) -> Iterator[Contradiction]:
+def _contents(agent_id: int, export: Export, incarnation: Incarnation) -> Iterator[Contradiction]:
     """Compare the blocks of an export with those of the trace, whose lengths and top chain hash agree."""
-    if life.otherwise or life.another_top or life.impossible or life.unknown:
+    if incarnation.otherwise or incarnation.another_top or incarnation.impossible or incarnation.unknown:
         return
     for place, exported, traced, touches in (
-        ("chain", export.chain, life.chain, "6"),
-        ("deque", export.blocks_to_be_committed, life.deque, "2"),
-        ("reconcile stack", export.reconcile_stack, life.stack, "2"),
+        ("chain", export.chain, incarnation.chain, "6"),
+        ("deque", export.blocks_to_be_committed, incarnation.deque, "2"),
+        ("reconcile stack", export.reconcile_stack, incarnation.stack, "2"),
     ):
         if [block.block_hash for block in exported] != traced:
             yield of_agent(
@@ -133,38 +135,40 @@ def _contents(agent_id: int, export: Export, life: Life) -> Iterator[Contradicti
 
 def compare_with_itself(evidence: Evidence) -> Iterator[Contradiction]:
     """Yield contradictions within each incarnation of an agent, and between incarnations."""
-    for agent_id, lives in evidence.lives.items():
-        for life in lives:
-            yield from _in_life(evidence, agent_id, life)
-        yield from _between_lives(evidence, agent_id, lives)
+    for agent_id, incarnations in evidence.incarnations.items():
+        for incarnation in incarnations:
+            yield from _in_incarnation(evidence, agent_id, incarnation)
+        yield from _between_incarnations(evidence, agent_id, incarnations)
 
 
-def _in_life(evidence: Evidence, agent_id: int, life: Life) -> Iterator[Contradiction]:
-    for sights, touches in (
-        (life.impossible, "3"),
-        (life.otherwise, "3"),
-        (life.another_top, "4"),
-        (life.flags, None),
-        (life.back_in_time, None),
-        (life.out_of_sequence, "1"),
+def _in_incarnation(evidence: Evidence, agent_id: int, incarnation: Incarnation) -> Iterator[Contradiction]:
+    for observations, touches in (
+        (incarnation.impossible, "3"),
+        (incarnation.otherwise, "3"),
+        (incarnation.another_top, "4"),
+        (incarnation.flags, None),
+        (incarnation.back_in_time, None),
+        (incarnation.out_of_sequence, "1"),
     ):
-        for sight in sights:
-            yield Contradiction(finding(evidence, agent_id, sight), touches)
+        for observation in observations:
+            yield Contradiction(finding(evidence, agent_id, observation), touches)
 
 
-def finding(evidence: Evidence, agent_id: int, sight: Sight) -> Finding:
+def finding(evidence: Evidence, agent_id: int, observation: Observation) -> Finding:
     """Return the observation as evidence, with the name of the block."""
-    block = sight.block_hash
-    return Finding(agent_id, f"{sight.where}: {sight.what}", evidence.name(block) if block else None, block)
+    block = observation.block_hash
+    return Finding(agent_id, f"{observation.where}: {observation.what}", evidence.name(block) if block else None, block)
 
 
-def _between_lives(evidence: Evidence, agent_id: int, lives: list[Life]) -> Iterator[Contradiction]:
+def _between_incarnations(
+    evidence: Evidence, agent_id: int, incarnations: list[Incarnation]
+) -> Iterator[Contradiction]:
     slack = slack_s(evidence.traces[agent_id])
     now = 0.0
-    for life in lives:
-        if life.runs and life.runs[0].t < now - slack:
-            what = f"an incarnation starts at {life.runs[0].t:g} s, before the previous one ends at {now:g} s"
-            line, run = next(life.numbered())
-            sight = Sight(line, run, what)
-            yield Contradiction(finding(evidence, agent_id, sight))
-        now = life.runs[-1].t if life.runs else now
+    for incarnation in incarnations:
+        if incarnation.runs and incarnation.runs[0].t < now - slack:
+            what = f"an incarnation starts at {incarnation.runs[0].t:g} s, before the previous one ends at {now:g} s"
+            line, run = next(incarnation.numbered())
+            observation = Observation(line, run, what)
+            yield Contradiction(finding(evidence, agent_id, observation))
+        now = incarnation.runs[-1].t if incarnation.runs else now

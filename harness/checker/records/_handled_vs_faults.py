@@ -16,7 +16,7 @@ from math import inf
 
 from harness.archive.connectivity import Link
 from harness.archive.traces import Trace
-from harness.checker._trace_replay import Sight
+from harness.checker._trace_replay import Observation
 from harness.checker.evidence import Evidence
 from harness.checker.records._export_vs_trace import finding
 from harness.checker.records.contradiction import ROUNDED_S, Contradiction, in_virtual_time, slack_s
@@ -40,11 +40,11 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         stops = stopped(evidence, agent_id, _clock_slack_s(trace))
         if cuts is None and not stops:
             continue
-        for life in evidence.lives[agent_id]:
-            for line, run in life.numbered():
+        for incarnation in evidence.incarnations[agent_id]:
+            for line, run in incarnation.numbered():
                 for what in (_while_stopped(run, stops), _over_a_cut(evidence, agent_id, run, cuts)):
                     if what is not None:
-                        yield Contradiction(finding(evidence, agent_id, Sight(line, run, what)), "1")
+                        yield Contradiction(finding(evidence, agent_id, Observation(line, run, what)), "1")
 
 
 def _clock_slack_s(trace: Trace) -> float:

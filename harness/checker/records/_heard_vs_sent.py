@@ -7,7 +7,7 @@ the network duplicates messages.
 from collections import Counter
 from collections.abc import Iterator
 
-from harness.checker._trace_replay import Sight
+from harness.checker._trace_replay import Observation
 from harness.checker.evidence import Evidence, Sending
 from harness.checker.records._export_vs_trace import finding
 from harness.checker.records.contradiction import Contradiction, slack_s
@@ -23,10 +23,10 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     slack = max(map(slack_s, evidence.traces.values()), default=0.0)
     sendings = evidence.sendings
     once = not _may_duplicate(evidence)
-    for agent_id, lives in evidence.lives.items():
+    for agent_id, incarnations in evidence.incarnations.items():
         handled: Counter[tuple[int, str, int]] = Counter()
-        for life in lives:
-            for line, run in life.numbered():
+        for incarnation in incarnations:
+            for line, run in incarnation.numbered():
                 trigger = run.trigger
                 if not isinstance(trigger, MessageTrigger):
                     continue
@@ -38,15 +38,15 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                     handled[key] += 1
                     if handled[key] > len(sent) and not evidence.injected.may_be(trigger):
                         what = f"handled {_named(trigger)} again, although nothing duplicates messages"
-                        yield Contradiction(finding(evidence, agent_id, Sight(line, run, what)), "1")
+                        yield Contradiction(finding(evidence, agent_id, Observation(line, run, what)), "1")
                 first_s, message = sent[0]
                 told = message.datagram
                 as_it_went = told is not None and (run.input is told or run.input == told)
                 if as_it_went and run.t >= first_s - slack and not run.changes:
                     continue  # most are like this
                 if not evidence.injected.may_be(trigger):
-                    for sight, touches in _unlike(line, run, trigger, sent, first_s - slack):
-                        yield Contradiction(finding(evidence, agent_id, sight), touches)
+                    for observation, touches in _unlike(line, run, trigger, sent, first_s - slack):
+                        yield Contradiction(finding(evidence, agent_id, observation), touches)
 
 
 def _may_duplicate(evidence: Evidence) -> bool:
@@ -57,15 +57,17 @@ def _may_duplicate(evidence: Evidence) -> bool:
 
 def _unlike(
     line: int, run: HandlerRun, trigger: MessageTrigger, sent: Sending, earliest_s: float
-) -> Iterator[tuple[Sight, str]]:
+) -> Iterator[tuple[Observation, str]]:
     """Yield each difference between the handled and the sent message, and the characteristic that it concerns."""
     if run.t < earliest_s:
-        yield Sight(line, run, f"handled {_named(trigger)} before it was sent at {sent[0][0]:g} s"), "1"
+        yield Observation(line, run, f"handled {_named(trigger)} before it was sent at {sent[0][0]:g} s"), "1"
     if run.input is not None and not _as_it_went(run.input, sent):
-        yield Sight(line, run, f"handled {_named(trigger)}, whose content differs from the sent message"), "1"
+        yield Observation(line, run, f"handled {_named(trigger)}, whose content differs from the sent message"), "1"
     elif run.changes and (other := _another_block(run, trigger, sent)):
         yield (
-            Sight(line, run, f"took this block from {_named(trigger)}, but that message carried another block", other),
+            Observation(
+                line, run, f"took this block from {_named(trigger)}, but that message carried another block", other
+            ),
             "4",
         )
 

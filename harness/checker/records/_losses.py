@@ -168,9 +168,9 @@ class _Ready:
     def __init__(self, evidence: Evidence, agent_id: int) -> None:
         self._latest_s = LATENCY.mean_s + LATENCY.jitter_s
         busy: list[tuple[float, float]] = [(from_s, until_s) for from_s, until_s, _ in stopped(evidence, agent_id, 0.0)]
-        for life in evidence.lives[agent_id]:
+        for incarnation in evidence.incarnations[agent_id]:
             since: float | None = None
-            for run in life.runs:
+            for run in incarnation.runs:
                 if run.state.reconciling and since is None:
                     since = run.t
                 elif not run.state.reconciling and since is not None:

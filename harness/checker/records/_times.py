@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
-from harness.checker._trace_replay import Sight
+from harness.checker._trace_replay import Observation
 from harness.checker.evidence import Evidence
 from harness.checker.recorded_inputs import event_of
 from harness.checker.records._export_vs_trace import finding
@@ -49,11 +49,11 @@ def _around_the_end(trace: Trace, end_s: float) -> tuple[float, float]:
 
 
 def _compare_runs(evidence: Evidence, agent_id: int, latest_s: float) -> Iterator[Contradiction]:
-    for life in evidence.lives[agent_id]:
-        if life.runs and life.runs[-1].t > latest_s:
-            line, run = next((line, run) for line, run in life.numbered() if run.t > latest_s)
+    for incarnation in evidence.incarnations[agent_id]:
+        if incarnation.runs and incarnation.runs[-1].t > latest_s:
+            line, run = next((line, run) for line, run in incarnation.numbered() if run.t > latest_s)
             what = f"ran at {run.t:g} s, although the agent ended at {evidence.end_of(agent_id):g} s"
-            yield Contradiction(finding(evidence, agent_id, Sight(line, run, what)))
+            yield Contradiction(finding(evidence, agent_id, Observation(line, run, what)))
 
 
 def _compare_export(
@@ -75,14 +75,14 @@ def _has_recorded_events(evidence: Evidence) -> bool:
 
 def _compare_events(evidence: Evidence, agent_id: int, trace: Trace) -> Iterator[Contradiction]:
     slack = max(slack_s(trace), SAME_TIME_S)
-    for life in evidence.lives[agent_id]:
-        for line, run in life.numbered():
+    for incarnation in evidence.incarnations[agent_id]:
+        for line, run in incarnation.numbered():
             if not isinstance(run.trigger, EventTrigger):
                 continue
             logged_s = _time_of_event(run, trace)
             if logged_s is not None and abs(logged_s - run.t) > slack:
                 what = f"logged an event at {run.t:g} s, but the timestamp of the event is {logged_s:g} s"
-                yield Contradiction(finding(evidence, agent_id, Sight(line, run, what)))
+                yield Contradiction(finding(evidence, agent_id, Observation(line, run, what)))
 
 
 def _time_of_event(run: HandlerRun, trace: Trace) -> float | None:

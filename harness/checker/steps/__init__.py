@@ -19,7 +19,7 @@ from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
 from harness.checker.steps._late_timers import JudgedTimers
 from harness.checker.steps.deviation import Deviation
-from harness.checker.steps.follower import Follower, Tells
+from harness.checker.steps.follower import Follower, OptionalParts
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, UnknownSettingError, checked
 from ucp.messages import MalformedDatagramError
 from ucp.trace import Commanded, Dropped
@@ -28,7 +28,7 @@ NAME = "every step"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """`deviates` at the first step that differs; `not applicable` where not every step of every agent can be judged."""
+    """Return `deviates` for any difference, `not applicable` if a step cannot be judged, else `as specified`."""
     blocks = Blocks(block for export in evidence.exports.values() for block in export.blocks())
     deviations: list[Deviation] = []
     timers = JudgedTimers()
@@ -78,17 +78,17 @@ def _why(unjudged: dict[int, str]) -> str:
 
 
 def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: Blocks) -> list[Follower]:
-    """One for each life."""
+    """Return a follower for each incarnation."""
 
     def was_paused(since: float, until: float) -> bool:
         return evidence.was_paused(header.agent_id, since, until)
 
-    tells = Tells.of(trace)
-    return [Follower(header, tells, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
+    parts = OptionalParts.of(trace)
+    return [Follower(header, parts, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
 
 
 def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Follower]) -> None:
-    """Take each life of the agent through all of its steps, up to the first that it tells in unknown words."""
+    """Follow each incarnation of the agent through its steps, up to the first step with an unknown name."""
     understood = not evidence.unknown.get(agent_id, {}).keys() - IGNORED_KINDS
     for follower, life in zip(followers, trace.incarnations(), strict=True):
         if evidence.watch is not None:
@@ -104,9 +104,9 @@ def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Fol
 
 
 def wrongly_dropped(header: CheckedHeader, line: int, aside: Dropped | Commanded) -> Deviation | None:
-    """What is wrong with a line that is no handler run: a datagram was dropped, and should have been handled."""
+    """Return a deviation if the agent dropped a datagram that it should have handled, else None."""
     if not isinstance(aside, Dropped) or header.secured:
-        return None  # what a secured agent drops without a look at its message is not in plain
+        return None  # a secured agent drops datagrams before it decrypts them
     try:
         sender, _, message = decoded(aside.datagram)
     except MalformedDatagramError:
@@ -137,10 +137,10 @@ def _deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost:
 
 
 def _known(deviation: Deviation) -> str | None:
-    """Whose it is, if it is one of the 20's: a record may name any other."""
+    """Return the handler of the deviation if it is one of the 20 handlers, else None."""
     return deviation.handler if deviation.handler in HANDLERS else None
 
 
 def _title(handler: str | None) -> str:
-    """ "Algorithm 5, vote_timer_expiration"."""
+    """Return a title such as "Algorithm 5, vote_timer_expiration"."""
     return f"Algorithm {HANDLERS[handler].algorithm}, {handler}" if handler else "an unknown handler"

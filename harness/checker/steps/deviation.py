@@ -1,4 +1,4 @@
-"""A step that differs from the reference's, in words: what the agent did, and what it should have done."""
+"""Describe a step that differs from the reference: the actual and the expected behaviour."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -9,17 +9,20 @@ from ucp.messages import MalformedDatagramError
 from ucp.trace import HandlerRun, Sent, Tally
 
 NameOf = Callable[[str], str]
-"""Name of a block for people, by its hash."""
+"""A function from the hash of a block to its name."""
 
 CHOOSES = 15
-"""The algorithm whose tally is what it chose."""
+"""The Algorithm whose tally is its choice."""
 SHOWN = 3
-"""More changes or messages of one step are counted."""
+"""Maximum number of listed changes or messages of a step. Further ones are counted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """`did` and `should` complete "it ..." and "should have ..."; or `what` is all that there is to say."""
+    """A difference between an agent and the reference.
+
+    `run` and `expected` are the recorded and the expected handler run. If no run can be compared, `what` has the text.
+    """
 
     agent_id: int
     line: int
@@ -30,13 +33,13 @@ class Deviation:
     expected: HandlerRun | None = None
 
     def sentence(self, name: NameOf) -> str:
-        """Where, by which handler, what it did and what it should have done."""
+        """Return the place, the handler, and the actual and expected behaviour."""
         known = HANDLERS.get(self.handler or "")
         handler = f"Algorithm {known.algorithm}, {known.name}: " if known else ""
         return f"trace line {self.line}, t={self.t:g} s: {handler}{self.difference(name)}"
 
     def difference(self, name: NameOf) -> str:
-        """What it did and what it should have done."""
+        """Return the actual and the expected behaviour."""
         if self.run is None or self.expected is None:
             return self.what
         did, should = zip(*differences(self.run, self.expected, name), strict=True)
@@ -44,7 +47,7 @@ class Deviation:
 
 
 def differences(run: HandlerRun, expected: HandlerRun, name: NameOf) -> Iterator[tuple[str, str]]:
-    """(what it did, what it should have done) of all that differs."""
+    """Yield (actual, expected) for each differing part of the step."""
     if run.branch != expected.branch:
         yield f"took the branch '{run.branch[:60]}'", f"taken '{expected.branch}'"
     as_changed = run.changes == expected.changes
@@ -95,7 +98,7 @@ def _message(message: Sent, others: Sequence[Sent], name: NameOf) -> str:
 
 
 def _content(message: Sent, other: Sent) -> str:
-    """What tells it from the other, of the same type and about the same block."""
+    """Return the content that differs from another message of the same type about the same block."""
     try:
         content = decoded(message.datagram).message
     except MalformedDatagramError as malformed:

@@ -1,4 +1,8 @@
-"""Following one life of an agent: the reference core is given what the agent was given, a handler at a time."""
+"""Follow one incarnation of an agent: give each recorded input to the reference, and compare the results.
+
+The follower holds a reference agent in the state of the judged agent. After a difference it adopts the recorded state
+of the judged agent, so that one mistake does not cause further differences.
+"""
 
 import math
 from collections.abc import Callable, Iterable
@@ -31,22 +35,22 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 
 COUNTING = frozenset(("proposed", "asked", "yes", "no", "new candidate", "counted", "block", "tie: block"))
-"""Branches that begin a tally, count in it, or choose from it; after others it may be what it likes."""
+"""Branches that begin a tally, count in it, or choose from it. After other branches the tally is not compared."""
 
 LOGS = ON_LOCAL_EVENT["Build Data Block"].name
-"""Only the vehicle triggers it."""
+"""Handler of Algorithm 1, which only a logged event triggers."""
 PAUSES = "receive_response_block_for_hash"
-"""Pauses the timer of phase 3, and lets it run on. No record shows that."""
+"""Handler that pauses the timer of phase 3 and continues it. No record shows this."""
 
 TOUCH_A_TIMER = frozenset((PAUSES,))
-"""Other handlers of messages commit, send, count and trigger: their changes tell what it takes to undo their steps."""
+"""Message handlers that change a timer. Other message handlers are undone from their recorded changes."""
 
 Paused = Callable[[float, float], bool]
-"""Whether the agent stood still at any time between two mission seconds."""
+"""A function that returns true if the agent was paused at any time between two mission seconds."""
 
 
 class NotHandledError(Exception):
-    """The reference would not have run this handler now: what the agent did, completing "it ..."."""
+    """The reference does not run this handler now. The message completes "it ..."."""
 
 
 class Expiry(NamedTuple):
@@ -59,20 +63,20 @@ class Expiry(NamedTuple):
     late_s: float
 
 
-class Tells(NamedTuple):
-    """What an agent's trace has of what may be left out: tallies, of these handlers, and which timers were started."""
+class OptionalParts(NamedTuple):
+    """The optional parts that a trace has: tallies of these handlers, and started timers."""
 
     tallying: frozenset[str]
     timers: bool
 
     @classmethod
-    def of(cls, trace: Trace) -> "Tells":
+    def of(cls, trace: Trace) -> "OptionalParts":
         tallying = frozenset({run.handler for run in trace.runs if run.tally is not None})
         return cls(tallying, timers=any(run.started for run in trace.runs))
 
 
 class AnotherHandlerError(NotHandledError):
-    """The run is another handler's than `handler`, for which the input is."""
+    """The input is for `handler`, but another handler ran."""
 
     def __init__(self, run: HandlerRun, handler: Handler) -> None:
         ran = HANDLERS[run.handler].algorithm if run.handler in HANDLERS else run.algorithm
@@ -80,26 +84,26 @@ class AnotherHandlerError(NotHandledError):
 
 
 class Follower:
-    """Holds the handler runs of one life of an agent against what the reference does."""
+    """Compares the handler runs of one incarnation of an agent with the reference."""
 
     def __init__(
         self,
         header: CheckedHeader,
-        tells: Tells,
+        parts: OptionalParts,
         blocks: Blocks,
         was_paused: Paused,
         implementation: Implementation = REFERENCE,
     ) -> None:
         self.deviations: list[Deviation] = []
-        """Where it differs, in order."""
+        """The differences, in order."""
         self.expiries: list[Expiry] = []
         """Each expiry of a timer of the reference that the agent handled, in order."""
         self.lost: str | None = None
-        """Why, and after which line, the agent cannot be followed any further."""
+        """The reason, with a trace line, why the agent cannot be followed any further. None while it can."""
         self.stops_before_handler = False
-        """Call `breakpoint()` before each handler: whoever steps from there into `run` is in the handler."""
+        """Call `breakpoint()` before each handler. A debugger steps from there into the handler."""
         self._header = header
-        self._tells = tells
+        self._parts = parts
         self._blocks = blocks
         self._was_paused = was_paused
         self._implementation = implementation
@@ -107,20 +111,20 @@ class Follower:
         self._core = implementation.core(header)
         self._timers = {timer.name: timer for timer in self._core.timers}
         self._ran: dict[str, tuple[int, float]] = {}
-        """Handlers that have run since the last input: trace line, mission second."""
+        """Handler runs since the last input: trace line and mission second."""
         self._adopted = False
-        """Since the last input the agent was found to differ: what it has triggered since is its own affair."""
+        """True if a difference was found since the last input. Handlers triggered since then are not compared."""
         self._began = False
         self._none_ends_before = math.inf
-        """No timer of the reference's ends sooner, by the agent's clock."""
+        """Time of the next timer expiry of the reference, by the agent's clock."""
         self._paused = 0, -math.inf
-        """Where the timer of phase 3 was paused last, to run on: trace line, and when, by the agent's clock."""
+        """Last pause of the phase 3 timer: trace line, and time by the agent's clock."""
         self._top, self._top_hex = b"", ""
         self._state: StateSummary | None = None
-        """What the agent said last of itself, while the reference is still in this state."""
+        """The last recorded state, while the reference is still in this state."""
 
     def follow(self, line: int, run: HandlerRun) -> None:
-        """See where this run, or what should have come before it, differs from the reference."""
+        """Compare this run, and the runs that should have come before it, with the reference."""
         if self.lost is not None:
             return
         core, trigger = self._core, run.trigger
@@ -173,18 +177,18 @@ class Follower:
         self._adopt(line, run, before)
 
     def begin_at(self, chain: Iterable[Block], current_block: bytes, sequence: int) -> None:
-        """The agent is idle, with this chain, the block that it builds, and the number of what it sends next."""
+        """Begin with an idle agent that has this chain, block under construction, and next sequence number."""
         self._core.be_idle_with(chain, current_block, sequence)
         self._began = True
 
     @property
     def state(self) -> State:
-        """What the agent holds, asks and counts by now; to look at."""
+        """The present state of the reference. The caller must not change it."""
         return self._core
 
     def copy(self) -> "Follower":
-        """Another, which goes on from here by itself; what it has found by now is left out."""
-        keep = [self._header, self._tells, self._blocks, self._was_paused, self._state, self._implementation]
+        """Return an independent copy without the differences so far."""
+        keep = [self._header, self._parts, self._blocks, self._was_paused, self._state, self._implementation]
         keep.append(self._on_message)
         keep += (*self._implementation.handlers.values(), *self._core.unchanging())
         memo: dict[int, Any] = {id(kept): kept for kept in keep}
@@ -193,14 +197,14 @@ class Follower:
         return deepcopy(self, memo)
 
     def foresee(self, line: int, run: HandlerRun) -> list[Deviation]:
-        """What the run that comes next shows to be wrong of those before it: what they triggered. Nothing is run."""
+        """Return the differences in triggered handlers that the next run reveals. Run no handler."""
         foreseeing = self.copy()
         if foreseeing.lost is None:
             foreseeing._triggered(line, run, _triggered_by(run))
         return foreseeing.deviations
 
     def end(self, at_s: float | None) -> None:
-        """See what should have come by the end of the run, at `at_s`, of an agent that was there to the end."""
+        """Report handlers that should have run until the end of the run at `at_s`, for an agent that ran until then."""
         if self.lost is not None:
             return
         self._not_run()
@@ -208,10 +212,10 @@ class Follower:
             line = max((line for line, _ in self._ran.values()), default=1)
             self._overdue(line, at_s, self._header.local(at_s))
 
-    # What should have come before
+    # Runs that should have come before
 
     def _triggered(self, line: int, run: HandlerRun, by: str | None) -> None:
-        """Handlers run that were triggered, and no others."""
+        """Check that triggered handlers run, and no others."""
         self._state = None
         triggered = self._core.triggered
         if self._adopted:
@@ -242,7 +246,7 @@ class Follower:
         self._adopted = True
 
     def _not_run(self) -> None:
-        """What was triggered has not run, and the next input has come."""
+        """Report a triggered handler that did not run before the next input."""
         triggered = self._core.triggered
         if triggered and not self._adopted:
             event, by = triggered[0]
@@ -250,7 +254,7 @@ class Follower:
         triggered.clear()
 
     def _overdue(self, line: int, at_s: float, now: float) -> None:
-        """Timers that ended long ago, and whose handlers have not run."""
+        """Report timers that expired long ago, and whose handlers did not run."""
         self._state = None
         late = now - self._header.late_s
         for timer in self._core.timers:
@@ -265,7 +269,7 @@ class Follower:
         self._none_ends_before = self._soonest_end()
 
     def _after_a_pause(self, deadline: float) -> str:
-        """Who may have stopped the timer of phase 3, if it was paused since it was started."""
+        """Return the handler that paused the phase 3 timer since its start, for the end of a sentence."""
         line, paused_at = self._paused
         if paused_at < deadline - self._header.settings.phase3_timeout_s:
             return ""
@@ -279,10 +283,10 @@ class Follower:
                 soonest = deadline
         return soonest
 
-    # What came
+    # Inputs
 
     def _input(self, line: int, run: HandlerRun, now: float) -> tuple[Handler, tuple[Any, ...]]:
-        """The handler that this runs, and what it is given, where no message came. Raises NotHandledError."""
+        """Return the handler and its arguments for an input other than a message. Raises NotHandledError."""
         trigger, on_local_event = run.trigger, self._implementation.on_local_event
         handler: Handler
         inputs: tuple[Any, ...]
@@ -312,7 +316,7 @@ class Follower:
         return handler
 
     def _message(self, run: HandlerRun, trigger: MessageTrigger) -> tuple[Handler, int, Message]:
-        """The handler that this runs, and what it is given: a message, and who sent it. Raises NotHandledError."""
+        """Return the handler for a message, the sender and the message. Raises NotHandledError."""
         try:
             sender, sequence, message = decoded(run.input)
         except MalformedDatagramError as malformed:
@@ -358,7 +362,7 @@ class Follower:
         return (event,)
 
     def _boot(self, run: HandlerRun) -> None:
-        """What was found is there before the handler runs: as its changes say, with the blocks of its input."""
+        """Restore the recorded data of the disk before the handler runs: the blocks of the input, in their places."""
         if self._began:
             raise NotHandledError("booted after other steps; a boot must be the first step")
         try:
@@ -381,7 +385,7 @@ class Follower:
                 break
         self._core.restore(completed, *places.values())
 
-    # Whether it is as it should be
+    # Comparison
 
     def _differs(self, run: HandlerRun, handler: Handler, branch: str, may_touch_timers: bool) -> bool:
         core = self._core
@@ -389,10 +393,10 @@ class Follower:
             return True
         if (run.sent or core.outbox) and not core.has_sent(run.sent):
             return True
-        if self._tells.timers and (run.started or {}) != core.started and timers_are_known(run):
+        if self._parts.timers and (run.started or {}) != core.started and timers_are_known(run):
             return True
-        tells_tally = branch in COUNTING and run.handler in self._tells.tallying
-        if tells_tally and run.tally != self._implementation.tally_of(core, handler) and tally_is_known(run):
+        has_tally = branch in COUNTING and run.handler in self._parts.tallying
+        if has_tally and run.tally != self._implementation.tally_of(core, handler) and tally_is_known(run):
             return True
         state = run.state
         if state is self._state and not (may_touch_timers or run.changes or core.triggered):
@@ -426,13 +430,13 @@ class Follower:
         changes, sent = list(core.changes), core.sent_in_full()
         taken = branch if branch_is_known(run) else run.branch
         expected = HandlerRun(run.t, handler.name, handler.algorithm, run.trigger, taken, changes, sent, state)
-        tells_tally = branch in COUNTING and run.handler in self._tells.tallying and tally_is_known(run)
-        expected.started = dict(core.started) if self._tells.timers and timers_are_known(run) else run.started
-        expected.tally = self._implementation.tally_of(core, handler) if tells_tally else run.tally
+        has_tally = branch in COUNTING and run.handler in self._parts.tallying and tally_is_known(run)
+        expected.started = dict(core.started) if self._parts.timers and timers_are_known(run) else run.started
+        expected.tally = self._implementation.tally_of(core, handler) if has_tally else run.tally
         return expected
 
     def _adopt(self, line: int, run: HandlerRun, before: Before | None) -> None:
-        """Go on from the agent's own state."""
+        """Continue from the recorded state of the agent."""
         self._adopted = True
         self._state = None
         try:
@@ -447,5 +451,5 @@ class Follower:
 
 
 def _triggered_by(run: HandlerRun) -> str | None:
-    """The handler whose local event triggered the run; None if something else did."""
+    """Return the handler whose local event triggered the run. None for another trigger."""
     return run.trigger.handler if isinstance(run.trigger, LocalTrigger) else None

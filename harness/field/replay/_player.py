@@ -13,7 +13,7 @@ from harness.checker.reference.algorithms import ON_TIMER
 from harness.checker.reference.state import State
 from harness.checker.steps import wrongly_dropped
 from harness.checker.steps.deviation import Deviation
-from harness.checker.steps.follower import Follower, Tells
+from harness.checker.steps.follower import Follower, OptionalParts
 from harness.checker.steps.implementation import REFERENCE, Implementation
 from harness.field.replay._agent_record import Entry, Record
 from harness.field.replay._resumption import ClockSet, Resumption
@@ -76,7 +76,7 @@ class Player:
         self.entries = entries if until_s is None else entries[: _later_than(entries, until_s)]
         self.position = 0
         self.result = ReplayResult()
-        self._tells = Tells.of(record.trace)
+        self._parts = OptionalParts.of(record.trace)
         self._unknown = unknown_names(record.trace.runs)
         self._blocks = RecordedBlocks(record)
         self._clock_set = ClockSet(record)
@@ -208,7 +208,7 @@ class Player:
         return None
 
     def _new_follower(self) -> Follower:
-        return Follower(self.record.header, self._tells, self._blocks, self.record.was_paused, self._implementation)
+        return Follower(self.record.header, self._parts, self._blocks, self.record.was_paused, self._implementation)
 
 
 def _later_than(entries: Iterable[Entry], until_s: float) -> int:

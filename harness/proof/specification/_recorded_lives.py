@@ -18,7 +18,7 @@ from harness.archive.vocabulary import (
     unknown_names,
 )
 from harness.checker.recorded_inputs import decoded, event_of, sealed_of, stored_blocks
-from harness.checker.steps.follower import COUNTING, Tells
+from harness.checker.steps.follower import COUNTING, OptionalParts
 from harness.checker.steps.trace_header import CheckedHeader
 from ucp.agent import HANDLERS, ON_TIMER, why_not_handled
 from ucp.block import LATEST_US, Block, InceptionBlock, next_chain_hash
@@ -105,14 +105,14 @@ def lives(trace: Trace, header: CheckedHeader, chains: Chains, *, ended: bool) -
 
     `ended`: the agent came to the end of its mission, so that nothing is missing at the end of its last life.
     """
-    tells = Tells.of(trace)
+    parts = OptionalParts.of(trace)
     count = len(trace.starts) + 1
     for number, runs in enumerate(trace.incarnations(), 1):
         is_last = number == count
         life = Life(header.agent_id, number, whole=ended and is_last and not trace.cut_off and trace.problem is None)
         if is_last:
             life.unread = trace.problem
-        writer = _Writer(header, tells, chains)
+        writer = _Writer(header, parts, chains)
         for line, run in runs:
             try:
                 life.steps.append(writer.step(run))
@@ -127,9 +127,9 @@ def lives(trace: Trace, header: CheckedHeader, chains: Chains, *, ended: bool) -
 class _Writer:
     """Writes the steps of one life."""
 
-    def __init__(self, header: CheckedHeader, tells: Tells, chains: Chains) -> None:
+    def __init__(self, header: CheckedHeader, parts: OptionalParts, chains: Chains) -> None:
         self._header = header
-        self._tells = tells
+        self._parts = parts
         self._chains = chains
         inception = InceptionBlock(header.initial_data).chain_hash
         self._number_of = {inception: INCEPTION}
@@ -281,7 +281,7 @@ class _Writer:
         return self._message(message) if sender == self._header.agent_id else NO_MESSAGE
 
     def _started(self, run: HandlerRun) -> Item:
-        if not self._tells.timers or not timers_are_known(run):
+        if not self._parts.timers or not timers_are_known(run):
             return NOT_TOLD
         return tuple(
             TIMERS[name] if self._durations.get(name) == duration_s else ANOTHER_DURATION

@@ -13,7 +13,7 @@ from pathlib import Path
 from harness.archive.traces import HEADER, HeldBlocks, Trace
 from harness.checker.recorded_inputs import Blocks
 from harness.checker.steps import wrongly_dropped
-from harness.checker.steps.follower import Follower, Tells
+from harness.checker.steps.follower import Follower, OptionalParts
 from harness.checker.steps.trace_header import checked
 from tests.fuzz.finding import require
 from ucp.agent import Agent
@@ -200,9 +200,9 @@ class _Driven:
 
     def judge(self) -> None:
         """As the reference core does it."""
-        header, tells = checked(self.trace.header), Tells.of(self.trace)
+        header, parts = checked(self.trace.header), OptionalParts.of(self.trace)
         for life in self.trace.incarnations():
-            follower = Follower(header, tells, Blocks(()), lambda since, until: False)
+            follower = Follower(header, parts, Blocks(()), lambda since, until: False)
             for line, run in life:
                 follower.follow(line, run)
             require(not follower.deviations, f"it deviates: {follower.deviations[:1]}")

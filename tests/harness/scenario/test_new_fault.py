@@ -81,7 +81,14 @@ def test_a_new_fault_is_one_file(tmp_path: Path) -> None:
     played = python(*run, "run")
     assert played.returncode == 0, played.stdout + played.stderr
     record = json.loads((tmp_path / "run/run.json").read_text())
-    told = {"detail": "agent 2", "agents": [2], "fully_connected": None, "disk": None, "by_hand": False}
+    told = {
+        "detail": "agent 2",
+        "agents": [2],
+        "fully_connected": None,
+        "disk": None,
+        "by_hand": False,
+        "planned_s": None,
+    }
     assert record["faults"][:2] == [{"at_s": 100, "what": "stun", **told}, {"at_s": 150, "what": "come to", **told}]
     lines = (tmp_path / "run/agents/2.trace.jsonl").read_text().splitlines()
     times = [float(found[1]) for line in lines if (found := re.search(r'"t":([\d.]+)', line))]
