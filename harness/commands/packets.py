@@ -66,12 +66,12 @@ def _output_lines(
     selected = list(selection.filter(everything, captures))
     shown = [transmission for transmission in selected if transmission.lost_by] if lost else selected
     chapters = None if follow is None else list(exchanges_about(names.find(follow), shown, exchanges))
+    losses = channel_losses(runs)
     if as_json:
-        yield from document(
-            captures, count_losses(selected), shown if chapters is None else in_order(chapters), exchanges, names
-        )
+        listed = shown if chapters is None else in_order(chapters)
+        yield from document(captures, count_losses(selected), listed, exchanges, names, losses)
         return
-    wording = TransmissionText(names, _paint(), channel_losses(runs))
+    wording = TransmissionText(names, _paint(), losses)
     yield packets_text.header(captures)
     if chapters is not None:
         yield from packets_text.exchange_lines(chapters, exchanges, wording)

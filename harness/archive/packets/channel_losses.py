@@ -8,6 +8,8 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from harness.archive.directory import CHANNEL_FILE
+from harness.archive.packets.capture_reader import ListenerName
+from harness.archive.packets.transmissions import Transmission
 
 ChannelLosses = Mapping[tuple[int, int], Mapping[str, list[int]]]
 """(sender, sequence number) -> reason -> vehicles. A reason in DROPS has no vehicles."""
@@ -39,6 +41,15 @@ def channel_losses(runs: Iterable[Path]) -> ChannelLosses:
         except OSError:
             continue
     return losses
+
+
+def loss_reasons(losses: ChannelLosses, transmission: Transmission) -> dict[str, list[ListenerName]]:
+    """Return the vehicles that lost the message on the channel, by reason. All vehicles lose a dropped message."""
+    named = {
+        reason: [name for name in transmission.lost_by if reason in DROPS or name in vehicles]
+        for reason, vehicles in losses.get((transmission.sender, transmission.sequence), {}).items()
+    }
+    return {reason: names for reason, names in named.items() if names}
 
 
 def _take(losses: dict[tuple[int, int], dict[str, list[int]]], text: str) -> None:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import Captures, Clock
 from harness.archive.packets.capture_reader import Capture, ListenerName
+from harness.archive.packets.channel_losses import ChannelLosses, loss_reasons
 from harness.archive.packets.exchanges import Exchanges, LinkLosses, Outcome
 from harness.archive.packets.transmissions import Origin, Transmission
 
@@ -69,7 +70,8 @@ class DatagramRecord(BaseModel):
 
     `origin` is `captured` (the capture of its sender has it), `inferred` (its sender had no capture then, and `at_s` is
     the time of the first reception) or `forged` (the named agent did not send it). The vehicles in `lost_by` had a
-    capture but did not receive it. Those in `not_listening` had no capture.
+    capture but did not receive it. Those in `not_listening` had no capture. `loss_reasons` has vehicles of `lost_by` by
+    the reason for which a shared channel lost the message. Without such a loss the key is absent.
     """
 
     number: int
@@ -85,6 +87,7 @@ class DatagramRecord(BaseModel):
     seen_leaving: _ListenerName | None
     received: list[ReceptionRecord]
     lost_by: list[_ListenerName]
+    loss_reasons: dict[str, list[_ListenerName]] = {}
     not_listening: list[_ListenerName]
     answers: list[AnswerRecord] | None
 
@@ -111,10 +114,11 @@ def document(
     shown: Iterable[Transmission],
     exchanges: Exchanges,
     names: BlockNames,
+    losses: ChannelLosses,
 ) -> Iterator[str]:
     """Yield the lines of one JSON document, with one line per datagram."""
     clock = captures.clock
-    record = PacketsRecord(
+    packets = PacketsRecord(
         epoch_us=clock.epoch_ns // 1000,
         speedup=clock.speedup,
         of_run=clock.of_run,
@@ -123,12 +127,15 @@ def document(
         errors=captures.errors,
         datagrams=[],
     )
-    whole = record.model_dump(mode="json", by_alias=True)
+    whole = packets.model_dump(mode="json", by_alias=True)
     del whole["datagrams"]
     yield json.dumps(whole)[:-1] + ', "datagrams": ['
     separator = ""
     for transmission in shown:
-        yield separator + _datagram(transmission, exchanges, names).model_dump_json()
+        record = _datagram(transmission, exchanges, names)
+        if reasons := loss_reasons(losses, transmission):
+            record.loss_reasons = reasons
+        yield separator + record.model_dump_json(exclude_unset=True)
         separator = ","
     yield "]}"
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import Captures
 from harness.archive.packets.capture_reader import ListenerName
-from harness.archive.packets.channel_losses import DROPS, ChannelLosses
+from harness.archive.packets.channel_losses import DROPS, ChannelLosses, loss_reasons
 from harness.archive.packets.datagram import MessageSummary
 from harness.archive.packets.exchanges import Exchanges, Outcome, RequestOutcome
 from harness.archive.packets.selection import Exchange, block_arrivals
@@ -60,15 +60,9 @@ class TransmissionText:
 
     def _reasons(self, transmission: Transmission) -> str:
         """Return why the channel lost the message, if there was a channel and it lost it."""
-        reasons = self._losses.get((transmission.sender, transmission.sequence), {})
-        named = {
-            reason: vehicles if reason in DROPS else [name for name in transmission.lost_by if name in vehicles]
-            for reason, vehicles in reasons.items()
-        }
         words = [
-            reason.replace("_", " ") + (f": {_list(names)}" if names else "")
-            for reason, names in named.items()
-            if names or reason in DROPS
+            reason.replace("_", " ") + ("" if reason in DROPS else f": {_list(names)}")
+            for reason, names in loss_reasons(self._losses, transmission).items()
         ]
         return f" ({'; '.join(words)})" if words else ""
 

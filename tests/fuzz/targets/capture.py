@@ -59,7 +59,7 @@ def _show(paths: list[Path]) -> None:
     list(packets_text.transmission_lines(transmissions, exchanges, TransmissionText(names, str, {}), None))
     packets_text.header(captures)
     list(packets_text.totals(captures, transmissions))
-    list(document(captures, count_losses(transmissions), transmissions, exchanges, names))
+    list(document(captures, count_losses(transmissions), transmissions, exchanges, names, {}))
 
 
 def seeds(flown: Path) -> Iterator[bytes]:

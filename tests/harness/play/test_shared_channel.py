@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from harness.archive.packets.packets_document import PacketsRecord
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario
 from tests.harness.command import harness
@@ -122,3 +123,12 @@ def test_packets_prints_the_reason_of_each_loss(tmp_path: Path) -> None:
     assert all(line["at_s"] <= line["began_s"] < line["ended_s"] for line in collided)
     printed = harness("packets", run, "--lost").stdout
     assert printed.count("(collision: ") + printed.count("half duplex: ") >= len(collided)
+
+    document = json.loads(harness("packets", run, "--json").stdout)
+    PacketsRecord.model_validate(document, extra="forbid")
+    recorded = {(line["sender"], line["sequence"]): line for line in lines}
+    for datagram in document["datagrams"]:
+        line = recorded[datagram["sender"], datagram["sequence"]]
+        expected = {line["dropped"]: datagram["lost_by"]} if "dropped" in line else line["lost"]
+        assert datagram.get("loss_reasons", {}) == expected
+    assert any("loss_reasons" not in datagram for datagram in document["datagrams"])
