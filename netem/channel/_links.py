@@ -19,6 +19,7 @@ from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from operator import add
 from random import Random
 
 from netem._distributions import SCALE, table
@@ -27,6 +28,9 @@ from netem.radio import MIN_DISTANCE_M, Place
 
 STEP = 0.1
 """Change of the shadowing after which it is drawn again: its correlation has then fallen to exp(-STEP), about 0.9."""
+
+_SILENT = -1_000_000
+"""Level in 0.01 dB at a receiver that a frame does not reach. No shadowing makes it audible."""
 
 _TABLE_SIZE = 4096
 _KEPT_STEPS = 1 << 16
@@ -37,15 +41,24 @@ _LIGHT_M_PER_S = 299_792_458.0
 @cache
 def linear(centibels: int) -> float:
     """Return the power of this level in 0.01 dB, relative to 10^-6 of level 0."""
+    if centibels < _SILENT // 2:
+        return 0.0
     tens, step = divmod(centibels, 1000)
     return _MANTISSA[step] * 10.0**tens if tens >= 0 else _MANTISSA[step] / 10.0**-tens
+
+
+@cache
+def _deviations(shadowing_db: float) -> list[int]:
+    """Return equally probable normal deviations in 0.01 dB."""
+    return [round(100 * shadowing_db * quantile / SCALE) for quantile in table("normal", _TABLE_SIZE)]
 
 
 @dataclass(slots=True)
 class Reach:
     """How a frame of one sender arrives at each receiver. Sets of receivers are bits: receiver 0 is the lowest bit."""
 
-    powers: list[float]
+    levels: list[int]
+    """Powers in 0.01 dB."""
     heard: int
     """Receivers that can receive the frame if nothing disturbs it."""
     energetic: int
@@ -56,6 +69,24 @@ class Reach:
     """Receivers that are out of range even without shadowing."""
     cut: int
     """Receivers that listen to another channel."""
+    _powers: list[float] | None = None
+
+    @property
+    def powers(self) -> list[float]:
+        """The power at each receiver. Only frames that overlap need it."""
+        if self._powers is None:
+            self._powers = [linear(level) for level in self.levels]
+        return self._powers
+
+
+@dataclass(slots=True)
+class _Mean:
+    """How frames of one sender arrive without shadowing."""
+
+    levels: list[int]
+    near: int
+    far: int
+    cut: int
 
 
 class Links:
@@ -67,16 +98,16 @@ class Links:
         self._power = _centibels(radio.power_dbm)
         self._sensitivity = _centibels(radio.sensitivity_dbm)
         self._energy = _centibels(energy_dbm)
-        self._deviation = 100 * radio.shadowing_db
         self._each_frame = radio.shadowing_db > 0 and 0.0 in (radio.shadowing_m, radio.shadowing_s)
         self._correlated = radio.shadowing_db > 0 and not self._each_frame
         self._draws = draws
-        self._quantiles = table("normal", _TABLE_SIZE)
+        self._deviations = _deviations(radio.shadowing_db)
+        self._bits = [1 << number for number in range(count)]
         self._group = [0] * count
         self._places = [Place(0.0, 0.0, 0.0)] * count
         self._first_metre_db = 20 * math.log10(4 * math.pi * MIN_DISTANCE_M * radio.frequency_hz / _LIGHT_M_PER_S)
-        self._loss: list[list[int] | None] = [None] * count
-        """Path loss from each sender to all receivers, computed when the sender sends."""
+        self._means: list[_Mean | None] = [None] * count
+        """Computed when the sender sends."""
         self._moved_m = [0.0] * count
         """Metres since the last change of the shadowing."""
         self._shadow = [[0] * count for _ in range(count)]
@@ -97,19 +128,21 @@ class Links:
         if self._correlated and 2 * max(self._moved_m) > STEP * self._radio.shadowing_m:
             self._ages_at = 0
         self._places = list(places)
-        self._loss = [None] * self._count
-        self._reaches = [None] * self._count
+        self._forget()
 
     def tune(self, groups: Sequence[int]) -> None:
         """Let only vehicles with the same number in `groups` hear and disturb each other."""
         self._group = list(groups)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._means = [None] * self._count
         self._reaches = [None] * self._count
 
     def reach(self, sender: int, now_ns: int) -> Reach:
         """Return how a frame arrives that `sender` begins to send now."""
         if self._each_frame:
-            words = self._words(self._count)
-            return self._computed(sender, [self._deviate(word) for word in words])
+            return self._computed(sender, self._drawn(self._count))
         if self._correlated and now_ns >= self._ages_at:
             self._age(now_ns)
         found = self._reaches[sender]
@@ -118,31 +151,34 @@ class Links:
         return found
 
     def _computed(self, sender: int, shadow: Sequence[int]) -> Reach:
-        powers = [0.0] * self._count
-        heard = energetic = faded = far = cut = 0
-        group, own = self._group, self._group[sender]
-        losses = self._loss[sender]
-        if losses is None:
-            losses = self._loss[sender] = [self._path_loss(self._places[sender], place) for place in self._places]
-        for receiver, loss in enumerate(losses):
+        mean = self._means[sender]
+        if mean is None:
+            mean = self._means[sender] = self._mean(sender)
+        levels = list(map(add, mean.levels, shadow))
+        sensitivity, energy = self._sensitivity, self._energy
+        heard = energetic = 0
+        for bit, level in zip(self._bits, levels, strict=True):
+            if level >= sensitivity:
+                heard |= bit
+            if level >= energy:
+                energetic |= bit
+        return Reach(levels, heard, energetic, mean.near & ~heard, mean.far & ~heard, mean.cut)
+
+    def _mean(self, sender: int) -> _Mean:
+        levels = [_SILENT] * self._count
+        near = far = cut = 0
+        for receiver, bit in enumerate(self._bits):
             if receiver == sender:
                 continue
-            bit = 1 << receiver
-            if group[receiver] != own:
+            if self._group[receiver] != self._group[sender]:
                 cut |= bit
                 continue
-            mean = self._power - loss
-            level = mean + shadow[receiver]
-            powers[receiver] = linear(level)
+            level = levels[receiver] = self._power - self._path_loss(self._places[sender], self._places[receiver])
             if level >= self._sensitivity:
-                heard |= bit
-            elif mean < self._sensitivity:
-                far |= bit
+                near |= bit
             else:
-                faded |= bit
-            if level >= self._energy:
-                energetic |= bit
-        return Reach(powers, heard, energetic, faded, far, cut)
+                far |= bit
+        return _Mean(levels, near, far, cut)
 
     def _path_loss(self, one: Place, other: Place) -> int:
         """Return the path loss: log-distance, or over a flat ground whichever of the two is greater.
@@ -169,29 +205,28 @@ class Links:
     def _shift(self, exponent: float | None) -> None:
         """Draw the shadowing again. Without an exponent, nothing of the old shadowing remains."""
         shadow, moved_m = self._shadow, self._moved_m
-        known: dict[float, tuple[float, float]] = {}
-        words = iter(self._words(self._count * (self._count - 1) // 2))
+        known = -1.0
+        kept = rest = 0.0
+        deviations = iter(self._drawn(self._count * (self._count - 1) // 2))
         for one, row in enumerate(shadow):
             for other in range(one):
                 moved = moved_m[one] + moved_m[other]
-                if moved not in known:
+                if moved != known:
+                    known = moved
                     share = 0.0 if exponent is None else math.exp(-exponent - moved / self._radio.shadowing_m)
                     kept = round(share * _KEPT_STEPS) / _KEPT_STEPS
-                    known[moved] = kept, math.sqrt(1 - kept * kept)
-                kept, rest = known[moved]
-                row[other] = shadow[other][one] = round(row[other] * kept + rest * self._deviate(next(words)))
+                    rest = math.sqrt(1 - kept * kept)
+                row[other] = shadow[other][one] = round(row[other] * kept + rest * next(deviations))
         self._moved_m = [0.0] * self._count
         self._reaches = [None] * self._count
 
-    def _deviate(self, word: int) -> int:
-        """Return a normal deviation in 0.01 dB from a word of 16 bits."""
-        return round(self._deviation * self._quantiles[word % _TABLE_SIZE] / SCALE)
-
-    def _words(self, count: int) -> array[int]:
+    def _drawn(self, count: int) -> list[int]:
+        """Draw normal deviations in 0.01 dB."""
         words = array("H", self._draws.randbytes(2 * count))
         if sys.byteorder == "big":
             words.byteswap()
-        return words
+        deviations = self._deviations
+        return [deviations[word % _TABLE_SIZE] for word in words]
 
 
 def _centibels(decibels: float) -> int:
