@@ -51,7 +51,8 @@ class Channel:
         """Stations that send, as bits."""
         self._finished: list[Transmission] = []
         self._numbers = count()
-        self._airtimes: dict[int, int] = {}
+        self._airtimes: dict[int, int | None] = {}
+        """Data bytes -> nanoseconds; None if the radio cannot send a message of this length."""
         self._silence = [linear(round(100 * radio.noise_dbm))] * len(vehicles)
         self._begins = 1 + linear(round(-100 * radio.preamble_db)) / linear(0)
         self._suffices = 1 + linear(round(-100 * radio.sinr_db)) / linear(0)
@@ -65,10 +66,10 @@ class Channel:
         now_ns = nanoseconds(now)
         if self._next_end <= now_ns or self._access.next_due <= now_ns:
             self._play(now_ns)
-        airtime = self._airtimes.get(data_bytes)
+        if data_bytes not in self._airtimes:
+            self._airtimes[data_bytes] = self._airtime(data_bytes)
+        airtime = self._airtimes[data_bytes]
         if airtime is None:
-            airtime = self._airtimes[data_bytes] = self._radio.airtime_ns(data_bytes)
-        if data_bytes > self._radio.largest_bytes or self._access.too_long(airtime):
             return Fate.TOO_LONG
         queue = self._queues[sender]
         if len(queue) >= self._radio.queue_frames:
@@ -81,7 +82,8 @@ class Channel:
 
     def next_event(self) -> float | None:
         """Return when the next frame begins or ends, in seconds; None if all queues are empty."""
-        next_ns = min(self._next_end, self._access.next_due)
+        ends, due = self._next_end, self._access.next_due
+        next_ns = ends if ends < due else due
         return None if next_ns == NEVER else next_ns / NANOSECONDS
 
     def advance(self, now: float) -> list[Transmission]:
@@ -103,11 +105,15 @@ class Channel:
         self._play(nanoseconds(now))
         self._links.tune(groups)
 
+    def _airtime(self, data_bytes: int) -> int | None:
+        airtime = self._radio.airtime_ns(data_bytes)
+        return None if data_bytes > self._radio.largest_bytes or self._access.too_long(airtime) else airtime
+
     def _play(self, until: int) -> None:
         access = self._access
         while True:
             due, ends = access.next_due, self._next_end
-            if min(due, ends) > until:
+            if ends > until and due > until:
                 return
             if ends <= due:
                 for frame in [frame for frame in self._active if frame.ends_ns == ends]:
@@ -122,7 +128,8 @@ class Channel:
             frame.begins_ns, frame.ends_ns = now, now + frame.airtime_ns
             frame.reach = self._links.reach(station, now)
             self._sending |= 1 << station
-            self._next_end = min(self._next_end, frame.ends_ns)
+            if frame.ends_ns < self._next_end:
+                self._next_end = frame.ends_ns
             frames.append(frame)
         if len(frames) == 1 and not self._active:
             frames[0].receiving = frames[0].reach.heard
