@@ -3,26 +3,27 @@
 Theory of operation
 -------------------
 
-An agent builds loggable events into blocks, and keeps a chain of its own and others' blocks that it tries to keep
-equal to its neighbours' chains. It is a set of 20 event handlers (Algorithms 1-20), each triggered by one of three
-things: a message arrives, a timer expires, or a local event happens, which the vehicle or another handler triggers.
-The tables `ON_MESSAGE`, `ON_TIMER` and `ON_LOCAL_EVENT` below say which; `ucp.commit` and `ucp.reconcile` hold the
-handlers, and contract/HANDLERS.md draws how one leads to another.
+An agent collects loggable events in blocks, and holds a chain of its own and other agents' blocks. It keeps this chain
+equal to those of its neighbours. It is a set of 20 event handlers (Algorithms 1-20). Each has one of three triggers: a
+message arrives, a timer expires, or a local event happens, which the vehicle or another handler triggers. The tables
+`ON_MESSAGE`, `ON_TIMER` and `ON_LOCAL_EVENT` below map triggers to handlers. `ucp.commit` and `ucp.reconcile` contain
+the handlers, and contract/HANDLERS.md draws which handler triggers which.
 
-Committing: a full block joins the deque. The agent proposes the deque's front, naming the chain that it would go on
-top of. For 10 seconds every agent that hears answers whether its own chain is that same one. If more agree than not,
-the block is committed and broadcast, and whoever has the same chain follows. If not, chains have parted: reconcile.
+Commit: a full block joins the deque. The agent proposes the front of the deque, with the top chain hash of its chain.
+For 10 seconds all other agents vote: an agent approves if its own chain has the same top chain hash. With a majority of
+the votes, the agent commits the block and broadcasts it, and agents with the same chain commit it too. Without a
+majority, the chains have diverged, and the agent starts a reconcile.
 
-Reconciling: blocks are popped onto a stack until the majority of whoever answers contains what is left (phase 1);
-then the majority's successors are asked for and committed one by one (phases 2 and 3); then what is left of the stack
-goes back on top and is broadcast (finalize). An agent that is asked for the successor of a chain that it does not
-have learns that it has diverged, and reconciles as well. While it reconciles, an agent answers nobody.
+Reconcile: the agent pops blocks from its chain onto a stack until the majority of the answering agents have its chain
+in theirs (phase 1). It asks for the successors in the majority's chain and commits them one by one (phases 2 and 3).
+Then it commits the rest of the stack again and broadcasts it (finalize). An agent that is asked for the successor of a
+chain hash that it does not have has diverged, and starts a reconcile too. An agent that reconciles answers no message.
 
-An agent has two faces. Its handlers see `ucp.core.Core`: the protocol state, and what they may do to it. Whoever drives
-it sees `Agent`, and the state to look at, as `agent.state`.
+An agent has two interfaces. Its handlers use `ucp.core.Core`: the protocol state and its operations. The caller uses
+`Agent`, and may read the state as `agent.state`.
 
-The agent does no I/O: it never opens a socket, reads a clock, starts a thread or draws from a random generator. It is
-driven, and it answers with what to do:
+The agent does no I/O: it never opens a socket, reads a clock, starts a thread or draws a random number. The caller
+passes input and time, and the agent returns datagrams and the time of its next timer:
 
     agent.receive_datagram(data, now)      agent.add_event(event, now)
     agent.next_timer()                     agent.handle_timer(now)
@@ -30,12 +31,11 @@ driven, and it answers with what to do:
 
 `now` is mission time in seconds and never goes back. Equal inputs give equal outputs.
 
-A handler runs to its end, then the local events that it triggered run in order, then comes the next input. That is
-why there are none of the thesis's re-entrant locks: they guard state between threads, and here is only one. For the
-same reason the thesis's tests of a flag before the lock is taken cannot race.
+A handler runs to its end. Then the local events that it triggered run in order, and only then the next input. The
+thesis has re-entrant locks, which guard the state between threads. An agent has one thread and needs none. For the same
+reason, the thesis's test of a flag before it takes the lock cannot race.
 
-Whatever the radio delivers, the agent counts what is not a well-formed message from another agent on the roster in
-`dropped`, and nothing else happens.
+A datagram that is not a well-formed message from another agent on the roster has no effect. `dropped` counts it.
 """
 
 import math
@@ -206,7 +206,7 @@ class Agent:
         return None if timer is None else timer.deadline
 
     def _soonest(self) -> Timer | None:
-        """The timer that ends next."""
+        """Return the timer that expires next. None if no timer runs."""
         soonest, ends = None, math.inf
         for timer in self.state.timers:
             deadline = timer.deadline
@@ -236,7 +236,7 @@ class Agent:
         self._handle(now, TimerTrigger(timer.name), None, self._on_timer[timer.name])
 
     def boot(self, recovered: StoredState, now: float) -> None:
-        """Restore the state that an earlier life stored on disk. Call it before any other input.
+        """Restore the state that an earlier incarnation stored on disk. Call it before any other input.
 
         Timers, votes and the current block are lost. A reconcile in progress ends as if no agent had answered
         (Algorithm 20): the rest of the stack goes back onto the chain, then the deque's front is proposed again.
@@ -273,7 +273,7 @@ class Agent:
     # How a handler runs
 
     def _drop(self, now: float, reason: str, datagram: Recorded | None) -> None:
-        """What came is not for any handler."""
+        """Count a datagram that no handler gets."""
         self.dropped[reason] += 1
         if self._tracing:
             self._trace.append(Dropped(now, reason, datagram or Recorded("")))
@@ -329,7 +329,7 @@ class Agent:
 
 
 def why_not_handled(agent_id: int, roster: Container[int], sender: int, message: Message) -> str | None:
-    """Why the agent drops a well-formed message; None if it handles it: it is another's, and of the roster's blocks."""
+    """Return the reason why the agent drops a well-formed message. None if it handles the message."""
     if sender == agent_id:
         return "own sender"
     if sender not in roster:
@@ -340,7 +340,7 @@ def why_not_handled(agent_id: int, roster: Container[int], sender: int, message:
 
 
 def tally_of(core: Core, handler: EventHandler[Any]) -> Tally | None:
-    """What the handler counts in, or chooses from that, as a trace has it; None if it does neither."""
+    """Return the counters or the choice of the handler for the trace. None if it has neither."""
     if handler.tally is None:
         return None
     if handler.tally == "majority_response_block_hash":

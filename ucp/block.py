@@ -1,7 +1,7 @@
 """Blocks and their hashes (Section 3.4, eq. 3.1-3.5).
 
-A block is what its agent made and nothing else: the chain hash (eq. 3.2) belongs to a position in a chain, not to
-the block, so it lives in `ucp.chain`. A block therefore never changes when it is popped and committed again.
+A block does not contain its chain hash (eq. 3.2), which belongs to a position in a chain (`ucp.chain`). A block
+therefore does not change if it is popped and committed again.
 """
 
 from functools import lru_cache
@@ -9,7 +9,7 @@ from functools import lru_cache
 from ucp._dataclass import dataclass, field
 from ucp.wire import Kind, struct_of
 
-try:  # hashlib brings OpenSSL along, which is a quarter of an agent's memory, for a few hashes a minute
+try:  # hashlib loads OpenSSL, which needs a quarter of an agent's memory
     from _sha2 import sha256  # type: ignore[import-not-found]
 except ImportError:
     try:
@@ -21,13 +21,13 @@ HASH_BYTES = 32
 MAX_EVENT_DATA_BYTES = 1024
 MAX_AGENT_ID = 0xFFFF
 LATEST_US = 2**64 - 1
-"""No timestamp is later."""
+"""Latest timestamp in microseconds."""
 
 CHAIN_HASHES_KEPT = 4096
-"""Agents of one process, and who judges them, come upon the same ones again and again."""
+"""Number of chain hashes in the cache. Agents of one process, and their judge, compute the same ones."""
 
 BLOCK_FIELDS = {"agent_id": Kind.U32, "timestamp_us": Kind.U64}
-"""What stands before a block's event data."""
+"""The header of a block."""
 BLOCK_HEADER = struct_of(BLOCK_FIELDS)
 
 

@@ -1,7 +1,7 @@
 """Building and committing blocks: Algorithms 1-6 (Sections 3.6.1 and 3.6.2).
 
-A full block waits in the deque, is proposed to the local UVS, and is committed if more agents approve than disapprove.
-Anything else means that chains have parted, and starts a reconcile.
+A full block waits in the deque. The agent proposes it to the local UVS, and commits it if more agents approve than
+disapprove. Otherwise the chains have diverged, and the agent starts a reconcile.
 """
 
 from ucp.block import LATEST_US, Block, next_chain_hash
@@ -96,9 +96,9 @@ def receive_vote_add_block(core: Core, sender: int, message: BlockAddResponse) -
 def vote_timer_expiration(core: Core) -> str:
     """Algorithm 5, Vote Timer Expiration: commit the candidate, vote again, or reconcile.
 
-    The pseudo-code does nothing when the chain changed during an approved vote; the prose and Section 4.3 vote again,
-    without which an agent would go idle with a block in its deque. A tie is not a majority: reconcile. With the setting
-    `asks_after_commit` Algorithm 20 will ask who does not follow, when the commit has had time to be heard.
+    The pseudo-code does nothing if the chain changed during an approved vote. The text and Section 4.3 vote again.
+    Otherwise an agent would become idle with a block in its deque. A tie is no majority and starts a reconcile. With
+    the setting `asks_after_commit`, Algorithm 20 asks which agents did not follow, after the commit has arrived.
     """
     if core.reconcile_in_progress:
         return "reconcile in progress"
@@ -123,14 +123,14 @@ def vote_timer_expiration(core: Core) -> str:
 def receive_commit_block(core: Core, sender: int, message: CommitBlock) -> str:
     """Algorithm 6, Receive Commit Block: another agent committed a block; follow if it succeeds our top.
 
-    Figure 3.9 says that this handler is also triggered locally. It is not: local commits happen in line, because
-    during Reconcile Finalize its own first test would refuse them.
+    In Figure 3.9 this handler also has a local trigger. Here it has none: an agent commits its own blocks directly,
+    because the first test of this handler would refuse them during Reconcile Finalize.
     """
     if core.reconcile_in_progress:
         return "reconcile in progress"
     if message.chain_hash != next_chain_hash(core.chain.top_chain_hash, message.block.block_hash):
         return "does not succeed"
     if core.holds(message.block.block_hash):
-        return "held already"  # no agent in good faith sends this; a second copy would break characteristic 3
+        return "held already"  # no correct agent sends this; a second copy would violate characteristic 3
     core.commit(message.block)
     return "committed"

@@ -1,7 +1,7 @@
-"""What event handlers may do to the protocol state of their vehicle.
+"""The operations of event handlers on the protocol state of their agent.
 
-An agent has two faces. `ucp.agent` is the one that whoever drives it sees; this is the one that its handlers see. A
-handler is held to what it has declared: to send, start or trigger anything else is an error of the handler.
+Handlers use this interface of an agent, and callers use `ucp.agent`. A handler may send, start and trigger only what it
+declares. Anything else raises an error.
 """
 
 from collections.abc import Callable, Iterable
@@ -17,19 +17,19 @@ from ucp.timers import Timer
 from ucp.trace import Recorded, Sent
 
 Seal = Callable[[bytes, int], bytes]
-"""What event data becomes when it is sealed, given it and its block's timestamp."""
+"""A function that seals event data, given this data and the timestamp of its block."""
 
 
 class Core(AgentState):
-    """The state, what handlers do to it, and what has come of that since the agent last took it away.
+    """The state, its operations, and their results since the agent last took them.
 
-    `outbox` has (sequence, message, its datagram as it is on record) to broadcast. `changes`, `announced` and `started`
-    are what the running handler changed, sent and started, as a line of the trace says it; like the record of datagrams
-    they are kept only while `tracing`. `sealed` is what it sealed, if it did: nobody else could do it again.
+    `outbox` has the (sequence, message, recorded datagram) to broadcast. `changes`, `announced` and `started` are the
+    changes, messages and timers of the running handler, as in a trace. They and the recorded datagrams exist only with
+    `tracing`. `sealed` is the event data that the handler sealed, because a replay cannot seal it again.
     """
 
     running: EventHandler[Any]
-    """The handler that runs."""
+    """The running handler."""
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class Core(AgentState):
     def restore(
         self, completed: Iterable[bytes], chain: Iterable[Block], deque: Iterable[Block], stack: Iterable[Block]
     ) -> None:
-        """Hold what an agent held that lost its power, and end the reconcile that it may have been in."""
+        """Restore the data of an earlier incarnation, and end the reconcile that it may have been in."""
         self.reconcile_in_progress = True
         for block_hash in completed:
             self.completed.append(block_hash)
@@ -91,13 +91,13 @@ class Core(AgentState):
             self.push_onto_deque(block)
         for block in stack:
             self.push_onto_stack(block)
-        own = set(self.completed)  # whatever others may have sent in its name
+        own = set(self.completed)  # other agents may have sent blocks in its name
         for block in (*self.chain, *self.blocks_to_be_committed, *self.reconcile_stack):
             if block.block_hash in own:
                 self.newest_block_timestamp_us = max(self.newest_block_timestamp_us, block.timestamp_us)
 
     def event_data(self, timestamp_us: int) -> bytes:
-        """What goes into a block of what was built: its events, or what they are sealed to (`ucp.secure`)."""
+        """Return the event data of the block under construction, sealed if the mission seals it (`ucp.secure`)."""
         events = bytes(self.current_block)
         if self._seal is None:
             return events
@@ -147,7 +147,7 @@ class Core(AgentState):
         return block
 
     def remove_from_stack(self, block_hash: bytes) -> Block | None:
-        """Take the block out of the reconcile stack, wherever in it; None if it is not there."""
+        """Remove the block from any place of the reconcile stack, and return it. None if it is not there."""
         for position in range(len(self.reconcile_stack) - 1, -1, -1):  # the mutual successor is mostly on top
             if self.reconcile_stack[position].block_hash == block_hash:
                 block = self.reconcile_stack.pop(position)

@@ -11,7 +11,7 @@ from ucp._dataclass import dataclass
 from ucp.wire import Kind, struct_of
 
 EVENT_FIELDS = {"timestamp_us": Kind.U64, "event_id": Kind.U8, "length": Kind.U16}
-"""What stands before an event's data."""
+"""The header of an event."""
 _HEADER = struct_of(EVENT_FIELDS)
 EVENT_HEADER_BYTES = _HEADER.size
 MAX_EVENT_BYTES = EVENT_HEADER_BYTES + 256
@@ -19,13 +19,13 @@ MAX_EVENT_BYTES = EVENT_HEADER_BYTES + 256
 
 MEAN_TIME_BETWEEN_EVENTS_S = 30.0
 MAX_MEAN_S = 31 * 86400.0
-"""No mission is longer; and to find out that nothing happens for years takes minutes."""
+"""Maximum mean in seconds. No mission is longer, and a search for an event over years takes minutes."""
 TRIAL_PERIOD_S = 1.0
 EVENT_DATA_BYTES = (32, 64, 128, 256)
 
 
 EventKind = Literal["mode", "arming", "text", "waypoint", "failsafe", "position", "battery"]
-"""What a mission can choose to log of a vehicle's telemetry."""
+"""A kind of telemetry event that a mission can select."""
 
 DEFAULT_LOG: tuple[EventKind, ...] = ("mode", "arming", "text", "position")
 
@@ -71,7 +71,7 @@ def decode_events(event_data: bytes) -> list[LoggableEvent]:
 
 
 def decode_event(event_data: bytes, offset: int) -> tuple[LoggableEvent, int]:
-    """The event that begins at `offset`, and where it ends. Raises MalformedEventsError."""
+    """Return the event that begins at `offset`, and the offset of its end. Raises MalformedEventsError."""
     body = offset + EVENT_HEADER_BYTES
     if body > len(event_data):
         raise MalformedEventsError(f"event header at byte {offset} is cut off")
@@ -95,7 +95,7 @@ class RandomEvents:
         self._next_trial_s = rng.random() * TRIAL_PERIOD_S
 
     def next(self) -> tuple[float, int, bytes]:
-        """Run trials until something happens: (mission seconds, event_id, data)."""
+        """Run trials until the next event. Return (mission second, event_id, data)."""
         lot, probability, at_s = self._rng.random, self._probability, self._next_trial_s
         while lot() > probability:
             at_s += TRIAL_PERIOD_S

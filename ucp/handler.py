@@ -1,7 +1,7 @@
-"""What an event handler is: one of Algorithms 1-20, and all that it declares.
+"""Event handlers: the function of one of Algorithms 1-20, and its declarations.
 
-A handler declares the branches that it can take, the messages that it may send, the timers that it may start and the
-local events that it may trigger. `ucp.core` holds it to that, and `docs.generate.handlers` draws the protocol from it.
+A handler declares its branches, and the messages, timers and local events that it may send, start and trigger.
+`ucp.core` enforces the declarations, and `docs.generate.handlers` draws the protocol from them.
 """
 
 import re
@@ -22,12 +22,12 @@ LocalEvent = Literal[
     "Reconcile Phase 3",
     "Reconcile Finalize",
 ]
-"""What happens inside an agent (Figure 3.3: the parallelograms), by its name in the thesis."""
+"""A local event of an agent (the parallelograms of Figure 3.3), by its name in the thesis."""
 
 
 @dataclass(frozen=True, eq=False)
 class EventHandler(Generic[P]):
-    """`run` is given the agent's core, then its input; it returns the branch that it took."""
+    """An event handler. `run` gets the core of the agent and the input, and returns the name of the branch."""
 
     name: str
     run: Callable[P, str]
@@ -37,11 +37,11 @@ class EventHandler(Generic[P]):
     starts: tuple[str, ...]
     triggers: tuple[LocalEvent, ...]
     tally: str | None = None
-    """Name of the part of the state that it counts in, or into which it puts what it chooses."""
+    """Attribute of the state with the counters or the choice of the handler. None without one."""
 
     @property
     def title(self) -> str:
-        """Number and name of the algorithm, as a good handler's docstring begins."""
+        """Return number and name of the algorithm. The docstring of each handler begins with them."""
         algorithm = re.match(rf"Algorithm ({self.algorithm}), (\w[\w ]+\w)", self.run.__doc__ or "")
         assert algorithm, f"{self.name} says which algorithm it is"
         return " ".join(algorithm.groups())
@@ -55,9 +55,10 @@ def event_handler(
     triggers: tuple[LocalEvent, ...] = (),
     tally: str | None = None,
 ) -> Callable[[Callable[P, str]], EventHandler[P]]:
-    """Declare a function to be the handler of Algorithm `algorithm`, and the most that it does.
+    """Declare a function as the handler of Algorithm `algorithm`.
 
-    `branches` are those that it returns; `starts` names timers, `tally` what of the state it counts in, or chooses.
+    `branches` has all return values. `sends`, `starts` and `triggers` have the allowed messages, timers and local
+    events. `tally` is the attribute of the state with its counters or its choice.
     """
 
     def declare(run: Callable[P, str]) -> EventHandler[P]:

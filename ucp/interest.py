@@ -1,9 +1,9 @@
-"""To whom a message can matter.
+"""Decide which messages can have an effect on which agents.
 
-Everything is broadcast, so N agents hear N times what each of them says, and nearly all of it changes nothing: an
-answer is for the agents that asked, and whoever reconciles answers nobody. This tells so from an agent's state, without
-running a handler. A driver in virtual time need not deliver what does not matter. Radios deliver it all the same, and
-the handlers then do nothing, as Algorithms 1-20 say.
+All messages are broadcast, so each of N agents receives the messages of all others. Most of them have no effect: an
+answer matters only to agents that asked, and an agent that reconciles answers no message. This module decides it from
+the state of an agent, without a handler run. A driver in virtual time may withhold messages without effect. Radios
+deliver them, and the handlers then do nothing, as Algorithms 1-20 define.
 """
 
 from collections.abc import Callable
@@ -25,12 +25,12 @@ from ucp.settings import Settings
 from ucp.state import AgentState
 
 Question = tuple[type[Message], bytes]
-"""What an agent wants to hear: answers of this type about this block or chain, or both.
+"""A question of an agent: the type of the answers, and their block or chain.
 
-It can have two questions at a time: one about its vote (of type Block Add Response), and one of its reconcile."""
+An agent can have two questions at a time: one about its vote (type Block Add Response), and one of its reconcile."""
 
 ONLY_COUNTED = frozenset((BlockAddResponse, ChainContainResponse, NextInSequenceResponse))
-"""Answers whose handlers only tally (Algorithms 4, 10 and 14): they send nothing and touch no timer."""
+"""Answers whose handlers only count (Algorithms 4, 10 and 14). They send no message and change no timer."""
 
 ASKED: dict[type[Message], Callable[[Any, Settings], Question]] = {
     BlockAddRequest: lambda message, settings: (
@@ -41,7 +41,7 @@ ASKED: dict[type[Message], Callable[[Any, Settings], Question]] = {
     ChainHashSuccessorQuery: lambda message, settings: (NextInSequenceResponse, message.chain_hash),
     RequestForBlock: lambda message, settings: (BlockResponse, message.block_hash),
 }
-"""Message -> what its sender wants to hear from now on; other messages ask nothing."""
+"""Message -> the question of its sender from now on. Other messages are no questions."""
 
 ANSWERED: dict[type[Message], Callable[[Any], Question]] = {
     BlockAddResponse: lambda message: (
@@ -52,7 +52,7 @@ ANSWERED: dict[type[Message], Callable[[Any], Question]] = {
     NextInSequenceResponse: lambda message: (NextInSequenceResponse, message.chain_hash),
     BlockResponse: lambda message: (BlockResponse, message.block.block_hash),
 }
-"""Message -> the question that it answers, so that it is nothing to those who have not asked it."""
+"""Message -> the question that it answers. It has no effect on agents without this question."""
 
 STILL_ASKED: dict[type[Message], Callable[[AgentState], bool]] = {
     BlockAddResponse: lambda state: state.voting_timer.active,
@@ -60,7 +60,7 @@ STILL_ASKED: dict[type[Message], Callable[[AgentState], bool]] = {
     NextInSequenceResponse: lambda state: state.phase_two_timer.active,
     BlockResponse: lambda state: state.phase_three_timer.active,
 }
-"""Answer -> whether the agent still waits for any of its type."""
+"""Answer -> function that returns true if the agent still waits for answers of this type."""
 
 MATTERS: dict[type[Message], Callable[[AgentState, int, Any], bool]] = {
     BlockAddRequest: lambda state, sender, message: not state.reconcile_in_progress,
@@ -91,4 +91,4 @@ MATTERS: dict[type[Message], Callable[[AgentState, int, Any], bool]] = {
         state.phase_three_timer.active and message.block.block_hash == state.majority_response_block_hash
     ),
 }
-"""(state of an agent, sender, message) -> whether the handler could change the agent, or make it send anything."""
+"""Message -> function of (state, sender, message) that returns true if the message can have an effect."""

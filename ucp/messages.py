@@ -4,13 +4,13 @@ Every datagram is broadcast and begins with one header, big-endian:
 
     magic "UC" | version u8 | type u8 | sender u32 | sequence u32 | body length u16
 
-The sender's sequence number identifies a datagram in traces and captures; the protocol does not use it. A datagram
-that is not exactly one well-formed message is refused with MalformedDatagramError: a radio delivers anything.
+The sender's sequence number identifies a datagram in traces and captures. The protocol does not use it. A datagram that
+is not exactly one well-formed message raises MalformedDatagramError.
 
-A message's WIRE declares its fields as they are sent, and the layers of `ucp.scapy` are made from it. `body` and
-`from_body` are written out for speed; tests hold them to WIRE.
+WIRE of a message declares its fields in their order. The layers of `ucp.scapy` are made from it. `body` and `from_body`
+are written by hand for speed, and tests compare them with WIRE.
 
-Nobody changes a message. That nobody could would make each take three times as long to make.
+Treat messages as immutable. They are not frozen, because creating a frozen object takes three times as long.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from ucp.block import BLOCK_HEADER, HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYT
 from ucp.wire import VARIABLE, Fields, Kind, struct_of
 
 PORT = 14600
-"""The UDP port of the harness's swarms; an agent is told its own in its mission file."""
+"""Default UDP port. The mission file of an agent contains its port."""
 MAGIC = b"UC"
 VERSION = 1
 HEADER_FIELDS = {
@@ -245,7 +245,7 @@ CARRY_A_BLOCK = frozenset((CommitBlock, BlockResponse))
 
 
 def block_named(message: Message) -> bytes | None:
-    """The hash of the block that a message is about, if it is about one."""
+    """Return the hash of the block that a message concerns. None if it concerns none."""
     if type(message) in CARRY_A_BLOCK:
         return message.block.block_hash  # type: ignore[union-attr]
     return getattr(message, "block_hash", None)
@@ -255,18 +255,18 @@ _FIXED_BYTES: dict[type[Message], int] = {
     message: HEADER.size + struct_of({name: kind for name, kind in message.WIRE.items() if kind not in VARIABLE}).size
     for message in TYPE_CODES
 }
-"""Length of each message's datagram, without what may be longer or shorter."""
+"""Length of the datagram of each message, without its part of variable length."""
 _MORE_BYTES: dict[type[Message], Callable[[Any], int]] = {
     BlockAddResponse: lambda message: HASH_BYTES if message.chain_hash else 0,
     CommitBlock: lambda message: BLOCK_HEADER.size + len(message.block.event_data),
     NextInSequenceResponse: lambda message: HASH_BYTES if message.block_hash else 0,
     BlockResponse: lambda message: BLOCK_HEADER.size + len(message.block.event_data),
 }
-"""Length of just that."""
+"""Length of this part of variable length."""
 
 
 def datagram_bytes(message: Message) -> int:
-    """Length of the datagram that `encode` makes of `message`."""
+    """Return the length in bytes of the encoded message."""
     kind = type(message)
     more = _MORE_BYTES.get(kind)
     return _FIXED_BYTES[kind] if more is None else _FIXED_BYTES[kind] + more(message)

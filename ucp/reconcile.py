@@ -1,8 +1,8 @@
 """Bringing a chain back into agreement with the local UVS: Algorithms 7-20 (Section 3.6.3).
 
-Phase 1 pops blocks onto the reconcile stack until the majority contains what is left. Phases 2 and 3 ask, block by
-block, what the majority has on top of that, and commit it. Finalize puts the rest of the stack back on top, telling
-everybody. While `reconcile_in_progress` is set the agent answers nobody.
+Phase 1 pops blocks onto the reconcile stack until the majority of agents contains the rest of the chain. Phases 2 and 3
+ask for the successors in the majority's chain, block by block, and commit them. Finalize commits the rest of the stack
+again, and broadcasts each block. While `reconcile_in_progress` is set, the agent answers no message.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ def reconcile_begin(core: Core) -> str:
 
 @event_handler(8, "asked", sends=(ChainContainQuery,), starts=("phase one",), tally="reconcile_vote_count")
 def reconcile_phase_1(core: Core) -> str:
-    """Algorithm 8, Reconcile Phase 1: ask who contains our top chain hash."""
+    """Algorithm 8, Reconcile Phase 1: ask which agents contain our top chain hash."""
     core.reconcile_vote_count = {"yes": 0, "no": 0}
     core.reconcile_responders.clear()
     core.send(ChainContainQuery(core.chain.top_chain_hash))
@@ -82,7 +82,7 @@ def receive_phase_1_response(core: Core, sender: int, message: ChainContainRespo
 def reconcile_phase_1_timer_expiration(core: Core) -> str:
     """Algorithm 11, Reconcile Phase 1 Timer Expiration: pop a block, or go on to phase 2.
 
-    A tie goes to phase 2 as printed (`<`), unless the setting `phase1_tie` says "pop".
+    A tie continues with phase 2 as printed (`<`), unless the setting `phase1_tie` is "pop".
     """
     yes, no = core.reconcile_vote_count["yes"], core.reconcile_vote_count["no"]
     if yes + no == 0:
@@ -90,7 +90,7 @@ def reconcile_phase_1_timer_expiration(core: Core) -> str:
         return "no response"
     if yes < no or (yes == no and core.settings.phase1_tie == "pop"):
         if not len(core.chain):
-            core.trigger("Reconcile Finalize")  # everybody has the inception block: a "no" to it is a stranger's
+            core.trigger("Reconcile Finalize")  # all agents have the inception block: a "no" is invalid
             return "at inception"
         core.pop_to_stack()
         core.trigger("Reconcile Phase 1")
@@ -166,15 +166,16 @@ def receive_response_next_in_sequence(core: Core, sender: int, message: NextInSe
 
 
 def most_named(candidates: Mapping[bytes, Sequence[int]]) -> list[bytes]:
-    """The candidates of phase 2 that most responders name: none if nobody has answered, more than one in a tie."""
+    """Return the candidates of phase 2 with the most votes: none without an answer, several in a tie."""
     most = max((count for count, _ in candidates.values()), default=0)
     return [candidate for candidate, (count, _) in candidates.items() if count == most]
 
 
 def without_minority_top(candidates: Mapping[bytes, Sequence[int]]) -> Mapping[bytes, Sequence[int]]:
-    """The candidates of phase 2; without "Is Top Of Chain" where as many name a block as, with whoever asks, do not.
+    """Return the candidates of phase 2, without "Is Top Of Chain" if a vote on this chain would not be approved.
 
-    That is when they would refuse the block that is proposed next, on top of this chain (Algorithms 3 and 5).
+    The responders that name a block would refuse the next proposed block (Algorithms 3 and 5). The asking agent counts
+    for "Is Top Of Chain".
     """
     with_us = 1 + candidates.get(IS_TOP_OF_CHAIN, (0,))[0]
     blocks = {candidate: counted for candidate, counted in candidates.items() if candidate != IS_TOP_OF_CHAIN}
@@ -194,9 +195,10 @@ def without_minority_top(candidates: Mapping[bytes, Sequence[int]]) -> Mapping[b
 def reconcile_phase_2_timer_expiration(core: Core) -> str:
     """Algorithm 15, Reconcile Phase 2 Timer Expiration: choose the plurality's answer.
 
-    A tie goes to the oldest timestamp, equal timestamps to the lowest hash. With the setting `phase2_tie` "block", a
-    tie never ends the search while a block is on offer. With `top_needs_majority` nothing less than what a vote needs
-    does: without it whoever is refused may be told that nothing follows, propose again, and so on for ever.
+    In a tie the oldest timestamp decides, and with equal timestamps the lowest hash. With the setting `phase2_tie`
+    "block", a tie never ends the search while a block is on offer. With `top_needs_majority`, only the majority of a
+    vote ends the search. Without it, a refused agent may learn that no block follows, propose again, and be refused
+    forever.
     """
     candidates: Mapping[bytes, Sequence[int]] = core.reconcile_response_dictionary
     if not candidates:
@@ -229,7 +231,7 @@ def reconcile_phase_2_timer_expiration(core: Core) -> str:
 def reconcile_phase_3(core: Core) -> str:
     """Algorithm 16, Reconcile Phase 3: take the block from the reconcile stack, or ask for it.
 
-    The pseudo-code stops after a block from the stack; Section 3.5.3 step 4 continues with phase 2, without which the
+    The pseudo-code stops after a block from the stack. Section 3.5.3 step 4 continues with phase 2. Otherwise the
     reconcile would never end.
     """
     block_hash = core.majority_response_block_hash
@@ -242,7 +244,7 @@ def reconcile_phase_3(core: Core) -> str:
         return "from the stack"
     if core.holds(block_hash):
         core.majority_response_block_hash = None
-        core.trigger("Reconcile Finalize")  # no chain in good faith offers it: a second copy is never committed
+        core.trigger("Reconcile Finalize")  # no correct agent offers it: a second copy is never committed
         return "held already"
     core.start(core.phase_three_timer, core.settings.phase3_timeout_s)
     core.send(RequestForBlock(block_hash))
@@ -263,10 +265,10 @@ def receive_request_block_for_hash(core: Core, sender: int, message: RequestForB
 
 @event_handler(18, "not in phase 3", "another block", "committed", triggers=("Reconcile Phase 2",))
 def receive_response_block_for_hash(core: Core, sender: int, message: BlockResponse) -> str:
-    """Algorithm 18, Receive Response Block for Hash: commit the block that was asked for.
+    """Algorithm 18, Receive Response Block for Hash: commit the requested block.
 
-    The thesis pauses the timer while it looks; a handler is atomic here, so the pause costs nothing and changes
-    nothing. `Core.commit` computes the chain hash anew, which the field test forgot (`ucp.quirks`).
+    The thesis pauses the timer during the test. A handler is atomic here, so the pause has no effect. `Core.commit`
+    computes the chain hash again, which the agents of the field test did not (`ucp.quirks`).
     """
     if not core.phase_three_timer.active:
         return "not in phase 3"
@@ -299,12 +301,12 @@ def reconcile_phase_3_timer_expiration(core: Core) -> str:
     triggers=("Process Next Deque Block",),
 )
 def reconcile_finalize(core: Core) -> str:
-    """Algorithm 20, Reconcile Finalize: put the reconcile stack back on top of the chain, telling everybody.
+    """Algorithm 20, Reconcile Finalize: commit the reconcile stack again, and broadcast each block.
 
-    Section 4.2 pauses between commits so that others can follow: the handler runs once more when `finalize_gap_s` is
-    over, and the flag stays set meanwhile. With the setting `asks_after_commit` the gap also follows a commit of
-    Algorithm 5, and then nothing is left to put back: whoever does not have the chain learns it by being asked for what
-    follows it (Algorithm 13).
+    Section 4.2 pauses between commits so that other agents can follow: the handler runs again after `finalize_gap_s`,
+    and the flag stays set until then. With the setting `asks_after_commit`, the gap also follows a commit of Algorithm
+    5. The stack is empty then, and the handler only asks for the successor of the chain. An agent without this chain
+    learns by this query that it has diverged (Algorithm 13).
     """
     if core.settings.asks_after_commit and not core.reconcile_in_progress:
         core.send(ChainHashSuccessorQuery(core.chain.top_chain_hash))

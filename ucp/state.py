@@ -1,7 +1,6 @@
-"""The protocol state of one vehicle; the names of its parts are the thesis's.
+"""The protocol state of one agent. Its attributes have the names of the thesis.
 
-Whoever drives an agent, exports its chain or keeps its store may look at this. Only event handlers change it, through
-`ucp.core`.
+Drivers, chain exports and stores may read the state. Only event handlers change it, through `ucp.core`.
 """
 
 from collections import Counter, deque
@@ -14,7 +13,7 @@ from ucp.timers import Timer
 
 
 class AgentState:
-    """What an agent holds, asks and counts. `now` is when its last input came, in mission seconds."""
+    """The blocks, questions and counters of an agent. `now` is the mission second of its last input."""
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Settings) -> None:
         self.agent_id = agent_id
@@ -60,12 +59,12 @@ class AgentState:
         self._held_aside: set[bytes] = set()  # hashes of the blocks in the deque and on the reconcile stack
 
     def holds(self, block_hash: bytes) -> bool:
-        """Is the block in the chain, the deque or the reconcile stack?"""
+        """Return true if the block is in the chain, the deque or the reconcile stack."""
         return block_hash in self.chain or block_hash in self._held_aside
 
     @property
     def idle(self) -> bool:
-        """No timer armed, no reconcile, nothing triggered and not yet run."""
+        """True if no timer runs, no reconcile is in progress, and no triggered handler waits."""
         if self.reconcile_in_progress:
             return False
         for timer in self.timers:

@@ -28,7 +28,7 @@ class Timer:
             self.deadline = None
 
     def resume(self, now: float) -> None:
-        """Go on from where it was paused; resumed in the same instant, it has the same deadline to the last bit."""
+        """Continue from the pause. Resumed at the same instant, it has exactly the same deadline."""
         if self._paused is not None:
             paused_at, deadline = self._paused
             self.deadline = deadline + (now - paused_at)

@@ -1,9 +1,9 @@
-"""What an agent tells about itself: a line of JSON for every handler run, and for all else that reached it.
+"""The trace of an agent: a line of JSON for each handler run, and for each other input.
 
-It suffices to run the agent again: every input is there in full, also the datagrams that were dropped. `changes` is
-complete: whoever replays it has the contents of chain, deque and reconcile stack after every step.
+A trace has all inputs in full, including dropped datagrams, so the agent can run again from it. `changes` is complete:
+a replay of the changes gives the contents of chain, deque and reconcile stack after each step.
 
-A line has datagrams, events and stores in base64. In memory they stay what they were, until somebody wants them so.
+A line has datagrams, events and stores in base64. In memory they stay decoded until their text is needed.
 """
 
 import base64
@@ -28,9 +28,9 @@ class Encodable(Protocol):
 
 
 class Recorded:
-    """Bytes on record: `text` is them in base64, and `content` what they say, None if they were read from a trace.
+    """Recorded bytes: `text` is base64, and `content` the decoded object, None if it was read from a trace.
 
-    Of the same content one will do for all who sent or received it.
+    Sender and receivers of a datagram share one object.
     """
 
     __slots__ = ("_text", "content")
@@ -71,9 +71,9 @@ class Recorded:
 
 @dataclass(slots=True)
 class Sent:
-    """A message broadcast; `block` is the hash of the block that it is about, if it is about one.
+    """A sent message. `block` is the hash of the block that it concerns, or None.
 
-    `datagram` is None in a trace of version 1, which does not have it.
+    `datagram` is None in a trace of version 1, which lacks it.
     """
 
     message: str
@@ -90,7 +90,7 @@ class Sent:
 
 @dataclass(slots=True)
 class StateSummary:
-    """What an agent holds: lengths of chain, deque and reconcile stack, flags, and the top chain hash."""
+    """A summary of the state: lengths of chain, deque and reconcile stack, flags, and the top chain hash."""
 
     chain: int
     deque: int
@@ -169,7 +169,7 @@ class HandlerRun:
 
 @dataclass(slots=True)
 class Dropped:
-    """A datagram that no handler was given, and why."""
+    """A datagram that the agent dropped, and the reason."""
 
     t: float
     dropped: str
@@ -181,7 +181,7 @@ class Dropped:
 
 @dataclass(slots=True)
 class Commanded:
-    """A command that an agent was given that triggers no handler, with all that came with it."""
+    """A command that triggers no handler, with its arguments."""
 
     t: float
     command: str
@@ -192,7 +192,7 @@ class Commanded:
 
 
 Entry = HandlerRun | Dropped | Commanded
-"""What a line of a trace says, but for the first."""
+"""The content of a line of a trace, except the header."""
 
 
 def header_line(
@@ -203,7 +203,7 @@ def header_line(
     clock: dict[str, Any],
     secured: bool = False,
 ) -> str:
-    """The first line of a trace: which agent, in which mission, with which settings and clock."""
+    """Return the first line of a trace: agent, mission, settings and clock."""
     header = {
         "schema": SCHEMA,
         "agent_id": agent_id,

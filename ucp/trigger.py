@@ -144,7 +144,7 @@ KINDS = frozenset(("message", *_OF_ONE_VALUE))
 
 
 def parse(fields: Mapping[str, int | str]) -> Trigger:
-    """Return the trigger that a trace's object says; `UnknownTrigger` if it is none. Keys beside it are ignored."""
+    """Return the trigger of an object in a trace. It is an `UnknownTrigger` if it has no valid key."""
     kinds = KINDS.intersection(fields)
     if len(kinds) != 1:
         return UnknownTrigger(fields)

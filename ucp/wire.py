@@ -10,7 +10,7 @@ from struct import Struct
 
 
 class Kind(Enum):
-    """What a field is; the value of one that has a fixed size is its format in Python's `struct`, big-endian."""
+    """The kind of a field. The value of a fixed size is its format in Python's `struct`, big-endian."""
 
     U8 = "B"
     U16 = "H"
@@ -20,12 +20,12 @@ class Kind(Enum):
     FLAG = "?"
     """One byte, 0 or 1."""
     BOOT = "16s"
-    """Which life of a vehicle, in secured datagrams."""
+    """Number of the incarnation of a vehicle, in secured datagrams."""
     HASH = "32s"
     OPTIONAL_HASH = "hash or nothing"
-    """The last field: all that is left, 32 bytes or none."""
+    """The last field: the remaining bytes, 32 or none."""
     BLOCK = "block"
-    """The last field: all that is left is a block."""
+    """The last field: the remaining bytes, a block."""
 
 
 Fields = Mapping[str, Kind]
@@ -35,5 +35,5 @@ VARIABLE = frozenset((Kind.OPTIONAL_HASH, Kind.BLOCK))
 
 
 def struct_of(fields: Fields) -> Struct:
-    """Packs and unpacks fields of fixed size in their order."""
+    """Return a struct that packs and unpacks fields of fixed size in their order."""
     return Struct("!" + "".join(kind.value for kind in fields.values()))
