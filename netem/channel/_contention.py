@@ -69,6 +69,10 @@ class CarrierSense:
         This runs for each frame and each waiting station, so it counts the slots itself.
         """
         all_due, all_from, all_left, slot, notices = self._due, self._from, self._left, self._slot, now + self._sense
+        resting = self._resting = {station for station in self._resting if self._counted(station, now)}
+        if not all_due and not resting:
+            self.next_due = NEVER
+            return
         busy = [(frame.ends_ns + self._difs, frame.sensed) for frame in frames]
         busy.sort(reverse=True)
         next_due = NEVER
@@ -88,10 +92,7 @@ class CarrierSense:
             if due < next_due:
                 next_due = due
         self.next_due = next_due
-        for station in [*self._resting] if self._resting else ():
-            if self._counted(station, now) == 0:
-                self._resting.remove(station)
-                continue
+        for station in resting:
             for idle_from, sensed in busy:
                 if sensed >> station & 1:
                     all_from[station] = max(all_from[station], idle_from)

@@ -85,8 +85,11 @@ class _Mean:
 
     levels: list[int]
     near: int
+    """Receivers in range."""
     far: int
+    """Receivers out of range."""
     cut: int
+    """Receivers that listen to another channel."""
 
 
 class Links:
