@@ -14,13 +14,15 @@ class UdpCounters:
 
     `broadcasts` counts the broadcasts that arrived, also the vehicle's own ones. `read` counts the datagrams that
     programs have read. `overflowed` counts those that the kernel discarded because the buffer of their socket was full,
-    and `unreachable` those that it discarded because no socket was open.
+    and `unreachable` those that it discarded because no socket was open. `others` counts the datagrams that arrived and
+    are no broadcasts, for example of a program that talks to itself over loopback.
     """
 
     broadcasts: int
     read: int
     overflowed: int
     unreachable: int
+    others: int
 
 
 def read_udp_counters() -> dict[str, int]:
@@ -28,7 +30,9 @@ def read_udp_counters() -> dict[str, int]:
     udp = _counters("snmp", "Udp:")
     unreachable = udp["NoPorts"] + udp["IgnoredMulti"]
     broadcasts = _counters("netstat", "IpExt:")["InBcastPkts"]
-    return asdict(UdpCounters(broadcasts, udp["InDatagrams"], udp["RcvbufErrors"], unreachable))
+    no_datagrams = _counters("snmp", "Tcp:")["InSegs"] + _counters("snmp", "Icmp:")["InMsgs"]
+    others = max(0, _counters("snmp", "Ip:")["InDelivers"] - no_datagrams - broadcasts)
+    return asdict(UdpCounters(broadcasts, udp["InDatagrams"], udp["RcvbufErrors"], unreachable, others))
 
 
 def _counters(file: str, group: str) -> dict[str, int]:

@@ -239,7 +239,7 @@ class DatagramsRead(_Model):
 
     `broadcasts` datagrams arrived, also the agent's own ones. `read` datagrams were read, `before_start` of them before
     the mission began. The kernel discarded `overflowed` datagrams, because the buffer of their socket was full, and
-    `unreachable` datagrams, because no socket was open.
+    `unreachable` datagrams, because no socket was open. `others` datagrams were no broadcasts.
     """
 
     read: int
@@ -247,6 +247,7 @@ class DatagramsRead(_Model):
     overflowed: int
     unreachable: int
     broadcasts: int
+    others: int = 0
 
 
 class BlockHolders(_Model):

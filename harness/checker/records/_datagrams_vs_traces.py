@@ -2,7 +2,8 @@
 
 A trace has a line for each datagram that its agent handled or dropped. The agent also reads its own broadcasts, which
 it ignores. Any further datagram that it read is missing in its trace. A datagram that was read at the end of an
-incarnation may be missing, because the agent ended before it handled the datagram.
+incarnation may be missing, because the agent ended before it handled the datagram. An agent may also use other sockets,
+for example between its processes. Datagrams that are no broadcasts therefore do not count.
 
 An agent that reads nothing has a complete trace. The kernel also counts the broadcasts that arrived at each vehicle. A
 broadcast that was neither read nor discarded by the kernel is left in the socket.
@@ -42,7 +43,8 @@ def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
         handled = sum(isinstance(run.trigger, MessageTrigger) for run in trace.runs)
         dropped = sum(isinstance(aside, Dropped) for _, aside in trace.asides)
         own = sum(len(run.sent) for run in trace.runs)
-        unrecorded = counted.read - counted.before_start - handled - dropped - own
+        read = counted.read - counted.before_start - counted.others
+        unrecorded = read - handled - dropped - own
         if unrecorded > _at_the_end(evidence, agent_id, trace, UNDER_WAY_WALL_S):
             yield of_agent(agent_id, _sentence(counted, unrecorded, handled, dropped, own), short=True)
 

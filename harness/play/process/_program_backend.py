@@ -453,6 +453,7 @@ class ProcessRun:
                 "before_start": self._read_before_start[agent].read,
                 "overflowed": counted[agent].overflowed,
                 "unreachable": counted[agent].unreachable,
+                "others": counted[agent].others,
                 "broadcasts": counted[agent].broadcasts,
             }
             for agent in agents

@@ -61,7 +61,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run(asked, 1, tmp_path_factory.mktemp("whole") / "run", Silent(), backend="sim", delivers_all=True).directory
 
 
-def judged(directory: Path, tmp_path: Path, agent: int, more: int, unread: int = 0) -> Result:
+def judged(directory: Path, tmp_path: Path, agent: int, more: int, unread: int = 0, others: int = 0) -> Result:
     """Judge the run if the kernel had counted the recorded datagrams of an agent, and some more."""
     shutil.copytree(directory, tmp_path / "run")
     lines = [json.loads(line) for line in (directory / f"agents/{agent}.trace.jsonl").read_text().splitlines()]
@@ -69,7 +69,7 @@ def judged(directory: Path, tmp_path: Path, agent: int, more: int, unread: int =
     sent = sum(len(line.get("sent", ())) for line in lines)
     read = received + sent + more + 2
     counters = {"before_start": 2, "read": read, "overflowed": 3, "unreachable": 5, "broadcasts": read + 8 + unread}
-    counted = {str(agent): counters}
+    counted = {str(agent): {**counters, "others": others}}
     edit(tmp_path / "run" / "run.json", lambda record: record.update(datagrams=counted))
     return check(gather(RunArchive(tmp_path / "run")))
 
@@ -99,6 +99,10 @@ def test_agent_that_discards_every_tenth_datagram_is_found(tmp_path: Path) -> No
     assert {finding.agent_id for finding in records.evidence} == {2}
     assert "datagrams that its trace lacks" in records.evidence[0].detail
     assert found.beside["steps"].verdict == "not applicable"
+
+
+def test_datagrams_of_other_sockets_do_not_count(whole: Path, tmp_path: Path) -> None:
+    assert judged(whole, tmp_path, 1, more=20, others=20).beside["records"].verdict == "agree"
 
 
 @pytest.mark.parametrize(("more", "agrees"), [(-5, True), (0, True), (20, False)])

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ from harness.play.child_processes import ChildProcesses
 from tests.harness.command import harness, write_scenario
 from tests.harness.conformance import wrong_programs
 
-AGENT = f"2={sys.executable} -P -m {wrong_programs.__name__} leaves_children"
+AGENT = f"2={shlex.quote(sys.executable)} -P -m {wrong_programs.__name__} leaves_children"
 
 
 def test_children_outside_the_session_are_ended() -> None:
