@@ -1,10 +1,10 @@
 """`dataclass` and `field`, as far as an agent needs them, without the standard library's module.
 
-An agent is to be ready at once, and small. `dataclasses` brings `inspect` along, and with it Python's parser, tokenizer
-and disassembler, and compiles every method by itself: of the time until an agent was ready that was a fifth.
+An agent must start fast and need little memory. `dataclasses` imports `inspect`, which imports Python's parser,
+tokenizer and disassembler. It also compiles each method separately. Together this took a fifth of the start time.
 
-What is made here is a dataclass to whoever asks: `dataclasses.fields`, `replace` and `asdict` take it, and so does
-pydantic. What no agent needs is not there, such as order, or fields that are inherited.
+The classes made here are dataclasses for other code: `dataclasses.fields`, `replace`, `asdict` and pydantic accept
+them. Features that no agent needs are missing, such as order and inherited fields.
 """
 
 from collections.abc import Callable
@@ -14,11 +14,11 @@ _CLASS_VAR: Any = ClassVar
 
 
 class _Options(dict[str, Any]):
-    """Of a field, as `dataclasses.field` takes them."""
+    """The options of a field, as in `dataclasses.field`."""
 
 
 class _Described:
-    """The fields as the standard library describes them, once somebody asks."""
+    """The fields as the standard library describes them, computed at the first access."""
 
     def __init__(self, kinds: dict[str, Any], fields: dict[str, _Options]) -> None:
         self._kinds = kinds
@@ -61,7 +61,7 @@ def _dataclass(
 
 
 def _options(content: dict[str, Any], name: str) -> _Options:
-    """Of a field; its default is the class's no more."""
+    """Return the options of a field, and remove its default from the class."""
     if name not in content:
         return _Options()
     default = content.pop(name)
@@ -69,7 +69,7 @@ def _options(content: dict[str, Any], name: str) -> _Options:
 
 
 def _methods(fields: dict[str, _Options], *, frozen: bool, eq: bool, then: bool) -> dict[str, Any]:
-    """All that are made of the fields' names, compiled at once; `then` calls what the class does after them."""
+    """Return the methods that are generated from the fields. `then` calls a further method of the class."""
     parameters, assignments = [], []
     given: dict[str, Any] = {"_set": object.__setattr__}
     for name, options in fields.items():
@@ -119,7 +119,7 @@ def _refuse(self: object, name: str, *value: object) -> None:
 
 
 def _set_state(self: object, state: Any) -> None:
-    """Come back from a copy or a pickle."""
+    """Restore the object from a copy or a pickle."""
     for content in state if isinstance(state, tuple) else (state,):
         for name, value in (content or {}).items():
             object.__setattr__(self, name, value)

@@ -1,14 +1,14 @@
-"""A command that an agent is given, as JSON that a trace can hold."""
+"""Check that a command is JSON that a trace can contain."""
 
 import json
 from typing import Any
 
 MAX_PARTS = 100
-"""No request has more objects and lists in it."""
+"""Maximum number of objects and lists in a request."""
 
 
 def check_request(request: dict[str, Any]) -> None:
-    """Raises ValueError for what json reads, and nobody else does: NaN, half a character; or for very much of it."""
+    """Raise ValueError for NaN, a lone surrogate, or too many parts. Python's json accepts them."""
     try:
         text = json.dumps(request, allow_nan=False, ensure_ascii=False)
     except RecursionError:

@@ -1,4 +1,4 @@
-"""What an agent says of itself when it is asked for its status, whoever drives it (see contract/CONTRACT.md)."""
+"""The status of an agent, as its driver reports it (see contract/CONTRACT.md)."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from ucp.agent import Agent
 
 
 def status_of(agent: Agent) -> dict[str, Any]:
-    """What the agent itself knows; whoever drives it knows more."""
+    """Return the part of the status that the agent has. Its driver adds the rest."""
     state = agent.state
     return {
         "agent_id": agent.agent_id,

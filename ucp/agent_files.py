@@ -1,4 +1,4 @@
-"""What an agent leaves on disk: its chain export, written whole or not at all, its trace and its log, line by line."""
+"""The files of an agent: the chain export, written completely or not at all, and trace and log, line by line."""
 
 import contextlib
 import json
@@ -16,9 +16,9 @@ def write_json_atomically(path: Path, document: dict[str, Any]) -> None:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write so that `path` holds either the old text or all of the new. Raises OSError (disk full, ...).
+    """Replace the content of `path` completely or not at all. Raises OSError, for example on a full disk.
 
-    Half a character, which JSON can hold and UTF-8 cannot, is written as a question mark.
+    A lone surrogate, which JSON allows and UTF-8 does not, becomes a question mark.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -34,7 +34,7 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 class LogFile:
-    """Appends what the agent has to say to people, a line each; one that the disk refuses is lost."""
+    """A log for people. A line that cannot be written is lost."""
 
     def __init__(self, path: Path) -> None:
         self._file: BinaryIO = path.open("ab", buffering=0)
@@ -50,10 +50,10 @@ class LogFile:
 
 
 class TraceFile:
-    """Appends whole lines; once the disk refuses one, stops for good and keeps what was written.
+    """A trace, to which whole lines are appended. It ends at the first line that the disk refuses.
 
-    Half a line, over which an earlier life of the agent was killed, is cut away. `problem` says why
-    it stopped, so that a trace that ends early is not mistaken for an agent that fell silent.
+    An incomplete last line of an earlier incarnation is removed. `problem` is the reason of the end, so that a trace
+    that ends early is distinguished from an agent that became silent.
     """
 
     def __init__(self, path: Path) -> None:
@@ -83,7 +83,7 @@ class TraceFile:
 
 
 def _end_of_last_line(file: BinaryIO) -> int:
-    """Where the last whole line of the file ends; 0 if it has none."""
+    """Return the end of the last complete line of the file, or 0."""
     end = file.seek(0, os.SEEK_END)
     while end:
         begin = max(0, end - CHUNK_BYTES)

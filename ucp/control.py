@@ -1,4 +1,4 @@
-"""The control socket: whoever runs the agent asks for its status, and for what no vehicle would ask.
+"""The control socket: a program asks for the status of the agent, and sends commands.
 
 A Unix stream socket; one JSON object per line in, one per line out (see contract/CONTRACT.md).
 """
@@ -16,21 +16,21 @@ from ucp.loop import Loop
 
 MAX_LINE_BYTES = 64 * 1024
 MAX_NAME = 40
-"""More of a wrong command is not shown."""
+"""Characters of a wrong command that an error shows."""
 
 Command = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 class CommandError(Exception):
-    """A command that cannot be carried out: one sentence."""
+    """A command that cannot be executed. The message is one sentence."""
 
 
 class UnsupportedCommandError(CommandError):
-    """A command for what this agent does not have."""
+    """A command that needs a feature that this agent lacks."""
 
 
 class ControlServer:
-    """Serves `commands` by name. The socket lies beside the agent's other files and goes when the agent does."""
+    """A server that executes `commands` by name. It removes its socket at the end."""
 
     def __init__(self, path: Path, commands: dict[str, Command], loop: Loop) -> None:
         self._path = path
@@ -39,7 +39,7 @@ class ControlServer:
         self._listener: socket.socket | None = None
 
     def start(self) -> None:
-        """Raises OSError. A socket that a dead agent left is replaced."""
+        """Begin to serve. Replace the socket of an agent that has ended. Raises OSError."""
         self._listener = listener = socket.socket(socket.AF_UNIX)
         listener.setblocking(False)
         # Under its name it is there only once it listens: whoever sees it can connect.
@@ -67,7 +67,7 @@ class ControlServer:
             _Client(self._listener.accept()[0], self.answer, self._loop)
 
     def answer(self, line: bytes) -> dict[str, Any]:
-        """What is answered to one line."""
+        """Return the answer to a line."""
         try:
             request = json.loads(line.decode())  # of bytes, json would also read UTF-16
             if not isinstance(request, dict):
@@ -89,9 +89,9 @@ class ControlServer:
 
 
 class _Client:
-    """A connection: line after line is answered, as fast as the client reads the answers.
+    """A connection that answers line by line, as fast as the client reads the answers.
 
-    One that goes away, or sends a line over the limit, ends; nothing else does.
+    It ends if the client disconnects or sends a line above the limit. Other connections continue.
     """
 
     def __init__(self, connection: socket.socket, answer: Callable[[bytes], dict[str, Any]], loop: Loop) -> None:
@@ -127,7 +127,7 @@ class _Client:
             self._go_on()
 
     def _go_on(self) -> None:
-        """Answer the next line, if a whole one is there."""
+        """Answer the next complete line, if there is one."""
         line, newline, rest = self._received.partition(b"\n")
         if newline:
             self._received = rest

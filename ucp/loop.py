@@ -1,7 +1,7 @@
-"""What a process of ours waits for: its sockets, the next moment at which something is due, and its end.
+"""An event loop for sockets, timers and signals.
 
-`asyncio` does that, too. But to import it takes longer than all else that an agent does until it is ready, and as much
-memory: with more agents than processors they would wait for that, and nothing else.
+`asyncio` can do the same. But its import takes longer than all other steps of an agent's start, and as much memory.
+With more agents than processors, the start of a swarm would mostly consist of this import.
 """
 
 import heapq
@@ -16,7 +16,7 @@ Callback = Callable[[], object]
 
 
 class Timer:
-    """Something that is due; `cancel` as long as it is not."""
+    """A scheduled callback. `cancel` it before it is due."""
 
     __slots__ = ("callback",)
 
@@ -28,9 +28,9 @@ class Timer:
 
 
 class Loop:
-    """`run` calls back what waits, one after the other, until `stop`.
+    """An event loop. `run` calls due callbacks one after another until `stop`.
 
-    `failed` is told of what a callback raises, and the loop goes on; without it that ends the loop.
+    `failed` gets the exception of a callback, and the loop continues. Without `failed`, the exception ends the loop.
     """
 
     def __init__(self, failed: Callable[[Exception], object] | None = None) -> None:
@@ -43,7 +43,7 @@ class Loop:
         self._awakens: socket.socket | None = None
 
     def watch(self, sock: socket.socket, *, readable: Callback | None = None, writable: Callback | None = None) -> None:
-        """Call back whenever `sock` can be read, or written; with neither it is watched no longer."""
+        """Call back whenever `sock` can be read or written. Without a callback, stop watching the socket."""
         events = (selectors.EVENT_READ if readable else 0) | (selectors.EVENT_WRITE if writable else 0)
         if sock in self._waiting and events:
             self._selector.modify(sock, events)
@@ -55,7 +55,7 @@ class Loop:
             self._waiting[sock] = readable, writable
 
     def call_later(self, delay_s: float, callback: Callback) -> Timer:
-        """`delay_s` is wall time; what is less than 0 is due at once."""
+        """Call back after `delay_s` seconds of wall time. A negative delay counts as 0."""
         timer = Timer(callback)
         heapq.heappush(self._due, (time.monotonic() + max(0.0, delay_s), next(self._number), timer))
         return timer
@@ -74,14 +74,14 @@ class Loop:
         self._running = False
 
     def run(self) -> None:
-        """Until it is stopped; it may run again then."""
+        """Run until `stop`. The loop may run again afterwards."""
         while self._running:
             self._call_back(self._selector.select(self._due_in_s()))
             self._call_what_is_due()
         self._running = True
 
     def close(self) -> None:
-        """Nothing is watched any more, and no signal heard; the sockets are whoever opened them's to close."""
+        """Stop watching sockets and signals. The caller closes the sockets that it opened."""
         if self._awakens is not None:
             signal.set_wakeup_fd(-1)
             self._awakens.close()
@@ -89,13 +89,13 @@ class Loop:
         self._selector.close()
 
     def _call_back(self, ready: list[tuple[selectors.SelectorKey, int]]) -> None:
-        """What the selector says can be read, or written."""
+        """Call back for a socket that can be read or written."""
         for key, events in ready:
             readable, writable = self._waiting.get(key.fileobj, (None, None))  # type: ignore[call-overload]
             self._call(readable if events & selectors.EVENT_READ and readable else writable)
 
     def _due_in_s(self) -> float | None:
-        """How long nothing is due; None: never."""
+        """Return the seconds until the next callback is due. None without one."""
         return max(0.0, self._due[0][0] - time.monotonic()) if self._due else None
 
     def _call_what_is_due(self) -> None:

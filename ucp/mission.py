@@ -1,4 +1,4 @@
-"""The mission file: all that one agent is told before it starts (schema `ucp-mission/1`, see contract/CONTRACT.md)."""
+"""The mission file, which an agent reads at its start (schema `ucp-mission/1`, see contract/CONTRACT.md)."""
 
 import base64
 import json
@@ -22,13 +22,13 @@ MAX_INITIAL_DATA_BYTES = 512 * 1024
 """The first line of a trace contains the initial data in base64. The reader takes lines of at most 16 MiB."""
 MAX_SPEEDUP = 1000.0
 LATEST_EPOCH_US = 2**63 - 1
-"""With these no timestamp of the next centuries is more than a block has room for."""
+"""Latest start of a mission. Timestamps of the next centuries then fit into a block."""
 MAX_NAME = 40
-"""More of a wrong name is not shown."""
+"""Characters of a wrong name that an error shows."""
 
 
 class MissionError(Exception):
-    """A mission file that cannot be used: one sentence with the file, the key and what is allowed."""
+    """A mission file that cannot be used. The message is one sentence with the file, the key and the allowed values."""
 
 
 class UnsupportedMissionError(MissionError):
@@ -37,7 +37,7 @@ class UnsupportedMissionError(MissionError):
 
 @dataclass(frozen=True)
 class Network:
-    """Where to broadcast. `address` is the agent's own IPv4 address: what comes back from it is its own echo."""
+    """The network. `address` is the IPv4 address of the agent, which ignores its own echoes."""
 
     address: str
     broadcast: str
@@ -46,7 +46,7 @@ class Network:
 
 @dataclass(frozen=True)
 class EventSource:
-    """Algorithm 21 ("random"), the vehicle's telemetry ("mavlink"), or silence ("none")."""
+    """The source of events: Algorithm 21 ("random"), the telemetry of the vehicle ("mavlink"), or none ("none")."""
 
     source: Literal["random", "mavlink", "none"] = "random"
     mean_s: float = MEAN_TIME_BETWEEN_EVENTS_S
@@ -58,17 +58,18 @@ class EventSource:
 
 @dataclass(frozen=True)
 class Security:
-    """The mission is secured. `bundle` is the file with the agent's keys, as seen from the mission file's directory."""
+    """The keys of a secured mission. `bundle` is their file, relative to the directory of the mission file."""
 
     bundle: str
 
 
 @dataclass(frozen=True)
 class Mission:
-    """`epoch_us` is the mission's start, microseconds since the Unix epoch; None waits for the command `start`.
+    """The content of a mission file.
 
-    `speedup` is how many mission seconds pass in one second of wall time. `store` is the file in which the agent keeps
-    what it holds, as seen from the mission file's directory; None keeps nothing.
+    `epoch_us` is the start of the mission in microseconds since the Unix epoch. With None, the agent waits for the
+    command `start`. `speedup` is the number of mission seconds per second of wall time. `store` is the file of the
+    agent's store, relative to the directory of the mission file. None means no store.
     """
 
     agent_id: int
@@ -147,7 +148,7 @@ def parse_mission(document: Any) -> Mission:
 
 
 def is_epoch(value: object) -> TypeGuard[int]:
-    """Whether it can be a mission's second 0 in microseconds since the Unix epoch."""
+    """Return true if the value can be the start of a mission in microseconds since the Unix epoch."""
     return type(value) is int and 0 <= value <= LATEST_EPOCH_US
 
 

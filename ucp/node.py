@@ -1,9 +1,9 @@
 """One agent as a process: `python -m ucp.node MISSION_FILE`. With `--virtual` it is `ucp.virtual`.
 
-It drives `ucp.agent.Agent` with a UDP broadcast socket, the clock, and an event source, and leaves its files beside
-the mission file: `<id>.chain.json`, `<id>.trace.jsonl`, `<id>.log`, and the control socket `<id>.control` while it
-runs; and its store, if the mission names one. SIGTERM exports the chain and ends it. contract/CONTRACT.md says what
-any agent under test must do; this is the default.
+The process drives `ucp.agent.Agent` with a UDP broadcast socket, the clock, and an event source. Next to the mission
+file it writes `<id>.chain.json`, `<id>.trace.jsonl`, `<id>.log`, a store if the mission names one, and the control
+socket `<id>.control` while it runs. SIGTERM exports the chain and ends the process. contract/CONTRACT.md defines the
+behaviour of any agent under test. This agent is the default.
 """
 
 import base64
@@ -50,7 +50,7 @@ class Node:
         self.mission = mission
         self._log_file = LogFile(directory / f"{mission.agent_id}.log")
         self.clock = MissionClock(mission.speedup)
-        self._lots = Random(mission.seed)  # of what is random about its quirks
+        self._lots = Random(mission.seed)  # the random draws of its quirks
         self.agent = self._maker_of_agents(mission, directory)(
             mission.agent_id,
             mission.roster,
@@ -104,7 +104,7 @@ class Node:
         return secured_agent(mission, directory, not_erased)
 
     def run(self) -> int:
-        """Serve until SIGTERM or SIGINT; the exit status, 1 if the chain could not be exported."""
+        """Serve until SIGTERM or SIGINT. Return the exit status, 1 if the chain could not be exported."""
         self._loop.stop_on(signal.SIGTERM, signal.SIGINT)
         self._loop.watch(self._socket, readable=self._receive)
         self._control.start()
@@ -129,7 +129,7 @@ class Node:
         return status
 
     def _failed(self, error: Exception) -> None:
-        """An input was not handled to its end, by a mistake of ours: it is on record, and the others still need us."""
+        """Record an exception of a handler, and continue, because other agents still need this one."""
         import traceback
 
         self._say("".join(traceback.format_exception(error)).rstrip())
@@ -163,7 +163,7 @@ class Node:
             self._drive(partial(self.agent.receive_datagram, data))
 
     def log_event(self, event_id: int, data: bytes) -> None:
-        """The vehicle, or whoever else, has something to be kept; before the mission, and at its end, it is not."""
+        """Log an event. It has no effect before the mission and after its end."""
         if not self.generating:
             return
         event = LoggableEvent(self.clock.timestamp_us(self.clock.now()), event_id, data)
@@ -177,9 +177,9 @@ class Node:
         self._drive(self.agent.handle_timer)
 
     def _drive(self, feed: Callable[[float], None]) -> None:
-        """Give the agent one input, then do what it says: store, trace, broadcast, and arm its next timer.
+        """Give the agent one input. Then write store and trace, broadcast its messages, and set its next timer.
 
-        What it has is on disk, and what it sends on record, before anybody hears of it: it can be killed in between.
+        Store and trace come before the broadcast, because the process can be killed in between.
         """
         feed(self.clock.now())
         self._keep(self.agent.trace())
@@ -332,7 +332,7 @@ class Node:
         return self.mission.quirks
 
     def _take_down_command(self, request: dict[str, Any]) -> None:
-        """Commands that trigger no handler are in the trace, too; of before the mission it has nothing."""
+        """Write commands that trigger no handler to the trace, except before the mission."""
         if self.clock.running:
             self._keep([Commanded(self.clock.now(), str(request.get("command")), request)])
 
@@ -362,7 +362,7 @@ class Node:
 
 
 def _broadcast_socket(mission: Mission) -> socket.socket:
-    """A socket on the mission's port that hears broadcasts. Raises OSError, which names the port."""
+    """Return a socket that receives broadcasts on the port of the mission. Raises OSError, which names the port."""
     port = mission.network.port
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -377,7 +377,7 @@ def _broadcast_socket(mission: Mission) -> socket.socket:
 
 
 def main(arguments: list[str], node: Callable[[Mission, Path], Node] = Node) -> int:
-    """Exit status 0; 1: no export; 2: the mission file is wrong, or its port in use; 127: it lacks a feature."""
+    """Return the exit status: 0, 1 without an export, 2 for a wrong mission or a used port, 127 without a feature."""
     if arguments == ["--virtual"]:
         from ucp.virtual import main as serve
 

@@ -1,12 +1,12 @@
-"""An agent's store: what it holds, kept on its vehicle's disk, so that after a brown-out it can go on from there.
+"""The store of an agent: its data on the disk of its vehicle, from which it continues after a power failure.
 
-The store is a journal. An entry is a line: the CRC-32 of the rest in eight hex digits, a space, and JSON. The first
-says whose store it is; each of the others says what one input changed, as a trace does, with the blocks that are new.
-An entry is on disk before anybody hears of what it says, and holds all that the input changed: whatever is read makes a
-state that the agent was in. Reading ends where the first line is torn or damaged.
+The store is a journal. An entry is a line: the CRC-32 of the rest in eight hexadecimal digits, a space, and JSON. The
+first entry identifies the agent. Each other entry has the changes by one input, as in a trace, and the new blocks. The
+agent writes an entry before other agents can observe the changes. Each entry has all changes of its input, so that the
+entries up to any line lead to a state of the agent. Reading ends at the first damaged line.
 
-An agent that boots begins its journal anew, with all that it found, and puts it in the place of the old one only when
-it is on disk: at every moment there is one that is good.
+An agent that boots writes a new journal with the recovered data, and replaces the old one when the new one is on disk.
+A valid journal therefore exists at any time.
 """
 
 import base64
@@ -33,13 +33,13 @@ Change = tuple[str, str]
 
 
 class StoreError(Exception):
-    """A store that this agent must not touch: one sentence."""
+    """A store that this agent must not change. The message is one sentence."""
 
 
 @dataclass(slots=True)
 class SecuredState:
-    """What a secured agent keeps besides: when its life began, in microseconds UTC, what its blocks' makers signed, by
-    block hash, and the newest revocation that it heard.
+    """Further data of a secured agent: the start of its incarnation in microseconds UTC, the signatures of blocks by
+    block hash, and the newest received revocation.
     """
 
     started_us: int
@@ -47,7 +47,7 @@ class SecuredState:
     revocation: bytes | None = None
 
     def replay(self, entry: dict[str, Any]) -> None:
-        """Take what an entry has of it, which is what was new then."""
+        """Add the new data of an entry."""
         self.started_us = max(self.started_us, int(entry.get("started_us", 0)))
         new = {bytes.fromhex(name): base64.b64decode(text) for name, text in entry.get("signatures", {}).items()}
         self.signatures = {**self.signatures, **new}
@@ -55,7 +55,7 @@ class SecuredState:
             self.revocation = base64.b64decode(revocation)
 
     def entry(self, before: "SecuredState | None" = None) -> dict[str, Any]:
-        """What of it is new since `before`, as an entry has it."""
+        """Return the data that is new since `before`, for an entry."""
         new: dict[str, Any] = {}
         if before is None:
             new["started_us"] = self.started_us
@@ -69,10 +69,10 @@ class SecuredState:
 
 @dataclass(slots=True)
 class StoredState:
-    """What an agent holds where, and the hashes of the blocks that it completed.
+    """The blocks of an agent by place, and the hashes of the blocks that it completed.
 
-    Blocks of the chain are oldest first, of the deque front first, of the stack top last. `secured` is None of an agent
-    without keys.
+    The chain has its oldest block first, the deque its front first, the stack its top last. `secured` is None without
+    keys.
     """
 
     completed: list[bytes] = field(default_factory=list)
@@ -93,17 +93,17 @@ class StoredState:
         yield from self.stack
 
     def encode(self) -> bytes:
-        """The blocks' data, the chain's first, then the deque's and the stack's, a length (u16) before each."""
+        """Return the data of all blocks, of chain, deque and stack in this order, each after its length (u16)."""
         return b"".join(len(data).to_bytes(2, "big") + data for data in (block.block_data() for block in self.blocks()))
 
     def check(self) -> None:
-        """Raises ValueError for what no agent holds."""
+        """Raise ValueError for an impossible state."""
         held = [block.block_hash for block in self.blocks()]
         if len({*held}) < len(held) or not {*self.completed} <= {*held}:
             raise ValueError("a block is in two places, or one that it completed in none")
 
     def _change(self, operation: str, block: Block) -> None:
-        """Make a change of a trace."""
+        """Apply a change, as in a trace."""
         match operation:
             case "complete":
                 self.completed.append(block.block_hash)
@@ -121,7 +121,7 @@ class StoredState:
                 self.stack.remove(block)
 
     def replay(self, entry: dict[str, Any], known: dict[str, Block]) -> None:
-        """Make all changes of an entry; `known` are the blocks of the entries before, by hash, and get this one's."""
+        """Apply all changes of an entry, and add its blocks to `known`, the blocks of earlier entries by hash."""
         for agent_id, timestamp_us, event_data in entry["blocks"]:
             block = block_on_disk(agent_id, timestamp_us, base64.b64decode(event_data))
             known[block.block_hash.hex()] = block
@@ -134,14 +134,14 @@ class StoredState:
 
 
 class Store:
-    """An agent's store in the file `path`. Raises OSError, or StoreError for a file that is not this agent's store.
+    """The store of an agent in the file `path`. Raises OSError, or StoreError for another file.
 
-    `state` is the agent's, now and as it goes on. `found` is what an earlier life left; None if there was none.
+    `state` is the state of the agent. `recovered` is the data of an earlier incarnation, or None.
     """
 
     def __init__(self, path: Path, state: AgentState) -> None:
         self.problem: str | None = None
-        """Why the store ends early, once the disk refuses it."""
+        """The error of the disk at which the store ends early, or None."""
         self._path = path
         self._state = state
         self._header = {
@@ -151,7 +151,7 @@ class Store:
         }
         self._written: set[str] = set()
         self._secured: SecuredState | None = None
-        """As it was written last in this life."""
+        """The last written data of this incarnation."""
         self._file: BinaryIO | None = None
         self.recovered = self._read()
 
@@ -175,9 +175,9 @@ class Store:
         return stored
 
     def write(self, changes: list[Change], secured: SecuredState | None = None) -> None:
-        """Have these changes, of one input to the agent, on disk. The first of a life name all that was found.
+        """Write the changes by one input to the disk. The first changes of an incarnation contain the recovered data.
 
-        With them goes what is new of what a `secured` agent keeps.
+        The entry also has the new data of a `secured` agent.
         """
         if self.problem is not None:
             return
@@ -202,7 +202,7 @@ class Store:
         self._written.update(new)
 
     def _begin(self, lines: bytes) -> BinaryIO:
-        """A journal that begins with these lines, in the place of what was there."""
+        """Replace the journal by a new one that begins with these lines."""
         beside = self._path.with_name(f".{self._path.name}.new")
         file = beside.open("wb", buffering=0)
         try:
@@ -250,7 +250,7 @@ def read_store(path: Path) -> tuple[Any, StoredState]:
 
 
 def block_on_disk(agent_id: int, timestamp_us: int, event_data: bytes) -> Block:
-    """A block as it is kept. Raises ValueError if it can be none, or no message carries it."""
+    """Return a block from the disk. Raises ValueError if it is invalid, or too large for a message."""
     try:
         return decode_block(BLOCK_HEADER.pack(agent_id, timestamp_us) + event_data)
     except struct.error as error:
@@ -263,14 +263,14 @@ def _line(document: dict[str, Any]) -> bytes:
 
 
 def _append(file: BinaryIO, lines: bytes) -> None:
-    """Have the lines on disk, or raise OSError."""
+    """Write the lines to the disk. Raises OSError."""
     if file.write(lines) != len(lines):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     os.fdatasync(file.fileno())
 
 
 def _sync_directory(path: Path) -> None:
-    """Have on disk what the files in it are called."""
+    """Write the names of the files in a directory to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -279,9 +279,9 @@ def _sync_directory(path: Path) -> None:
 
 
 def _entries(path: Path) -> Iterator[Any]:
-    """The entries of a store up to the first that is not whole; none if there is no store.
+    """Yield the entries of a store up to the first damaged one; none without a store.
 
-    Raises OSError; ValueError or RecursionError for an entry that is whole and no JSON.
+    Raises OSError, or ValueError or RecursionError for an undamaged entry that is not JSON.
     """
     try:
         file = path.open("rb")

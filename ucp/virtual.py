@@ -1,9 +1,8 @@
 """One agent in virtual time: `python -m ucp.node --virtual`.
 
-It reads lines of JSON from standard input, each one input with the time at which it comes, and answers each with a line
-on standard output: what it broadcasts, when its next timer ends, and what its trace says of it. It has no socket, no
-file and no clock, and when the next mission line comes it has forgotten the last. contract/CONTRACT.md says what any
-agent does that can be driven so.
+The program reads lines of JSON from standard input. Each line has an input and its time. The program answers with a
+line on standard output: its broadcasts, the time of its next timer, and its trace lines. It has no socket, no file and
+no clock. A mission line starts a new agent. contract/CONTRACT.md defines this for any agent.
 """
 
 import base64
@@ -31,13 +30,13 @@ if TYPE_CHECKING:
     from ucp.secure.secured_agent import SecuredAgent
 
 LATEST_S = 1e12
-"""Mission seconds; the timestamp of no event would have room for more."""
+"""Latest mission second. Later timestamps do not fit into an event."""
 MAX_LINE_BYTES = 16 * MAX_MISSION_BYTES
-"""The longest is a mission with a store."""
+"""Maximum length of a line. A mission with a store is the longest."""
 
 
 class InputError(Exception):
-    """A line that is no input, or one that the agent cannot take: one sentence."""
+    """A line that is no valid input. The message is one sentence."""
 
     def __init__(self, sentence: str, *, unsupported: bool = False) -> None:
         super().__init__(sentence)
@@ -45,7 +44,7 @@ class InputError(Exception):
 
 
 def serve(lines: BinaryIO, answers: BinaryIO) -> None:
-    """Answer every line, until there are no more."""
+    """Answer each line until the end of the input."""
     agent: VirtualAgent | None = None
     while line := lines.readline(MAX_LINE_BYTES):
         try:
@@ -65,7 +64,7 @@ def serve(lines: BinaryIO, answers: BinaryIO) -> None:
 
 
 class VirtualAgent:
-    """One life of an agent, beginning with the line `{"t", "mission", "trace", "store"}`. Raises InputError."""
+    """One incarnation of an agent. It begins with the line `{"t", "mission", "trace", "store"}`. Raises InputError."""
 
     def __init__(self, given: dict[str, Any]) -> None:
         try:
@@ -84,7 +83,7 @@ class VirtualAgent:
         self._epoch_us = mission.epoch_us
         self._tracing = given.get("trace", True) is True
         self._lots = Random(mission.seed)
-        """Of what is random about its quirks."""
+        """The random draws of its quirks."""
         make, self._secured = _maker(mission, given), mission.security is not None
         self._agent = make(
             mission.agent_id,
@@ -99,7 +98,7 @@ class VirtualAgent:
         self._generating = True
         self._handled = self._bytes_sent = 0
         self._told: dict[str, Any] | None = None
-        """What it answers to the command that it was given last."""
+        """The answer to the last command."""
         self._noted: list[Commanded] = []
         now = self._advance(given)
         if given.get("store") is not None:
@@ -128,7 +127,7 @@ class VirtualAgent:
             raise InputError("neither a mission, a datagram, an event, a timer nor a command")
 
     def answer(self) -> str:
-        """What came of the last input, as a line."""
+        """Return the results of the last input as a line."""
         entries = [*self._agent.trace(), *self._noted]
         self._noted = []
         self._handled += sum(isinstance(entry, HandlerRun) for entry in entries)
@@ -237,7 +236,7 @@ class VirtualAgent:
         self._agent.replace_handlers(wrong_handlers(self._mission.quirks, self._lots))
 
     def _note(self, given: dict[str, Any], now: float) -> None:
-        """Commands that trigger no handler are in the trace, too."""
+        """Write a command that triggers no handler to the trace."""
         if self._tracing:
             request = {key: value for key, value in given.items() if key != "t"}
             self._noted.append(Commanded(now, str(given["command"]), request))
@@ -254,7 +253,7 @@ _COMMANDS: dict[str, Callable[[VirtualAgent, dict[str, Any], float], dict[str, A
 
 
 def _maker(mission: Mission, given: dict[str, Any]) -> Callable[..., Agent]:
-    """What makes the mission's agent; all arguments are Agent's. Raises InputError."""
+    """Return a function that makes the agent of the mission, with the arguments of Agent. Raises InputError."""
     if mission.security is None:
         return Agent
     try:

@@ -1,7 +1,7 @@
 """The interface of a backend, and the seeds that it gives its agents.
 
-Whoever treats backends differently asks one of these properties, and never which backend it is. A new one is a room of
-its own here, its name in `harness.backend_names`, and its place in the table `harness.play.backends`.
+Code that treats backends differently asks one of these properties, and never for the name of the backend. A new backend
+needs a folder here, its name in `harness.backend_names`, and an entry in the table `harness.play.backends`.
 """
 
 import asyncio
@@ -19,23 +19,23 @@ from harness.scenario import Scenario
 
 
 class Backend(ABC):
-    """Plays scenarios, any number of them."""
+    """A backend, which plays any number of scenarios."""
 
     name: ClassVar[BackendName]
     virtual_time: ClassVar[bool] = False
-    """Whether mission time is computed: no machine is late for it, a speedup means nothing, there is no telemetry."""
+    """True if mission time is computed. There is then no lag, no speedup and no telemetry."""
     plays_in_memory: ClassVar[bool] = False
-    """Whether `harness.run.simulate` plays the same without a run directory, for sweeps over thousands of runs."""
+    """True if `harness.run.simulate` can play the same run in memory, for sweeps over thousands of runs."""
 
     not_in_uml: ClassVar[str | None] = None
-    """Why it does not play inside User Mode Linux, and the way out; None if it does."""
+    """The reason why it does not run inside User Mode Linux, with a solution. None if it does."""
 
     @abstractmethod
     def refuse(self, scenario: Scenario) -> None:
-        """Raises HarnessError, a sentence with the way out, if the scenario cannot be played so, or not here."""
+        """Raise HarnessError, a sentence with a solution, if this backend or this machine cannot play the scenario."""
 
     def remark(self, scenario: Scenario) -> str | None:
-        """What it plays otherwise than the scenario says, in a sentence, if anything."""
+        """Return a sentence about a difference from the scenario, if there is one."""
         return None
 
     @abstractmethod
@@ -62,6 +62,6 @@ class Backend(ABC):
 
 
 def agent_seed(seed: int, agent_id: int, life: int = 1) -> int:
-    """What an agent's events and quirks are drawn from; an agent that was restarted is in its second `life`."""
+    """Return the seed of an agent's events and quirks. A restarted agent is in its second `life`."""
     again = f" life {life}" if life > 1 else ""
     return Random(f"{seed}/agent {agent_id}{again}").getrandbits(63)

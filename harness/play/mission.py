@@ -1,6 +1,7 @@
-"""The story of a mission, whichever backend runs the agents: a `Swarm` is what a backend must be able to do.
+"""Play a mission on any backend. `Swarm` is the interface of a backend.
 
-Play the timeline, stop the events, let the agents settle, and reconcile finally if the scenario asks for it.
+A mission plays the timeline, stops the events, lets the agents settle, and ends with a final reconcile if the scenario
+asks for it.
 """
 
 from collections.abc import Awaitable, Callable
@@ -16,14 +17,14 @@ from harness.scenario.fates import Fate
 from ucp.trace import HandlerRun
 
 MAX_FINAL_ROUNDS = 20
-"""Bound on the rounds of a final reconcile; each lets every agent reconcile once."""
+"""Maximum number of rounds of a final reconcile. In each round every agent reconciles once."""
 
 Outcome = Literal["completed", "interrupted", "failed", "not supported"]
 
 
 @dataclass
 class RunOutcome:
-    """What became of a run, before anybody judges it."""
+    """The outcome of a run before its verdict."""
 
     outcome: Outcome = "completed"
     outcome_detail: str | None = None
@@ -46,13 +47,13 @@ class RunOutcome:
     unmatched_fates: list[str] = field(default_factory=list)
 
     def end_early(self, outcome: Outcome, error: HarnessError) -> None:
-        """The mission did not end normally, because of `error`."""
+        """Record that the mission did not end normally, because of `error`."""
         self.outcome = "not supported" if isinstance(error, UnsupportedError) else outcome
         self.outcome_detail = str(error)
         self.exit_status = error.exit_status
 
     def record(self, change: dict[str, Any]) -> None:
-        """Take down a change that was made; of those that flight makes, only who is connected to whom."""
+        """Record a change. Of the changes by flight, record only those of the connected groups."""
         if change["what"] == RANGE and self.network and _same_connections(change, self.network[-1]):
             return
         if "fully_connected" in change:
@@ -63,7 +64,7 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class Sought:
-    """A run of a handler that somebody waits for. None means any branch, or any agent."""
+    """A handler run that a caller waits for. None means any branch, or any agent."""
 
     handler: str
     branch: str | None = None
@@ -78,65 +79,65 @@ def _same_connections(now: dict[str, Any], before: dict[str, Any]) -> bool:
 
 
 class Swarm(Protocol):
-    """Agents that a mission is played with; times are mission seconds."""
+    """The agents of a mission, and the operations on them. Times are mission seconds."""
 
     played: RunOutcome
 
     def now(self) -> float: ...
 
     def enter(self, stage: str) -> None:
-        """Say to whoever watches what comes now."""
+        """Show the stage of the mission to the user."""
 
     async def begin(self, first: Change) -> None:
-        """Start everybody, under these conditions, and with them the mission's clock."""
+        """Start all agents under these conditions, and the clock of the mission."""
 
     async def until(self, mission_s: float) -> None: ...
 
     async def until_run(self, sought: Sought, mission_s: float) -> int | None:
-        """As `until`, but no further than until an agent runs what is sought; its ID, None if nobody has.
+        """Wait as `until` does, but only until an agent runs this handler. Return its ID, or None at the end.
 
-        What came of the last change counts, too, and of real processes what has come since the last `until`.
+        Handler runs that the last change caused also count, and with processes all runs since the last `until`.
         """
 
     async def apply(self, change: Change) -> None:
-        """Make the change, and take it down in `played`."""
+        """Make the change, and record it in `played`."""
 
     async def hold(self, fate: Fate) -> int:
-        """Hold back what fits the fate, from its `from_s` on, until `release`; the hold's number.
+        """Hold back the messages that match the fate, from its `from_s` until `release`. Return the number of the hold.
 
         Raises ScenarioError if messages cannot be held here.
         """
 
     async def release(self, number: int, fate: Fate) -> None:
-        """End a hold: by now it is known until when it lasts, which is `until_s` and `hold_until_s` of `fate`."""
+        """End a hold at `until_s` and `hold_until_s` of `fate`."""
 
     async def stop_events(self) -> None: ...
 
     async def until_idle(self, limit_s: float) -> bool:
-        """Wait until all living agents are idle and nothing is on its way; False if `limit_s` pass before."""
+        """Wait until all living agents are idle and no message is under way. Return false after `limit_s`."""
 
     async def keep_chains(self) -> None:
-        """Keep the chains as they stand, before anybody puts them in order."""
+        """Export the chains before the final reconcile."""
 
     async def reconcile(self, agent_id: int) -> None:
-        """Have the agent begin a reconcile."""
+        """Make the agent begin a reconcile."""
 
     async def top_chain_hashes(self) -> dict[int, str]:
-        """Of every living agent."""
+        """Return the top chain hash of each living agent."""
 
     async def completed(self) -> dict[int, int]:
-        """How many blocks of its own each agent has completed that is neither dead nor paused."""
+        """Return the number of completed blocks of each agent that is neither dead nor paused."""
 
     async def snapshot(self) -> RunOutcome:
-        """What has been played by now, with exports and traces up to now, for whoever judges a run that goes on."""
+        """Return the outcome so far, with exports and traces up to now, to judge an active run."""
 
 
 Story = Callable[[Swarm, Scenario], Awaitable[None]]
-"""What a swarm is led through, from its beginning to its end."""
+"""A function that plays a mission with a swarm, from start to end."""
 
 
 async def play(swarm: Swarm, scenario: Scenario) -> None:
-    """Play the mission with `swarm`; `swarm.played` tells how it went."""
+    """Play the mission with `swarm`. `swarm.played` has the outcome."""
     first, *changes = timeline_of(scenario)
     await swarm.begin(first)
     swarm.enter("mission")
@@ -148,14 +149,14 @@ async def play(swarm: Swarm, scenario: Scenario) -> None:
 
 
 async def play_on(opening: AbstractAsyncContextManager[Swarm], scenario: Scenario, story: Story = play) -> RunOutcome:
-    """Lead the swarm that opens through the story; what became of it."""
+    """Open the swarm, play the story with it, and return the outcome."""
     async with opening as swarm:
         await story(swarm, scenario)
     return swarm.played
 
 
 async def settle(swarm: Swarm, scenario: Scenario) -> None:
-    """The end of a mission: no more events; the agents finish, and reconcile finally if the scenario asks for it."""
+    """End a mission: stop the events, wait until the agents are idle, and play the final reconcile if asked."""
     swarm.enter("settling")
     await swarm.stop_events()
     swarm.played.settled = await swarm.until_idle(scenario.settle.limit_s)
@@ -164,7 +165,7 @@ async def settle(swarm: Swarm, scenario: Scenario) -> None:
 
 
 async def reconcile_finally(swarm: Swarm, limit_s: float) -> None:
-    """Clear all conditions and let one agent after another reconcile, until a round changes no chain."""
+    """Clear all network conditions, and let one agent after another reconcile until a round changes no chain."""
     await swarm.keep_chains()
     swarm.enter("final reconcile")
     began_s = swarm.now()
