@@ -45,9 +45,7 @@ def matrix_command(
     ] = False,
     variant: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Protocol variant: also play each run with it, and write a page of paired differences."
-        ),
+        typer.Option(metavar="FILE", help="Python file with a protocol variant to compare in pairs."),
     ] = None,
     nights: Annotated[
         Path | None,

@@ -97,7 +97,7 @@ def prove_command(
         str | None,
         typer.Option(
             metavar="ORIGINAL",
-            help="Original agent: commit, checkout or `installed`; exit status 1 only for findings that it lacks.",
+            help="Original to compare with: commit, checkout or `installed`.",
         ),
     ] = None,
     cores_: Annotated[

@@ -24,7 +24,7 @@ def variant_option() -> Any:
                 metavar="FILE",
                 callback=put_in_force,
                 rich_help_panel=RARE,
-                help="Protocol variant, a Python file: agents play it, and the reference judges by it.",
+                help="Python file with a protocol variant, for agents and judge.",
             ),
         ] = None,
     ) -> None: ...
