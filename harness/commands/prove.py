@@ -117,7 +117,8 @@ def prove_command(
     """Explore all states that a small swarm can reach within bounds.
 
     Exit status 0: all properties hold. 1: a property is violated, and a scenario shows it. 4: a limit of time or memory
-    was reached before all states were explored. 130: interrupted.
+    was reached before all states were explored. 130: interrupted. With --against, 1 only for findings that the original
+    lacks.
     """
     if timers not in TIMERS:
         raise BoundsError(f"--timers must be one of {', '.join(TIMERS)}, not {timers!r}")
