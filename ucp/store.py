@@ -241,7 +241,7 @@ def read_store(path: Path) -> tuple[Any, StoredState]:
         for entry in entries:
             stored.replay(entry, known)
         stored.check()
-    except (ValueError, TypeError, LookupError, RecursionError):
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
         raise StoreError(
             f"{path} has an entry whose checksum is right and that no agent wrote: move it away or name another file "
             "as `store`"

@@ -51,6 +51,9 @@ Watch = Callable[[State, HandlerRun | None], None]
 """A function that gets the state of an agent after each handler run, and the run. The run is None at the start of an
 incarnation."""
 
+MAX_LINK_CHANGES = 20_000_000
+"""Maximum number of links times changes of the network whose losses are computed, which takes some ten seconds."""
+
 _HASH = re.compile(f"[0-9a-f]{{{2 * HASH_BYTES}}}")
 
 
@@ -360,7 +363,7 @@ def gather(archive: RunArchive) -> Evidence:
         archive.lag(),
         archive.public_keys,
         scenario=archive.record.scenario,
-        link_losses=[*archive.link_losses(archive.roster)],
+        link_losses=_link_losses(archive),
         stores=archive.stores,
     )
 
@@ -379,6 +382,14 @@ def check_variant(archive: RunArchive) -> None:
         f"{archive.directory}: the run was made with the variant {str(made_with)[:80]}{given}: name its file with "
         "--variant"
     )
+
+
+def _link_losses(archive: RunArchive) -> list[tuple[float, dict[Link, float]]]:
+    """Return the losses of all links over time. Empty if they would take too long to compute."""
+    changes = len(archive.conditions(Condition) or ())
+    if changes * len(archive.roster) ** 2 > MAX_LINK_CHANGES:
+        return []
+    return [*archive.link_losses(archive.roster)]
 
 
 def _captures(archive: RunArchive) -> Captures | None:

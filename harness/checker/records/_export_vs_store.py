@@ -12,6 +12,8 @@ from harness.checker.evidence import Evidence
 from harness.checker.records.contradiction import Contradiction, of_agent
 from ucp.store import SCHEMA, StoredState, StoreError, read_store
 
+MAX_STORE_BYTES = 256 * 1024 * 1024
+
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
     """Yield each store that is damaged, or whose content differs from the export."""
@@ -22,6 +24,9 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
             continue
         if incarnations is None or not any(run.changes for run in incarnations[-1].runs):
             continue  # its last incarnation wrote no store
+        if not path.is_file() or path.stat().st_size > MAX_STORE_BYTES:
+            yield of_agent(agent_id, f"its store {path.name} is no file, or larger than {MAX_STORE_BYTES} bytes", "2")
+            continue
         try:
             header, stored = read_store(path)
         except (StoreError, OSError):

@@ -2,7 +2,9 @@
 
 import base64
 import json
+import os
 import shutil
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -200,3 +202,22 @@ def test_event_with_another_timestamp_is_found(directory: Path) -> None:
 
     edit_lines(directory / "agents" / "1.trace.jsonl", shift)
     assert "but the timestamp of the event is" in found(directory)
+
+
+def test_store_that_no_agent_wrote_is_reported(directory: Path) -> None:
+    text = json.dumps({"changes": [], "blocks": [], "secured": 5}).encode()
+    header = b'{"schema":"ucp-store/1"}'
+    lines = b"".join(b"%08x %s\n" % (zlib.crc32(line), line) for line in (header, text))
+    (directory / "agents" / "1.store").write_bytes(lines)
+    assert "its store 1.store is damaged" in found(directory)
+
+
+def test_store_with_other_blocks_than_the_export_is_reported(directory: Path) -> None:
+    header = b'{"schema":"ucp-store/1"}'
+    (directory / "agents" / "1.store").write_bytes(b"%08x %s\n" % (zlib.crc32(header), header))
+    assert "its store and its export differ in the chain" in found(directory)
+
+
+def test_store_that_is_a_fifo_is_not_read(directory: Path) -> None:
+    os.mkfifo(directory / "agents" / "1.store")
+    assert "its store 1.store is no file" in found(directory)
