@@ -47,7 +47,7 @@ def test_records_of_reference_pass(case: str, tmp_path: Path) -> None:
         ("stamps_block_with_first_event", STEPS, "Algorithm 1, build_data_block"),
         ("exports_no_completed_blocks", AGREE, "the completed blocks of the trace"),
         ("leaves_children", "the agent leaves no process running at its end", "came sleep"),
-        ("leaks_descriptors", "inputs and clients leave no descriptors open", "came 50 more"),
+        ("leaks_descriptors", "inputs and clients leave no descriptors open", "after 50 messages and clients; came 5"),
         ("writes_export_in_place", "a chain export replaces the earlier one in one step", "came the same"),
         ("leaves_other_files", "SIGTERM exports the chain, exit status 0", "came scratch.tmp"),
         ("sends_after_sigterm", "SIGINT exports the chain, exit status 0", "came Chain Contain Query"),
