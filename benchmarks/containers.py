@@ -19,7 +19,7 @@ from typing import Any
 from benchmarks.rounds import Spread, show
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
-from harness.play._vehicle_keys import Handed
+from harness.play._vehicle_keys import KeyDirectories
 from harness.play.containers._container_backend import Containers
 from harness.play.containers._container_preflight import require_root
 from harness.play.process._agent_process import AgentProcess, agent_command
@@ -46,7 +46,8 @@ async def once(agents: int, open_lab: OpenLab, directory: Path) -> tuple[float, 
     begin = time.perf_counter()
     async with await open_lab(scenario, rundir, lambda _: None) as lab:
         starts = (
-            agent.start(lab, scenario, 1, b"benchmark", False, False, None, Handed(None, Path())) for agent in started
+            agent.start(lab, scenario, 1, b"benchmark", False, False, None, KeyDirectories(None, Path()))
+            for agent in started
         )
         await asyncio.gather(*starts)
         up = time.perf_counter()

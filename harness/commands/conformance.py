@@ -17,7 +17,7 @@ from harness.conformance.results import TITLES, Results
 from harness.conformance.results_table import progress, render, summary, to_junit
 from harness.conformance.vectors import generate, to_lines
 from harness.errors import HarnessError, MachineError
-from harness.play.agent_control import located
+from harness.play.agent_control import resolve_command
 from harness.run.parallel import terminated_is_interrupted
 from ucp.agent import HANDLERS
 
@@ -82,7 +82,7 @@ def conformance_command(
     console = Console(stderr=as_json, highlight=False)
     place = keep or Path("conformance-failures")
     with TemporaryDirectory(prefix="ucp-conformance-") as scratch, terminated_is_interrupted(), progress() as told:
-        asked = Asked(tuple(located(command, "the agent")), only, _fresh(place), virtual)
+        asked = Asked(tuple(resolve_command(command, "the agent")), only, _fresh(place), virtual)
         results = conform(asked, Path(scratch), told)
     if junit is not None:
         write_new(junit, [to_junit(results)])
@@ -102,7 +102,7 @@ def _all_of(agents: Mapping[str, Sequence[str]], only: str | None, page: Path, *
     for name, command in agents.items():
         with TemporaryDirectory(prefix="ucp-conformance-") as scratch, terminated_is_interrupted(), progress() as told:
             try:
-                asked = Asked(tuple(located(list(command), "the agent")), only, None, virtual)
+                asked = Asked(tuple(resolve_command(list(command), "the agent")), only, None, virtual)
                 outcomes[name] = conform(asked, Path(scratch), told)
             except MachineError:
                 raise

@@ -6,7 +6,7 @@ from sitl.address import Address, connected
 from sitl.vehicle import VehicleError
 
 
-def refuse_what_no_ground_station_sees(scenario: Scenario) -> None:
+def refuse_unreachable_ground_station(scenario: Scenario) -> None:
     """Raises ScenarioError if there is no way to the scenario's ground station, or nothing for it to see."""
     if scenario.gcs is None:
         return

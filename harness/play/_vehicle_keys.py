@@ -45,7 +45,7 @@ class MissionKeys:
         return self.authority.revoke(agent_id)
 
 
-def keys_of(scenario: Scenario, secret: bytes) -> MissionKeys | None:
+def mission_keys(scenario: Scenario, secret: bytes) -> MissionKeys | None:
     """The mission's keys; None if it is not secured. Fresh ones come of `secret`, 32 bytes.
 
     Raises ScenarioError, or MachineError where nothing can be secured.
@@ -74,7 +74,7 @@ def keys_of(scenario: Scenario, secret: bytes) -> MissionKeys | None:
 
 def refuse_revocations(scenario: Scenario) -> None:
     """Raises ScenarioError if its timeline revokes what nobody here can."""
-    keys_of(scenario, bytes(FRESH_BYTES))
+    mission_keys(scenario, bytes(FRESH_BYTES))
 
 
 def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
@@ -121,7 +121,7 @@ def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Sc
     return authority
 
 
-class Handed:
+class KeyDirectories:
     """A directory for each vehicle with its bundle, which nobody else reads; `keys` are the mission's, if any."""
 
     def __init__(self, keys: MissionKeys | None, directory: Path) -> None:
@@ -141,14 +141,14 @@ class Handed:
 
 
 @contextmanager
-def handed_out(scenario: Scenario) -> Iterator[Handed]:
-    """The vehicles' keys, until the run is over. Raises as `keys_of`, and OSError."""
-    keys = keys_of(scenario, os.urandom(FRESH_BYTES))
+def key_directories(scenario: Scenario) -> Iterator[KeyDirectories]:
+    """The vehicles' keys, until the run is over. Raises as `mission_keys`, and OSError."""
+    keys = mission_keys(scenario, os.urandom(FRESH_BYTES))
     if keys is None:
-        yield Handed(None, Path())
+        yield KeyDirectories(None, Path())
         return
     with tempfile.TemporaryDirectory(prefix="ucp-keys-") as directory:
-        handed = Handed(keys, Path(directory))
+        handed = KeyDirectories(keys, Path(directory))
         for vehicle in handed.directories.values():
             vehicle.mkdir()
         yield handed

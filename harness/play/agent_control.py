@@ -23,7 +23,7 @@ FIRST_LINE_BYTES = 256
 """So much of it the kernel reads."""
 
 
-def located(command: Sequence[str], what: str) -> list[str]:
+def resolve_command(command: Sequence[str], what: str) -> list[str]:
     """The command, wherever it is started. Raises ScenarioError, of `what`, if there is no such program."""
     program, *arguments = command
     path = shutil.which(program)
@@ -64,23 +64,23 @@ _OF_A_SHELL = re.compile(
 )
 
 
-def last_words_in(log: Path) -> str:
+def last_line_in(log: Path) -> str:
     """The last line of the file that says something; empty if none does."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, log.stat().st_size - LOOKED_AT_BYTES))
-            return last_words(file.read().decode("utf-8", "replace"))
+            return last_line(file.read().decode("utf-8", "replace"))
     except OSError:
         return ""
 
 
-def last_words(text: str) -> str:
+def last_line(text: str) -> str:
     """The last line that says something, as one line for people."""
     lines = ("".join(filter(str.isprintable, line)).strip() for line in reversed(text.splitlines()))
     return next(filter(None, lines), "")[:CHARACTERS]
 
 
-def of_a_shell(words: str) -> bool:
+def is_shell_error(words: str) -> bool:
     """Whether a shell, or what else starts programs, says so that it did not find one."""
     return _OF_A_SHELL.fullmatch(words) is not None
 
@@ -163,7 +163,7 @@ class AgentControl:
                 raise
         if not answer.get("ok"):
             refused = AgentUnsupportedError if answer.get("unsupported") is True else AgentRefusedError
-            raise refused(last_words(str(answer.get("error", ""))) or "no reason given")
+            raise refused(last_line(str(answer.get("error", ""))) or "no reason given")
         return answer
 
     def close(self) -> None:

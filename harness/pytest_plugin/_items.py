@@ -116,10 +116,10 @@ class StoryItem(pytest.Item):
             )
 
     def _skip_what_needs_virtual_time(self) -> None:
-        from harness.play.process.process_preflight import refuse_what_needs_virtual_time
+        from harness.play.process.process_preflight import refuse_virtual_time_keys
 
         try:
-            refuse_what_needs_virtual_time(self._story.scenario)
+            refuse_virtual_time_keys(self._story.scenario)
         except ScenarioError as error:
             pytest.skip(str(error))
 

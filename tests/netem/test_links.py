@@ -18,7 +18,7 @@ from typing import Any, get_args
 import pytest
 
 from harness.errors import MachineError
-from harness.play.process.process_preflight import refuse_what_this_machine_cannot
+from harness.play.process.process_preflight import refuse_unsupported_network
 from harness.scenario import Scenario
 from netem.conditions import NetworkConditions
 from netem.errors import EngineError
@@ -271,13 +271,13 @@ def test_preflight_finds_conditions_that_some_kernels_refuse(netem: str) -> None
         links = [{"from": 1, "to": 2, "delay": delay}]
         return Scenario(name="Far", agents=3, speedup=1, timeline=[ramp], network={"links": links})
 
-    refuse_what_this_machine_cannot(scenario(2.0))
+    refuse_unsupported_network(scenario(2.0))
     with pytest.raises(
         MachineError,
         match=r"this kernel does not support .*--backend sim.*delay\.jitter_s asked.* 1 "
         r"to 2",
     ):
-        refuse_what_this_machine_cannot(scenario(5.0))
+        refuse_unsupported_network(scenario(5.0))
 
 
 def test_preflight_tests_links_that_differ_because_of_flight(netem: str, tmp_path: Path) -> None:
@@ -293,7 +293,7 @@ def test_preflight_tests_links_that_differ_because_of_flight(netem: str, tmp_pat
     in_lab([1, 2, 3], netem, tmp_path, story)
     flying = {"name": "Twice", "agents": 3, "speedup": 1, "network": {"duplicate": 0.5, "radio": {"hard_range": {}}}}
     with pytest.raises(MachineError, match="duplicat") if refused else nullcontext():
-        refuse_what_this_machine_cannot(Scenario.model_validate(flying))
+        refuse_unsupported_network(Scenario.model_validate(flying))
 
 
 def test_preflight_refuses_unsupported_conditions_with_the_remedy(tmp_path: Path) -> None:

@@ -24,11 +24,11 @@ class Containers(Processes):
 
     def refuse(self, scenario: Scenario) -> None:
         from harness.play.containers._container_preflight import check_debuggers, check_docker, refuse_variants
-        from harness.play.process.process_preflight import refuse_what_programs_cannot
+        from harness.play.process.process_preflight import refuse_unplayable
 
         refuse_variants()
         check_debuggers(scenario)
-        refuse_what_programs_cannot(scenario)
+        refuse_unplayable(scenario)
         check_docker(scenario)
         self.agent_commands(scenario)
 

@@ -13,7 +13,7 @@ import yaml
 
 from harness.archive.directory import PUBLIC_KEYS_FILE
 from harness.errors import RunDirectoryError, ScenarioError
-from harness.play._vehicle_keys import FRESH, FRESH_BYTES, MissionKeys, keys_of
+from harness.play._vehicle_keys import FRESH, FRESH_BYTES, MissionKeys, mission_keys
 from harness.play.containers import _images, ownership
 from harness.play.containers._container_backend import Containers
 from harness.play.containers._container_preflight import check_debuggers
@@ -93,7 +93,7 @@ def _keys(scenario: Scenario) -> MissionKeys | None:
             "`security.keys`: a compose file needs key bundles in a directory, because it holds no keys itself: write "
             "them with `ucp-harness keys bundle HOME --out bundles`, and set {keys: bundles}"
         )
-    return keys_of(scenario, bytes(FRESH_BYTES))
+    return mission_keys(scenario, bytes(FRESH_BYTES))
 
 
 def _secrets(scenario: Scenario, keys: MissionKeys | None) -> dict[str, Any]:

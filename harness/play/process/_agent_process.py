@@ -1,7 +1,8 @@
-"""One agent under test as a program in its vehicle's namespace: started, asked, exported, stopped.
+"""One agent under test: a program in the network namespace of its vehicle.
 
-An agent that is killed and begins again, or comes back from a brown-out, has another life: another process, with a
-directory of its own, so that nothing of an earlier life is overwritten, or found by an agent that should have nothing.
+The harness starts the program, sends commands to its control socket, and collects its files. An agent that starts
+again after a kill or a brown-out is a new incarnation: a new process in a directory of its own. The new process cannot
+overwrite files of an earlier incarnation. It also does not find them, unless the fault left the disk intact.
 """
 
 import asyncio
@@ -21,17 +22,17 @@ from pydantic import ValidationError
 from harness.archive.directory import RunDirectory
 from harness.archive.traces import HANDLER_RUN, SUFFIX, read_trace
 from harness.errors import AgentFailedError, HarnessError, MachineError, ScenarioError, UnsupportedError
-from harness.play._vehicle_keys import Handed
+from harness.play._vehicle_keys import KeyDirectories
 from harness.play.agent_control import (
     AgentControl,
     AgentRefusedError,
     AgentSilentError,
     AgentUnsupportedError,
     Status,
-    last_words,
-    last_words_in,
-    located,
-    of_a_shell,
+    is_shell_error,
+    last_line,
+    last_line_in,
+    resolve_command,
 )
 from harness.play.child_processes import ChildProcesses
 from harness.play.process._run_lab import MissionLab, Program
@@ -46,88 +47,90 @@ START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
 """Wall time after which an agent that does not answer counts as hung."""
 STOP_GRACE_S = 5.0
-ASK_AGAIN_S = 0.02
-MOMENT_S = 0.5
+RETRY_S = 0.02
+END_LIMIT_S = 0.5
 
 
 def agent_command(scenario: Scenario, agent_id: int) -> list[str]:
-    """What starts the agent here, but for the mission file: its files as absolute paths.
+    """Return the command of the agent without the mission file. Paths in it are absolute.
 
-    Raises ScenarioError if there is no such program.
+    Raises ScenarioError if the program does not exist.
     """
     command = scenario.command_of(agent_id)
     if command is None:
         variant = variant_in_use()
         program = ["ucp.node"] if variant is None else ["harness.play.variant_agent", str(variant.file)]
         return [sys.executable, "-P", "-m", *program]
-    of_whom = f" of agent {agent_id}" if isinstance(scenario.agent_command, dict) else ""
-    return located(command, f"`agent_command`{of_whom}")
+    owner = f" of agent {agent_id}" if isinstance(scenario.agent_command, dict) else ""
+    return resolve_command(command, f"`agent_command`{owner}")
 
 
 @dataclass
 class _Incarnation:
-    """`store` is where it keeps what it holds, if the scenario asks for that; `status` is its last."""
+    """The time of an agent from a start to the next end, with its files."""
 
     directory: Path
     store: Path
+    """File in which the agent stores its state, if it has a disk."""
     processes: ChildProcesses = field(default_factory=ChildProcesses)
     status: Status | None = None
-    between_s: tuple[float, float] = (0.0, 0.0)
-    """When it told its status, in mission seconds."""
+    """The last status that the agent reported."""
+    status_between_s: tuple[float, float] = (0.0, 0.0)
+    """Earliest and latest mission second at which the agent can have read its counters for `status`."""
     killed: bool = False
-    """The data that it held is gone."""
+    """The agent ended by SIGKILL, and its disk was not kept."""
     switched_off: bool = False
-    """What it did between its last status and its end only its files tell."""
+    """The agent ended by SIGTERM. Only its files show its actions after the last status."""
     reboot: bool = False
-    """It began with what was on disk."""
-    counted: bool = False
-    """What it completed is known, though it was killed."""
-    trace_brought: int = 0
-    """Bytes of its trace that are where the checker looks for them."""
+    """The agent started with the data on its disk."""
+    completed_known: bool = False
+    """The completed blocks of this killed incarnation have been read from its trace."""
+    trace_bytes_copied: int = 0
+    """Number of bytes of its trace that the trace of the first incarnation already contains."""
 
     def handler_runs(self) -> dict[str, int | float] | None:
-        """How many it had counted when it was asked last."""
+        """Return the number of handler runs in the last status, with the time of the status, for run.json."""
         if self.status is None:
             return None
-        from_s, until_s = self.between_s
+        from_s, until_s = self.status_between_s
         return {"counted": self.status.handled, "from_s": round(from_s, 3), "until_s": round(until_s, 3)}
 
 
 class AgentProcess:
-    """`status` is the agent's last, None while it has none; `outcome` is what became of it, for run.json.
-
-    `now` tells mission seconds.
-    """
+    """The process of one agent, with its earlier incarnations."""
 
     def __init__(self, agent_id: int, rundir: RunDirectory, command: Sequence[str], now: Callable[[], float]) -> None:
+        """`command` starts the agent when the name of its mission file is appended. `now` returns mission seconds."""
         self.agent_id = agent_id
         self._command = command
         self._now = now
         self.outcome = "not started"
+        """State of the agent. After the run, `run.json` records it with `detail`."""
         self.detail: str | None = None
         self._rundir = rundir
-        self._lives: list[_Incarnation] = []
+        self._incarnations: list[_Incarnation] = []
         self._process: Program | None = None
-        self._being_asked = asyncio.Lock()
-        """Nobody stops or kills it while it is asked for its status."""
+        self._control_lock = asyncio.Lock()
+        """Held while the agent answers a status request, so that no fault ends or pauses it meanwhile."""
         self._completed_before: list[str] = []
         self._left_behind: list[str] = []
 
     @property
-    def lives(self) -> int:
-        """How many it has had, this one included."""
-        return len(self._lives)
+    def incarnations(self) -> int:
+        """The number of incarnations so far, including the current one."""
+        return len(self._incarnations)
 
     @property
     def awake(self) -> bool:
-        """Whether it runs and answers."""
+        """True if the agent runs, is not paused, and has not failed."""
         return self.outcome == "running"
 
     @property
     def status(self) -> Status | None:
-        return self._lives[-1].status if self.outcome in ("running", "paused") else None
+        """The last status of the current incarnation. None if the agent neither runs nor is paused."""
+        return self._incarnations[-1].status if self.outcome in ("running", "paused") else None
 
-    # A life
+    # Start and end of an incarnation
 
     async def start(
         self,
@@ -138,15 +141,18 @@ class AgentProcess:
         with_vehicle: bool,
         keeps_disk: bool,
         epoch_us: int | None,
-        keys: Handed,
+        keys: KeyDirectories,
     ) -> None:
-        """Start the program and wait until it answers; with `epoch_us` it joins the mission that began then.
+        """Start the program, and wait until it reports its status.
 
-        With `keeps_disk` it stores what it holds, to be rebooted with it. `keys` are the mission's, if it is secured.
-        Raises AgentFailedError, AgentRefusedError, UnsupportedError; ScenarioError for a program that is none.
+        - `keeps_disk`: the agent stores its state in a file, with which it can reboot.
+        - `epoch_us`: start time of the mission that the agent joins. None if the mission has not started.
+        - `keys`: the key directories of a secured mission.
+
+        Raises AgentFailedError, AgentRefusedError or UnsupportedError, and ScenarioError if the program cannot be run.
         """
-        life = self._begin_life()
-        bundle = keys.hand(self.agent_id, kept=life.reboot)
+        incarnation = self._begin_incarnation()
+        bundle = keys.hand(self.agent_id, kept=incarnation.reboot)
         mission = mission_file(
             self.agent_id,
             scenario,
@@ -155,20 +161,20 @@ class AgentProcess:
             address=lab.addresses[self.agent_id],
             broadcast=lab.broadcast,
             with_vehicle=with_vehicle,
-            life=len(self._lives),
+            incarnation=len(self._incarnations),
             epoch_us=epoch_us,
-            store=os.path.relpath(life.store, life.directory) if keeps_disk else None,
+            store=os.path.relpath(incarnation.store, incarnation.directory) if keeps_disk else None,
             bundle=None if bundle is None else str(bundle),
         )
-        path = self._rundir.write_mission(life.directory, self.agent_id, mission)
+        path = self._rundir.write_mission(incarnation.directory, self.agent_id, mission)
         output = self._log
         self._control = AgentControl(self._control_path)
         try:
             self._process = await lab.spawn(
                 self.agent_id,
                 [*self._command, path.name],
-                cwd=life.directory,
-                env=life.processes.environment(os.environ),
+                cwd=incarnation.directory,
+                env=incarnation.processes.environment(os.environ),
                 stdout=output,
                 stderr=output,
                 role="agent",
@@ -177,73 +183,76 @@ class AgentProcess:
             if scenario.command_of(self.agent_id) is None:
                 raise
             raise ScenarioError(f"`agent_command` of agent {self.agent_id}: {error}") from None
-        await self._wait_until_it_answers(self._process)
+        await self._wait_for_first_status(self._process)
         self.outcome = "running"
 
-    def _begin_life(self) -> _Incarnation:
-        directory = self._rundir.agent(self.agent_id, len(self._lives) + 1)
+    def _begin_incarnation(self) -> _Incarnation:
+        directory = self._rundir.agent(self.agent_id, len(self._incarnations) + 1)
         kept = self.outcome == "rebooting"
-        store = self._lives[-1].store if kept else directory / f"{self.agent_id}.store"
-        self._lives.append(_Incarnation(directory, store, reboot=kept))
-        return self._lives[-1]
+        store = self._incarnations[-1].store if kept else directory / f"{self.agent_id}.store"
+        self._incarnations.append(_Incarnation(directory, store, reboot=kept))
+        return self._incarnations[-1]
 
-    async def _wait_until_it_answers(self, process: Program) -> None:
+    async def _wait_for_first_status(self, process: Program) -> None:
         deadline = asyncio.get_running_loop().time() + START_LIMIT_S
         while True:
             try:
-                asked_s = self._now()
-                self._take(await self._control.ask("status", timeout_s=ANSWER_LIMIT_S), asked_s)
+                requested_s = self._now()
+                self._accept_status(await self._control.ask("status", timeout_s=ANSWER_LIMIT_S), requested_s)
                 return
             except AgentSilentError:
                 if process.returncode is not None:
-                    raise self._crashed(process) from None
+                    raise self._end_error(process) from None
                 if asyncio.get_running_loop().time() > deadline:
-                    raise self._failed("hung", f"did not answer within {START_LIMIT_S:g} s of its start") from None
-                await asyncio.sleep(ASK_AGAIN_S)
+                    raise self._failure("hung", f"did not answer within {START_LIMIT_S:g} s of its start") from None
+                await asyncio.sleep(RETRY_S)
 
     async def watch(self) -> None:
-        """Raises AgentFailedError when the process ends, or UnsupportedError."""
+        """Wait for the end of the process, then raise AgentFailedError or UnsupportedError."""
         assert self._process is not None
         await self._process.wait()
-        raise self._crashed(self._process)
+        raise self._end_error(self._process)
 
     async def kill(self, *, disk_kept: bool = False) -> None:
-        """SIGKILL, which no agent survives; what it held is gone but for its disk, if that is kept.
+        """Kill the process with SIGKILL. `disk_kept` lets the next incarnation start with the data on its disk.
 
-        Stop watching it before. Raises AgentFailedError if it had failed by itself.
+        Cancel `watch` first. Raises AgentFailedError if the agent has already failed.
         """
         assert self._process is not None
-        async with self._being_asked:
+        async with self._control_lock:
             if self.awake:
-                await self._ask_status()  # its counters die with it
+                await self._ask_status()  # the counters are lost with the process
             self._control.close()
             self.outcome = "rebooting" if disk_kept else "killed"
-            self._lives[-1].killed = not disk_kept
+            self._incarnations[-1].killed = not disk_kept
             await self._process.send_signal(signal.SIGKILL)
             await self._process.wait()
             await self._end_children()
             self._control_path.unlink(missing_ok=True)
 
     async def switch_off(self) -> None:
-        """SIGTERM: it exports its chain and ends. Stop watching it before. Raises AgentFailedError if it does not."""
+        """End the process with SIGTERM, on which an agent exports its chain. Cancel `watch` first.
+
+        Raises AgentFailedError if the agent ends with an error, or not at all.
+        """
         assert self._process is not None
-        async with self._being_asked:
+        async with self._control_lock:
             if self.awake:
                 await self._ask_status()
             at_s = self._now()
             self._control.close()
             status = await self._process.terminate(STOP_GRACE_S)
-            self._lives[-1].switched_off = True
+            self._incarnations[-1].switched_off = True
             self._left_behind += await self._end_children()
             if status != 0:
-                raise self._failed("not exported", f"was switched off (SIGTERM) and ended with {self._process.end}")
+                raise self._failure("not exported", f"was switched off (SIGTERM) and ended with {self._process.end}")
             self.outcome, self.detail = "exported", f"switched off at {at_s:.1f} s"
-            self._rundir.copy_export(self.agent_id, self._lives[-1].directory)
+            self._rundir.copy_export(self.agent_id, self._incarnations[-1].directory)
 
     async def pause(self) -> None:
-        """It stands still, and what reaches it waits in its socket, as much as fits there."""
+        """Suspend the process. Incoming messages wait in its socket buffer, and are lost when it is full."""
         assert self._process is not None
-        async with self._being_asked:
+        async with self._control_lock:
             await self._process.pause()
             self.outcome = "paused"
 
@@ -252,71 +261,81 @@ class AgentProcess:
         await self._process.resume()
         self.outcome = "running"
 
-    # What it is asked
+    # Commands
 
     async def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
-        """Raises AgentFailedError if the agent does not answer, AgentRefusedError if it cannot, UnsupportedError."""
+        """Send a command and return the answer.
+
+        Raises AgentFailedError if the agent does not answer, AgentRefusedError if it refuses the command, and
+        UnsupportedError if it does not support the command.
+        """
         try:
             return await self._control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
         except AgentUnsupportedError as error:
-            raise self._unsupported(f"refused the command {command}: {last_words(str(error))}") from None
+            raise self._unsupported_error(f"refused the command {command}: {last_line(str(error))}") from None
         except AgentRefusedError as error:
             raise AgentRefusedError(f"agent {self.agent_id} refused to {command}: {error}") from None
         except AgentSilentError as error:
             if self._process is not None and await self._has_ended(self._process):
-                raise self._crashed(self._process) from None
-            raise self._failed("hung", f"stopped answering: {error}") from None
+                raise self._end_error(self._process) from None
+            raise self._failure("hung", f"stopped answering: {error}") from None
 
     async def _has_ended(self, process: Program) -> bool:
-        """Of which one hears a moment after its connection is lost."""
+        """Return whether the process has ended. Its end may become known a moment after its connection is lost."""
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(process.wait(), MOMENT_S)
+            await asyncio.wait_for(process.wait(), END_LIMIT_S)
         return process.returncode is not None
 
     async def poll(self) -> Status | None:
-        """Ask for the status; None of an agent that is dead or paused. Raises AgentFailedError."""
-        async with self._being_asked:
+        """Request the status. Return None if the agent is dead or paused. Raises as `ask`."""
+        async with self._control_lock:
             return await self._ask_status() if self.awake else None
 
     async def _ask_status(self) -> Status:
-        asked_s = self._now()
-        return self._take(await self.ask("status"), asked_s)
+        requested_s = self._now()
+        return self._accept_status(await self.ask("status"), requested_s)
 
-    def _take(self, answer: dict[str, Any], asked_s: float) -> Status:
+    def _accept_status(self, answer: dict[str, Any], requested_s: float) -> Status:
         try:
             status = Status.model_validate(answer)
         except ValidationError as error:
             wrong = ", ".join(dict.fromkeys(str(problem["loc"][0]) for problem in error.errors()))
             detail = f"does not follow the agent contract: in its status {wrong} is missing or wrong"
-            raise self._failed("broken", detail) from None
-        life = self._lives[-1]
-        life.status = status
+            raise self._failure("broken", detail) from None
+        incarnation = self._incarnations[-1]
+        incarnation.status = status
         own_s = status.mission_s
-        life.between_s = (asked_s, self._now()) if own_s is None else (own_s, own_s)
+        incarnation.status_between_s = (requested_s, self._now()) if own_s is None else (own_s, own_s)
         return status
 
     async def export(self) -> None:
-        """Have the chain exported. Raises AgentFailedError, or MachineError if the agent could not write it."""
+        """Make the agent export its chain, and copy the export to the place where the checker reads it.
+
+        Raises AgentFailedError, or MachineError if the agent could not write the export.
+        """
         await self.poll()
         try:
             await self.ask("export")
         except AgentRefusedError as error:
             self.outcome, self.detail = "not exported", str(error)
             raise MachineError(f"{error}; the part written before is kept") from None
-        self._rundir.copy_export(self.agent_id, self._lives[-1].directory)
+        self._rundir.copy_export(self.agent_id, self._incarnations[-1].directory)
 
-    async def export_finally(self) -> None:
-        """The last export, of an agent that is still alive. Raises as `export`."""
+    async def export_at_end(self) -> None:
+        """Export the chain for the last time, if the agent is alive. Raises as `export`."""
         if self.outcome == "paused":
             await self.resume()
         if self.awake:
             await self.export()
             self.outcome = "exported"
 
-    def runs_since(self, mission_s: float, handler: str) -> list[HandlerRun]:
-        """What its trace has of this handler after then, of this life; damage is the checker's affair."""
+    def handler_runs_since(self, mission_s: float, handler: str) -> list[HandlerRun]:
+        """Return the runs of this handler after `mission_s` from the trace of the current incarnation, oldest first.
+
+        Lines that cannot be parsed are skipped, because the checker reports them.
+        """
         runs: list[HandlerRun] = []
-        trace = self._lives[-1].directory / f"{self.agent_id}{SUFFIX}"
+        trace = self._incarnations[-1].directory / f"{self.agent_id}{SUFFIX}"
         name = json.dumps(handler).encode()
         for line in reversed(trace.read_bytes().split(b"\n")[1:-1] if trace.exists() else ()):
             if name in line:
@@ -327,7 +346,7 @@ class AgentProcess:
                     runs.append(run)
         return runs[::-1]
 
-    # The end
+    # End of the run
 
     async def stop(self) -> None:
         if self._process is None:
@@ -344,78 +363,84 @@ class AgentProcess:
             self._left_behind += left
 
     async def _end_children(self) -> list[str]:
-        return await asyncio.to_thread(self._lives[-1].processes.end_left_behind)
+        return await asyncio.to_thread(self._incarnations[-1].processes.end_left_behind)
 
-    def put_together(self) -> None:
-        """Put what all lives have left where that of one life would be: for the checker. Raises OSError.
+    def collect_files(self) -> None:
+        """Join the traces of all incarnations, and copy the last export, to the files that the checker reads.
 
-        May be done again and again: what is there is not put there twice.
+        A repeated call adds only new lines. Raises OSError.
         """
-        for number, life in enumerate(self._lives, 1):
-            if life.killed and not life.counted:
-                trace = read_trace(life.directory / f"{self.agent_id}{SUFFIX}")
+        for number, incarnation in enumerate(self._incarnations, 1):
+            if incarnation.killed and not incarnation.completed_known:
+                trace = read_trace(incarnation.directory / f"{self.agent_id}{SUFFIX}")
                 self._completed_before += trace.completed() if trace else []
-                life.counted = True
+                incarnation.completed_known = True
             if number > 1:
-                life.trace_brought += self._rundir.append_trace(self.agent_id, life.directory, life.trace_brought)
-                self._rundir.copy_export(self.agent_id, life.directory)
+                incarnation.trace_bytes_copied += self._rundir.append_trace(
+                    self.agent_id, incarnation.directory, incarnation.trace_bytes_copied
+                )
+                self._rundir.copy_export(self.agent_id, incarnation.directory)
 
     def to_json(self) -> dict[str, Any]:
-        lives = self._lives
+        incarnations = self._incarnations
+        statuses = [incarnation.status for incarnation in incarnations if incarnation.status is not None]
         record = {
             "outcome": self.outcome,
             "detail": self.detail,
             "command": list(self._command),
-            "version": next((life.status.version for life in reversed(lives) if life.status is not None), None),
-            "restarts": sum(not life.reboot for life in lives[1:]),
-            "reboots": sum(life.reboot for life in lives),
+            "version": statuses[-1].version if statuses else None,
+            "restarts": sum(not incarnation.reboot for incarnation in incarnations[1:]),
+            "reboots": sum(incarnation.reboot for incarnation in incarnations),
             "completed_before": list(dict.fromkeys(self._completed_before)),
             "left_behind": self._left_behind,
         }
-        statuses = [life.status for life in lives if life.status is not None]
         if not statuses:
             return record
-        ended_at_once = self.outcome in ("killed", "rebooting") or lives[-1].switched_off
-        last_words_of = None if ended_at_once else lives[-1].status
+        ended_at_once = self.outcome in ("killed", "rebooting") or incarnations[-1].switched_off
+        last_status = None if ended_at_once else incarnations[-1].status
         failures = [status.send_failures for status in statuses if status.send_failures is not None]
         return record | {
-            "idle": last_words_of.idle if last_words_of else None,
+            "idle": last_status.idle if last_status else None,
             "bytes_sent": sum(status.bytes_sent for status in statuses),
             "dropped": dict(sum((Counter(status.dropped) for status in statuses), Counter())),
             "send_failures": sum(failures) if failures else None,
             "trace_problem": next((status.trace_problem for status in statuses if status.trace_problem), None),
-            "handler_runs": [life.handler_runs() for life in lives],
+            "handler_runs": [incarnation.handler_runs() for incarnation in incarnations],
         }
 
     @property
     def _control_path(self) -> Path:
-        return self._lives[-1].directory / f"{self.agent_id}.control"
+        return self._incarnations[-1].directory / f"{self.agent_id}.control"
 
     @property
     def _log(self) -> Path:
-        return self._lives[-1].directory / f"{self.agent_id}.log"
+        return self._incarnations[-1].directory / f"{self.agent_id}.log"
 
-    def _crashed(self, process: Program) -> HarnessError:
-        """What it means that it has ended: at its start it may say that it lacks what the mission needs."""
-        status = self._lives[-1].status
-        words = last_words_in(self._log)
+    def _end_error(self, process: Program) -> HarnessError:
+        """Return the error for an agent that ended by itself.
+
+        Exit status 127 before the start of the mission means that the agent lacks a feature of the mission. A shell
+        also ends with 127, if it does not find a program.
+        """
+        status = self._incarnations[-1].status
+        words = last_line_in(self._log)
         if process.returncode != UNSUPPORTED or (status is not None and status.started):
-            return self._failed("crashed", f"ended by itself with {process.end}")
-        if of_a_shell(words):
-            return self._failed("crashed", f"ended by itself with {process.end} ({words})")
-        return self._unsupported(words)
+            return self._failure("crashed", f"ended by itself with {process.end}")
+        if is_shell_error(words):
+            return self._failure("crashed", f"ended by itself with {process.end} ({words})")
+        return self._unsupported_error(words)
 
-    def _unsupported(self, words: str) -> UnsupportedError:
+    def _unsupported_error(self, words: str) -> UnsupportedError:
         error = UnsupportedError.of(self.agent_id, self._command, words)
         self.outcome, self.detail = "not supported", str(error)
         return error
 
-    def _failed(self, outcome: str, detail: str) -> AgentFailedError:
+    def _failure(self, outcome: str, detail: str) -> AgentFailedError:
         self.outcome, self.detail = outcome, detail
         log = self._log.relative_to(self._rundir.path)
         return AgentFailedError(self.agent_id, outcome, f"{detail}; its log is {log}")
 
 
 def reboots_with_disk(agent_id: int, scenario: Scenario) -> bool:
-    """Whether the scenario ever asks for what is on the agent's disk."""
+    """Return whether a fault of the scenario reboots the agent with the data on its disk."""
     return any(fault.disk_left == "kept" and agent_id in fault.agents for fault in scenario.faults_in_order())

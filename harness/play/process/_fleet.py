@@ -1,4 +1,4 @@
-"""The vehicles of one run as programs: made ready, flown, seen at a ground station, lost and replaced."""
+"""The vehicles of a run as programs. Start them, fly them, connect them to a ground station, and replace lost ones."""
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
@@ -20,9 +20,9 @@ from ucp.clock import MissionClock
 
 
 class Fleet:
-    """A vehicle for each agent of the roster, by its ID; false if the run has none (`kinds` is empty).
+    """The vehicles of a run, one for each agent of the roster. Without vehicles (`kinds` is empty) the fleet is false.
 
-    What goes wrong with a vehicle, VehicleFailedError, ends the mission by way of the watchers.
+    The watchers end the mission with VehicleFailedError when a vehicle fails.
     """
 
     def __init__(
@@ -45,13 +45,13 @@ class Fleet:
     def __bool__(self) -> bool:
         return bool(self._vehicles)
 
-    def _vehicle(self, vehicle_id: int, life: int = 1) -> VehicleProcess:
-        return VehicleProcess(vehicle_id, self._sysids[vehicle_id], self._kinds[vehicle_id], self._rundir, life)
+    def _vehicle(self, vehicle_id: int, incarnation: int = 1) -> VehicleProcess:
+        return VehicleProcess(vehicle_id, self._sysids[vehicle_id], self._kinds[vehicle_id], self._rundir, incarnation)
 
     async def start(self, lab: MissionLab, show: Callable[[str], None]) -> None:
-        """Start them all, and return when all are ready to arm; `show` is told how far they are.
+        """Start all vehicles, and wait until all are ready to arm. `show` receives the progress as text.
 
-        Raises VehicleFailedError, and ScenarioError if there is no way to the ground station.
+        Raises VehicleFailedError, and ScenarioError if the ground station cannot be reached.
         """
         if not self._vehicles:
             return
@@ -60,8 +60,8 @@ class Fleet:
         if self._scenario.gcs:
             self._station = await self._open_station(Address.parse(self._scenario.gcs))
         for vehicle in self._vehicles.values():
-            await self._take_charge_of(vehicle, lab)
-        readied = [self._watchers.task(vehicle.get_ready()) for vehicle in self._vehicles.values()]
+            await self._supervise(vehicle, lab)
+        readied = [self._watchers.create_task(vehicle.get_ready()) for vehicle in self._vehicles.values()]
         for ready, next_one in enumerate(asyncio.as_completed(readied)):
             show(f"{ready} of {len(readied)} vehicles are ready")
             await next_one
@@ -82,8 +82,8 @@ class Fleet:
         for vehicle_id in vehicle_ids:
             self._vehicles[vehicle_id].hand_over()
 
-    async def _take_charge_of(self, vehicle: VehicleProcess, lab: MissionLab) -> None:
-        """Of one that has just been started."""
+    async def _supervise(self, vehicle: VehicleProcess, lab: MissionLab) -> None:
+        """Watch a vehicle that has just started, give it its flight, and connect it to the ground station."""
         self._watchers.start(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
         flight = self._scenario.flight_of(vehicle.vehicle_id)
         vehicle.prepare(flight, self._scenario.vehicles.takeoff_altitude_m)
@@ -91,7 +91,7 @@ class Fleet:
             await vehicle.join(self._station, lab)
 
     def take_off(self) -> None:
-        """All of them begin to fly what they are to fly."""
+        """Start the flights of all vehicles."""
         for vehicle in self._vehicles.values():
             self._fly(vehicle)
 
@@ -99,41 +99,41 @@ class Fleet:
         self._watchers.start(vehicle.fly(), of=f"flight {vehicle.vehicle_id}")
 
     def places(self) -> dict[int, Place]:
-        """Where they last said that they are, in metres from the middle of the field."""
+        """Return the last reported positions, in metres from the middle of the field."""
         field = self._scenario.vehicles.field
         return {vehicle_id: vehicle.place(field) for vehicle_id, vehicle in self._vehicles.items()}
 
-    # What can happen to one
+    # Faults
 
     async def shoot_down(self, vehicle_id: int) -> None:
-        """Nothing happens if the run has no vehicles."""
+        """Kill a vehicle. A fleet without vehicles does nothing."""
         if not self._vehicles:
             return
         self._watchers.stop(f"flight {vehicle_id}")
         self._watchers.stop(f"vehicle {vehicle_id}")
         await self._vehicles[vehicle_id].kill()
 
-    async def replace(self, vehicle_id: int, lab: MissionLab, life: int) -> None:
-        """Another takes its place, and flies what it flew. Nothing happens if the run has no vehicles."""
+    async def replace(self, vehicle_id: int, lab: MissionLab, incarnation: int) -> None:
+        """Kill a vehicle, and start a new one with the same flight. A fleet without vehicles does nothing."""
         if not self._vehicles:
             return
-        await self.shoot_down(vehicle_id)  # a wreck still holds its ports
-        vehicle = self._vehicles[vehicle_id] = self._vehicle(vehicle_id, life)
+        await self.shoot_down(vehicle_id)  # a fallen vehicle still holds its ports
+        vehicle = self._vehicles[vehicle_id] = self._vehicle(vehicle_id, incarnation)
         await self._boot(vehicle, lab)
-        await self._take_charge_of(vehicle, lab)
+        await self._supervise(vehicle, lab)
         self._fly(vehicle)
 
     def fall(self, vehicle_id: int) -> None:
         self._watchers.start(self._vehicles[vehicle_id].fall(), of=f"flight {vehicle_id}")
 
-    async def befall(self, vehicle_id: int, what: str, circumstance: Circumstance, at_s: float) -> str | None:
-        """As VehicleProcess.befall: returns why the vehicle does not simulate it, if so."""
-        return await self._vehicles[vehicle_id].befall(what, circumstance, at_s)
+    async def simulate(self, vehicle_id: int, what: str, circumstance: Circumstance, at_s: float) -> str | None:
+        """Make a vehicle simulate a circumstance, as `VehicleProcess.simulate` does."""
+        return await self._vehicles[vehicle_id].simulate(what, circumstance, at_s)
 
-    # The end
+    # End of the run
 
     def close_station(self) -> dict[str, Any] | None:
-        """No ground station hears them any more; returns what it did, None if there was none."""
+        """Disconnect the ground station, and return its record for run.json. None if the run has no ground station."""
         if self._station is None:
             return None
         done = self._station.to_json()

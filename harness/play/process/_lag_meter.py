@@ -1,4 +1,4 @@
-"""The program that measures lag during a mission, started and ended by the orchestrator."""
+"""Start and stop the program that measures lag during a mission."""
 
 import asyncio
 import json
@@ -27,12 +27,12 @@ class LagMeter:
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.DEVNULL,
-            start_new_session=True,  # the terminal's Ctrl-C is for the orchestrator alone
+            start_new_session=True,  # Ctrl-C on the terminal must reach only the harness
         )
         assert process.stdin is not None
         agents = {str(inode): str(agent) for agent, inode in networks.items()}
-        asked = {"epoch_us": epoch_us, "speedup": speedup, "networks": agents}
-        process.stdin.write(json.dumps(asked).encode() + b"\n")
+        request = {"epoch_us": epoch_us, "speedup": speedup, "networks": agents}
+        process.stdin.write(json.dumps(request).encode() + b"\n")
         return cls(process)
 
     async def stop(self) -> None:

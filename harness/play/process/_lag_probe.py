@@ -52,7 +52,7 @@ class Counters:
             try:
                 threads = {entry.name: _busy_ns(entry.path) for entry in os.scandir(f"/proc/{pid}/task")}
             except OSError:
-                continue  # it has ended
+                continue  # the process has ended
             self._busy[pid] = threads
             known = before.get(pid, {})
             grown = sum(ns - known.get(thread, 0) for thread, ns in threads.items())
@@ -60,7 +60,7 @@ class Counters:
         return busy
 
     def stalled(self) -> float:
-        """Return how long the whole machine was not there for a program: it waited for a disk or a hypervisor."""
+        """Return how long the machine ran no program, because of a disk or a hypervisor."""
         before, self._stalled = self._stalled, self._read_stalled()
         return sum(self._stalled) - sum(before)
 
@@ -112,12 +112,12 @@ def measure(file: TextIO, started: float, speedup: float, counters: Counters, en
 
 
 def main(path: str) -> None:
-    asked = json.loads(sys.stdin.readline())
-    started = time.monotonic() - (time.time() - asked["epoch_us"] / MICROSECONDS)
-    counters = Counters({int(inode): agent for inode, agent in asked["networks"].items()})
+    request = json.loads(sys.stdin.readline())
+    started = time.monotonic() - (time.time() - request["epoch_us"] / MICROSECONDS)
+    counters = Counters({int(inode): agent for inode, agent in request["networks"].items()})
     with Path(path).open("a", encoding="ascii") as file:
         ended = threading.Event()
-        measuring = threading.Thread(target=measure, args=(file, started, asked["speedup"], counters, ended))
+        measuring = threading.Thread(target=measure, args=(file, started, request["speedup"], counters, ended))
         measuring.start()
         sys.stdin.read()
         ended.set()

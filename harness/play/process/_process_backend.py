@@ -1,6 +1,6 @@
-"""The backend of processes: vehicles and agents as programs of this machine, in a private network.
+"""The process backend. Vehicles and agents are programs on this machine, in a private network.
 
-What builds networks and flies vehicles takes its time to import, which who plays in virtual time need not wait for.
+The modules for networks and vehicles are imported only when a run needs them, because these imports are slow.
 """
 
 import asyncio
@@ -26,23 +26,23 @@ class Processes(Backend):
     name: ClassVar[BackendName] = "process"
 
     def refuse(self, scenario: Scenario) -> None:
-        from harness.play.process.process_preflight import refuse_what_programs_cannot
+        from harness.play.process.process_preflight import refuse_unplayable
 
-        refuse_what_programs_cannot(scenario)
+        refuse_unplayable(scenario)
         self.agent_commands(scenario)
 
     def agent_command(self, scenario: Scenario, agent_id: int) -> list[str]:
-        """What starts the agent, but for the mission file. Raises HarnessError if nothing would."""
+        """Return the command of the agent without the mission file. Raises HarnessError if it cannot be run."""
         from harness.play.process._agent_process import agent_command
 
         return agent_command(scenario, agent_id)
 
     def agent_commands(self, scenario: Scenario) -> dict[int, list[str]]:
-        """What starts each agent. Raises as `agent_command`."""
+        """Return the command of each agent. Raises as `agent_command`."""
         return {agent_id: self.agent_command(scenario, agent_id) for agent_id in scenario.roster}
 
     async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "MissionLab":
-        """What vehicles and agents live in; see `harness.play.process._run_lab.OpenLab`."""
+        """Open the lab that runs the vehicles and agents. See `harness.play.process._run_lab.OpenLab`."""
         from harness.play.process.process_preflight import network_needs
         from netem.lab import Lab
 
@@ -60,13 +60,13 @@ class Processes(Backend):
         delivers_all: bool = False,
         pace: Pace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
-        from harness.play.process._program_backend import ProcessRun
+        from harness.play.process._program_run import ProgramRun
         from harness.play.process.vehicle_kinds import choose_vehicles
 
-        # Another run is another mission: its blocks must not be taken for this one's.
-        own = f"{scenario.name}, seed {seed}, {datetime.now(UTC).isoformat()}".encode()
-        initial_data = own if scenario.initial_data is None else base64.b64decode(scenario.initial_data)
-        return ProcessRun(
+        # Each run needs an inception block of its own, so that blocks of different runs cannot be confused.
+        unique = f"{scenario.name}, seed {seed}, {datetime.now(UTC).isoformat()}".encode()
+        initial_data = unique if scenario.initial_data is None else base64.b64decode(scenario.initial_data)
+        return ProgramRun(
             scenario,
             seed,
             choose_vehicles(scenario),

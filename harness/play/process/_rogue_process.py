@@ -1,6 +1,7 @@
-"""The rogue node as a process in its own place on the air: started, told what to inject, stopped.
+"""The rogue node as a process in a network namespace of its own.
 
-It is ours, not under test: if it fails, the machine or the harness has failed, and the run ends with that.
+The harness starts it, orders injections, and stops it. The rogue node is part of the harness and not under test. If it
+fails, the run fails with a MachineError.
 """
 
 import asyncio
@@ -19,16 +20,16 @@ from netem.lab import Lab, LabProcess
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
 STOP_GRACE_S = 5.0
-ASK_AGAIN_S = 0.02
+RETRY_S = 0.02
 
 
 class RogueProcess:
-    """`vehicle` is its ID on the air, where it is no agent's."""
+    """The process of the rogue node. `vehicle` is its ID in the lab, which no agent has."""
 
     def __init__(self, vehicle: int, scenario: Scenario, seed: int, rundir: RunDirectory) -> None:
         self.vehicle = vehicle
         self.sent: dict[int, int] = {}
-        """How many datagrams each injection that had begun had made when it was last asked."""
+        """Number of an injection -> number of datagrams that it made. Filled by `stop`."""
         self._scenario = scenario
         self._seed = seed
         self._rundir = rundir
@@ -53,13 +54,13 @@ class RogueProcess:
                 return
             except AgentSilentError:
                 if self._process.returncode is not None:
-                    raise self._ended(self._process) from None
+                    raise self._end_error(self._process) from None
                 if asyncio.get_running_loop().time() > deadline:
-                    raise self._failed(f"did not answer within {START_LIMIT_S:g} s of its start") from None
-                await asyncio.sleep(ASK_AGAIN_S)
+                    raise self._failure(f"did not answer within {START_LIMIT_S:g} s of its start") from None
+                await asyncio.sleep(RETRY_S)
 
     async def begin(self, epoch_us: int, captured: Path | None) -> None:
-        """The mission begins; in the file `captured` are a vehicle's keys."""
+        """Start the mission. `captured` is the file with the keys of a captured vehicle."""
         scenario = self._scenario
         roster, keys = list(scenario.roster), None if captured is None else str(captured)
         await self._ask(
@@ -67,18 +68,19 @@ class RogueProcess:
         )
 
     async def inject(self, injected: Injected) -> None:
+        """Order an injection. Raises MachineError."""
         await self._ask(
             "inject", what=injected.what, number=injected.number, injection=injected.injection.model_dump(mode="json")
         )
 
     async def watch(self) -> None:
-        """Raises MachineError when the process ends."""
-        assert self._process is not None, "it is watched once it runs"
+        """Wait for the end of the process, then raise MachineError."""
+        assert self._process is not None, "`start` comes first"
         await self._process.wait()
-        raise self._ended(self._process)
+        raise self._end_error(self._process)
 
     async def stop(self) -> None:
-        """Take down what it has sent, and end it. Raises MachineError if it has failed."""
+        """Read the numbers of sent datagrams into `sent`, and end the process. Raises MachineError if it has failed."""
         if self._process is None or self._process.returncode is not None:
             return
         answer = await self._ask("status")
@@ -90,11 +92,11 @@ class RogueProcess:
         try:
             return await self._control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
         except (AgentSilentError, AgentRefusedError) as error:
-            raise self._failed(f"does not {command}: {error}") from None
+            raise self._failure(f"does not {command}: {error}") from None
 
-    def _ended(self, process: LabProcess) -> MachineError:
-        return self._failed(f"ended by itself with {process.end}")
+    def _end_error(self, process: LabProcess) -> MachineError:
+        return self._failure(f"ended by itself with {process.end}")
 
-    def _failed(self, detail: str) -> MachineError:
+    def _failure(self, detail: str) -> MachineError:
         log = self._rundir.rogue_log
         return MachineError(f"the rogue node {detail}; its log is {log.relative_to(self._rundir.path)}")

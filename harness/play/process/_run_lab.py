@@ -1,6 +1,6 @@
-"""What a run needs of the lab that its vehicles and agents live in, whatever they are made of.
+"""The interface of a lab that runs the vehicles and agents of a mission.
 
-`netem.lab.Lab` is one, where they are processes; `harness.play.containers._container_lab.ContainerLab` is another.
+`netem.lab.Lab` implements it with processes, and `harness.play.containers._container_lab.ContainerLab` with containers.
 """
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -19,33 +19,36 @@ Role = Literal["agent", "vehicle"]
 
 
 class Program(Protocol):
-    """A program that was started in the lab. Raises NetemError if the lab fails."""
+    """A program that runs in the lab. The methods raise NetemError if the lab fails."""
 
     @property
     def returncode(self) -> int | None:
-        """None while it runs; then its exit status, or minus the signal that killed it (subprocess)."""
+        """The exit status, or the negative number of the signal that killed the program. None while it runs."""
 
     @property
     def end(self) -> str:
-        """How it ended, for people."""
+        """A phrase for the user that describes how the program ended."""
 
     async def wait(self) -> int:
-        """Wait for its end; what it said is in its files then."""
+        """Wait for the end of the program. Its output is complete in its files then. Return `returncode`."""
 
     async def send_signal(self, number: int) -> None:
-        """Nothing happens if it has ended."""
+        """Send a signal. A program that has ended is ignored."""
 
     async def pause(self) -> None:
-        """It stands still until `resume`."""
+        """Suspend the program until `resume`."""
 
     async def resume(self) -> None: ...
 
     async def terminate(self, grace_s: float) -> int:
-        """End it with SIGTERM, or after `grace_s` seconds with SIGKILL; returns its return code."""
+        """End the program with SIGTERM, and after `grace_s` seconds with SIGKILL. Return `returncode`."""
 
 
 class MissionLab(Protocol):
-    """Raises NetemError wherever it fails; as netem.lab.Lab does, and says, what is not said here."""
+    """A lab of vehicles. The methods raise NetemError if the lab fails.
+
+    Methods without a docstring are documented in `netem.lab.Lab`.
+    """
 
     @property
     def addresses(self) -> Mapping[int, str]: ...
@@ -58,7 +61,7 @@ class MissionLab(Protocol):
 
     @property
     def network(self) -> NetworkLab:
-        """The lab of `netem` with the switch, for programs that watch it: those are always processes."""
+        """The lab of `netem` with the switch. Programs of the harness, for example captures, run in it as processes."""
 
     async def spawn(
         self,
@@ -79,18 +82,21 @@ class MissionLab(Protocol):
     async def read(self) -> Applied: ...
 
     async def watch(self) -> None:
-        """Raises when the lab has failed by itself."""
+        """Wait until the lab fails by itself, then raise NetemError."""
 
     async def close(self) -> None:
-        """End everything in it, and remove it; may be called again, and raises nothing then."""
+        """End all programs, and remove the lab. A repeated call does nothing."""
 
     async def __aenter__(self) -> Self: ...
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """As `close`, but raises nothing."""
+        """Close the lab. Errors are ignored."""
 
 
 OpenLab = Callable[[Scenario, RunDirectory, Callable[[str], None]], Awaitable[MissionLab]]
-"""Brings up the lab of a run, saying what it does if that takes long. Raises NetemError or HarnessError."""
+"""A function that opens the lab of a run. The last argument shows slow steps to the user.
+
+Raises NetemError or HarnessError.
+"""

@@ -1,4 +1,4 @@
-"""One vehicle as a program in its own namespace, and the pilot that flies it."""
+"""One vehicle: a program in a network namespace of its own, and the pilot that flies it."""
 
 import asyncio
 import contextlib
@@ -23,10 +23,10 @@ from sitl.vehicle import STATION_PORT, Home, Launch, VehicleError, VehicleKind
 
 LISTEN_LIMIT_S = 20.0
 CONNECT_LIMIT_S = 2.0
-ASK_AGAIN_S = 0.05
+RETRY_S = 0.05
 STOP_GRACE_S = 3.0
-ENDING_S = 0.5
-LAST_WORDS = 3
+END_LIMIT_S = 0.5
+LAST_LINES = 3
 PARAMETERS = "parameters.parm"
 
 
@@ -35,18 +35,20 @@ class VehicleFailedError(HarnessError):
 
 
 class VehicleProcess:
-    """One vehicle, with `sysid` its MAVLink system ID; one that takes the place of a lost one has another `life`."""
+    """One vehicle. `sysid` is its MAVLink system ID. The replacement of a lost vehicle has the next `incarnation`."""
 
-    def __init__(self, vehicle_id: int, sysid: int, kind: VehicleKind, rundir: RunDirectory, life: int = 1) -> None:
+    def __init__(
+        self, vehicle_id: int, sysid: int, kind: VehicleKind, rundir: RunDirectory, incarnation: int = 1
+    ) -> None:
         self.vehicle_id = vehicle_id
         self.sysid = sysid
         self.kind = kind
-        self._given_up = self._introduced = False
+        self._abandoned = self._introduced = False
         self.pilot: Pilot | None = None
-        self._directory = rundir.vehicle(vehicle_id, life)
+        self._directory = rundir.vehicle(vehicle_id, incarnation)
         self._process: Program | None = None
         self._flight: Procedure | None = None
-        self._befallen: list[dict[str, Any]] = []
+        self._circumstances: list[dict[str, Any]] = []
         self._station_port = STATION_PORT
 
     @property
@@ -81,19 +83,19 @@ class VehicleProcess:
                 break
             except (ConnectionError, TimeoutError):
                 if self._process.returncode is not None:
-                    raise self._ended(self._process) from None
+                    raise self._end_error(self._process) from None
                 if asyncio.get_running_loop().time() > deadline:
                     raise VehicleFailedError(
                         f"vehicle {self.vehicle_id} ({self.kind.name}) does not listen on port {launch.pilot_port} "
-                        f"after {LISTEN_LIMIT_S:g} s{self._last_words()}"
+                        f"after {LISTEN_LIMIT_S:g} s{self._last_output()}"
                     ) from None
-                await asyncio.sleep(ASK_AGAIN_S)
+                await asyncio.sleep(RETRY_S)
         tlog = self._directory / "telemetry.tlog"
         self.pilot = Pilot(self.sysid, sock, tlog, speedup, self._home, self.kind.vehicle_type, self.vehicle_id)
         await self.pilot.start()
 
     async def join(self, station: GroundStation, lab: MissionLab) -> None:
-        """Be seen at a ground station, and listen to it. Raises VehicleFailedError."""
+        """Connect the vehicle and the ground station with each other. Raises VehicleFailedError."""
         try:
             sock = await lab.connect(self.vehicle_id, self._station_port, timeout_s=CONNECT_LIMIT_S)
         except (ConnectionError, TimeoutError):
@@ -104,67 +106,71 @@ class VehicleProcess:
         await station.attach(self.vehicle_id, self.sysid, sock)
 
     def hand_over(self) -> None:
-        """An operator flies it from now on."""
+        """Let an operator fly the vehicle from now on."""
         assert self.pilot is not None
         self.pilot.hand_over()
 
     def place(self, field: Home) -> Place:
-        """Where it last said that it is, as seen from the middle of the field; at its home until it knows."""
+        """Return the last reported position relative to the middle of the field, or home if there is no report yet."""
         position = self.pilot.state.position if self.pilot else None
         if position is None:
             return Place(*field.metres_to(self._home.lat_deg, self._home.lon_deg, self._home.alt_m))
         return Place(*field.metres_to(position.lat_deg, position.lon_deg, position.alt_m))
 
     def prepare(self, flight: Flight | None, altitude_m: float) -> None:
-        """What it is to fly: a plan, or without one up to `altitude_m`."""
+        """Set the flight: the plan, or a climb to `altitude_m` if there is no plan."""
         assert self.pilot is not None
         self._flight = self.pilot.flight(flight.planned(), flight.by) if flight else self.pilot.ascent(altitude_m)
 
     async def _introduce(self) -> None:
-        """Take down what it says of itself, once. Raises VehicleFailedError, having killed it."""
+        """Set the given parameters, and read version and parameters of the vehicle into the record. Do this once.
+
+        Raises VehicleFailedError after a kill.
+        """
         assert self.pilot is not None
         if self._introduced:
             return
         self._introduced = True
-        await self._piloted(self.pilot.introduce(self.kind.parameters))
+        await self._run_pilot(self.pilot.introduce(self.kind.parameters))
         known = self.pilot.link.parameters
         if known:
             (self._directory / PARAMETERS).write_text(in_lines(known), encoding="utf-8")
 
     async def get_ready(self) -> None:
-        """Up to arming. Raises VehicleFailedError, having killed it."""
+        """Prepare the vehicle until it can be armed. Raises VehicleFailedError after a kill."""
         assert self.pilot is not None and self._flight is not None
         await self._introduce()
-        await self._piloted(self.pilot.get_ready(self._flight))
+        await self._run_pilot(self.pilot.get_ready(self._flight))
 
     async def fly(self) -> None:
-        """And stay in touch with it as long as the mission takes. Raises VehicleFailedError, having killed it."""
+        """Fly, and then read the telemetry until the mission ends. Raises VehicleFailedError after a kill."""
         assert self.pilot is not None and self._flight is not None
         await self._introduce()
-        await self._piloted(self.pilot.fly(self._flight))
-        await self._piloted(self.pilot.stay_in_touch())
+        await self._run_pilot(self.pilot.fly(self._flight))
+        await self._run_pilot(self.pilot.stay_in_touch())
 
-    async def _piloted(self, flight: Coroutine[Any, Any, None]) -> None:
+    async def _run_pilot(self, flight: Coroutine[Any, Any, None]) -> None:
+        """Run an operation of the pilot. If the vehicle fails in it, kill the vehicle and raise VehicleFailedError."""
         try:
             await flight
         except VehicleError as error:
             assert self._process is not None
-            with contextlib.suppress(TimeoutError):  # a connection ends just before its process does
-                await asyncio.wait_for(self._process.wait(), ENDING_S)
-                raise self._ended(self._process) from None
-            self._given_up = True
-            await self._process.send_signal(signal.SIGKILL)  # it may spin, or fly on who knows where
+            with contextlib.suppress(TimeoutError):  # a process ends shortly after its connection
+                await asyncio.wait_for(self._process.wait(), END_LIMIT_S)
+                raise self._end_error(self._process) from None
+            self._abandoned = True
+            await self._process.send_signal(signal.SIGKILL)  # it may be in an endless loop, or fly away
             raise VehicleFailedError("; ".join(filter(None, (str(error), self.kind.lack)))) from None
 
     async def watch(self) -> None:
-        """Raises VehicleFailedError when the process ends by itself."""
+        """Wait for the end of the process. Raises VehicleFailedError if it ends by itself."""
         assert self._process is not None
         await self._process.wait()
-        if not self._given_up:
-            raise self._ended(self._process)
+        if not self._abandoned:
+            raise self._end_error(self._process)
 
     async def kill(self) -> None:
-        """It is shot down: SIGKILL. Neither watch nor fly it any more before."""
+        """Kill the process with SIGKILL. Cancel `watch` and `fly` first."""
         assert self._process is not None
         await self._process.send_signal(signal.SIGKILL)
         await self._process.wait()
@@ -172,17 +178,17 @@ class VehicleProcess:
             await self.pilot.close()
 
     async def fall(self) -> None:
-        """Its motors stop, what it was flying ends, and it falls to the ground. Raises VehicleFailedError."""
+        """Stop the motors, end the flight, and let the vehicle fall to the ground. Raises VehicleFailedError."""
         assert self.pilot is not None
-        await self._piloted(self.pilot.terminate_flight())
+        await self._run_pilot(self.pilot.terminate_flight())
 
-    async def befall(self, what: str, circumstance: Circumstance, at_s: float) -> str | None:
-        """Have it simulate this; returns why it does not, in a sentence, if so. Raises nothing."""
+    async def simulate(self, what: str, circumstance: Circumstance, at_s: float) -> str | None:
+        """Make the vehicle simulate a circumstance. If the vehicle cannot, return the reason as a sentence."""
         assert self.pilot is not None
-        told: dict[str, Any] = {"at_s": at_s, "what": what, "parameters": {}}
-        self._befallen.append(told)
+        entry: dict[str, Any] = {"at_s": at_s, "what": what, "parameters": {}}
+        self._circumstances.append(entry)
         try:
-            told["parameters"] = dict(await self.pilot.befall(circumstance))
+            entry["parameters"] = dict(await self.pilot.befall(circumstance))
         except VehicleError as error:
             return (
                 f"{what} at {at_s:g} s: vehicle {self.vehicle_id} ({self.kind.name} {self.kind.vehicle_type}) {error}"
@@ -197,7 +203,7 @@ class VehicleProcess:
 
     def to_json(self) -> dict[str, Any]:
         record: dict[str, Any] = {"kind": self.kind.name, "type": self.kind.vehicle_type, "sysid": self.sysid}
-        record |= self._what_flew()
+        record |= self._firmware()
         if self.pilot is not None:
             state, factor = self.pilot.state, self.pilot.real_time_factor
             record["mode"] = state.mode
@@ -209,14 +215,14 @@ class VehicleProcess:
                 record["garbage"] = state.garbage
             if state.log_error is not None:
                 record["telemetry_log_error"] = state.log_error
-            if self._befallen:
-                record["befallen"] = self._befallen
+            if self._circumstances:
+                record["befallen"] = self._circumstances
             if state.texts:
                 record["last_text"] = state.texts[-1]
         return record
 
-    def _what_flew(self) -> dict[str, Any]:
-        """As far as it has said; files from the run's directory on."""
+    def _firmware(self) -> dict[str, Any]:
+        """Return the reported version, type and parameters. File names are relative to the run directory."""
         given: dict[str, Any] = {"frame": self.kind.frame, "binary_sha256": self.kind.sha256}
         if self.pilot is not None:
             state, parameters = self.pilot.state, self.pilot.link.parameters
@@ -231,14 +237,14 @@ class VehicleProcess:
             given["parameters_given"] = dict(self.kind.parameters)
         return {key: value for key, value in given.items() if value is not None}
 
-    def _ended(self, process: Program) -> VehicleFailedError:
+    def _end_error(self, process: Program) -> VehicleFailedError:
         return VehicleFailedError(
-            f"vehicle {self.vehicle_id} ({self.kind.name}) ended by itself with {process.end}{self._last_words()}"
+            f"vehicle {self.vehicle_id} ({self.kind.name}) ended by itself with {process.end}{self._last_output()}"
         )
 
-    def _last_words(self) -> str:
+    def _last_output(self) -> str:
         try:
-            lines = self._output.read_text(encoding="utf-8", errors="replace").splitlines()[-LAST_WORDS:]
+            lines = self._output.read_text(encoding="utf-8", errors="replace").splitlines()[-LAST_LINES:]
         except OSError:
             lines = []
         words = " / ".join(line.strip() for line in lines if line.strip())

@@ -1,4 +1,4 @@
-"""What runs beside a mission, and ends it when something goes wrong: watchers of programs, the user's Ctrl-C."""
+"""Tasks that run beside a mission, for example watchers of programs. An error in a task ends the mission."""
 
 import asyncio
 from collections import defaultdict
@@ -12,16 +12,19 @@ T = TypeVar("T")
 
 
 class Watchers:
-    """Tasks beside a mission. What one of them raises ends the mission, and they end with it, or before by `stop`."""
+    """A group of tasks beside a mission.
+
+    An exception in a task ends the mission. A task ends with the mission at the latest, and earlier through `stop`.
+    """
 
     def __init__(self) -> None:
         self._group = asyncio.TaskGroup()
         self._tasks: dict[str, list[asyncio.Task[None]]] = defaultdict(list)
-        """Of what -> the tasks that watch it, or fly it."""
+        """Name of a program or flight -> the tasks that watch it or control it."""
 
     @asynccontextmanager
     async def guard(self, *watched: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
-        """The mission is inside, beside what is watched all along; raises the first failure of anything."""
+        """Run the mission in this context, with `watched` as tasks. If any of them fails, raise the root error."""
         try:
             async with self._group:
                 for coroutine in watched:
@@ -30,17 +33,20 @@ class Watchers:
                 for what in list(self._tasks):
                     self.stop(what)
         except BaseExceptionGroup as errors:
-            raise _first(errors) from None
+            raise _root_error(errors) from None
 
     def start(self, coroutine: Coroutine[Any, Any, None], of: str = "mission") -> None:
-        self._tasks[of].append(self.task(coroutine))
+        self._tasks[of].append(self.create_task(coroutine))
 
     def stop(self, of: str) -> None:
         for task in self._tasks.pop(of, ()):
             task.cancel()
 
-    def task(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """One that the mission waits for. Raises RuntimeError if the mission is ending by a failure already."""
+    def create_task(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Start a task without a name, which `stop` does not end. The mission waits for its end.
+
+        Raises RuntimeError if a failure is already ending the mission.
+        """
         try:
             return self._group.create_task(coroutine)
         except RuntimeError:
@@ -48,8 +54,8 @@ class Watchers:
             raise
 
 
-async def unless_interrupted(opening: Awaitable[T], interrupted: asyncio.Event) -> T:
-    """What is opened. Raises InterruptedRunError, once what was begun has been taken back."""
+async def open_unless_interrupted(opening: Awaitable[T], interrupted: asyncio.Event) -> T:
+    """Return the result of `opening`. If the run is interrupted, cancel `opening` and raise InterruptedRunError."""
     opened = asyncio.ensure_future(opening)
     interruption = asyncio.create_task(interrupted.wait())
     await asyncio.wait({opened, interruption}, return_when=asyncio.FIRST_COMPLETED)
@@ -62,9 +68,9 @@ async def unless_interrupted(opening: Awaitable[T], interrupted: asyncio.Event) 
     return opened.result()
 
 
-def _first(errors: BaseExceptionGroup[BaseException]) -> BaseException:
-    """The error to report: an agent's or vehicle's own before what followed from it."""
+def _root_error(errors: BaseExceptionGroup[BaseException]) -> BaseException:
+    """Return the error to report: a failed agent first, then other HarnessErrors, then the consequences."""
     flat: list[BaseException] = []
     for error in errors.exceptions:
-        flat += [_first(error)] if isinstance(error, BaseExceptionGroup) else [error]
+        flat += [_root_error(error)] if isinstance(error, BaseExceptionGroup) else [error]
     return min(flat, key=lambda error: (not isinstance(error, HarnessError), not isinstance(error, AgentFailedError)))

@@ -1,4 +1,4 @@
-"""What an agent is told before it starts: its mission file (`ucp-mission/1`, see ucp/contract/CONTRACT.md)."""
+"""The mission file that an agent reads at its start (`ucp-mission/1`, see ucp/contract/CONTRACT.md)."""
 
 import base64
 from typing import Any
@@ -12,7 +12,7 @@ from ucp.messages import PORT
 from ucp.mission import SCHEMA
 
 NO_QUIRKS = {"ignore_commit": 0.0, "crash_on_tie": False, "early_phase3_expiry": False, "stale_chain_hash": False}
-"""The quirks that a mission file always has; the others are there if they are asked for."""
+"""The quirks that each mission file has. It has further quirks only if the scenario requests them."""
 
 
 def mission_file(
@@ -24,14 +24,17 @@ def mission_file(
     address: str,
     broadcast: str,
     with_vehicle: bool,
-    life: int = 1,
+    incarnation: int = 1,
     epoch_us: int | None = None,
     store: str | None = None,
     bundle: str | None = None,
 ) -> dict[str, Any]:
-    """`seed` is the run's; an agent has one of its own in each `life`. With `epoch_us` it joins a mission under way.
+    """Return the mission file of an agent as JSON.
 
-    `bundle` is the file with its keys, in a secured mission.
+    - `seed`: seed of the run. The file has a seed derived from it, which differs for each agent and incarnation.
+    - `epoch_us`: start time of the mission, if the agent joins an active mission.
+    - `store`: file in which the agent stores its state. None: the agent has no disk.
+    - `bundle`: file with the agent's keys in a secured mission.
     """
     events = scenario.events
     document = {
@@ -52,7 +55,7 @@ def mission_file(
         },
         "settings": scenario.settings_of(agent_id).told(),
         "quirks": {**NO_QUIRKS, **scenario.quirks_of(agent_id)},
-        "seed": agent_seed(seed, agent_id, life),
+        "seed": agent_seed(seed, agent_id, incarnation),
         "speedup": scenario.speedup,
         "epoch_us": epoch_us,
         "store": store,
@@ -63,7 +66,10 @@ def mission_file(
 
 
 def _source(events: Events, with_vehicle: bool) -> str:
-    """Scripted events come by the command `log`, and those of no vehicle from the agent itself."""
+    """Return the event source. The harness sends scripted events by the command `log`, so their source is "none".
+
+    An agent without a vehicle draws its events at random.
+    """
     if events.source == "scripted":
         return "none"
     return events.source if with_vehicle else "random"

@@ -1,11 +1,11 @@
-"""Checks before a run with processes: what this machine cannot do."""
+"""Checks before a run with processes or containers, which reject a scenario that this machine cannot play."""
 
 import asyncio
 import tempfile
 from pathlib import Path
 
 from harness.errors import MachineError, ScenarioError
-from harness.play._ground_station_check import refuse_what_no_ground_station_sees
+from harness.play._ground_station_check import refuse_unreachable_ground_station
 from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.scenario import Scenario
 from harness.scenario.changes import NetworkChange, timeline_of
@@ -16,16 +16,16 @@ from netem.radio import over_the_air
 from netem.tc import may_refuse
 
 
-def refuse_what_programs_cannot(scenario: Scenario) -> None:
-    """Raises HarnessError for what neither processes nor containers can play, or not on this machine."""
-    refuse_what_needs_virtual_time(scenario)
-    refuse_what_this_machine_cannot(scenario)
+def refuse_unplayable(scenario: Scenario) -> None:
+    """Raise HarnessError if real programs, or this machine, cannot play the scenario."""
+    refuse_virtual_time_keys(scenario)
+    refuse_unsupported_network(scenario)
     choose_vehicles(scenario)
-    refuse_what_no_ground_station_sees(scenario)
+    refuse_unreachable_ground_station(scenario)
 
 
-def refuse_what_needs_virtual_time(scenario: Scenario) -> None:
-    """Raises ScenarioError naming the keys that real processes cannot be given yet."""
+def refuse_virtual_time_keys(scenario: Scenario) -> None:
+    """Raise ScenarioError if the scenario has keys that need virtual time. The message lists them."""
     keys = [
         *(["fates"] if scenario.fates else []),
         *(["datagrams"] if scenario.datagrams else []),
@@ -42,29 +42,31 @@ def refuse_what_needs_virtual_time(scenario: Scenario) -> None:
 
 
 def network_needs(scenario: Scenario) -> list[str]:
-    """What the scenario asks of the network beyond loss and partition, each once.
+    """Return the network features that the scenario needs beyond loss and partitions, each once.
 
-    Raises ScenarioError for conditions that mean nothing on a clock that runs at the scenario's speedup.
+    Raises ScenarioError for conditions that are impossible at the speedup of the scenario.
     """
-    return list(dict.fromkeys(need for state in _networks(scenario) for need in state.needs()))
+    return list(dict.fromkeys(need for state in _network_states(scenario) for need in state.needs()))
 
 
-def on_the_air(conditions: NetworkConditions, scenario: Scenario) -> NetworkConditions:
-    """These conditions between the vehicles, and perfect ones around the rogue node, if the scenario has one."""
+def add_rogue_listener(conditions: NetworkConditions, scenario: Scenario) -> NetworkConditions:
+    """Return these conditions for the vehicles, and perfect links to the rogue node if the scenario has one."""
     return conditions.with_listener(scenario.rogue, scenario.roster) if scenario.rogue else conditions
 
 
-def _networks(scenario: Scenario) -> list[NetworkConditions]:
-    """Every state of the network, each once, without partitions, on a clock that runs at the scenario's speedup.
+def _network_states(scenario: Scenario) -> list[NetworkConditions]:
+    """Return each state of the network once, at the speedup of the scenario and without partitions.
 
-    Where a radio will make links differ, also as one in which they do.
+    With a radio model, one link of each state loses more than the others, because links differ during the flight.
     """
     states = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
     out_of_reach = {frozenset(scenario.roster[:2]): 0.5} if scenario.network.radio else {}
     networks: list[NetworkConditions] = []
     for state in states:
         try:
-            network = on_the_air(over_the_air(state, out_of_reach).healed(), scenario).at_speed(scenario.speedup)
+            network = add_rogue_listener(over_the_air(state, out_of_reach).healed(), scenario).at_speed(
+                scenario.speedup
+            )
         except ConditionsError as error:
             raise ScenarioError(f"`network` at `speedup` {scenario.speedup:g}: {error}") from None
         if network not in networks:
@@ -72,20 +74,20 @@ def _networks(scenario: Scenario) -> list[NetworkConditions]:
     return networks
 
 
-def refuse_what_this_machine_cannot(scenario: Scenario) -> None:
-    """Raises MachineError, with the way out, if no engine here does what the network asks.
+def refuse_unsupported_network(scenario: Scenario) -> None:
+    """Raise MachineError, with a solution, if no engine of this machine supports the network of the scenario.
 
-    Tried in a lab of its own, for a fraction of a second, and only if it asks for more than loss and partitions; what
-    some kernels refuse although they have netem is rehearsed there.
+    If the scenario needs more than loss and partitions, open a lab for a fraction of a second. Some kernels with netem
+    reject certain conditions. Apply these conditions in the lab.
     """
     needs = network_needs(scenario)
-    rehearsed = [network for network in _networks(scenario) if may_refuse(network)]
+    uncertain = [network for network in _network_states(scenario) if may_refuse(network)]
     if not needs:
         return
 
     async def attempt(folder: str) -> None:
         async with await Lab.open(scenario.on_the_air, needs=needs, log=Path(folder, "lab.log")) as lab:
-            for network in rehearsed:
+            for network in uncertain:
                 await lab.apply(network)
 
     with tempfile.TemporaryDirectory() as folder:

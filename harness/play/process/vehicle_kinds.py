@@ -1,4 +1,4 @@
-"""Which kind of vehicle flies for each vehicle of a scenario: ArduPilot, or the embedded vehicle."""
+"""The choice between ArduPilot and the embedded vehicle for each vehicle of a scenario."""
 
 import os
 
@@ -11,11 +11,11 @@ from sitl.vehicle import NoBinaryError, NoProgramError, VehicleError, VehicleKin
 
 
 def choose_vehicles(scenario: Scenario) -> dict[int, VehicleKind]:
-    """The kind of each vehicle; empty: no vehicles.
+    """Return the kind of each vehicle. The result is empty if the scenario has no vehicles.
 
-    ArduPilot if the binaries of all are found, else the embedded vehicle, unless the scenario says. Raises
-    VehicleFailedError for a binary, or for what is asked of a vehicle, that will not do, MachineError if a program is
-    asked for and not here.
+    Unless the scenario names a kind, all vehicles are ArduPilot if the binaries of all of them are found. Otherwise all
+    are embedded vehicles. Raises VehicleFailedError for an unusable binary or an impossible vehicle set-up, and
+    MachineError if a required program is missing.
     """
     vehicles = scenario.vehicles
     if vehicles.kind == "none":
@@ -34,7 +34,10 @@ def choose_vehicles(scenario: Scenario) -> dict[int, VehicleKind]:
 
 
 def _ardupilots(scenario: Scenario) -> dict[int, VehicleKind] | None:
-    """Raises NoBinaryError if they are asked for, or have to fly a frame of their own, and are not here."""
+    """Return ArduPilot for each vehicle, or None for embedded vehicles.
+
+    Raises NoBinaryError if the scenario requires ArduPilot, and a binary is missing.
+    """
     vehicles = scenario.vehicles
     if vehicles.kind == "embedded":
         return None

@@ -10,7 +10,7 @@ from functools import partial
 from random import Random
 from typing import Any
 
-from harness.play._vehicle_keys import keys_of
+from harness.play._vehicle_keys import mission_keys
 from harness.play.rogue._captured_bundle import CapturedKeys
 from harness.play.simulation._crypto_cache import remembered
 from harness.play.simulation._simulated_agent import OwnAgent
@@ -47,7 +47,7 @@ class Keys:
         self.nothing_is_dropped = not told and _drops_nothing(scenario)
         """Whether agents handle all that reaches them, so that what cannot matter need not be delivered."""
         self._seed = seed
-        keys = keys_of(scenario, _of_seed(seed, "keys"))
+        keys = mission_keys(scenario, _of_seed(seed, "keys"))
         assert keys is not None, "the scenario is secured"
         self.mission = keys
         self._bundles: dict[int, Bundle] = dict(keys.bundles)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from harness.archive.directory import RunDirectory
 from harness.errors import AgentFailedError, InterruptedRunError, MachineError, ScenarioError
-from harness.play._ground_station_check import refuse_what_no_ground_station_sees
+from harness.play._ground_station_check import refuse_unreachable_ground_station
 from harness.play._pace import Pace
 from harness.play.backend import Backend
 from harness.play.progress import Progress, Snapshot
@@ -43,7 +43,7 @@ class VirtualTime(Backend):
         befall = {fault.what: fault for fault in scenario.faults_in_order() if isinstance(fault, VehicleFault)}
         if befall:
             raise ScenarioError(no_vehicles([*befall]))
-        refuse_what_no_ground_station_sees(scenario)
+        refuse_unreachable_ground_station(scenario)
         if scenario.foreign:
             _refuse_what_foreign_agents_cannot(scenario)
 

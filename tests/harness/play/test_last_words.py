@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.play.agent_control import CHARACTERS, last_words_in, of_a_shell
+from harness.play.agent_control import CHARACTERS, is_shell_error, last_line_in
 
 
 @pytest.mark.parametrize(
@@ -21,18 +21,18 @@ from harness.play.agent_control import CHARACTERS, last_words_in, of_a_shell
     ],
 )
 def test_a_shell_that_does_not_find_a_program_is_told_from_an_agent(words: str) -> None:
-    assert of_a_shell(words)
+    assert is_shell_error(words)
 
 
 @pytest.mark.parametrize("words", ["", "telemetry: not found", "feature 'store' not found", "line 3: no store"])
 def test_an_agents_own_sentence_is_its_own(words: str) -> None:
-    assert not of_a_shell(words)
+    assert not is_shell_error(words)
 
 
 def test_the_last_line_that_says_something_is_shown_and_is_bounded(tmp_path: Path) -> None:
     log = tmp_path / "7.log"
-    assert last_words_in(log) == ""
+    assert last_line_in(log) == ""
     log.write_bytes(b"x" * 10000 + b"\nready\n\x1b[31mno\xff store\x1b[0m\r\n \n\x07\n")
-    assert last_words_in(log) == "[31mno\ufffd store[0m"
+    assert last_line_in(log) == "[31mno\ufffd store[0m"
     log.write_bytes(b"x" * 10000)
-    assert last_words_in(log) == "x" * CHARACTERS
+    assert last_line_in(log) == "x" * CHARACTERS

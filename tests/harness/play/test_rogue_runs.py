@@ -14,7 +14,7 @@ from scapy.utils import rdpcap
 from harness.archive.record_file import validate_leniently
 from harness.archive.run_record import InjectedMessages, RunRecord
 from harness.errors import ScenarioError
-from harness.play.process.process_preflight import on_the_air
+from harness.play.process.process_preflight import add_rogue_listener
 from harness.play.progress import Silent
 from harness.play.rogue.rogue_line import injection_of
 from harness.report._rogue_section import section
@@ -279,7 +279,7 @@ def test_mistake_in_an_injection_is_one_sentence(entry: dict[str, Any], sentence
 def test_rogue_links_are_perfect_and_other_links_unchanged() -> None:
     asked = NetworkConditions(LinkConditions(loss=0.2), receivers={3: LinkConditions(loss=0.5)})
     asked = asked.with_partition([[1, 2], [3]])
-    held = on_the_air(asked, injecting(FORGE, agents=3))
+    held = add_rogue_listener(asked, injecting(FORGE, agents=3))
     rogue = injecting(FORGE, agents=3).rogue
     assert rogue == 65535
     assert injecting(FORGE, agents=[65535, 2]).rogue == 65534
@@ -290,4 +290,4 @@ def test_rogue_links_are_perfect_and_other_links_unchanged() -> None:
     for sender, receiver in ((1, 2), (2, 1), (1, 3), (3, 1), (2, 3), (3, 2)):
         lost = 1.0 if asked.is_cut(sender, receiver) else asked.link(sender, receiver).loss
         assert held.link(sender, receiver).loss == lost
-    assert on_the_air(asked, injecting(agents=3)) is asked
+    assert add_rogue_listener(asked, injecting(agents=3)) is asked

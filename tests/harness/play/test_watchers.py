@@ -1,4 +1,4 @@
-"""What runs beside a mission ends with it, and what fails first is what is said."""
+"""The tasks beside a mission end with it, and the first error is reported."""
 
 import asyncio
 import gc
@@ -11,29 +11,29 @@ from harness.play.process._watchers import Watchers
 
 
 class LostError(HarnessError):
-    """What is watched fails."""
+    """The error of a watched task."""
 
 
-async def fails() -> None:
+async def fail() -> None:
     raise LostError("agent 2 ended by itself")
 
 
-async def goes_on() -> None:
+async def wait() -> None:
     await asyncio.sleep(3600)
 
 
-def test_what_begins_to_be_watched_while_a_mission_fails_is_not_talked_of() -> None:
+def test_task_started_while_a_mission_fails_causes_no_warning() -> None:
     async def mission() -> None:
         watchers = Watchers()
-        async with watchers.guard(fails()):
+        async with watchers.guard(fail()):
             try:
                 await asyncio.sleep(3600)
             finally:
-                watchers.start(goes_on())
+                watchers.start(wait())
 
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         with pytest.raises(LostError, match="agent 2 ended by itself"):
             asyncio.run(mission())
         gc.collect()
-    assert not said, [str(warning.message) for warning in said]
+    assert not warned, [str(warning.message) for warning in warned]

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from harness.errors import ScenarioError
-from harness.play.process.process_preflight import refuse_what_needs_virtual_time
+from harness.play.process.process_preflight import refuse_virtual_time_keys
 from harness.play.rogue.lies import made_block
 from harness.proof import Bounds, BoundsError, in_words, prove
 from harness.proof.attacker._attacker import Captor
@@ -293,7 +293,7 @@ def test_a_lie_is_heard_by_whom_it_is_told_also_without_keys() -> None:
     assert not played.evidence.traces[2].runs
     assert len(played.played.unmatched_fates) == 1
     with pytest.raises(ScenarioError, match=r"timeline\.lie"):
-        refuse_what_needs_virtual_time(parse(document))
+        refuse_virtual_time_keys(parse(document))
 
 
 def test_lies_are_for_who_is_captured(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from dataclasses import fields
 import pytest
 
 from harness.errors import ScenarioError
-from harness.play.process.process_preflight import refuse_what_programs_cannot
+from harness.play.process.process_preflight import refuse_unplayable
 from harness.scenario import Scenario
 from harness.scenario._channel import OWN_KEYS, ChannelModel, Preset
 from harness.scenario.load import parse, parse_yaml
@@ -82,4 +82,4 @@ def test_unknown_preset_is_refused_with_the_known_ones() -> None:
 
 def test_backend_in_real_time_refuses_a_channel_before_it_starts() -> None:
     with pytest.raises(ScenarioError, match=r"^`network.channel` needs virtual time: use --backend sim$"):
-        refuse_what_programs_cannot(scenario())
+        refuse_unplayable(scenario())

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from harness.archive.exports import Export
 from harness.errors import AgentFailedError
-from harness.play.agent_control import Status, last_words, of_a_shell
+from harness.play.agent_control import Status, is_shell_error, last_line
 from harness.play.simulation._simulated_agent import Outgoing, Stored
 from harness.play.simulation.foreign._answer import (
     AgentLacksError,
@@ -242,8 +242,8 @@ class ForeignAgent:
         if told.get("ok") is False:
             error = str(told.get("error", "no reason given"))
             if told.get("unsupported") is True:
-                raise self._lacks(f"refused the command {command}: {last_words(error)}")
-            raise self._failure("crashed", f"refused to {command}: {last_words(error)}")
+                raise self._lacks(f"refused the command {command}: {last_line(error)}")
+            raise self._failure("crashed", f"refused to {command}: {last_line(error)}")
         return told
 
     def _give(self, line: str, what: str, now: float) -> Answer:
@@ -279,9 +279,9 @@ class ForeignAgent:
         except AnswerError as error:
             raise self._failure("crashed", f"answered {what} at {now:g} s {error}") from None
         except LacksError as error:
-            raise self._lacks(last_words(str(error))) from None
+            raise self._lacks(last_line(str(error))) from None
         except RefusedError as error:
-            raise self._failure("crashed", f"refused {what} at {now:g} s: {last_words(str(error))}") from None
+            raise self._failure("crashed", f"refused {what} at {now:g} s: {last_line(str(error))}") from None
         self.record.add(given, said)
         self._now = max(now, self._now)
         return answer
@@ -308,8 +308,8 @@ class ForeignAgent:
 
     def _has_no_virtual_time(self, status: int) -> AgentFailedError | AgentLacksError:
         """It ended before it said anything."""
-        words = self._program.last_words()
-        if of_a_shell(words):
+        words = self._program.last_line()
+        if is_shell_error(words):
             return self._failure("crashed", f"ended by itself with status {status} ({words})")
         return self._lacks(
             f"with --virtual it ends with status {status}{words and ', and says: '}{words}; use --backend process, or "

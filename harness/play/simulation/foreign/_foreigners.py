@@ -125,7 +125,7 @@ class Foreigners:
             address=addresses.address(agent_id),
             broadcast=addresses.BROADCAST,
             with_vehicle=False,
-            life=life,
+            incarnation=life,
             epoch_us=0,
             store="store" if reboots_with_disk(agent_id, self._scenario) else None,
             bundle=f"{agent_id}.bundle.json" if self._keys else None,

@@ -23,7 +23,7 @@ from threading import Lock
 from typing import IO
 
 from harness.archive.exports import MAX_EXPORT_BYTES
-from harness.play.agent_control import LOOKED_AT_BYTES, last_words, last_words_in
+from harness.play.agent_control import LOOKED_AT_BYTES, last_line, last_line_in
 from harness.play.child_processes import ChildProcesses
 from harness.play.simulation.foreign._answer import Outcome
 
@@ -177,16 +177,16 @@ class Program:
         """Where its log is, or what it said last, as the end of a sentence."""
         if self.log is not None:
             return f"; its log is {self.log}"
-        words = self.last_words()
+        words = self.last_line()
         return f"; its last output: {words}" if words else ""
 
-    def last_words(self) -> str:
+    def last_line(self) -> str:
         """What it said last on standard error; empty if nothing."""
         if self.log is not None:
-            return last_words_in(self.log)
+            return last_line_in(self.log)
         size = self._errors.seek(0, os.SEEK_END)
         self._errors.seek(max(0, size - LOOKED_AT_BYTES))
-        return last_words(self._errors.read().decode("utf-8", "replace"))
+        return last_line(self._errors.read().decode("utf-8", "replace"))
 
     def forget_words(self) -> None:
         """What it said on standard error in a mission that is over, if nobody keeps it."""

@@ -1,7 +1,8 @@
-"""A scenario played by real programs in a real, private network: as processes, or in containers.
+"""One run with real programs in a real, private network. The programs are processes or containers.
 
-Build the lab, start vehicles and agents and the mission's clock, play the mission while watching everybody, export,
-stop, take the lab down. A crash, a hang or Ctrl-C ends the mission early, and still exports what there is.
+A run opens the lab, starts the vehicles, the agents and the mission clock, and plays the mission. Meanwhile it watches
+all programs. At the end it exports the chains, stops the programs and closes the lab. A crash, a hang or Ctrl-C ends
+the mission early. The agents that are still alive then export their chains.
 """
 
 import asyncio
@@ -15,7 +16,7 @@ from typing import Any, Self
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError
 from harness.play._radio_range import TRACK_S, RadioRange
-from harness.play._vehicle_keys import Handed, handed_out
+from harness.play._vehicle_keys import KeyDirectories, key_directories
 from harness.play.agent_control import AgentRefusedError, Status
 from harness.play.mission import RunOutcome, Sought
 from harness.play.process._agent_process import AgentProcess, reboots_with_disk
@@ -23,8 +24,8 @@ from harness.play.process._fleet import Fleet
 from harness.play.process._lag_meter import LagMeter
 from harness.play.process._rogue_process import RogueProcess
 from harness.play.process._run_lab import MissionLab, OpenLab
-from harness.play.process._watchers import Watchers, unless_interrupted
-from harness.play.process.process_preflight import on_the_air
+from harness.play.process._watchers import Watchers, open_unless_interrupted
+from harness.play.process.process_preflight import add_rogue_listener
 from harness.play.progress import Progress, Snapshot
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, Injected, NetworkChange, describe, injected_nothing
@@ -42,16 +43,12 @@ from ucp.clock import MICROSECONDS, MissionClock
 POLL_S = 0.25
 QUIET_POLL_S = 0.1
 START_DELAY_S = 0.05
-FOLLOW_S = 0.1
-"""Wall time between two looks at where the vehicles are, at least."""
+MIN_FOLLOW_S = 0.1
+"""Minimum wall time between two reads of the vehicles' positions."""
 
 
-class ProcessRun:
-    """One run; open it once. `kinds` of vehicles, none: no vehicles. `interrupted` ends the mission early.
-
-    `open_lab` says what vehicles and agents are made of, `agent_commands` what starts each agent there.
-    With `keeps_disks` every agent has a disk that it can be rebooted with, else those that the scenario reboots so.
-    """
+class ProgramRun:
+    """One run, which implements `harness.play.mission.Swarm` and `harness.scenario.faults.Lives`. Open it once."""
 
     def __init__(
         self,
@@ -67,6 +64,14 @@ class ProcessRun:
         open_lab: OpenLab,
         keeps_disks: bool,
     ) -> None:
+        """
+        - `kinds`: kind of each vehicle. Empty: a run without vehicles.
+        - `interrupted`: ends the mission early when it is set.
+        - `agent_commands`: command of each agent, without the mission file.
+        - `open_lab`: opens a lab of processes or of containers.
+        - `keeps_disks`: each agent has a disk with which it can reboot. Otherwise only the agents that the scenario
+          reboots with their disk have one.
+        """
         self.scenario = scenario
         self.seed = seed
         self.initial_data = initial_data
@@ -84,28 +89,28 @@ class ProcessRun:
         self.agents = [
             AgentProcess(agent_id, rundir, agent_commands[agent_id], self.clock.now) for agent_id in scenario.roster
         ]
-        self._keys: Handed
+        self._keys: KeyDirectories
         self._capture: LiveCapture | None = None
         self._reach = RadioRange(scenario)
         self._changing_network = asyncio.Lock()
         self._watchers = Watchers()
         self._fleet = Fleet(scenario, kinds, rundir, self.clock, self._watchers)
         self._lag: LagMeter | None = None
-        self._read_before_start: Mapping[int, UdpCounters] = {}
+        self._udp_before_start: Mapping[int, UdpCounters] = {}
         self._injected: list[Injected] = []
-        """What the rogue node was told."""
-        self._passed_s = 0.0
-        """When it had last gone on for as long as it was asked to."""
+        """The injections that the rogue node was ordered to make."""
+        self._waited_until_s = 0.0
+        """Mission second at which the last `until` or `until_run` ended."""
         self._starting: dict[int, asyncio.Task[None]] = {}
-        """Agents that begin again and do not answer yet."""
+        """Agent -> its restart, which may still be under way."""
 
     @asynccontextmanager
     async def opened(self) -> AsyncIterator[Self]:
-        """The mission is inside. Raises HarnessError if there is no lab, MachineError if this machine cannot build it.
+        """Open the lab for the mission in this context, and end the run afterwards.
 
-        All else that goes wrong is in `played`.
+        Raises HarnessError if the lab cannot be opened. Later errors are recorded in `played`.
         """
-        with handed_out(self.scenario) as self._keys:
+        with key_directories(self.scenario) as self._keys:
             self.rundir.keys = self._keys.directories
             if (keys := self._keys.keys) is not None:
                 self.rundir.write_public_keys(keys.public)
@@ -116,7 +121,9 @@ class ProcessRun:
     @asynccontextmanager
     async def _in_lab(self) -> AsyncIterator[None]:
         try:
-            lab = await unless_interrupted(self._open_lab(self.scenario, self.rundir, self._show), self.interrupted)
+            lab = await open_unless_interrupted(
+                self._open_lab(self.scenario, self.rundir, self._show), self.interrupted
+            )
         except HarnessError:
             raise
         except LabUnavailable as error:
@@ -130,20 +137,20 @@ class ProcessRun:
                 async with self._watchers.guard(self._watch_for_interruption(), lab.watch()):
                     yield
             except HarnessError as error:
-                self._ended_early(error)
+                self._end_early(error)
             except LiveCaptureError as error:
-                self._ended_early(MachineError(str(error)))
+                self._end_early(MachineError(str(error)))
             except NetemError as error:
-                self._ended_early(MachineError(f"the lab failed: {error}"))
+                self._end_early(MachineError(f"the lab failed: {error}"))
             except OSError as error:
-                self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
-            await self._wind_up(lab)
+                self._end_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
+            await self._end_run(lab)
 
     async def _watch_for_interruption(self) -> None:
         await self.interrupted.wait()
         raise InterruptedRunError(f"the run was interrupted at mission second {self.clock.now():.0f}")
 
-    # The story, as harness.play.mission tells it
+    # The methods of harness.play.mission.Swarm
 
     def now(self) -> float:
         return self.clock.now()
@@ -166,7 +173,7 @@ class ProcessRun:
             self._fleet.take_off()
 
     async def _log_script(self) -> None:
-        """Have the agents that run log what the scenario's script says."""
+        """Make each running agent log its scripted events at their times."""
         for event in sorted(self.scenario.events.script, key=lambda event: event.at_s):
             await self.until(event.at_s)
             agent = self._agent(event.agent)
@@ -187,7 +194,7 @@ class ProcessRun:
             self._watchers.start(self._rogue.watch(), of="rogue")
 
     async def _start_agent(self, agent: AgentProcess, lab: MissionLab) -> None:
-        """Start it, into the mission if that is under way."""
+        """Start the agent. An active mission goes on with it."""
         with_vehicle = bool(self._fleet)
         keeps_disk = self._keeps_disks or reboots_with_disk(agent.agent_id, self.scenario)
         epoch_us = self.clock.epoch_us
@@ -205,13 +212,13 @@ class ProcessRun:
             captured = self.scenario.security.captured if self.scenario.security else None
             await self._rogue.begin(epoch_us, None if captured is None else self._keys.hand(captured, kept=True))
         self.clock.start(epoch_us)
-        self._read_before_start = await self._lab.network.datagrams()
-        networks = {agent_id: self._lab.network.networks[agent_id] for agent_id in self.scenario.roster}
-        self._lag = await LagMeter.start(self.rundir.lag, epoch_us, self.scenario.speedup, networks)
+        self._udp_before_start = await self._lab.network.datagrams()
+        namespaces = {agent_id: self._lab.network.networks[agent_id] for agent_id in self.scenario.roster}
+        self._lag = await LagMeter.start(self.rundir.lag, epoch_us, self.scenario.speedup, namespaces)
 
     async def apply(self, change: Change) -> None:
         if isinstance(change, NetworkChange):
-            await self._put_into_force(self._reach.ask(change), asked=change.conditions)
+            await self._apply_conditions(self._reach.ask(change), asked=change.conditions)
             return
         if isinstance(change, Injected):
             if self._rogue is None:
@@ -229,7 +236,10 @@ class ProcessRun:
         self.rundir.append_network(record)
 
     async def _strike_all(self, fault: Fault) -> None:
-        """Raises ScenarioError if it can happen to none of them; to whom it could not is on record otherwise."""
+        """Apply the fault to its agents at the same time.
+
+        Raises ScenarioError if it is possible for no agent. If it is impossible for some agents, record the reasons.
+        """
         strikes = [self._strike(fault, agent_id) for agent_id in fault.agents]
         problems = [problem for problem in await asyncio.gather(*strikes, return_exceptions=True) if problem]
         for problem in problems:
@@ -242,7 +252,7 @@ class ProcessRun:
             await self._starting.pop(agent_id)
         await fault.strike(self, agent_id)
 
-    # What faults do to an agent, and to its vehicle if it has one: harness.scenario.faults.Lives
+    # The methods of harness.scenario.faults.Lives
 
     async def end_life(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
         shot_down = [self._fleet.shoot_down(agent_id)] if with_vehicle else []
@@ -250,8 +260,8 @@ class ProcessRun:
 
     async def begin_life(self, agent_id: int, *, new_vehicle: bool = False) -> None:
         agent = self._agent(agent_id)
-        start = self._start_again(agent) if new_vehicle else self._start_agent(agent, self._lab)
-        self._starting[agent_id] = self._watchers.task(start)
+        start = self._restart_with_vehicle(agent) if new_vehicle else self._start_agent(agent, self._lab)
+        self._starting[agent_id] = self._watchers.create_task(start)
 
     async def fall(self, agent_id: int) -> None:
         self._fleet.fall(agent_id)
@@ -270,7 +280,7 @@ class ProcessRun:
         await asyncio.gather(self._agent(agent_id).switch_off(), self._fleet.shoot_down(agent_id))
 
     async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
-        assert self._keys.keys is not None, "was refused"
+        assert self._keys.keys is not None, "`refuse_revocations` comes first"
         revocation = base64.b64encode(self._keys.keys.revoke(agent_id)).decode("ascii")
         hearers = [agent for agent in self.agents if agent.agent_id in heard_by and agent.awake]
         await asyncio.gather(*(agent.ask("revoke", revocation=revocation) for agent in hearers))
@@ -280,12 +290,12 @@ class ProcessRun:
             raise ScenarioError(f"`{what}` needs vehicles, but this run has none")
         at_s = round(self.clock.now(), 3)
         if not by_hand:
-            self._watchers.task(self._befall(agent_id, what, circumstance, at_s))
-        elif problem := await self._fleet.befall(agent_id, what, circumstance, at_s):
-            raise ScenarioError(problem)  # whoever asked for it waits for an answer
+            self._watchers.create_task(self._simulate_circumstance(agent_id, what, circumstance, at_s))
+        elif problem := await self._fleet.simulate(agent_id, what, circumstance, at_s):
+            raise ScenarioError(problem)  # the user waits for the result of an intervention
 
-    async def _befall(self, agent_id: int, what: str, circumstance: Circumstance, at_s: float) -> None:
-        if problem := await self._fleet.befall(agent_id, what, circumstance, at_s):
+    async def _simulate_circumstance(self, agent_id: int, what: str, circumstance: Circumstance, at_s: float) -> None:
+        if problem := await self._fleet.simulate(agent_id, what, circumstance, at_s):
             self.played.unmatched_fates.append(problem)
 
     def _agent(self, agent_id: int) -> AgentProcess:
@@ -295,56 +305,60 @@ class ProcessRun:
         self._watchers.stop(f"agent {agent.agent_id}")
         await agent.kill(disk_kept=disk_kept)
 
-    async def _start_again(self, agent: AgentProcess) -> None:
-        """A new agent, on a new vehicle in the place of the one that was lost."""
-        await self._fleet.replace(agent.agent_id, self._lab, life=agent.lives + 1)
+    async def _restart_with_vehicle(self, agent: AgentProcess) -> None:
+        """Start a new vehicle in place of the lost one, and a new incarnation of the agent on it."""
+        await self._fleet.replace(agent.agent_id, self._lab, incarnation=agent.incarnations + 1)
         await self._start_agent(agent, self._lab)
 
-    async def _put_into_force(self, change: NetworkChange, asked: NetworkConditions | None = None) -> None:
-        """`asked` by the timeline, not by flight, of which it is on record what changed."""
-        async with self._changing_network:  # in the order in which they were asked for
-            conditions = on_the_air(change.conditions, self.scenario)
+    async def _apply_conditions(self, change: NetworkChange, asked: NetworkConditions | None = None) -> None:
+        """Apply the conditions of a change, and record it.
+
+        The timeline passes the requested conditions in `asked`, and the record shows them with the applied ones. A
+        change by flight is recorded as the change alone.
+        """
+        async with self._changing_network:  # apply changes in the order of their requests
+            conditions = add_rogue_listener(change.conditions, self.scenario)
             applied = await self._lab.apply(conditions.at_speed(self.scenario.speedup))
         self.network = change.detail
         record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
         self.played.record(record)
         if asked is not None:
-            record |= {"asked": asked.to_json(), "applied": self._of_the_swarm(applied)}
+            record |= {"asked": asked.to_json(), "applied": self._without_rogue(applied)}
         self.rundir.append_network(record)
 
-    def _of_the_swarm(self, applied: Applied) -> dict[str, Any]:
-        """What the kernel holds and has counted for receivers that are vehicles."""
+    def _without_rogue(self, applied: Applied) -> dict[str, Any]:
+        """Return the conditions and counters of the kernel as JSON, without the rogue node."""
         figures = applied.to_json()
         if self._rogue is not None:
             figures["receivers"].pop(str(self._rogue.vehicle), None)
         return figures
 
     async def _follow_flight(self) -> None:
-        """Write down where the vehicles are, and have the network follow them."""
+        """Record the positions of the vehicles, and adapt the network to them."""
         radio = self.scenario.network.radio
-        every_s = max(FOLLOW_S, self.clock.wall_s(radio.update_s if radio else TRACK_S))
+        every_s = max(MIN_FOLLOW_S, self.clock.wall_s(radio.update_s if radio else TRACK_S))
         while True:
             places = self._fleet.places()
             self.rundir.append_tracks(self.clock.now(), places)
             if change := self._reach.move(self.clock.now(), places):
-                await self._put_into_force(change)
+                await self._apply_conditions(change)
             await asyncio.sleep(every_s)
 
     async def until(self, mission_s: float) -> None:
-        while (left_s := mission_s - self.clock.now()) > 0:  # a clock that is about to start stands at 0
+        while (left_s := mission_s - self.clock.now()) > 0:  # the clock is 0 until the mission starts
             await asyncio.sleep(self.clock.wall_s(left_s))
-            self._passed_s = self.clock.now()
+            self._waited_until_s = self.clock.now()
 
     async def until_run(self, sought: Sought, mission_s: float) -> int | None:
         while True:
             over = self.clock.now() >= mission_s
             for agent in self.agents:
-                for run in agent.runs_since(self._passed_s, sought.handler):
+                for run in agent.handler_runs_since(self._waited_until_s, sought.handler):
                     if sought.is_met_by(agent.agent_id, run):
-                        self._passed_s = run.t
+                        self._waited_until_s = run.t
                         return agent.agent_id
             if over:
-                self._passed_s = self.clock.now()
+                self._waited_until_s = self.clock.now()
                 return None
             await asyncio.sleep(QUIET_POLL_S)
 
@@ -386,16 +400,16 @@ class ProcessRun:
     async def snapshot(self) -> RunOutcome:
         await asyncio.gather(*(agent.export() for agent in self._awake()))
         for agent in self.agents:
-            agent.put_together()
+            agent.collect_files()
         agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
         return replace(self.played, mission_s=round(self.clock.now(), 1), agents=agents)
 
     def _awake(self) -> list[AgentProcess]:
-        """The agents that are neither dead nor paused."""
+        """Return the agents that are neither dead nor paused."""
         return [agent for agent in self.agents if agent.awake]
 
     async def _statuses(self) -> dict[int, Status]:
-        """The status of each agent that is neither dead nor paused."""
+        """Return the status of each agent that is neither dead nor paused."""
         polled = await asyncio.gather(*(agent.poll() for agent in self.agents))
         return {agent.agent_id: status for agent, status in zip(self.agents, polled, strict=True) if status}
 
@@ -405,52 +419,52 @@ class ProcessRun:
             self._show(self.stage)
             await asyncio.sleep(POLL_S)
 
-    # The end
+    # End of the run
 
-    def _ended_early(self, error: HarnessError) -> None:
+    def _end_early(self, error: HarnessError) -> None:
         self.played.end_early("interrupted" if isinstance(error, InterruptedRunError) else "failed", error)
 
-    async def _wind_up(self, lab: MissionLab) -> None:
-        """Export whatever can be exported, and stop everybody. Never raises for an agent or vehicle."""
+    async def _end_run(self, lab: MissionLab) -> None:
+        """Export the chains of the living agents, stop all programs, and close the lab. Record errors of programs."""
         self._show("exporting")
         self.played.mission_s = round(self.clock.now(), 1)
         if self._lag is not None:
             await self._lag.stop()
-        exported = await asyncio.gather(*(agent.export_finally() for agent in self.agents), return_exceptions=True)
+        exported = await asyncio.gather(*(agent.export_at_end() for agent in self.agents), return_exceptions=True)
         for error in exported:
             if error is not None and not isinstance(error, HarnessError):
                 raise error
             if error is not None and self.played.outcome == "completed":
-                self._ended_early(error)
+                self._end_early(error)
         self.played.vehicles = self._fleet.to_json()
         self.played.ground_station = self._fleet.close_station()
         try:
             if self._rogue is not None:
                 await self._stop_rogue(self._rogue)
-            self.played.counters = self._of_the_swarm(await lab.read())
+            self.played.counters = self._without_rogue(await lab.read())
             self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
             await asyncio.gather(*(agent.stop() for agent in self.agents), self._fleet.stop())
-            self.played.datagrams = self._datagrams_read(await lab.network.datagrams())
+            self.played.datagrams = self._datagram_counters(await lab.network.datagrams())
             for agent in self.agents:
-                agent.put_together()
-        except NetemError as error:  # the lab is gone, and with it whoever seemed to have crashed
-            self._ended_early(MachineError(str(error)))
+                agent.collect_files()
+        except NetemError as error:  # the loss of the lab explains the crashes
+            self._end_early(MachineError(str(error)))
         except OSError as error:
-            self._ended_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
+            self._end_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
         await self._end_capture()
         try:
             await lab.close()
         except NetemError as error:
-            self._ended_early(MachineError(str(error)))
+            self._end_early(MachineError(str(error)))
         self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
 
-    def _datagrams_read(self, counted: Mapping[int, UdpCounters]) -> dict[str, dict[str, int]]:
+    def _datagram_counters(self, counted: Mapping[int, UdpCounters]) -> dict[str, dict[str, int]]:
         """Return the datagrams of each agent whose vehicle does not use UDP itself, for run.json."""
-        agents = [agent for agent in self._read_before_start if agent in self.scenario.roster]
+        agents = [agent for agent in self._udp_before_start if agent in self.scenario.roster]
         return {
             str(agent): {
                 "read": counted[agent].read,
-                "before_start": self._read_before_start[agent].read,
+                "before_start": self._udp_before_start[agent].read,
                 "overflowed": counted[agent].overflowed,
                 "unreachable": counted[agent].unreachable,
                 "others": counted[agent].others,
@@ -467,7 +481,7 @@ class ProcessRun:
             counted = await self._capture.stop()
         except LiveCaptureError as error:
             if self.played.outcome == "completed":
-                self._ended_early(MachineError(str(error)))
+                self._end_early(MachineError(str(error)))
             return
         self.played.capture = {str(vehicle): frames for vehicle, frames in counted.items()}
 
@@ -476,7 +490,7 @@ class ProcessRun:
             await rogue.stop()
         except MachineError as error:
             if self.played.outcome == "completed":
-                self._ended_early(error)
+                self._end_early(error)
         self.played.unmatched_fates += injected_nothing(self._injected, rogue.sent)
 
     def _show(self, stage: str) -> None:
