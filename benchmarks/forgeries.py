@@ -25,7 +25,7 @@ from ucp.messages import BlockAddRequest, BlockResponse, ChainContainResponse, C
 from ucp.secure.bundle import KeySet
 from ucp.secure.crypto_suite import SenderKeys
 from ucp.secure.envelope import CLEAR, SIGNATURE_BYTES
-from ucp.secure.secured_agent import SecuredAgent, boot_of
+from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
 from ucp.trace import Recorded
 
@@ -42,8 +42,8 @@ LATER_S = (1.0, 40.0)
 
 
 def session(agent_id: int, keys: KeySet = KEYS, now: float = NOW) -> Session:
-    begun = Session(keys.bundle(agent_id), boot_of(1_000_000, bytes(8)))
-    begun.epochs.look_at(now)
+    begun = Session(keys.bundle(agent_id), make_boot(1_000_000, bytes(8)))
+    begun.epochs.set_clock(now)
     return begun
 
 
@@ -86,7 +86,7 @@ def at_random(draw: Random) -> Iterator[bytes]:
 
 def _header(draw: Random, length: int) -> bytes:
     numbers = draw.randrange(1, 11), draw.choice(ROSTER), draw.randrange(2**32), length, EPOCH
-    return CLEAR.pack(b"UC", 2, *numbers, boot_of(1_000_000, bytes(8)), 0)
+    return CLEAR.pack(b"UC", 2, *numbers, make_boot(1_000_000, bytes(8)), 0)
 
 
 def bits_flipped(draw: Random) -> Iterator[bytes]:
@@ -178,7 +178,7 @@ def all_of(agent: SecuredAgent) -> dict[str, Any]:
         "revocation": agent.revocation,
         "heard": {
             sender: (life.boot, life.window._newest, tuple(life.window._words), dict(life.requests))
-            for sender, life in session._lives.items()
+            for sender, life in session._incarnations.items()
         },
     }
 

@@ -43,8 +43,8 @@ from ucp.messages import (
     encode,
 )
 from ucp.secure.bundle import KeySet
-from ucp.secure.envelope import read_clear, sealed_bytes
-from ucp.secure.secured_agent import boot_of
+from ucp.secure.envelope import read_clear_header, sealed_bytes
+from ucp.secure.secured_agent import make_boot
 from ucp.secure.session import Session
 
 ROSTER = (1, 2)
@@ -73,7 +73,7 @@ def microseconds(rounds: int, what: Callable[[], object]) -> float:
 def per_datagram(rounds: int) -> None:
     say("message", "plain bytes", "secured", "sent us", "secured", "opened us", "secured")
     numbers = count()
-    sender, receiver = (Session(KEYS.bundle(agent_id), boot_of(1, bytes(8))) for agent_id in (2, 1))
+    sender, receiver = (Session(KEYS.bundle(agent_id), make_boot(1, bytes(8))) for agent_id in (2, 1))
 
     def seal(message: Message) -> bytes:
         return sender.seal(next(numbers), message, None, None, 0)
@@ -92,7 +92,7 @@ def per_datagram(rounds: int) -> None:
 
 def open_next(receiver: Session, datagrams: Iterator[bytes]) -> None:
     datagram = next(datagrams)
-    receiver.open(datagram, read_clear(datagram))
+    receiver.open(datagram, read_clear_header(datagram))
 
 
 def per_mission(missions: int) -> None:

@@ -92,16 +92,16 @@ class Node:
         if mission.security is None:
             return Agent
         try:
-            from ucp.secure._secured_vehicle import secured_agent  # needs the extra `secure`
+            from ucp.secure._secured_vehicle import agent_factory  # needs the extra `secure`
         except ModuleNotFoundError as error:
             raise UnsupportedMissionError(
                 f"needs the feature 'secured', and {error.name} is not installed here"
             ) from None
 
-        def not_erased(error: OSError) -> None:
+        def report_write_error(error: OSError) -> None:
             self._say(f"the group's last secret is still on disk: {error.strerror}")
 
-        return secured_agent(mission, directory, not_erased)
+        return agent_factory(mission, directory, report_write_error)
 
     def run(self) -> int:
         """Serve until SIGTERM or SIGINT. Return the exit status, 1 if the chain could not be exported."""

@@ -71,7 +71,7 @@ from ucp.secure.envelope import (
     SEAL_BYTES,
     SIGNATURE_BYTES,
     TAG_BYTES,
-    read_clear,
+    read_clear_header,
 )
 from ucp.secure.envelope import VERSION as SECURED_VERSION
 from ucp.wire import Fields, Kind
@@ -219,7 +219,7 @@ class SecuredUCP(Packet):
 
     def guess_payload_class(self, payload: bytes) -> type[Packet]:
         try:
-            clear = read_clear(self.original)
+            clear = read_clear_header(self.original)
         except MalformedDatagramError:
             return conf.raw_layer
         if clear.type != REVOCATION:
@@ -335,7 +335,7 @@ def opened(packet: Packet, opener: "Opener") -> Packet:
     header = packet.getlayer(SecuredUCP)
     if header is None:
         raise MalformedDatagramError("not secured")
-    return UCP(opener.open(header.do_build()).said.encode())
+    return UCP(opener.open(header.do_build()).datagram.encode())
 
 
 def message_of(packet: Packet) -> tuple[int, int, Message]:

@@ -257,12 +257,12 @@ def _maker(mission: Mission, given: dict[str, Any]) -> Callable[..., Agent]:
     if mission.security is None:
         return Agent
     try:
-        from ucp.secure._secured_vehicle import secured_in_virtual_time  # needs the extra `secure`
+        from ucp.secure._secured_vehicle import virtual_agent_factory  # needs the extra `secure`
     except ModuleNotFoundError as error:
         why = f"this mission needs the feature 'secured', and {error.name} is not installed here"
         raise InputError(why, unsupported=True) from None
     try:
-        return secured_in_virtual_time(mission, given.get("bundle"), given.get("boot"))
+        return virtual_agent_factory(mission, given.get("bundle"), given.get("boot"))
     except MissionError as error:
         raise InputError(str(error)) from None
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ucp.secure.bundle import PublicKeys
-    from ucp.secure.crypto_suite import Signed
+    from ucp.secure.crypto_suite import SignatureClaim
 
 NAME = "genuine"
 
@@ -53,7 +53,7 @@ class _Recomputed:
 class _Signatures:
     """Signatures of blocks. Each is verified once."""
 
-    def __init__(self, keys: "PublicKeys", verified: "Callable[[Signed], bool] | None") -> None:
+    def __init__(self, keys: "PublicKeys", verified: "Callable[[SignatureClaim], bool] | None") -> None:
         from ucp.secure.crypto_suite import verify
 
         self._keys = keys
@@ -68,7 +68,7 @@ class _Signatures:
         return self._checked[claim]
 
     def _look(self, block: ExportedBlock) -> str | None:
-        from ucp.secure.block_signature import claim_of_block
+        from ucp.secure.block_signature import block_claim
 
         public_key = self._keys.vehicles.get(block.agent_id)
         if public_key is None:
@@ -76,7 +76,7 @@ class _Signatures:
         if block.signature is None:
             return "without a signature: it was made or edited without keys"
         data = Block(block.agent_id, block.timestamp_us, block.event_bytes).block_data()
-        if not self._verified(claim_of_block(public_key, self._keys.mission, data, base64.b64decode(block.signature))):
+        if not self._verified(block_claim(public_key, self._keys.mission, data, base64.b64decode(block.signature))):
             return f"whose signature does not match the key of agent {block.agent_id}: it was forged or edited"
         return None
 

@@ -38,7 +38,7 @@ from ucp.trigger import MessageTrigger
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
-    from ucp.secure.crypto_suite import Signed
+    from ucp.secure.crypto_suite import SignatureClaim
 
 Derived = TypeVar("Derived")
 
@@ -135,7 +135,7 @@ class Evidence:
     """The measured lag of machine and agents. None if it was not measured."""
     public_keys: "PublicKeys | None" = None
     """The keys of a secured mission, which verify the signatures of blocks."""
-    verified: "Callable[[Signed], bool] | None" = None
+    verified: "Callable[[SignatureClaim], bool] | None" = None
     """A function that returns true for a valid signature without verifying it, for a swarm played in this process."""
     watch: Watch | None = None
     """A function that gets each step of the step judge."""

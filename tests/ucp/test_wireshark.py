@@ -37,7 +37,7 @@ from ucp.messages import (
     decode,
     encode,
 )
-from ucp.secure.envelope import CLEAR, CLEAR_FIELDS, read_clear
+from ucp.secure.envelope import CLEAR, CLEAR_FIELDS, read_clear_header
 from ucp.secure.revocation import Revocation
 
 TIMEOUT_S = 120.0
@@ -143,7 +143,7 @@ def test_the_list_of_packets_names_message_and_sender(tmp_path: Path) -> None:
 
 def test_of_a_secured_mission_it_shows_what_is_in_clear(tmp_path: Path) -> None:
     body = Revocation(3, frozenset((2, 9)), bytes(range(64))).encode()
-    sealed, revokes = session(2).seal(7, CommitBlock(LOGGED, A), None, None, 1), session(1).tell(3, body)
+    sealed, revokes = session(2).seal(7, CommitBlock(LOGGED, A), None, None, 1), session(1).revocation_datagram(3, body)
     for datagram, layer in zip((sealed, revokes), layers(tmp_path, (sealed, revokes)), strict=True):
         header = shown("ucpchain", dict(zip(CLEAR_FIELDS, CLEAR.unpack_from(datagram), strict=True)))
         assert {name: layer[name] for name in header} == header
@@ -180,7 +180,7 @@ def test_what_the_codec_refuses_is_malformed_for_the_same_reason(tmp_path: Path)
     for datagram, layer in zip(datagrams, layers(tmp_path, datagrams), strict=True):
         reason = None
         try:
-            read_clear(datagram) if datagram[:3] == b"UC\2" else decode(datagram)
+            read_clear_header(datagram) if datagram[:3] == b"UC\2" else decode(datagram)
         except MalformedDatagramError as malformed:
             reason = malformed.reason
         assert experts(layer).get("ucpchain.malformed") == reason, datagram.hex()

@@ -1,5 +1,5 @@
 """Secure missions: keys, signed blocks, sealed event data.
 
-A layer around the protocol, which knows nothing of it. Only missions that have keys import anything of this package; it
-needs the extra `secure`.
+This package is a layer around the protocol. The protocol does not depend on it. Only missions with keys import this
+package, because it needs the extra `secure`.
 """

@@ -1,4 +1,8 @@
-"""A secured agent on its vehicle: with the bundle that it was handed, a life of its own, and old secrets erased."""
+"""Create the secured agent of a mission from its bundle.
+
+On a vehicle, the bundle is a file. The agent chooses a new boot at each start, and rewrites the file at each new epoch
+so that it no longer contains older secrets. In virtual time, the simulation hands over the bundle and the boot.
+"""
 
 import os
 import time
@@ -12,17 +16,18 @@ from ucp.sealed import sealed_to
 from ucp.secure.bundle import BUNDLE_SCHEMA, Bundle, load_bundle, write_bundle
 from ucp.secure.envelope import BOOT_BYTES
 from ucp.secure.keyfile import KeyFileError, key_in
-from ucp.secure.sealing import seal_of
-from ucp.secure.secured_agent import SecuredAgent, boot_of
+from ucp.secure.sealing import make_seal
+from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
 
 
-def secured_agent(
-    mission: Mission, directory: Path, not_erased: Callable[[OSError], None]
+def agent_factory(
+    mission: Mission, directory: Path, report_write_error: Callable[[OSError], None]
 ) -> Callable[..., SecuredAgent]:
-    """What makes the mission's agent; all arguments are Agent's. `directory` is the mission file's.
+    """Return a function that creates the agent of a mission. Its arguments are those of Agent.
 
-    `not_erased` hears of a disk that refuses a bundle without old secrets. Raises MissionError.
+    `directory` is the directory of the mission file. `report_write_error` is called if a bundle without old secrets
+    cannot be written to disk. Raises MissionError.
     """
     assert mission.security is not None, "the mission is secured"
     path = directory / mission.security.bundle
@@ -31,43 +36,44 @@ def secured_agent(
     except KeyFileError as error:
         raise MissionError(f"`security.bundle`: {error}") from None
 
-    def keep(newer: Bundle) -> None:
+    def save(new_bundle: Bundle) -> None:
         try:
-            write_bundle(path, newer)
+            write_bundle(path, new_bundle)
         except OSError as error:
-            not_erased(error)
+            report_write_error(error)
 
-    _check(bundle, mission, f"`security.bundle`: {path}")
-    return _with_keys(mission, Session(bundle, boot_of(time.time_ns() // 1000, os.urandom(8)), keep))
+    _check_bundle(bundle, mission, f"`security.bundle`: {path}")
+    return _factory(mission, Session(bundle, make_boot(time.time_ns() // 1000, os.urandom(8)), save))
 
 
-def secured_in_virtual_time(mission: Mission, bundle: Any, boot: Any) -> Callable[..., SecuredAgent]:
-    """The same of an agent that reads no file and no clock: it is told its bundle, as JSON, and which life it is.
+def virtual_agent_factory(mission: Mission, bundle: Any, boot: Any) -> Callable[..., SecuredAgent]:
+    """Return a function that creates the agent of a mission in virtual time. It reads no file and no clock.
 
-    Raises MissionError.
+    `bundle` is the content of a bundle file. `boot` is the boot of this incarnation in hexadecimal. Raises
+    MissionError.
     """
     if not isinstance(bundle, dict) or bundle.get("schema") != BUNDLE_SCHEMA:
-        raise MissionError(f"`bundle` must be what a file of the schema {BUNDLE_SCHEMA} holds")
+        raise MissionError(f"`bundle` must be the JSON object of a file of the schema {BUNDLE_SCHEMA}")
     try:
-        handed = Bundle.of_json(bundle)
-        life = key_in({"boot": boot}, "boot", BOOT_BYTES)
+        parsed_bundle = Bundle.from_json(bundle)
+        parsed_boot = key_in({"boot": boot}, "boot", BOOT_BYTES)
     except KeyFileError as error:
         raise MissionError(f"in `bundle` or `boot`: {error}") from None
-    _check(handed, mission, "`bundle`")
-    return _with_keys(mission, Session(handed, life))
+    _check_bundle(parsed_bundle, mission, "`bundle`")
+    return _factory(mission, Session(parsed_bundle, parsed_boot))
 
 
-def _check(bundle: Bundle, mission: Mission, what: str) -> None:
-    """Raises MissionError if it is not this agent's in this mission."""
-    without = sorted({*mission.roster} - bundle.public.vehicles.keys())
-    if bundle.agent_id != mission.agent_id or without:
-        whose = f"has no keys of agent {without[0]}" if without else f"is agent {bundle.agent_id}'s"
-        raise MissionError(f"{what} {whose}: hand out the bundle of agent {mission.agent_id}")
+def _check_bundle(bundle: Bundle, mission: Mission, place: str) -> None:
+    """Raise MissionError if the bundle does not belong to this agent in this mission."""
+    missing = sorted({*mission.roster} - bundle.public.vehicles.keys())
+    if bundle.agent_id != mission.agent_id or missing:
+        problem = f"has no keys of agent {missing[0]}" if missing else f"is agent {bundle.agent_id}'s"
+        raise MissionError(f"{place} {problem}: hand out the bundle of agent {mission.agent_id}")
     depot = sealed_to(mission.initial_data)
     if depot is not None and depot != bundle.public.depot:
-        raise MissionError(f"{what} seals to another depot than the mission's `initial_data` names")
+        raise MissionError(f"{place} seals to another depot than the mission's `initial_data` names")
 
 
-def _with_keys(mission: Mission, session: Session) -> Callable[..., SecuredAgent]:
+def _factory(mission: Mission, session: Session) -> Callable[..., SecuredAgent]:
     seals = sealed_to(mission.initial_data) is not None
-    return partial(SecuredAgent, session, seal=seal_of(session.epochs.bundle) if seals else None)
+    return partial(SecuredAgent, session, seal=make_seal(session.epochs.bundle) if seals else None)

@@ -1,25 +1,29 @@
-"""The makers' signatures of the blocks that an agent holds: beside the protocol, which knows nothing of them."""
+"""The makers' signatures of the blocks that an agent holds. They are no part of the agent's protocol state."""
 
 from collections.abc import Mapping
 
 from ucp.block import Block
-from ucp.secure.block_signature import claim_of_block, sign_block
+from ucp.secure.block_signature import block_claim, sign_block
 from ucp.secure.session import Session
 from ucp.state import AgentState
 
 
 class BlockSignatures:
-    """Signatures by block hash. Each is checked once; of blocks that the agent does not hold none is kept."""
+    """Signatures by block hash.
+
+    A signature is verified once per block. The signature of a received block that the agent did not accept is
+    discarded.
+    """
 
     def __init__(self, session: Session, state: AgentState) -> None:
         self._session = session
         self._state = state
         self._by_hash: dict[bytes, bytes] = {}
         self._signed = 0
-        """How many of the blocks that the agent completed are signed."""
+        """Length of `state.completed` at the last call of `held`."""
 
     def held(self) -> Mapping[bytes, bytes]:
-        """Of all blocks that the agent holds; its own it signs by now at the latest."""
+        """Return the signatures of all blocks that the agent holds, after signing its own new blocks."""
         completed = self._state.completed
         if self._signed < len(completed):
             new = set(completed[self._signed :])
@@ -30,23 +34,26 @@ class BlockSignatures:
         return self._by_hash
 
     def is_genuine(self, block: Block, signature: bytes) -> bool:
-        """Whether its maker, who is of the mission, signed the block. If so, the signature is kept for now."""
+        """Return whether the block's maker signed the block, and keep a valid signature.
+
+        The maker must be on the roster.
+        """
         if block.block_hash in self.held():
             return True
         session = self._session
-        claim = claim_of_block(session.public_keys[block.agent_id], session.mission, block.block_data(), signature)
-        if not session.arithmetic.verified(claim):
+        claim = block_claim(session.public_keys[block.agent_id], session.mission, block.block_data(), signature)
+        if not session.crypto.verify(claim):
             return False
         self._by_hash[block.block_hash] = signature
         return True
 
     def forget_unless_held(self, block: Block) -> None:
-        """The agent has looked at the block: it took it, or it did not."""
+        """Discard the signature of a block that the agent did not accept."""
         if not self._state.holds(block.block_hash):
             self._by_hash.pop(block.block_hash, None)
 
     def restore(self, signatures: Mapping[bytes, bytes]) -> None:
-        """Go on with what was on disk."""
+        """Add the signatures that were on disk."""
         self._by_hash.update(signatures)
 
     def _sign(self, block: Block) -> bytes:

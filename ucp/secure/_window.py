@@ -1,16 +1,17 @@
-"""Which of a sender's sequence numbers have come: the sliding window of RFC 6479.
+"""The sequence numbers that a receiver has accepted from a sender: the sliding window of RFC 6479.
 
-A ring of words with one more than the window needs: it moves on by clearing whole words, and never shifts a bit.
+The window is a ring of words, with one word more than the window needs. It moves on by clearing whole words, and never
+shifts a bit.
 """
 
 WINDOW = 1024
-"""How far behind the newest sequence number one may be and still count."""
+"""Number of sequence numbers in the window, the newest one included. Older ones are rejected."""
 _WORD_BITS = 64
 _WORDS = WINDOW // _WORD_BITS + 1
 
 
 class ReplayWindow:
-    """Of one sender's one life. Only what proved authentic is `accept`ed."""
+    """The window of one incarnation of one sender. The caller accepts only sequence numbers of authentic datagrams."""
 
     __slots__ = ("_newest", "_words")
 
@@ -19,7 +20,7 @@ class ReplayWindow:
         self._words = [0] * _WORDS
 
     def is_fresh(self, sequence: int) -> bool:
-        """Whether it has not come yet, and is not so old that nobody knows."""
+        """Return whether the number is inside or above the window, and was not accepted before."""
         if sequence > self._newest:
             return True
         if sequence <= self._newest - WINDOW:
@@ -27,7 +28,7 @@ class ReplayWindow:
         return not self._words[sequence // _WORD_BITS % _WORDS] >> sequence % _WORD_BITS & 1
 
     def accept(self, sequence: int) -> None:
-        """It has come; it `is_fresh`."""
+        """Record a number as accepted. `is_fresh(sequence)` must be true."""
         word = sequence // _WORD_BITS
         newest_word = self._newest // _WORD_BITS
         if sequence > self._newest:

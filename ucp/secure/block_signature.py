@@ -1,20 +1,21 @@
-"""A block's signature by its maker: beside the block, not hashed into it, so that hashes and chains stay as they are.
+"""The signature of a block by its maker.
 
-Ed25519 (RFC 8032) over a domain tag, the mission's ID and BD (eq. 3.5): nothing that is signed for anything else, or in
-another mission, passes for it.
+The signature accompanies the block and is not part of its hash, so hashes and chains stay the same. It is an Ed25519
+signature (RFC 8032) over a domain tag, the mission's ID and BD (eq. 3.5). Because of the tag and the ID, a signature of
+other data or of another mission is not valid for a block.
 """
 
-from ucp.secure.crypto_suite import Signed
+from ucp.secure.crypto_suite import SignatureClaim
 from ucp.secure.sealed_datagrams import Signer
 
 _TAG = b"UCP block\0"
 
 
 def sign_block(maker: Signer, mission: bytes, block_data: bytes) -> bytes:
-    """The signature of the block with this BD, 64 bytes."""
+    """Return the signature of the block with this BD (64 bytes)."""
     return maker.sign(_TAG + mission + block_data)
 
 
-def claim_of_block(public_key: bytes, mission: bytes, block_data: bytes, signature: bytes) -> Signed:
-    """That the maker with this public key signed the block with this BD in this mission."""
-    return Signed(public_key, signature, _TAG + mission + block_data)
+def block_claim(public_key: bytes, mission: bytes, block_data: bytes, signature: bytes) -> SignatureClaim:
+    """Return the claim that the owner of this public key signed the block with this BD in this mission."""
+    return SignatureClaim(public_key, signature, _TAG + mission + block_data)

@@ -1,11 +1,11 @@
-"""The keys of a mission: what everybody may know of them, what one vehicle has, and what stays home.
+"""The keys of a mission: the public keys, the bundle of each vehicle, and the key set on the ground.
 
-An authority (Ed25519) speaks for whoever sends the swarm. Each vehicle (Ed25519) signs for itself. All vehicles share
-the group secret of an epoch, from which the keys of datagrams are derived. Event data is sealed to the depot (X25519).
-The private keys of authority and depot are in no vehicle.
+The authority (Ed25519) signs revocations for the operator of the swarm. Each vehicle (Ed25519) signs its own datagrams
+and blocks. All vehicles share the group secret of an epoch, from which the keys of datagrams are derived. Event data is
+sealed to the public key of the depot (X25519). No vehicle has the private keys of the authority or the depot.
 
-`public.json` (schema `ucp-keys/1`) holds no secret. The bundle of vehicle 7, `7.bundle.json` (schema `ucp-bundle/1`),
-holds its own secrets, and is refused if others can read it.
+`public.json` (schema `ucp-keys/1`) holds no secret. `7.bundle.json` (schema `ucp-bundle/1`), the bundle of vehicle 7,
+holds the secrets of this vehicle. A bundle that other users can read is rejected.
 """
 
 from collections.abc import Iterable, Mapping
@@ -25,7 +25,7 @@ KEY_BYTES = 32
 MISSION_ID_BYTES = 16
 DEFAULT_EPOCH_S = 600.0
 MAX_EPOCH_S = 31 * 86400.0
-"""No mission is longer."""
+"""Maximum length of an epoch, 31 days. No mission is longer."""
 LAST_EPOCH = 2**32 - 1
 
 PUBLIC_SCHEMA = "ucp-keys/1"
@@ -35,9 +35,9 @@ PUBLIC_NAME = "public.json"
 
 @dataclass(frozen=True)
 class PublicKeys:
-    """What everybody may know: the mission's ID, and the public keys of authority, depot and all vehicles.
+    """The public part of a mission's keys: the mission's ID, and the public keys of authority, depot and all vehicles.
 
-    `depot` is None where event data is not sealed. Epoch e begins `epoch_s` * e mission seconds after the start.
+    `depot` is None if event data is not sealed. Epoch e begins `epoch_s` * e mission seconds after the start.
     """
 
     mission: bytes
@@ -47,7 +47,7 @@ class PublicKeys:
     epoch_s: float = DEFAULT_EPOCH_S
 
     def to_json(self) -> dict[str, Any]:
-        """As `public.json` has it."""
+        """Return the content of `public.json`."""
         return {
             "schema": PUBLIC_SCHEMA,
             "mission": self.mission.hex(),
@@ -58,8 +58,8 @@ class PublicKeys:
         }
 
     @classmethod
-    def of_json(cls, document: Mapping[str, Any]) -> Self:
-        """Raises KeyFileError, without the file's name."""
+    def from_json(cls, document: Mapping[str, Any]) -> Self:
+        """Parse the content of `public.json`. Raises KeyFileError without the file's name."""
         depot = None if document.get("depot") is None else key_in(document, "depot", KEY_BYTES)
         if depot is not None and not _can_seal_to(depot):
             raise KeyFileError("`depot` is not a usable X25519 public key")
@@ -70,14 +70,14 @@ class PublicKeys:
             key_in(document, "mission", MISSION_ID_BYTES),
             key_in(document, "authority", KEY_BYTES),
             depot,
-            _vehicles(document.get("vehicles")),
+            _parse_vehicles(document.get("vehicles")),
             float(epoch_s),
         )
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """All that one vehicle is given: what is public, its private key, and the group secret of an epoch."""
+    """The keys of one vehicle: the public keys, its private key, and the group secret of epoch `epoch`."""
 
     public: PublicKeys
     agent_id: int
@@ -86,11 +86,11 @@ class Bundle:
     epoch: int = 0
 
     def at_epoch(self, epoch: int, group_secret: bytes) -> "Bundle":
-        """The same vehicle's bundle in a later epoch."""
+        """Return the bundle of the same vehicle in a later epoch."""
         return replace(self, epoch=epoch, group_secret=group_secret)
 
     def to_json(self) -> dict[str, Any]:
-        """As the file has it, with all that is secret."""
+        """Return the content of the bundle's file, secrets included."""
         return {
             **self.public.to_json(),
             "schema": BUNDLE_SCHEMA,
@@ -101,9 +101,9 @@ class Bundle:
         }
 
     @classmethod
-    def of_json(cls, document: Mapping[str, Any]) -> Self:
-        """Raises KeyFileError, without the file's name."""
-        public = PublicKeys.of_json(document)
+    def from_json(cls, document: Mapping[str, Any]) -> Self:
+        """Parse the content of a bundle's file. Raises KeyFileError without the file's name."""
+        public = PublicKeys.from_json(document)
         agent_id, epoch = document.get("agent_id"), document.get("epoch")
         if type(agent_id) is not int or agent_id not in public.vehicles:
             raise KeyFileError("`agent_id` must be one of `vehicles`")
@@ -117,7 +117,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class KeySet:
-    """All keys of a mission, as they are at home; `group_secret` is that of epoch 0."""
+    """All keys of a mission, private keys included. It stays on the ground. `group_secret` is that of epoch 0."""
 
     public: PublicKeys
     authority: bytes = field(repr=False)
@@ -129,9 +129,9 @@ class KeySet:
     def derived(
         cls, seed: bytes, roster: Iterable[int], *, seals: bool = False, epoch_s: float = DEFAULT_EPOCH_S
     ) -> Self:
-        """The key set that comes of a seed: equal seeds, equal keys. New keys take 32 bytes of `os.urandom`.
+        """Return the key set derived from a seed. Equal seeds give equal keys.
 
-        `seals` says whether there is a depot key.
+        For new keys, `seed` must be 32 bytes of `os.urandom`. If `seals` is true, the set has a depot key.
         """
 
         def derive(name: str, length: int = KEY_BYTES) -> bytes:
@@ -149,41 +149,41 @@ class KeySet:
         return cls(public, authority, depot, vehicles, derive("group secret"))
 
     def bundle(self, agent_id: int) -> Bundle:
-        """What this vehicle is given. Raises KeyError if it is not on the roster."""
+        """Return the bundle of a vehicle. Raises KeyError if it is not on the roster."""
         return Bundle(self.public, agent_id, self.vehicles[agent_id], self.group_secret)
 
 
 def bundle_name(agent_id: int) -> str:
-    """What the file of a vehicle's bundle is called."""
+    """Return the name of the bundle file of a vehicle."""
     return f"{agent_id}.bundle.json"
 
 
 def load_bundle(path: Path) -> Bundle:
-    """The bundle in a file that nobody else can read. Raises KeyFileError."""
-    return read_key_file(path, BUNDLE_SCHEMA, Bundle.of_json, secret=True)
+    """Read a bundle from a file. Raises KeyFileError, also if other users can read the file."""
+    return read_key_file(path, BUNDLE_SCHEMA, Bundle.from_json, secret=True)
 
 
 def write_bundle(path: Path, bundle: Bundle) -> None:
-    """Write it in the place of an older one, with mode 0600. Raises OSError."""
+    """Write a bundle with mode 0600, and replace an older one. Raises OSError."""
     write_key_file(path, bundle.to_json(), secret=True)
 
 
 def load_public(path: Path) -> PublicKeys:
-    """The public keys in a file. Raises KeyFileError."""
-    return read_key_file(path, PUBLIC_SCHEMA, PublicKeys.of_json, secret=False)
+    """Read public keys from a file. Raises KeyFileError."""
+    return read_key_file(path, PUBLIC_SCHEMA, PublicKeys.from_json, secret=False)
 
 
 def write_public(path: Path, public: PublicKeys) -> None:
-    """Raises OSError."""
+    """Write public keys to a file. Raises OSError."""
     write_key_file(path, public.to_json(), secret=False)
 
 
 def public_key_of(private_key: bytes) -> bytes:
-    """The Ed25519 public key that belongs to a private one."""
+    """Return the Ed25519 public key of a private key."""
     return Ed25519PrivateKey.from_private_bytes(private_key).public_key().public_bytes_raw()
 
 
-def _vehicles(document: Any) -> dict[int, bytes]:
+def _parse_vehicles(document: Any) -> dict[int, bytes]:
     if not isinstance(document, dict) or not 1 <= len(document) <= MAX_AGENT_ID:
         raise KeyFileError("`vehicles` must be an object with the public key of each vehicle")
     vehicles = {}
@@ -196,7 +196,10 @@ def _vehicles(document: Any) -> dict[int, bytes]:
 
 
 def _can_seal_to(depot: bytes) -> bool:
-    """Whether a secret can be agreed on with this key: with points of low order none can (RFC 7748, Section 6.1)."""
+    """Return whether event data can be sealed to this public key.
+
+    Points of low order give no shared secret (RFC 7748, Section 6.1).
+    """
     try:
         X25519PrivateKey.from_private_bytes(bytes(KEY_BYTES)).exchange(X25519PublicKey.from_public_bytes(depot))
     except ValueError:

@@ -1,7 +1,8 @@
-"""The primitives of secure missions: one suite, named by the contract, and nothing to negotiate.
+"""The cryptographic primitives of secure missions. The agent contract defines one suite, so agents negotiate nothing.
 
-HKDF-Expand with SHA-256 (RFC 5869), ChaCha20-Poly1305 (RFC 8439) and Ed25519 (RFC 8032). Everything that is derived or
-signed begins with a tag of its own and the mission's ID, so that no key or signature means anything elsewhere.
+The suite is HKDF-Expand with SHA-256 (RFC 5869), ChaCha20-Poly1305 (RFC 8439) and Ed25519 (RFC 8032). The input of each
+derivation and signature contains a tag for its purpose and the mission's ID. A key or signature is therefore valid only
+for this purpose in this mission.
 """
 
 import hmac
@@ -16,7 +17,7 @@ from ucp.secure.envelope import SIGNATURE_BYTES
 
 KEY_BYTES = 32
 NONCE_BYTES = 12
-PUBLIC_KEYS_KEPT = 1024
+MAX_CACHED_KEYS = 1024
 
 _SENDER = b"UCP sender\0"
 _MASK = b"UCP signature mask\0"
@@ -24,7 +25,7 @@ _EPOCH = b"UCP epoch\0"
 
 
 def expand(key: bytes, info: bytes, length: int) -> bytes:
-    """HKDF-Expand (RFC 5869, Section 2.3)."""
+    """Return `length` bytes of HKDF-Expand (RFC 5869, Section 2.3)."""
     output = block = hmac.digest(key, info + b"\1", "sha256")
     counter = 1
     while len(output) < length:
@@ -35,12 +36,12 @@ def expand(key: bytes, info: bytes, length: int) -> bytes:
 
 
 def next_epoch_secret(secret: bytes, mission: bytes) -> bytes:
-    """The group secret of the next epoch; there is no way back."""
+    """Return the group secret of the next epoch. The function is one-way."""
     return expand(secret, _EPOCH + mission, KEY_BYTES)
 
 
 class SenderKeys:
-    """What one sender's datagrams of one epoch and one life are sealed with; its secrets are never shown."""
+    """The keys that seal the datagrams of one sender in one epoch and one incarnation. `repr` hides them."""
 
     __slots__ = ("_aead", "_iv", "_mask")
 
@@ -52,45 +53,45 @@ class SenderKeys:
         self._mask = derived[KEY_BYTES + NONCE_BYTES :]
 
     def encrypt(self, sequence: int, body: bytes, clear: bytes) -> bytes:
-        """Ciphertext and tag. Whoever calls it uses each sequence once."""
+        """Return the ciphertext and its tag. The caller must use each sequence once."""
         return self._aead.encrypt(self._nonce(sequence), body, clear)
 
     def decrypt(self, sequence: int, ciphertext: bytes, clear: bytes) -> bytes | None:
-        """The body; None if ciphertext, tag and clear header do not belong together."""
+        """Return the body. None if ciphertext, tag and clear header do not belong together."""
         try:
             return self._aead.decrypt(self._nonce(sequence), ciphertext, clear)
         except InvalidTag:
             return None
 
-    def masked(self, sequence: int, signature: bytes) -> bytes:
-        """A signature as it is on the air, or one from the air as it was made."""
+    def mask_signature(self, sequence: int, signature: bytes) -> bytes:
+        """Return the masked form of a signature, or the signature of a masked form. Masking is an XOR."""
         return (int.from_bytes(signature, "big") ^ self.keystream(sequence)).to_bytes(SIGNATURE_BYTES, "big")
 
     def keystream(self, sequence: int) -> int:
-        """What masks the signature of the datagram with this sequence."""
+        """Return the mask for the signature of the datagram with this sequence, as an integer of 64 bytes."""
         return int.from_bytes(expand(self._mask, _MASK + sequence.to_bytes(4, "big"), SIGNATURE_BYTES), "big")
 
     def _nonce(self, sequence: int) -> bytes:
         return (self._iv ^ sequence).to_bytes(NONCE_BYTES, "big")
 
 
-class Signed(NamedTuple):
-    """A signature with what it is of, and whose."""
+class SignatureClaim(NamedTuple):
+    """The claim that the owner of a public key signed some bytes with this signature."""
 
     public_key: bytes
     signature: bytes
     signed: bytes
 
 
-def verify(claim: Signed) -> bool:
-    """Whether the owner of the public key signed it. Never raises, whatever the bytes are."""
+def verify(claim: SignatureClaim) -> bool:
+    """Return whether the claim is true. Malformed keys and signatures give False."""
     try:
-        _loaded(claim.public_key).verify(claim.signature, claim.signed)
+        _load_public_key(claim.public_key).verify(claim.signature, claim.signed)
     except (InvalidSignature, ValueError):
         return False
     return True
 
 
-@lru_cache(PUBLIC_KEYS_KEPT)
-def _loaded(public_key: bytes) -> Ed25519PublicKey:
+@lru_cache(MAX_CACHED_KEYS)
+def _load_public_key(public_key: bytes) -> Ed25519PublicKey:
     return Ed25519PublicKey.from_public_bytes(public_key)

@@ -1,9 +1,10 @@
-"""The clear header of a secured datagram, version 2, and what a receiver can tell from it before it computes anything.
+"""The clear header of a secured datagram (version 2), and the checks that need no cryptography.
 
     "UC" | version u8 = 2 | type u8 | sender u32 | sequence u32 | length u16 | epoch u32 | boot | revocations u16
 
-Then come the ciphertext with its tag and the sender's masked signature; of type 10, a revocation, its body. All of the
-header is authenticated with what follows it. CONTRACT.md has every byte.
+The ciphertext with its tag and the sender's masked signature follow the header. In a revocation (type 10), its unsealed
+body follows. The seal and the signature of a datagram also cover its header, except in a revocation, whose authority
+signs only the body. CONTRACT.md specifies every byte.
 """
 
 from typing import NamedTuple
@@ -29,27 +30,27 @@ SIGNATURE_BYTES = 64
 CLEAR_FIELDS = {**HEADER_FIELDS, "epoch": Kind.U32, "boot": Kind.BOOT, "revocations": Kind.U16}
 CLEAR = struct_of(CLEAR_FIELDS)
 SEAL_BYTES = TAG_BYTES + SIGNATURE_BYTES
-"""What sealing adds behind the header, whatever is sealed."""
+"""Number of bytes that sealing adds to a body: the tag and the sender's signature."""
 LAST_SEQUENCE = 2**32 - 1
 REVOCATION = 10
-"""The type that says which keys are revoked; it is signed by the authority and not encrypted."""
+"""Type of a revocation. The authority signs it, and it is not encrypted."""
 TYPES = frozenset(range(1, REVOCATION + 1))
 
 NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
-"""Type of a message -> its name, in clear as its type is."""
+"""Type of a message -> its name."""
 
 REQUEST_FIELDS = {"request_sender": Kind.U32, "request_boot": Kind.BOOT, "request_sequence": Kind.U32}
-"""Sealed before the body of a response: the request that it answers."""
+"""Fields of the request that a response answers. They are sealed in front of the response's body."""
 REQUEST = struct_of(REQUEST_FIELDS)
 REQUEST_OF = {2: 1, 5: 4, 7: 6, 9: 8}
 """Type of a response -> type of the request that it answers."""
 REQUESTS = frozenset(REQUEST_OF.values())
 WITH_BLOCK = frozenset((3, 9))
-"""Types of the messages that carry a block, and behind it, sealed too, its maker's signature."""
+"""Types of the messages that carry a block. The signature of the block's maker is sealed after the block."""
 
 
-class Clear(NamedTuple):
-    """What the header says, which nobody vouches for by itself."""
+class ClearHeader(NamedTuple):
+    """The fields of a clear header. They are not authenticated until the datagram is opened."""
 
     type: int
     sender: int
@@ -59,13 +60,13 @@ class Clear(NamedTuple):
     revocations: int
 
     def pack(self, length: int) -> bytes:
-        """The header of a datagram with so many bytes behind it."""
+        """Return the header's bytes. `length` is the number of bytes after the header."""
         code, sender, sequence, *rest = self
         return CLEAR.pack(MAGIC, VERSION, code, sender, sequence, length, *rest)
 
 
-def read_clear(datagram: bytes) -> Clear:
-    """The header of a secured datagram. Raises MalformedDatagramError for anything else."""
+def read_clear_header(datagram: bytes) -> ClearHeader:
+    """Return the header of a secured datagram. Raises MalformedDatagramError if it is not a secured datagram."""
     if len(datagram) < 4:
         raise MalformedDatagramError("truncated")
     if len(datagram) > MAX_DATAGRAM_BYTES:
@@ -85,7 +86,7 @@ def read_clear(datagram: bytes) -> Clear:
         raise MalformedDatagramError("unknown type")
     if code != REVOCATION and length < SEAL_BYTES:
         raise MalformedDatagramError("wrong length")
-    return Clear(code, sender, sequence, *rest)
+    return ClearHeader(code, sender, sequence, *rest)
 
 
 ADDED_BYTES: dict[str, int] = {
@@ -96,9 +97,9 @@ ADDED_BYTES: dict[str, int] = {
     + (SIGNATURE_BYTES if code in WITH_BLOCK else 0)
     for message, code in TYPE_CODES.items()
 }
-"""By how much a message's secured datagram is longer than its plain one, by the message's name."""
+"""Name of a message -> number of bytes that its secured datagram is longer than its plain one."""
 
 
 def sealed_bytes(message: Message) -> int:
-    """Length of the secured datagram of `message`."""
+    """Return the length of the secured datagram of `message` in bytes."""
     return datagram_bytes(message) + ADDED_BYTES[message.NAME]

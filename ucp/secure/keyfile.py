@@ -1,6 +1,7 @@
-"""Files that hold keys: JSON, bounded, refused if others can read what is secret, written whole or not at all.
+"""Read and write files with keys.
 
-What a file says about a key is never shown: an error names the place, and what is allowed there.
+A key file is JSON of limited size. A secret file that other users can read is rejected. A file is written completely or
+not at all. Error messages never show the value of a key: they name its place and the permitted format.
 """
 
 import contextlib
@@ -12,34 +13,38 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 MAX_FILE_BYTES = 8 * 1024 * 1024
-"""The public keys of the largest roster take 5 MiB."""
-OTHERS = 0o077
+"""Maximum size of a key file. The public keys of the largest roster take 5 MiB."""
+OTHER_USERS = 0o077
+"""Permission bits of other users and groups."""
 SECRET_MODE, PUBLIC_MODE = 0o600, 0o644
 
 T = TypeVar("T")
 
 
 class KeyFileError(Exception):
-    """A file with keys that cannot be used: one sentence with the file, and with nothing secret."""
+    """An unusable key file. The message is one sentence with the file's name and without secrets."""
 
 
 def read_key_file(path: Path, schema: str, parse: Callable[[dict[str, Any]], T], *, secret: bool) -> T:
-    """What `parse` makes of the JSON object of this schema in a file.
+    """Return the result of `parse` for the JSON object in a key file with this schema.
 
-    Raises KeyFileError; also if it is `secret`, and others can read it.
+    Raises KeyFileError, also if the file is `secret` and other users can read it.
     """
     return read_any_key_file(path, {schema: (secret, parse)})
 
 
 def read_any_key_file(path: Path, kinds: Mapping[str, tuple[bool, Callable[[dict[str, Any]], T]]]) -> T:
-    """As `read_key_file` does, of whichever schema the file is: for each whether it is secret, and how it is parsed."""
+    """Read a key file of one of several schemas. `kinds` maps each schema to whether it is secret, and to its parser.
+
+    Raises KeyFileError like `read_key_file`.
+    """
     try:
         document, mode = _read(path)
         schema = document.get("schema")
         if not isinstance(schema, str) or schema not in kinds:
             raise KeyFileError(f"not a file of the schema {' or '.join(kinds)}")
         secret, parse = kinds[schema]
-        if secret and mode & OTHERS:
+        if secret and mode & OTHER_USERS:
             raise KeyFileError(
                 "other users can read this secret: run chmod 600, or make new keys if they may have read it"
             )
@@ -49,14 +54,14 @@ def read_any_key_file(path: Path, kinds: Mapping[str, tuple[bool, Callable[[dict
 
 
 def _read(path: Path) -> tuple[dict[str, Any], int]:
-    """The JSON object in a file, and the file's mode. Raises KeyFileError, without the file's name."""
+    """Return the JSON object in a file, and the file's mode. Raises KeyFileError without the file's name."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         with os.fdopen(descriptor, "rb") as file:
             mode = os.fstat(descriptor).st_mode
             data = file.read(MAX_FILE_BYTES + 1) if stat.S_ISREG(mode) else None
     except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "that is no path"
+        reason = error.strerror if isinstance(error, OSError) else "the path is not valid"
         raise KeyFileError(f"cannot be read: {reason}") from None
     if data is None:
         raise KeyFileError("not a key file")
@@ -65,20 +70,20 @@ def _read(path: Path) -> tuple[dict[str, Any], int]:
     try:
         document = json.loads(data)
     except (ValueError, RecursionError):
-        raise KeyFileError("not JSON") from None  # what is there instead may be a key
+        raise KeyFileError("not JSON") from None  # the parser's message may quote a key
     if not isinstance(document, dict):
         raise KeyFileError("not a key file")
     return document, mode
 
 
 def write_key_file(path: Path, document: Mapping[str, Any], *, secret: bool) -> None:
-    """Write a file in the place of an older one, so that there is all of the one or all of the other.
+    """Write a key file and replace an older one atomically. A reader sees either the complete old or new file.
 
-    What is `secret` nobody else can read, not for a moment. Raises OSError.
+    Other users can read a `secret` file at no moment. Raises OSError.
     """
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     mode = SECRET_MODE if secret else PUBLIC_MODE
-    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
     try:
         with os.fdopen(descriptor, "wb") as file:
             if secret:
@@ -86,19 +91,22 @@ def write_key_file(path: Path, document: Mapping[str, Any], *, secret: bool) -> 
             file.write(json.dumps(document, indent=1).encode("ascii") + b"\n")
             file.flush()
             os.fsync(descriptor)
-        beside.replace(path)
+        temporary.replace(path)
     except BaseException:
         with contextlib.suppress(OSError):
-            beside.unlink()
+            temporary.unlink()
         raise
 
 
 def key_in(document: Mapping[str, Any], name: str, length: int, within: str = "") -> bytes:
-    """A key, of `length` bytes in hexadecimal. Raises KeyFileError, which does not show it."""
+    """Return the key under `name`: `length` bytes in hexadecimal. Raises KeyFileError, which does not show the key.
+
+    `within` is the path to `document` for the error message, for example `vehicles.`.
+    """
     text = document.get(name)
     if isinstance(text, str) and len(text) == 2 * length and text.isascii():
         with contextlib.suppress(ValueError):
             key = bytes.fromhex(text)
-            if len(key) == length:  # there may be spaces in it
+            if len(key) == length:  # bytes.fromhex skips spaces
                 return key
     raise KeyFileError(f"`{within}{name}` must be {2 * length} hexadecimal digits")

@@ -1,21 +1,24 @@
-"""Opens datagrams after the fact, as a capture has them: in any order, as often as they are there, of any epoch.
+"""Open the secured datagrams of a capture after a mission.
 
-An agent opens what is fresh and drops the rest (`ucp.secure.session`). Whoever looks at what crossed the air wants to
-see all of it; what is not authentic is told here, too.
+An agent drops replayed and old datagrams (`ucp.secure.session`). The reader of a capture wants to see all datagrams, so
+an opener accepts them in any order and any number of times. It still rejects datagrams that are not authentic.
 """
 
 from ucp.messages import MalformedDatagramError
 from ucp.secure.bundle import Bundle
 from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret, verify
-from ucp.secure.envelope import REVOCATION, read_clear
-from ucp.secure.sealed_datagrams import Opened, decrypted, domain_of, understood
+from ucp.secure.envelope import REVOCATION, read_clear_header
+from ucp.secure.sealed_datagrams import OpenedDatagram, decrypt, parse_body, signing_domain
 
 EPOCHS_AHEAD = 4096
-"""How far the secrets are made that no clock asks for: four weeks, if an epoch has 600 s."""
+"""Maximum number of epochs after the bundle's for which secrets are computed: four weeks with epochs of 600 s."""
 
 
 class Opener:
-    """Opens what any vehicle of a mission sent, from the bundle of one, in the bundle's epoch and later ones."""
+    """Opens datagrams of all vehicles of a mission with the bundle of one vehicle.
+
+    It opens datagrams of the bundle's epoch and of later epochs. Secrets of earlier epochs cannot be computed.
+    """
 
     def __init__(self, bundle: Bundle) -> None:
         self._public = bundle.public
@@ -23,13 +26,13 @@ class Opener:
         self._secrets = [bundle.group_secret]
         self._keys: dict[tuple[int, int, bytes], SenderKeys] = {}
 
-    def open(self, datagram: bytes) -> Opened:
-        """What the datagram says.
+    def open(self, datagram: bytes) -> OpenedDatagram:
+        """Return the content of a datagram.
 
-        Raises MalformedDatagramError: for a revocation, which is not sealed, and for whatever is not authentic, of
-        an epoch before the bundle's, or of nobody who has keys.
+        Raises MalformedDatagramError if the datagram is a revocation (which is not sealed), is not authentic, belongs
+        to an epoch before the bundle's, or comes from a sender that is not on the roster.
         """
-        clear = read_clear(datagram)
+        clear = read_clear_header(datagram)
         if clear.type == REVOCATION:
             raise MalformedDatagramError("not sealed")
         public_key = self._public.vehicles.get(clear.sender)
@@ -37,11 +40,11 @@ class Opener:
             raise MalformedDatagramError("sender not on the roster")
         sealed_by = clear.epoch, clear.sender, clear.boot
         keys = self._keys.get(sealed_by) or SenderKeys(self._secret(clear.epoch), self._public.mission, *sealed_by)
-        body, claim = decrypted(keys, datagram, clear, domain_of(self._public.mission), public_key)
+        body, claim = decrypt(keys, datagram, clear, signing_domain(self._public.mission), public_key)
         if not verify(claim):
             raise MalformedDatagramError("not signed by its sender")
         self._keys[sealed_by] = keys
-        return understood(clear, body)
+        return parse_body(clear, body)
 
     def _secret(self, epoch: int) -> bytes:
         later = epoch - self._first

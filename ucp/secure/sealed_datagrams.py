@@ -1,7 +1,7 @@
-"""What a sealed datagram says, and whether its sender says it: functions of bytes alone, which know of no receiver.
+"""Functions that decrypt and parse a sealed datagram. Their results depend only on bytes and keys, not on a receiver.
 
-Whoever plays many vehicles in one process may remember what these gave for the same bytes under the same keys
-(`Arithmetic`). What is fresh, asked for, or of a sender that is not revoked each session decides for itself.
+A process that plays many vehicles may therefore cache the results for all of them (`CryptoFunctions`). Each session
+decides on its own whether a datagram is fresh, answers a request, and comes from a sender that is not revoked.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from ucp.messages import Datagram, MalformedDatagramError, decode_body
-from ucp.secure.crypto_suite import SenderKeys, Signed, verify
+from ucp.secure.crypto_suite import SenderKeys, SignatureClaim, verify
 from ucp.secure.envelope import (
     BOOT_BYTES,
     CLEAR,
@@ -19,8 +19,8 @@ from ucp.secure.envelope import (
     REQUEST_OF,
     SIGNATURE_BYTES,
     WITH_BLOCK,
-    Clear,
-    read_clear,
+    ClearHeader,
+    read_clear_header,
 )
 from ucp.trace import Recorded
 
@@ -28,50 +28,50 @@ _DATAGRAM = b"UCP datagram\0"
 
 
 class Request(NamedTuple):
-    """A datagram that asks something, as a response names it."""
+    """The request that a response answers, identified by its sender, boot and sequence."""
 
     sender: int
     boot: bytes
     sequence: int
 
 
-NOTHING_ASKED = Request(0, bytes(BOOT_BYTES), 0)
-"""What a response names that answers nothing. No request is like that."""
+NO_REQUEST = Request(0, bytes(BOOT_BYTES), 0)
+"""The value in a response that answers no request. No real request has the sender 0."""
 
 
-class Opened(NamedTuple):
-    """What a datagram said that proved authentic."""
+class OpenedDatagram(NamedTuple):
+    """An authentic datagram after decryption."""
 
-    clear: Clear
-    said: Datagram
+    clear: ClearHeader
+    datagram: Datagram
     recorded: Recorded
-    """The datagram of version 1 that says the same."""
+    """The datagram of version 1 with the same content, as the trace records it."""
     request: Request | None
-    """What it answers; None if it is no response."""
+    """The request that it answers. None if it is not a response."""
     block_signature: bytes
 
 
-def domain_of(mission: bytes) -> bytes:
-    """What stands before all that is signed of a datagram of this mission."""
+def signing_domain(mission: bytes) -> bytes:
+    """Return the tag and mission ID in front of the signed bytes of each datagram of a mission."""
     return _DATAGRAM + mission
 
 
-def decrypted(
-    keys: SenderKeys, datagram: bytes, clear: Clear, domain: bytes, public_key: bytes
-) -> tuple[bytes, Signed]:
-    """What was sealed, and the signature that is still to be verified.
+def decrypt(
+    keys: SenderKeys, datagram: bytes, clear: ClearHeader, domain: bytes, public_key: bytes
+) -> tuple[bytes, SignatureClaim]:
+    """Return the body of a sealed datagram, and the claim of its signature, which the caller must still verify.
 
-    Raises MalformedDatagramError if the keys do not open it.
+    Raises MalformedDatagramError if the keys do not decrypt the datagram.
     """
     signed, signature = datagram[:-SIGNATURE_BYTES], datagram[-SIGNATURE_BYTES:]
     body = keys.decrypt(clear.sequence, signed[CLEAR.size :], signed[: CLEAR.size])
     if body is None:
         raise MalformedDatagramError("not authentic")
-    return body, Signed(public_key, keys.masked(clear.sequence, signature), domain + signed)
+    return body, SignatureClaim(public_key, keys.mask_signature(clear.sequence, signature), domain + signed)
 
 
-def understood(clear: Clear, body: bytes) -> Opened:
-    """What a body says that was sealed. Raises MalformedDatagramError for one that no message has."""
+def parse_body(clear: ClearHeader, body: bytes) -> OpenedDatagram:
+    """Parse a decrypted body. Raises MalformedDatagramError if it is no body of this message type."""
     request, block_signature = None, b""
     if clear.type in REQUEST_OF:
         if len(body) < REQUEST.size:
@@ -81,27 +81,31 @@ def understood(clear: Clear, body: bytes) -> Opened:
         if len(body) < SIGNATURE_BYTES:
             raise MalformedDatagramError("wrong length")
         body, block_signature = body[:-SIGNATURE_BYTES], body[-SIGNATURE_BYTES:]
-    said = Datagram(clear.sender, clear.sequence, decode_body(clear.type, body))
-    return Opened(clear, said, Recorded(None, said), request, block_signature)
+    datagram = Datagram(clear.sender, clear.sequence, decode_body(clear.type, body))
+    return OpenedDatagram(clear, datagram, Recorded(None, datagram), request, block_signature)
 
 
 class Signer(Protocol):
-    """Who has a private key."""
+    """An object that signs with a private key."""
 
     def sign(self, data: bytes, /) -> bytes:
-        """The signature of these bytes, 64 bytes."""
+        """Return the signature of `data` (64 bytes)."""
 
 
 @dataclass(frozen=True)
-class Arithmetic:
-    """What a session works out of bytes alone; each has the arguments of the function that stands here."""
+class CryptoFunctions:
+    """The functions of bytes and keys that a session calls.
 
-    read: Callable[[bytes], Clear] = read_clear
+    The defaults compute each result. A simulation replaces them by functions with the same arguments that cache
+    results.
+    """
+
+    read: Callable[[bytes], ClearHeader] = read_clear_header
     sender_keys: Callable[[bytes, bytes, int, int, bytes], SenderKeys] = SenderKeys
-    decrypted: Callable[[SenderKeys, bytes, Clear, bytes, bytes], tuple[bytes, Signed]] = decrypted
-    understood: Callable[[Clear, bytes], Opened] = understood
+    decrypt: Callable[[SenderKeys, bytes, ClearHeader, bytes, bytes], tuple[bytes, SignatureClaim]] = decrypt
+    parse_body: Callable[[ClearHeader, bytes], OpenedDatagram] = parse_body
     signer: Callable[[bytes], Signer] = Ed25519PrivateKey.from_private_bytes
-    verified: Callable[[Signed], bool] = verify
+    verify: Callable[[SignatureClaim], bool] = verify
 
 
-ARITHMETIC = Arithmetic()
+CRYPTO_FUNCTIONS = CryptoFunctions()

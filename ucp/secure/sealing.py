@@ -1,12 +1,12 @@
-"""Event data that the depot alone can read: whoever carries it, or captures who carries it, cannot.
+"""Seal event data so that only the depot can read it. The vehicles that carry it, and their captors, cannot.
 
-HPKE (RFC 9180) in base mode: DHKEM(X25519, HKDF-SHA256), HKDF-SHA256, ChaCha20-Poly1305, one message with each key.
-What is sealed cannot be passed off as another block's: mission, agent and timestamp are in `info`. (As additional data
-they would be bound no closer, and libraries whose HPKE knows none could not open it.)
+Sealing is HPKE (RFC 9180) in base mode: DHKEM(X25519, HKDF-SHA256), HKDF-SHA256, ChaCha20-Poly1305, and one message per
+key. `info` contains mission, agent and timestamp, so sealed data of one block is not valid in another block.
+Additional data (AAD) would bind them as well, but some HPKE libraries do not support it.
 
-A vehicle that draws no random numbers derives each ephemeral key from its private key and from all that it seals with
-it. So equal blocks are equal bytes, and two that differ in anything never have a key in common. No library's HPKE takes
-an ephemeral key; what is to be opened is opened by the library's own.
+An agent draws no random numbers. It derives the ephemeral key of each block from its private key and from all data of
+the block. Equal blocks therefore give equal bytes, and blocks that differ never share a key. HPKE libraries do not
+accept an ephemeral key, so this module seals with its own code. It opens with the HPKE of the library.
 """
 
 import struct
@@ -34,12 +34,12 @@ _BASE_MODE = b"\0"
 
 
 class NotOpenedError(Exception):
-    """Event data that this key does not open: one sentence."""
+    """Event data that this key does not open. The message is one sentence."""
 
 
 @dataclass(frozen=True)
 class Depot:
-    """Who can read what was sealed in a mission."""
+    """The depot's private key, which opens the sealed event data of a mission."""
 
     mission: bytes
     private_key: bytes = field(repr=False)
@@ -49,7 +49,7 @@ class Depot:
         return X25519PrivateKey.from_private_bytes(self.private_key).public_key().public_bytes_raw()
 
     def open(self, sealed: bytes, agent_id: int, timestamp_us: int) -> bytes:
-        """The events of a block. Raises NotOpenedError."""
+        """Return the events of the block with this agent ID and timestamp. Raises NotOpenedError."""
         key: Any = X25519PrivateKey.from_private_bytes(self.private_key)
         try:
             return _LIBRARY.decrypt(sealed, key, _info(self.mission, agent_id, timestamp_us))
@@ -57,8 +57,8 @@ class Depot:
             raise NotOpenedError("not sealed to this depot by the agent that it names, or damaged") from None
 
 
-def seal_of(bundle: Bundle) -> Seal | None:
-    """How this vehicle seals its event data; None if its mission does not."""
+def make_seal(bundle: Bundle) -> Seal | None:
+    """Return the function with which this vehicle seals its event data. None if its mission does not seal."""
     depot = bundle.public.depot
     if depot is None:
         return None
@@ -66,22 +66,25 @@ def seal_of(bundle: Bundle) -> Seal | None:
 
     def seal(event_data: bytes, timestamp_us: int) -> bytes:
         info = _info(mission, agent_id, timestamp_us)
-        everything = HMAC(bundle.private_key, SHA256())
-        everything.update(b"UCP ephemeral key\0" + depot + info + event_data)
-        return sealed(event_data, recipient, X25519PrivateKey.from_private_bytes(everything.finalize()), info)
+        derivation = HMAC(bundle.private_key, SHA256())
+        derivation.update(b"UCP ephemeral key\0" + depot + info + event_data)
+        return _hpke_seal(event_data, recipient, X25519PrivateKey.from_private_bytes(derivation.finalize()), info)
 
     return seal
 
 
-def sealed(plain: bytes, recipient: X25519PublicKey, ephemeral: X25519PrivateKey, info: bytes) -> bytes:
-    """HPKE's one message in base mode: the ephemeral public key (32), the ciphertext, the tag (16)."""
+def _hpke_seal(plain: bytes, recipient: X25519PublicKey, ephemeral: X25519PrivateKey, info: bytes) -> bytes:
+    """Seal one message with HPKE in base mode.
+
+    Return the ephemeral public key (32 bytes), the ciphertext and the tag (16 bytes).
+    """
     enc = ephemeral.public_key().public_bytes_raw()
     key, nonce = key_schedule(ephemeral.exchange(recipient), enc, recipient.public_bytes_raw(), info)
     return enc + ChaCha20Poly1305(key).encrypt(nonce, plain, None)
 
 
 def key_schedule(shared: bytes, enc: bytes, recipient: bytes, info: bytes) -> tuple[bytes, bytes]:
-    """The key, and the nonce of the first message (RFC 9180, Sections 4.1 and 5.1), of a Diffie-Hellman secret."""
+    """Return the key and the first nonce for a Diffie-Hellman secret (RFC 9180, Sections 4.1 and 5.1)."""
     secret = _expand(_KEM_SUITE, _extract(_KEM_SUITE, b"", b"eae_prk", shared), b"shared_secret", enc + recipient)
     context = _BASE_MODE + _extract(_SUITE, b"", b"psk_id_hash", b"") + _extract(_SUITE, b"", b"info_hash", info)
     secret = _extract(_SUITE, secret, b"secret", b"")

@@ -1,11 +1,12 @@
-"""An agent behind keys: the same agent with the same face, whose datagrams are sealed and opened on the way.
+"""An agent of a secured mission. It has the interface of `Agent`, and seals and opens its datagrams.
 
-The protocol knows nothing of it. What reaches its handlers is authentic and fresh, of a sender whose keys are not
-revoked; a block is its maker's; a response answers the newest request of its kind that is known. Whatever else the
-radio delivers is counted in `dropped`, as ever, and nothing else happens.
+The handlers of the protocol do not change. They receive a message only if it is authentic and fresh, and its sender is
+not revoked. If the message carries a block, the block's maker has signed it. If the message is a response, it answers
+the newest known request of its type. A new revocation is stored and forwarded. All other datagrams are counted in
+`dropped` and change no state of the agent.
 
-Its trace has datagrams in their plain form, as everybody's, so that it is read and judged like any other; those that
-were dropped are there as they came.
+The trace contains datagrams in their plain form, so it is read and judged like any other trace. Only dropped datagrams
+are recorded as they were received.
 """
 
 import struct
@@ -16,20 +17,20 @@ from typing import Any, NamedTuple
 from ucp.agent import Agent, why_not_handled
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
 from ucp.secure._signatures import BlockSignatures
-from ucp.secure.envelope import BOOT_BYTES, CLEAR, LAST_SEQUENCE, REQUESTS, REVOCATION, Clear
+from ucp.secure.envelope import BOOT_BYTES, CLEAR, LAST_SEQUENCE, REQUESTS, REVOCATION, ClearHeader
 from ucp.secure.revocation import Revocation, RevocationError
-from ucp.secure.sealed_datagrams import Opened, Request
+from ucp.secure.sealed_datagrams import OpenedDatagram, Request
 from ucp.secure.session import Session
 from ucp.store import SecuredState, StoredState
 from ucp.trace import Commanded, Recorded, in_base64
 
-TOLD_AGAIN_S = 5.0
-"""Mission seconds from one telling of a revocation to the next, at least."""
+REVOCATION_INTERVAL_S = 5.0
+"""Minimum time in mission seconds between two broadcasts of a revocation."""
 _BOOT_TIME = struct.Struct("!Q")
 
 
-class Outgoing(NamedTuple):
-    """A datagram to broadcast: as it goes on the air, and what it says, unless it is a revocation."""
+class OutgoingDatagram(NamedTuple):
+    """A datagram to broadcast, with its message in plain form. A revocation has no message."""
 
     sealed: bytes
     sequence: int = 0
@@ -37,61 +38,63 @@ class Outgoing(NamedTuple):
     plain: Recorded | None = None
 
 
-def boot_of(started_us: int, chance: bytes) -> bytes:
-    """Which life of a vehicle: when it began, in microseconds UTC, and 8 bytes of chance."""
-    boot = _BOOT_TIME.pack(started_us) + chance
+def make_boot(started_us: int, random_bytes: bytes) -> bytes:
+    """Return the boot of an incarnation: its start in microseconds UTC, and 8 random bytes."""
+    boot = _BOOT_TIME.pack(started_us) + random_bytes
     assert len(boot) == BOOT_BYTES
     return boot
 
 
 class SecuredAgent(Agent):
-    """An agent with a session; all other arguments are Agent's. Raises ValueError for a roster without keys."""
+    """An agent that sends and receives through a session. The other arguments are those of Agent.
+
+    Raises ValueError if the session belongs to another agent, or lacks the public key of an agent on the roster.
+    """
 
     def __init__(self, session: Session, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        without = sorted(self.roster - session.public_keys.keys())
-        if without or session.agent_id != self.agent_id:
-            raise ValueError(
-                f"the keys belong to agent {session.agent_id}, and keys of {without or 'others'} are missing"
-            )
+        if session.agent_id != self.agent_id:
+            raise ValueError(f"the session belongs to agent {session.agent_id}, not to agent {self.agent_id}")
+        if missing := sorted(self.roster - session.public_keys.keys()):
+            raise ValueError(f"the session has no public keys of the agents {missing}")
         self.session = session
         self.revocation: Revocation | None = None
-        """The newest that is known."""
+        """The newest known revocation."""
         self.problem: str | None = None
-        """Why it no longer sends, if so."""
+        """The reason why the agent sends no more. None if it sends."""
         self._signatures = BlockSignatures(session, self.state)
-        self._answers: dict[int, Request] = {}
-        """Sequence of a response in the outbox -> what it answers."""
-        self._tells = False
-        self._told_at: float | None = None
+        self._answered_requests: dict[int, Request] = {}
+        """Sequence of a response in the outbox -> the request that it answers."""
+        self._revocation_due = False
+        self._revocation_sent_at: float | None = None
 
     @property
     def signatures(self) -> Mapping[bytes, bytes]:
-        """The makers' signatures of all blocks that it holds, by block hash."""
+        """The makers' signatures of all blocks that the agent holds, by block hash."""
         return self._signatures.held()
 
     # From the air
 
     def receive_datagram(self, data: bytes, now: float) -> None:
-        self.session.epochs.look_at(now)
+        self.session.epochs.set_clock(now)
         try:
-            clear = self.session.arithmetic.read(data)
-            if why := self._why_not_opened(clear):
-                raise MalformedDatagramError(why)
+            clear = self.session.crypto.read(data)
+            if reason := self._drop_reason(clear):
+                raise MalformedDatagramError(reason)
             if clear.type == REVOCATION:
                 if not self.revoke(data[CLEAR.size :], now, {"from": clear.sender}):
                     raise MalformedDatagramError("known already")
                 return
             opened = self.session.open(data, clear)
-            if clear.revocations < self._revocations:
-                self._tell(now)
-            self._check(opened)
+            if clear.revocations < self._revocation_number:
+                self._schedule_revocation(now)
+            self._check_opened(opened)
         except MalformedDatagramError as malformed:
             self._drop(now, malformed.reason, Recorded(in_base64(data)))
             return
         self._handle_opened(opened, now)
 
-    def _why_not_opened(self, clear: Clear) -> str | None:
+    def _drop_reason(self, clear: ClearHeader) -> str | None:
         if clear.sender == self.agent_id:
             return "own sender"
         if clear.sender not in self.roster:
@@ -100,23 +103,23 @@ class SecuredAgent(Agent):
             return "revoked sender"
         return None
 
-    def _check(self, opened: Opened) -> None:
-        """Raises MalformedDatagramError for an authentic message that must not be handled."""
-        sender, _, message = opened.said
-        if why := why_not_handled(self.agent_id, self.roster, sender, message):
-            raise MalformedDatagramError(why)
-        if opened.request is not None and not self.session.is_asked(opened.request, opened.clear.type):
+    def _check_opened(self, opened: OpenedDatagram) -> None:
+        """Raise MalformedDatagramError if no handler may receive this authentic message."""
+        sender, _, message = opened.datagram
+        if reason := why_not_handled(self.agent_id, self.roster, sender, message):
+            raise MalformedDatagramError(reason)
+        if opened.request is not None and not self.session.is_newest_request(opened.request, opened.clear.type):
             raise MalformedDatagramError("answers no request")
         if type(message) in CARRY_A_BLOCK and not self._signatures.is_genuine(message.block, opened.block_signature):  # type: ignore[union-attr]
             raise MalformedDatagramError("block not signed by its maker")
 
-    def _handle_opened(self, opened: Opened, now: float) -> None:
-        clear, (sender, sequence, message) = opened.clear, opened.said
-        waiting = len(self._core.outbox)
+    def _handle_opened(self, opened: OpenedDatagram, now: float) -> None:
+        clear, (sender, sequence, message) = opened.clear, opened.datagram
+        outbox_length = len(self._core.outbox)
         super().receive_message(sender, sequence, message, now, opened.recorded)
         if clear.type in REQUESTS:
             request = Request(sender, clear.boot, sequence)
-            self._answers.update((answer, request) for answer, _, _ in self._core.outbox[waiting:])
+            self._answered_requests.update((answer, request) for answer, _, _ in self._core.outbox[outbox_length:])
         if type(message) in CARRY_A_BLOCK:
             self._signatures.forget_unless_held(message.block)  # type: ignore[union-attr]
 
@@ -125,77 +128,79 @@ class SecuredAgent(Agent):
     def datagrams_to_send(self) -> list[bytes]:
         return [outgoing.sealed for outgoing in self.sealed_to_send()]
 
-    def sealed_to_send(self) -> Sequence[Outgoing]:
-        """What to broadcast, in order; empties the outbox."""
-        if not self._tells and not self._core.outbox:
+    def sealed_to_send(self) -> Sequence[OutgoingDatagram]:
+        """Return the datagrams to broadcast in order, and empty the outbox."""
+        if not self._revocation_due and not self._core.outbox:
             return ()
-        self.session.epochs.look_at(self.state.now)
+        self.session.epochs.set_clock(self.state.now)
         outgoing = []
-        if self._tells and self.revocation is not None:
-            self._tells = False
-            outgoing.append(Outgoing(self.session.tell(self.revocation.number, self.revocation.encode())))
+        if self._revocation_due and self.revocation is not None:
+            self._revocation_due = False
+            outgoing.append(
+                OutgoingDatagram(self.session.revocation_datagram(self.revocation.number, self.revocation.encode()))
+            )
         for sequence, message, plain in self._taken_from_outbox():
             if sequence > LAST_SEQUENCE:
-                self.problem = "it has used all sequence numbers of this life: it sends no more until it starts anew"
+                self.problem = "the agent has used all sequence numbers of this boot: restart it so that it sends again"
                 continue
             signature = self.signatures.get(message.block.block_hash) if type(message) in CARRY_A_BLOCK else None  # type: ignore[union-attr]
-            request = self._answers.pop(sequence, None)
-            sealed = self.session.seal(sequence, message, request, signature, self._revocations)
-            outgoing.append(Outgoing(sealed, sequence, message, plain))
+            request = self._answered_requests.pop(sequence, None)
+            sealed = self.session.seal(sequence, message, request, signature, self._revocation_number)
+            outgoing.append(OutgoingDatagram(sealed, sequence, message, plain))
         return outgoing
 
     # Revocations
 
     @property
-    def _revocations(self) -> int:
+    def _revocation_number(self) -> int:
         return 0 if self.revocation is None else self.revocation.number
 
-    def revoke(self, body: bytes, now: float, came: Mapping[str, Any] | None = None) -> bool:
-        """The authority says whose keys are revoked; whether that is new.
+    def revoke(self, body: bytes, now: float, origin: Mapping[str, Any] | None = None) -> bool:
+        """Accept the body of a revocation, and return whether it is newer than the known one.
 
-        Raises MalformedDatagramError if the authority does not say so.
+        `origin` is written to the trace. Raises MalformedDatagramError if the authority did not sign the revocation.
         """
-        if 0 < int.from_bytes(body[:2], "big") <= self._revocations:
+        if 0 < int.from_bytes(body[:2], "big") <= self._revocation_number:
             return False
         try:
             revocation = Revocation.decode(body, self.session.authority, self.session.mission)
         except RevocationError:
             raise MalformedDatagramError("not signed by the authority") from None
         self.revocation = revocation
-        request = {"command": "revoke", "revocation": in_base64(body), **(came or {})}
+        request = {"command": "revoke", "revocation": in_base64(body), **(origin or {})}
         if self._tracing:
             self._trace.append(Commanded(now, "revoke", request))
-        self._told_at = None
-        self._tell(now)
+        self._revocation_sent_at = None
+        self._schedule_revocation(now)
         return True
 
-    def _tell(self, now: float) -> None:
-        """Somebody may not know of the newest revocation."""
-        if self._told_at is None or now >= self._told_at + TOLD_AGAIN_S:
-            self._tells, self._told_at = True, now
+    def _schedule_revocation(self, now: float) -> None:
+        """Broadcast the newest revocation with the next datagrams, at most once per REVOCATION_INTERVAL_S."""
+        if self._revocation_sent_at is None or now >= self._revocation_sent_at + REVOCATION_INTERVAL_S:
+            self._revocation_due, self._revocation_sent_at = True, now
 
     # Brown-outs
 
     def secured_state(self) -> SecuredState:
-        """What it keeps on its vehicle's disk beside what every agent does."""
+        """Return the state that a secured agent stores on disk in addition to the state of every agent."""
         revocation = None if self.revocation is None else self.revocation.encode()
         return SecuredState(self.started_us, dict(self.signatures), revocation)
 
     @property
     def started_us(self) -> int:
-        """When this life began, in microseconds UTC, as others are told."""
+        """The start of this incarnation in microseconds UTC, as its datagrams contain it."""
         (started_us,) = _BOOT_TIME.unpack_from(self.session.boot)
         return int(started_us)
 
     def boot(self, recovered: StoredState, now: float) -> None:
-        """Go on from the store; this life is a later one than those before, whatever the clock says by now."""
+        """Continue from the store. The boot becomes later than the stored one, even if the clock went back."""
         secured = recovered.secured
         if secured is not None:
             self._signatures.restore(secured.signatures)
             if self.started_us <= secured.started_us:
-                self.session.boot = boot_of(secured.started_us + 1, self.session.boot[_BOOT_TIME.size :])
+                self.session.boot = make_boot(secured.started_us + 1, self.session.boot[_BOOT_TIME.size :])
             if secured.revocation is not None:
-                with suppress(RevocationError):  # of keys that it had before
+                with suppress(RevocationError):  # the store may be older than the present keys
                     self.revocation = Revocation.decode(
                         secured.revocation, self.session.authority, self.session.mission
                     )

@@ -1,11 +1,11 @@
-"""What one vehicle needs in one life to send datagrams that are authentic, confidential and fresh, and to open them.
+"""Seal and open the datagrams of one incarnation of a vehicle.
 
-The construction is that of Group OSCORE (RFC 10021): an AEAD under a key of the sender's own, derived from the group's
-secret, and over that the sender's signature, so that who holds the group's secret does not speak for others. There are
-no round trips: everything that a receiver needs is in the datagram.
+The construction is that of Group OSCORE (RFC 10021). The sender derives its own key from the group secret, encrypts and
+authenticates the datagram with it (AEAD), and signs the result. Because of the signature, a vehicle with the group
+secret cannot send in the name of another vehicle. Each datagram contains all data that a receiver needs, so there are
+no round trips.
 
-Checks stand in the order of what they cost, the cheapest first; nothing changes before a datagram has passed them up to
-its signature.
+A receiver does its cheapest checks first. A datagram changes no state of the session before its signature is verified.
 """
 
 from collections.abc import Callable
@@ -23,13 +23,20 @@ from ucp.secure.envelope import (
     SEAL_BYTES,
     SIGNATURE_BYTES,
     WITH_BLOCK,
-    Clear,
+    ClearHeader,
 )
-from ucp.secure.sealed_datagrams import ARITHMETIC, NOTHING_ASKED, Arithmetic, Opened, Request, domain_of
+from ucp.secure.sealed_datagrams import (
+    CRYPTO_FUNCTIONS,
+    NO_REQUEST,
+    CryptoFunctions,
+    OpenedDatagram,
+    Request,
+    signing_domain,
+)
 
 
-class _Life:
-    """Of another sender: the newest of its lives that was heard, and what of it."""
+class _Incarnation:
+    """The newest known incarnation of another sender, with its accepted sequence numbers and its newest requests."""
 
     __slots__ = ("boot", "requests", "window")
 
@@ -37,112 +44,118 @@ class _Life:
         self.boot = boot
         self.window = ReplayWindow()
         self.requests: dict[int, int] = {}
-        """Type of a request -> sequence of the newest that was heard."""
+        """Type of a request -> sequence of the newest request of this type that was received."""
 
 
 class Session:
-    """One vehicle's life. `boot` is when it began, in microseconds UTC (8 bytes), and 8 bytes of chance.
+    """The session of one incarnation of a vehicle.
 
-    `keep` is given the bundle whenever old secrets are gone from it.
+    `boot` consists of the incarnation's start in microseconds UTC (8 bytes) and 8 random bytes. `save_bundle` is called
+    with the new bundle after each change of the epoch.
     """
 
     def __init__(
         self,
         bundle: Bundle,
         boot: bytes,
-        keep: Callable[[Bundle], None] = lambda _: None,
-        arithmetic: Arithmetic = ARITHMETIC,
+        save_bundle: Callable[[Bundle], None] = lambda _: None,
+        crypto: CryptoFunctions = CRYPTO_FUNCTIONS,
     ) -> None:
         self.agent_id = bundle.agent_id
         self.boot = boot
         self.mission = bundle.public.mission
         self.authority = bundle.public.authority
         self.public_keys = bundle.public.vehicles
-        self.arithmetic = arithmetic
-        self.private_key = arithmetic.signer(bundle.private_key)
-        self.epochs = Epochs(bundle, keep, arithmetic.sender_keys)
-        self._domain = domain_of(self.mission)
-        self._lives: dict[int, _Life] = {}
-        self._asked: dict[int, int] = {}
-        """Type of a request -> sequence of the newest of its own."""
+        self.crypto = crypto
+        self.private_key = crypto.signer(bundle.private_key)
+        self.epochs = Epochs(bundle, save_bundle, crypto.sender_keys)
+        self._domain = signing_domain(self.mission)
+        self._incarnations: dict[int, _Incarnation] = {}
+        self._own_requests: dict[int, int] = {}
+        """Type of a request -> sequence of this vehicle's newest request of this type."""
 
     # To the air
 
     def seal(
         self, sequence: int, message: Message, request: Request | None, block_signature: bytes | None, revocations: int
     ) -> bytes:
-        """The datagram of a message. Each sequence, at most LAST_SEQUENCE, is used once."""
-        self.asks(sequence, message)
+        """Return the sealed datagram of a message. The caller must use each sequence once, up to LAST_SEQUENCE."""
+        self.record_sent(sequence, message)
         code = TYPE_CODES[type(message)]
         body = message.body()
         if code in REQUEST_OF:
-            body = REQUEST.pack(*(request or NOTHING_ASKED)) + body
+            body = REQUEST.pack(*(request or NO_REQUEST)) + body
         if code in WITH_BLOCK:
             body += block_signature or bytes(SIGNATURE_BYTES)
         epoch = self.epochs.current
         assert 0 <= sequence <= LAST_SEQUENCE, "a nonce is used once"
-        clear = Clear(code, self.agent_id, sequence, epoch, self.boot, revocations).pack(len(body) + SEAL_BYTES)
-        keys = self.epochs.keys_of(epoch, self.agent_id, self.boot)
+        clear = ClearHeader(code, self.agent_id, sequence, epoch, self.boot, revocations).pack(len(body) + SEAL_BYTES)
+        keys = self.epochs.sender_keys(epoch, self.agent_id, self.boot)
         self.epochs.remember(epoch, self.agent_id, self.boot, keys)
         ciphertext = keys.encrypt(sequence, body, clear)
         signature = self.private_key.sign(self._domain + clear + ciphertext)
-        return clear + ciphertext + keys.masked(sequence, signature)
+        return clear + ciphertext + keys.mask_signature(sequence, signature)
 
-    def asks(self, sequence: int, message: Message) -> None:
-        """It sends a message: if that asks something, answers to what it asked of the kind before no longer count."""
+    def record_sent(self, sequence: int, message: Message) -> None:
+        """Record a sent message. If it is a request, answers to earlier requests of its type no longer count."""
         code = TYPE_CODES[type(message)]
         if code in REQUESTS:
-            self._asked[code] = sequence
+            self._own_requests[code] = sequence
 
-    def tell(self, number: int, revocation: bytes) -> bytes:
-        """The datagram of a revocation with this number: whoever knows the authority can read it."""
-        clear = Clear(REVOCATION, self.agent_id, 0, self.epochs.current, self.boot, number)
+    def revocation_datagram(self, number: int, revocation: bytes) -> bytes:
+        """Return the datagram of a revocation. It is not sealed, so receivers need only the authority's public key."""
+        clear = ClearHeader(REVOCATION, self.agent_id, 0, self.epochs.current, self.boot, number)
         return clear.pack(len(revocation)) + revocation
 
     # From the air
 
-    def open(self, datagram: bytes, clear: Clear) -> Opened:
-        """What a datagram with this header says; its sender is another vehicle of the mission.
+    def open(self, datagram: bytes, clear: ClearHeader) -> OpenedDatagram:
+        """Return the content of a datagram with this header. The sender must be another vehicle of the mission.
 
         Raises MalformedDatagramError.
         """
-        life = self._lives.get(clear.sender)
+        incarnation = self._incarnations.get(clear.sender)
         if not self.epochs.can_open(clear.epoch):
             raise MalformedDatagramError("epoch out of range")
-        if life is not None and clear.boot < life.boot:
+        if incarnation is not None and clear.boot < incarnation.boot:
             raise MalformedDatagramError("old boot")
-        if life is not None and clear.boot == life.boot and not life.window.is_fresh(clear.sequence):
+        if (
+            incarnation is not None
+            and clear.boot == incarnation.boot
+            and not incarnation.window.is_fresh(clear.sequence)
+        ):
             raise MalformedDatagramError("replayed")
-        body = self._authentic(datagram, clear)
-        if life is None or clear.boot != life.boot:
-            life = self._lives[clear.sender] = _Life(clear.boot)
-        life.window.accept(clear.sequence)
+        body = self._authenticate(datagram, clear)
+        if incarnation is None or clear.boot != incarnation.boot:
+            incarnation = self._incarnations[clear.sender] = _Incarnation(clear.boot)
+        incarnation.window.accept(clear.sequence)
         if clear.epoch > self.epochs.current:
-            self.epochs.follow(clear.epoch)
+            self.epochs.advance_to(clear.epoch)
         if clear.type in REQUESTS:
-            life.requests[clear.type] = max(clear.sequence, life.requests.get(clear.type, 0))
-        return self.arithmetic.understood(clear, body)
+            incarnation.requests[clear.type] = max(clear.sequence, incarnation.requests.get(clear.type, 0))
+        return self.crypto.parse_body(clear, body)
 
-    def _authentic(self, datagram: bytes, clear: Clear) -> bytes:
-        """The body, if the group's secret and the sender's signature vouch for it."""
-        keys = self.epochs.keys_of(clear.epoch, clear.sender, clear.boot)
-        body, claim = self.arithmetic.decrypted(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
-        if not self.arithmetic.verified(claim):
+    def _authenticate(self, datagram: bytes, clear: ClearHeader) -> bytes:
+        """Return the decrypted body. Raises MalformedDatagramError if decryption or the signature fails."""
+        keys = self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot)
+        body, claim = self.crypto.decrypt(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
+        if not self.crypto.verify(claim):
             raise MalformedDatagramError("not signed by its sender")
         self.epochs.remember(clear.epoch, clear.sender, clear.boot, keys)
         return body
 
-    def is_asked(self, request: Request, code: int) -> bool:
-        """Whether a response of type `code` counts: no newer request of that kind by that sender is known.
+    def is_newest_request(self, request: Request, code: int) -> bool:
+        """Return whether a response of type `code` counts: no newer request of its type by the same sender is known.
 
-        Of others a request need not have been heard; its own it knows.
+        If this vehicle sent the request, it must be its newest. A request of another vehicle need not have been
+        received.
         """
-        asking = REQUEST_OF[code]
+        request_type = REQUEST_OF[code]
         if request.sender == self.agent_id:
-            return request.boot == self.boot and request.sequence == self._asked.get(asking)
+            return request.boot == self.boot and request.sequence == self._own_requests.get(request_type)
         if request.sender not in self.public_keys:
             return False
-        life = self._lives.get(request.sender)
-        if life is None or request.boot > life.boot:
+        incarnation = self._incarnations.get(request.sender)
+        if incarnation is None or request.boot > incarnation.boot:
             return True
-        return request.boot == life.boot and request.sequence >= life.requests.get(asking, 0)
+        return request.boot == incarnation.boot and request.sequence >= incarnation.requests.get(request_type, 0)

@@ -20,7 +20,7 @@ from harness.archive.packets.datagram import MessageSummary, NotUcpError, summar
 from harness.archive.packets.pcap import INBOUND, OUTBOUND, CaptureFile, Frame
 from ucp.block import MAX_AGENT_ID
 from ucp.messages import TYPE_CODES, MalformedDatagramError, decode
-from ucp.secure.envelope import REVOCATION, VERSION, read_clear
+from ucp.secure.envelope import REVOCATION, VERSION, read_clear_header
 
 if TYPE_CHECKING:
     from ucp.secure.opening import Opener
@@ -173,11 +173,11 @@ def _plain(payload: bytes) -> Datagram:
 
 def _secured(payload: bytes, opener: "Opener | None") -> Datagram:
     """Return a datagram of a secured mission. Without `opener`, only its sender, sequence number and type are known."""
-    clear = read_clear(payload)
+    clear = read_clear_header(payload)
     if clear.type == REVOCATION:
         raise NotUcpError("a revocation of keys")
     if opener is not None:
-        sender, sequence, message = opener.open(payload).said
+        sender, sequence, message = opener.open(payload).datagram
         return Datagram(sender, sequence, summarize(message))
     return Datagram(clear.sender, clear.sequence, MessageSummary(NAMES[clear.type], None, None))
 

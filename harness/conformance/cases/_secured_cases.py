@@ -23,7 +23,7 @@ from ucp.messages import (
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import KeySet
-    from ucp.secure.sealed_datagrams import Opened
+    from ucp.secure.sealed_datagrams import OpenedDatagram
 
 BUNDLE = "keys.json"
 ASKS, LOST = PEERS[:2]
@@ -35,10 +35,10 @@ class Air:
 
     def __init__(self, agent: Alone, keys: "KeySet") -> None:
         from ucp.secure.opening import Opener
-        from ucp.secure.secured_agent import boot_of
+        from ucp.secure.secured_agent import make_boot
         from ucp.secure.session import Session
 
-        boot = boot_of(round(time.time() * MICROSECONDS), os.urandom(8))
+        boot = make_boot(round(time.time() * MICROSECONDS), os.urandom(8))
         self.sessions = {peer: Session(keys.bundle(peer), boot) for peer in (ASKS, LOST)}
         self.agent = agent
         self._opener = Opener(keys.bundle(ASKS))
@@ -49,7 +49,7 @@ class Air:
         self._sequence += 1
         return self.sessions[sender].seal(self._sequence, message, None, None, 0)
 
-    async def hear(self, count: int, what: str) -> "list[Opened]":
+    async def hear(self, count: int, what: str) -> "list[OpenedDatagram]":
         """The next datagrams, which anybody with keys can open."""
         ear, until = self.agent.ear, time.time() + PATIENCE_S
         while len(ear.heard) < count and time.time() < until:
@@ -69,7 +69,11 @@ class Air:
         asked = self.sealed(ASKS, ChainContainQuery(INCEPTION))
         self.agent.ear.say(asked)
         (heard,) = await self.hear(1, f"an answer after {after}")
-        must(heard.said.message == ChainContainResponse(INCEPTION, True), f"that answer after {after}", heard.said)
+        must(
+            heard.datagram.message == ChainContainResponse(INCEPTION, True),
+            f"that answer after {after}",
+            heard.datagram,
+        )
         request = heard.request
         named = None if request is None else (request.sender, request.boot, request.sequence)
         right = ASKS, self.sessions[ASKS].boot, self._sequence
@@ -125,19 +129,19 @@ async def _authentic(bench: Bench) -> None:
 
 @case("with keys, blocks are signed in messages and in the export", SECTION, 1)
 async def _signed(bench: Bench) -> None:
-    from ucp.secure.block_signature import claim_of_block
+    from ucp.secure.block_signature import block_claim
     from ucp.secure.crypto_suite import verify
 
     async with _secured(bench) as (air, keys):
         while (await air.agent.status())["completed"] == 0:
             await air.agent.log(bytes(200))
         proposed, committed = await air.hear(2, "a Block Add Request and a Commit Block")
-        must(isinstance(proposed.said.message, BlockAddRequest), "a Block Add Request", proposed.said)
-        message = committed.said.message
+        must(isinstance(proposed.datagram.message, BlockAddRequest), "a Block Add Request", proposed.datagram)
+        message = committed.datagram.message
         assert isinstance(message, CommitBlock), "it follows the other"
         public = keys.public.vehicles[AGENT], keys.public.mission, message.block.block_data()
         must(
-            verify(claim_of_block(*public, committed.block_signature)),
+            verify(block_claim(*public, committed.block_signature)),
             "a Commit Block with its maker's signature",
             "another",
         )
@@ -152,10 +156,10 @@ async def _revoked(bench: Bench) -> None:
     async with _secured(bench) as (air, keys):
         authority = Ed25519PrivateKey.from_private_bytes(keys.authority)
         forged = Revocation.signed(Ed25519PrivateKey.generate(), keys.public.mission, 2, [ASKS]).encode()
-        air.agent.ear.say(air.sessions[LOST].tell(2, forged))
+        air.agent.ear.say(air.sessions[LOST].revocation_datagram(2, forged))
         await air.answers_only("a revocation that the authority did not sign")
         body = Revocation.signed(authority, keys.public.mission, 1, [LOST]).encode()
-        air.agent.ear.say(air.sessions[ASKS].tell(1, body))
+        air.agent.ear.say(air.sessions[ASKS].revocation_datagram(1, body))
         await asyncio.sleep(CALM_S)
         told = [data for _, data in air.agent.ear.take()]
         must(any(data.endswith(body) for data in told), "the revocation, passed on", f"{len(told)} other datagrams")

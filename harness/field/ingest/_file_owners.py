@@ -95,11 +95,11 @@ def _signed(flight: Flight) -> Iterator[ExportedBlock]:
 
 def _has_signed(keys: "PublicKeys", block: ExportedBlock) -> bool:
     """Return whether the signature of a block is valid under these keys."""
-    from ucp.secure.block_signature import claim_of_block
+    from ucp.secure.block_signature import block_claim
     from ucp.secure.crypto_suite import verify
 
     public_key = keys.vehicles.get(block.agent_id)
     if public_key is None or block.signature is None:
         return False
     data = Block(block.agent_id, block.timestamp_us, block.event_bytes).block_data()
-    return verify(claim_of_block(public_key, keys.mission, data, base64.b64decode(block.signature)))
+    return verify(block_claim(public_key, keys.mission, data, base64.b64decode(block.signature)))

@@ -209,7 +209,7 @@ def _read(path: Path, agent_id: int, epoch_us: int | None, opener: "Opener | Non
             datagram, direction = unwrap(frame)
             is_sealed = len(datagram) >= HEADER.size and datagram[2] == SECURED
             if is_sealed and opener is not None:
-                datagram = opener.open(datagram).said.encode()
+                datagram = opener.open(datagram).datagram.encode()
             sender, sequence, _ = decode(datagram)
         except NotUcpError:
             continue

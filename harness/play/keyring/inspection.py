@@ -97,8 +97,8 @@ def _inspect(path: Path) -> Facts:
         }
 
     kinds: dict[str, tuple[bool, Callable[[Facts], Facts]]] = {
-        PUBLIC_SCHEMA: (False, lambda document: {"kind": "public keys", **_public(PublicKeys.of_json(document))}),
-        BUNDLE_SCHEMA: (True, lambda document: _bundle(Bundle.of_json(document))),
+        PUBLIC_SCHEMA: (False, lambda document: {"kind": "public keys", **_public(PublicKeys.from_json(document))}),
+        BUNDLE_SCHEMA: (True, lambda document: _bundle(Bundle.from_json(document))),
         AUTHORITY_SCHEMA: (True, private),
         DEPOT_SCHEMA: (True, private),
         VEHICLES_SCHEMA: (True, vehicles),

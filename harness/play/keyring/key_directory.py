@@ -195,8 +195,8 @@ def load_revocation(path: Path, public: PublicKeys) -> Revocation:
             body = base64.b64decode(str(document.get("message")), validate=True)
             return Revocation.decode(body, public.authority, public.mission)
         except (binascii.Error, ValueError) as error:
-            reason = error if isinstance(error, RevocationError) else "not base64"
-            raise KeyFileError(f"`message` is {reason}") from None
+            reason = error if isinstance(error, RevocationError) else "it is not base64"
+            raise KeyFileError(f"`message` is not a valid revocation: {reason}") from None
 
     return _as_keys_error(lambda: read_key_file(path, REVOCATION_SCHEMA, parse, secret=False))
 

@@ -11,9 +11,9 @@ from dataclasses import replace
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import Bundle
-from ucp.secure.envelope import read_clear
+from ucp.secure.envelope import read_clear_header
 from ucp.secure.sealed_datagrams import Request
-from ucp.secure.secured_agent import boot_of
+from ucp.secure.secured_agent import make_boot
 from ucp.secure.session import Session
 
 
@@ -38,13 +38,13 @@ class CapturedKeys:
 
         Return None if it cannot be opened.
         """
-        self._receiver.epochs.look_at(now)
+        self._receiver.epochs.set_clock(now)
         try:
-            clear = read_clear(datagram)
+            clear = read_clear_header(datagram)
             opened = self._receiver.open(datagram, clear)
         except (MalformedDatagramError, KeyError):  # the sender belongs to another mission
             return None
-        message = opened.said.message
+        message = opened.datagram.message
         if type(message) in CARRY_A_BLOCK:
             self._signatures[message.block.block_hash] = opened.block_signature  # type: ignore[union-attr]
         return message, Request(clear.sender, clear.boot, clear.sequence)
@@ -56,7 +56,7 @@ class CapturedKeys:
         session = self._sessions.get(sender)
         if session is None:
             session = self._sessions[sender] = self._session(sender, now_us)
-        session.epochs.look_at(now)
+        session.epochs.set_clock(now)
         signature = None
         if type(message) in CARRY_A_BLOCK:
             block = message.block  # type: ignore[union-attr]
@@ -66,4 +66,4 @@ class CapturedKeys:
 
     def _session(self, sender: int, now_us: int) -> Session:
         """Return a forged incarnation of the sender that begins now, and is therefore newer than the genuine one."""
-        return Session(replace(self._bundle, agent_id=sender), boot_of(now_us, self._random_bytes()))
+        return Session(replace(self._bundle, agent_id=sender), make_boot(now_us, self._random_bytes()))

@@ -33,7 +33,7 @@ from ucp.messages import (
     NextInSequenceResponse,
     decode,
 )
-from ucp.secure.envelope import NAMES, REQUEST_OF, read_clear
+from ucp.secure.envelope import NAMES, REQUEST_OF, read_clear_header
 from ucp.secure.envelope import VERSION as SECURED
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class Rogue:
         if datagram[2:3] != bytes([SECURED]):
             sender, _, message = decode(datagram)
             return sender, message.NAME, message, None
-        clear = read_clear(datagram)
+        clear = read_clear_header(datagram)
         self._secured = True
         opened = self._captured.opened(datagram, now) if self._captured else None
         return clear.sender, NAMES.get(clear.type, ""), *(opened or (None, None))

@@ -3,7 +3,7 @@
 from typing import Any
 
 from ucp.messages import MalformedDatagramError, block_named, decode
-from ucp.secure.envelope import NAMES, read_clear
+from ucp.secure.envelope import NAMES, read_clear_header
 from ucp.secure.envelope import VERSION as SECURED
 
 OF_NO_INJECTION = -1
@@ -27,7 +27,7 @@ def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes
 def _secured(datagram: bytes) -> dict[str, Any]:
     """Return the unencrypted fields of a sealed datagram."""
     try:
-        clear = read_clear(datagram)
+        clear = read_clear_header(datagram)
     except MalformedDatagramError as malformed:
         return {"refused": malformed.reason}
     if clear.type not in NAMES:

@@ -16,9 +16,9 @@ from itertools import count
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from ucp.secure.crypto_suite import SenderKeys, Signed, verify
-from ucp.secure.envelope import read_clear
-from ucp.secure.sealed_datagrams import Arithmetic, decrypted, understood
+from ucp.secure.crypto_suite import SenderKeys, SignatureClaim, verify
+from ucp.secure.envelope import read_clear_header
+from ucp.secure.sealed_datagrams import CryptoFunctions, decrypt, parse_body
 
 DATAGRAMS_REMEMBERED = 1024
 SIGNATURES_REMEMBERED = 4096
@@ -28,16 +28,16 @@ KEYSTREAMS_REMEMBERED = 64
 VERIFIED_EVERY = 128
 
 
-def remembered() -> Arithmetic:
-    """The arithmetic of all sessions of a mission."""
+def remembered() -> CryptoFunctions:
+    """Return the cached cryptographic functions of all sessions of a mission."""
     signatures = Signatures()
-    return Arithmetic(
-        read=lru_cache(DATAGRAMS_REMEMBERED)(read_clear),
+    return CryptoFunctions(
+        read=lru_cache(DATAGRAMS_REMEMBERED)(read_clear_header),
         sender_keys=lru_cache(SENDERS_REMEMBERED)(RememberingSenderKeys),
-        decrypted=lru_cache(DATAGRAMS_REMEMBERED)(decrypted),
-        understood=lru_cache(DATAGRAMS_REMEMBERED)(understood),
+        decrypt=lru_cache(DATAGRAMS_REMEMBERED)(decrypt),
+        parse_body=lru_cache(DATAGRAMS_REMEMBERED)(parse_body),
         signer=signatures.signer,
-        verified=lru_cache(SIGNATURES_REMEMBERED)(signatures.verified),
+        verify=lru_cache(SIGNATURES_REMEMBERED)(signatures.verified),
     )
 
 
@@ -65,7 +65,7 @@ class Signatures:
     def signer(self, private_key: bytes) -> "RememberingSigner":
         return RememberingSigner(private_key, self._made)
 
-    def verified(self, claim: Signed) -> bool:
+    def verified(self, claim: SignatureClaim) -> bool:
         """As `ucp.secure.crypto_suite.verify`."""
         made_here = self._made.get(claim.signature) == (claim.public_key, claim.signed)
         return (made_here and next(self._number) % VERIFIED_EVERY != 0) or verify(claim)

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from harness.play.simulation.foreign._foreigners import Foreigners
     from harness.play.simulation.foreign._virtual_program import Programs
     from ucp.secure.bundle import PublicKeys
-    from ucp.secure.crypto_suite import Signed
+    from ucp.secure.crypto_suite import SignatureClaim
 
 ANY_LIFE = 0
 REMEMBERED = 10_000
@@ -135,9 +135,9 @@ class Clockwork:
         return self._keys.mission.public if self._keys else None
 
     @property
-    def verified(self) -> "Callable[[Signed], bool] | None":
+    def verified(self) -> "Callable[[SignatureClaim], bool] | None":
         """Whether a signature that may have been made here is good; None of a mission that is not secured."""
-        return self._keys.arithmetic.verified if self._keys else None
+        return self._keys.crypto.verify if self._keys else None
 
     def _keys_of_agents(self, *, told: bool) -> "Keys":
         from harness.play.simulation._secured_agents import Keys  # needs the extra `secure`

@@ -19,8 +19,8 @@ from netem.medium import LATENCY
 from ucp.clock import MICROSECONDS
 from ucp.export import export_chain
 from ucp.secure.bundle import Bundle
-from ucp.secure.sealing import seal_of
-from ucp.secure.secured_agent import SecuredAgent, boot_of
+from ucp.secure.sealing import make_seal
+from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
 from ucp.store import StoredState
 
@@ -55,7 +55,7 @@ class Keys:
         chance = Random(f"{seed}/captured")
         self.captured = None if captured is None else CapturedKeys(self._bundles[captured], lambda: chance.randbytes(8))
         """What the rogue node has."""
-        self.arithmetic = remembered()
+        self.crypto = remembered()
 
     def agent(self, agent_id: int, life: int, now: float) -> Callable[..., SecuredOwnAgent]:
         """What makes the agent of a life that begins `now`, in mission seconds; lives are counted from 1."""
@@ -65,15 +65,15 @@ class Keys:
 
         boot = self._boot(agent_id, life, now)
         bundle = self._bundles[agent_id]
-        session = Session(bundle, boot, keep, self.arithmetic)
-        return partial(SecuredOwnAgent, session, seal=seal_of(bundle) if self.mission.seals else None)
+        session = Session(bundle, boot, keep, self.crypto)
+        return partial(SecuredOwnAgent, session, seal=make_seal(bundle) if self.mission.seals else None)
 
     def handed(self, agent_id: int, life: int, now: float) -> dict[str, Any]:
         """What an agent of another make is told of its keys when a life begins."""
         return {"bundle": self.mission.bundles[agent_id].to_json(), "boot": self._boot(agent_id, life, now).hex()}
 
     def _boot(self, agent_id: int, life: int, now: float) -> bytes:
-        return boot_of(round(now * MICROSECONDS) + life, _of_seed(self._seed, f"boot {agent_id} {life}")[:8])
+        return make_boot(round(now * MICROSECONDS) + life, _of_seed(self._seed, f"boot {agent_id} {life}")[:8])
 
 
 def _drops_nothing(scenario: Scenario) -> bool:

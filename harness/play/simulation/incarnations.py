@@ -12,13 +12,13 @@ from ucp.events import RandomEvents
 from ucp.state import AgentState
 
 if TYPE_CHECKING:
-    from ucp.secure.secured_agent import Outgoing
+    from ucp.secure.secured_agent import OutgoingDatagram
 
 
 class Secured(Protocol):
     """An agent with keys, whoever made it."""
 
-    def sealed_to_send(self) -> "Iterable[Outgoing]":
+    def sealed_to_send(self) -> "Iterable[OutgoingDatagram]":
         """What it broadcasts since it was last asked, in order."""
 
     def revoke(self, body: bytes, now: float) -> object:

@@ -61,7 +61,7 @@ class Gate:
             bundle = replace(self._keys.bundle(self._captured), agent_id=sender)
             self._mouths[sender] = Session(bundle, CAPTORS_BOOT)
         session = self._mouths[sender]
-        session.epochs.look_at(now)
+        session.epochs.set_clock(now)
         signature = None
         if type(message) in CARRY_A_BLOCK:
             block = message.block  # type: ignore[union-attr]

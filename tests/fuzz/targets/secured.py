@@ -3,7 +3,7 @@
 Others with keys say to it what they like, well sealed and signed, or sealed with what they do not have, damaged,
 again, of any epoch and any life; the authority revokes anybody. The agent raises nothing, keeps no more than there are
 vehicles and blocks, what is dropped before its signature is verified changes nothing, and it does as one that shares
-its arithmetic with others in virtual time.
+its cached cryptography with others in virtual time.
 """
 
 from collections.abc import Iterator
@@ -27,15 +27,15 @@ from ucp.messages import (
     Message,
     NextInSequenceResponse,
 )
-from ucp.secure._epochs import AHEAD, SENDERS_KEPT
+from ucp.secure._epochs import MAX_CACHED_KEYS, MAX_EPOCHS_AHEAD
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import KeySet
 from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret
-from ucp.secure.envelope import CLEAR, MAGIC, SEAL_BYTES, VERSION, read_clear
+from ucp.secure.envelope import CLEAR, MAGIC, SEAL_BYTES, VERSION, read_clear_header
 from ucp.secure.opening import Opener
 from ucp.secure.revocation import Revocation
-from ucp.secure.sealed_datagrams import ARITHMETIC, NOTHING_ASKED, Arithmetic, Request, domain_of
-from ucp.secure.secured_agent import SecuredAgent, boot_of
+from ucp.secure.sealed_datagrams import CRYPTO_FUNCTIONS, NO_REQUEST, CryptoFunctions, Request, signing_domain
+from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
 from ucp.settings import Settings
 from ucp.store import StoredState
@@ -75,9 +75,9 @@ class _Program:
 class _Driven:
     """The agent, and what others have said to it."""
 
-    def __init__(self, arithmetic: Arithmetic) -> None:
+    def __init__(self, crypto: CryptoFunctions) -> None:
         self.now = 0.0
-        self._arithmetic = arithmetic
+        self._crypto = crypto
         self._life = 0
         self.agent = self._born()
         self._said: list[bytes] = [b""]
@@ -89,7 +89,7 @@ class _Driven:
 
     def _born(self) -> SecuredAgent:
         self._life += 1
-        session = Session(KEYS.bundle(1), boot_of(self._life, bytes(8)), arithmetic=self._arithmetic)
+        session = Session(KEYS.bundle(1), make_boot(self._life, bytes(8)), crypto=self._crypto)
         return SecuredAgent(session, 1, ROSTER, b"fuzz", SETTINGS)
 
     def operate(self, program: _Program) -> None:
@@ -121,7 +121,7 @@ class _Driven:
         who, lies = program.byte(), program.byte()
         sender, signer = 2 + who % 3, 2 + (who if lies % 8 else who + 1) % 3
         epoch = min(len(self._secrets) - 1, max(0, int(self.now // KEYS.public.epoch_s) + lies // 8 % 16 - 3))
-        boot = boot_of(lies // 128, bytes(8))
+        boot = make_boot(lies // 128, bytes(8))
         self._sequence += 1
         sequence = program.byte() if lies % 32 == 31 else self._sequence
         code, body = said if isinstance(said, tuple) else (who // 4 % 16, said)
@@ -130,7 +130,9 @@ class _Driven:
         keys = SenderKeys(self._secrets[epoch], KEYS.public.mission, epoch, sender, boot)
         signed = clear + keys.encrypt(sequence, body, clear)
         private_key = Ed25519PrivateKey.from_private_bytes(KEYS.vehicles[signer])
-        datagram = signed + keys.masked(sequence, private_key.sign(domain_of(KEYS.public.mission) + signed))
+        datagram = signed + keys.mask_signature(
+            sequence, private_key.sign(signing_domain(KEYS.public.mission) + signed)
+        )
         self._said = [*self._said, datagram][-KEPT:]
         return datagram
 
@@ -140,7 +142,7 @@ class _Driven:
         state = self.agent.state
         blocks = [*BLOCKS, *state.blocks_to_be_committed, *state.chain]
         block, chain_hash = blocks[choice % len(blocks)], state.chain.top_chain_hash
-        asked = Request(1, self.agent.session.boot, self.agent.session._asked.get(code - 1, 0))
+        asked = Request(1, self.agent.session.boot, self.agent.session._own_requests.get(code - 1, 0))
         messages: dict[int, Message] = {
             1: BlockAddRequest(block.block_hash, chain_hash),
             3: CommitBlock(block, chain_hash),
@@ -152,7 +154,7 @@ class _Driven:
         if code == 2:
             body = bytes([choice & 1]) + block.block_hash
         if code in (2, 5, 7, 9):
-            request = asked if choice & 64 else NOTHING_ASKED
+            request = asked if choice & 64 else NO_REQUEST
             body = request.sender.to_bytes(4, "big") + request.boot + request.sequence.to_bytes(4, "big") + body
         if code in (3, 9):
             maker = Ed25519PrivateKey.from_private_bytes(KEYS.vehicles.get(block.agent_id, bytes(32)))
@@ -187,7 +189,7 @@ class _Driven:
         if reasons and set(reasons) <= BEFORE_ITS_SIGNATURE and not has_moved_on:
             require(_of(agent) == before, f"dropped as {list(reasons)}, and the agent is another")
         if not reasons and agent.received.total() == handled:
-            require(read_clear(data).type == 10, "neither dropped nor handled")
+            require(read_clear_header(data).type == 10, "neither dropped nor handled")
         self.look()
 
     def _wait(self, seconds: float) -> None:
@@ -209,19 +211,19 @@ class _Driven:
         agent, session = self.agent, self.agent.session
         for datagram in agent.datagrams_to_send():
             require(len(datagram) <= MAX_DATAGRAM_BYTES, "it sends what no datagram holds")
-            if read_clear(datagram).type != 10:
+            if read_clear_header(datagram).type != 10:
                 Opener(KEYS.bundle(2)).open(datagram)
         for entry in agent.trace():
             entry.to_line()
         state = agent.state
         held = len(state.chain) + len(state.blocks_to_be_committed) + len(state.reconcile_stack)
-        require(len(session._lives) < len(ROSTER), "it remembers senders that there are not")
-        require(all(len(life.requests) <= 4 for life in session._lives.values()), "it remembers too many requests")
-        require(len(session.epochs._sender_keys) <= SENDERS_KEPT, "it keeps too many keys")
-        require(len(agent._answers) == 0, "it keeps what its answers answered")
+        require(len(session._incarnations) < len(ROSTER), "it remembers senders that there are not")
+        require(all(len(each.requests) <= 4 for each in session._incarnations.values()), "it keeps too many requests")
+        require(len(session.epochs._sender_keys) <= MAX_CACHED_KEYS, "it keeps too many keys")
+        require(len(agent._answered_requests) == 0, "it keeps what its answers answered")
         require(len(agent.signatures) <= held + len(state.completed), "it keeps signatures of what it does not hold")
         ahead = session.epochs.current - max(0, int(self.now // KEYS.public.epoch_s))
-        require(ahead <= AHEAD, "others have driven it too far")
+        require(ahead <= MAX_EPOCHS_AHEAD, "others have driven it too far")
 
 
 def _of(agent: SecuredAgent) -> dict[str, Any]:
@@ -237,13 +239,13 @@ def _of(agent: SecuredAgent) -> dict[str, Any]:
         "revocation": agent.revocation,
         "heard": {
             sender: (life.boot, life.window._newest, tuple(life.window._words), dict(life.requests))
-            for sender, life in session._lives.items()
+            for sender, life in session._incarnations.items()
         },
     }
 
 
-def _driven(data: bytes, arithmetic: Arithmetic) -> tuple[object, ...]:
-    program, driven = _Program(data), _Driven(arithmetic)
+def _driven(data: bytes, crypto: CryptoFunctions) -> tuple[object, ...]:
+    program, driven = _Program(data), _Driven(crypto)
     for _ in range(MOST_OPERATIONS):
         if program.over:
             break
@@ -253,7 +255,7 @@ def _driven(data: bytes, arithmetic: Arithmetic) -> tuple[object, ...]:
 
 
 def run(data: bytes) -> None:
-    require(_driven(data, ARITHMETIC) == _driven(data, remembered()), "with remembered arithmetic it does otherwise")
+    require(_driven(data, CRYPTO_FUNCTIONS) == _driven(data, remembered()), "cached cryptography gives another result")
     with suppress(MalformedDatagramError):
         Opener(KEYS.bundle(1)).open(data)
 

@@ -15,9 +15,9 @@ from ucp.messages import BlockAddRequest, CommitBlock, MalformedDatagramError
 from ucp.secure._window import ReplayWindow
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import Bundle, KeySet
-from ucp.secure.crypto_suite import Signed, verify
-from ucp.secure.sealed_datagrams import Arithmetic
-from ucp.secure.secured_agent import SecuredAgent, boot_of
+from ucp.secure.crypto_suite import SignatureClaim, verify
+from ucp.secure.sealed_datagrams import CryptoFunctions
+from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
 
 ROSTER = (1, 2, 3, 4)
@@ -26,17 +26,17 @@ OTHERS = KeySet.derived(bytes(31) + b"1", ROSTER)
 QUESTION = BlockAddRequest(bytes(32), bytes(32))
 
 
-def session(bundle: Bundle, arithmetic: Arithmetic) -> Session:
-    return Session(bundle, boot_of(1, bytes(8)), arithmetic=arithmetic)
+def session(bundle: Bundle, crypto: CryptoFunctions) -> Session:
+    return Session(bundle, make_boot(1, bytes(8)), crypto=crypto)
 
 
-def sealed(bundle: Bundle, arithmetic: Arithmetic, sequence: int = 0) -> bytes:
-    return session(bundle, arithmetic).seal(sequence, QUESTION, None, None, 0)
+def sealed(bundle: Bundle, crypto: CryptoFunctions, sequence: int = 0) -> bytes:
+    return session(bundle, crypto).seal(sequence, QUESTION, None, None, 0)
 
 
 def what_comes_of(datagram: bytes, receiver: Session) -> str:
     try:
-        return type(receiver.open(datagram, receiver.arithmetic.read(datagram)).said.message).__name__
+        return type(receiver.open(datagram, receiver.crypto.read(datagram)).datagram.message).__name__
     except MalformedDatagramError as dropped:
         return dropped.reason
 
@@ -54,30 +54,30 @@ def what_comes_of(datagram: bytes, receiver: Session) -> str:
     ids=["another secret", "another mission", "another public key"],
 )
 def test_who_has_other_keys_opens_nothing_though_all_others_have(wrong: Bundle, reason: str) -> None:
-    arithmetic = remembered()
-    datagram = sealed(KEYS.bundle(1), arithmetic)
-    right, again, other = (session(bundle, arithmetic) for bundle in (KEYS.bundle(3), KEYS.bundle(4), wrong))
+    crypto = remembered()
+    datagram = sealed(KEYS.bundle(1), crypto)
+    right, again, other = (session(bundle, crypto) for bundle in (KEYS.bundle(3), KEYS.bundle(4), wrong))
     came_of = [what_comes_of(datagram, receiver) for receiver in (right, other, again)]
     assert came_of == ["BlockAddRequest", reason, "BlockAddRequest"]
 
 
 def test_other_bytes_are_opened_anew() -> None:
-    arithmetic = remembered()
-    datagram = sealed(KEYS.bundle(1), arithmetic)
-    assert what_comes_of(datagram, session(KEYS.bundle(2), arithmetic)) == "BlockAddRequest"
+    crypto = remembered()
+    datagram = sealed(KEYS.bundle(1), crypto)
+    assert what_comes_of(datagram, session(KEYS.bundle(2), crypto)) == "BlockAddRequest"
     for place in range(len(datagram)):
         bent = bytearray(datagram)
         bent[place] ^= 1
-        receiver = session(KEYS.bundle(3), arithmetic)
+        receiver = session(KEYS.bundle(3), crypto)
         receiver.public_keys = dict.fromkeys(range(2**16), KEYS.public.vehicles[1])
         assert what_comes_of(bytes(bent), receiver) != "BlockAddRequest"
 
 
 def test_what_was_heard_is_each_receivers_own_knowledge() -> None:
-    arithmetic = remembered()
-    datagram = sealed(KEYS.bundle(1), arithmetic)
+    crypto = remembered()
+    datagram = sealed(KEYS.bundle(1), crypto)
     for agent_id in (2, 3):
-        receiver = session(KEYS.bundle(agent_id), arithmetic)
+        receiver = session(KEYS.bundle(agent_id), crypto)
         assert what_comes_of(datagram, receiver) == "BlockAddRequest"
         assert what_comes_of(datagram, receiver) == "replayed"
 
@@ -86,18 +86,20 @@ def test_a_claim_is_good_if_it_verifies_and_not_else() -> None:
     signatures = Signatures()
     makers = {agent_id: signatures.signer(KEYS.vehicles[agent_id]) for agent_id in (1, 2)}
     made = [
-        Signed(KEYS.public.vehicles[each], makers[each].sign(data), data) for each in (1, 2) for data in (b"a", b"b")
+        SignatureClaim(KEYS.public.vehicles[each], makers[each].sign(data), data)
+        for each in (1, 2)
+        for data in (b"a", b"b")
     ]
     for one in made:
         for two in made:
             for three in made:
-                claim = Signed(one.public_key, two.signature, three.signed)
+                claim = SignatureClaim(one.public_key, two.signature, three.signed)
                 assert signatures.verified(claim) == verify(claim) == (claim in made)
 
 
 def test_a_signature_that_was_not_made_here_is_verified() -> None:
     maker, here = Signatures().signer(KEYS.vehicles[1]), Signatures()
-    claim = Signed(KEYS.public.vehicles[1], maker.sign(b"a"), b"a")
+    claim = SignatureClaim(KEYS.public.vehicles[1], maker.sign(b"a"), b"a")
     assert here.verified(claim)
     assert not here.verified(claim._replace(signed=b"b"))
 
@@ -106,7 +108,7 @@ def test_a_library_whose_signatures_do_not_verify_is_found(monkeypatch: pytest.M
     monkeypatch.setattr(memory, "verify", lambda claim: False)
     signatures = Signatures()
     maker = signatures.signer(KEYS.vehicles[1])
-    claims = [Signed(KEYS.public.vehicles[1], maker.sign(data), data) for data in map(bytes, range(1, 300))]
+    claims = [SignatureClaim(KEYS.public.vehicles[1], maker.sign(data), data) for data in map(bytes, range(1, 300))]
     assert not all(map(signatures.verified, claims))
 
 
@@ -114,7 +116,7 @@ def test_a_memory_that_is_full_forgets_and_is_as_right(monkeypatch: pytest.Monke
     monkeypatch.setattr(memory, "SIGNATURES_REMEMBERED", 2)
     signatures = Signatures()
     maker = signatures.signer(KEYS.vehicles[1])
-    claims = [Signed(KEYS.public.vehicles[1], maker.sign(data), data) for data in (b"a", b"b", b"c", b"d")]
+    claims = [SignatureClaim(KEYS.public.vehicles[1], maker.sign(data), data) for data in (b"a", b"b", b"c", b"d")]
     assert all(map(signatures.verified, claims))
     assert len(signatures._made) == 2
 
@@ -160,7 +162,7 @@ def test_who_has_a_wrong_key_of_another_is_seen(monkeypatch: pytest.MonkeyPatch)
 
 def test_who_verifies_wrongly_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoil(agent: SecuredAgent) -> None:
-        agent.session.arithmetic = replace(agent.session.arithmetic, verified=lambda claim: False)
+        agent.session.crypto = replace(agent.session.crypto, verify=lambda claim: False)
 
     assert dropped(played(monkeypatch, 3, spoil)) == of_one(3, "not signed by its sender")
 
@@ -173,15 +175,15 @@ def test_whose_window_is_wrong_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
             return self._newest < 0
 
     def spoil(agent: SecuredAgent) -> None:
-        authentic = agent.session._authentic
+        authentic = agent.session._authenticate
 
         def narrowed(*arguments: Any) -> bytes:
             body = authentic(*arguments)
-            for life in agent.session._lives.values():
+            for life in agent.session._incarnations.values():
                 life.window.__class__ = Narrow
             return body
 
-        monkeypatch.setattr(agent.session, "_authentic", narrowed)
+        monkeypatch.setattr(agent.session, "_authenticate", narrowed)
 
     assert dropped(played(monkeypatch, 3, spoil))["3"] >= {"replayed"}
 
@@ -196,7 +198,7 @@ def test_who_signs_other_bytes_than_it_sends_is_seen(monkeypatch: pytest.MonkeyP
 
 def test_who_signs_with_anothers_key_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoil(agent: SecuredAgent) -> None:
-        agent.session.private_key = agent.session.arithmetic.signer(bytes(32))
+        agent.session.private_key = agent.session.crypto.signer(bytes(32))
 
     assert dropped(played(monkeypatch, 3, spoil))["1"] == {"not signed by its sender"}
 
@@ -211,9 +213,9 @@ def test_who_seals_for_another_epoch_is_seen(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_block_in_anothers_name_is_seen_though_its_signature_was_made_here() -> None:
-    arithmetic = remembered()
+    crypto = remembered()
     maker, receiver = (
-        SecuredAgent(session(KEYS.bundle(agent_id), arithmetic), agent_id, ROSTER, b"test") for agent_id in (1, 2)
+        SecuredAgent(session(KEYS.bundle(agent_id), crypto), agent_id, ROSTER, b"test") for agent_id in (1, 2)
     )
     block = Block(3, 1, b"x")
     signature = sign_block(maker.session.private_key, KEYS.public.mission, block.block_data())

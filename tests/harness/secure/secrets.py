@@ -8,7 +8,7 @@ from pathlib import Path
 from harness.play.keyring.key_directory import Home
 from ucp.messages import MalformedDatagramError
 from ucp.secure.crypto_suite import KEY_BYTES, NONCE_BYTES, expand, next_epoch_secret
-from ucp.secure.envelope import CLEAR, MAGIC, VERSION, read_clear
+from ucp.secure.envelope import CLEAR, MAGIC, VERSION, read_clear_header
 
 _SENDER = b"UCP sender\0"
 _CLEAR_START = MAGIC + bytes([VERSION])
@@ -68,7 +68,7 @@ def boots_in(content: bytes) -> set[tuple[int, bytes]]:
     while start >= 0:
         length = int.from_bytes(content[start + 12 : start + 14], "big")
         try:
-            clear = read_clear(content[start : start + CLEAR.size + length])
+            clear = read_clear_header(content[start : start + CLEAR.size + length])
             found.add((clear.sender, clear.boot))
         except MalformedDatagramError:
             pass

@@ -16,7 +16,7 @@ from tests.ucp.air import Air
 from ucp.agent import Agent
 from ucp.export import export_chain
 from ucp.sealed import seal_to
-from ucp.secure.sealing import seal_of
+from ucp.secure.sealing import make_seal
 from ucp.settings import Settings
 from ucp.trace import SCHEMA, Recorded, in_base64
 
@@ -34,7 +34,7 @@ class SealedSwarm:
         self.initial_data = seal_to(b"sealed", bundles[1].public.depot or b"")
         self.air = Air(ROSTER)
         self.air.agents = {
-            agent_id: Agent(agent_id, ROSTER, self.initial_data, SETTINGS, seal=seal_of(bundle))
+            agent_id: Agent(agent_id, ROSTER, self.initial_data, SETTINGS, seal=make_seal(bundle))
             for agent_id, bundle in bundles.items()
         }
         for agent_id in ROSTER:

@@ -1,4 +1,4 @@
-"""Files that hold keys: what is written is read, what is wrong is refused in a sentence, no secret is shown."""
+"""Files with keys: a written file is read back, a wrong one is rejected, and no message shows a secret."""
 
 import json
 import os
@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from ucp.secure.block_signature import claim_of_block, sign_block
+from ucp.secure.block_signature import block_claim, sign_block
 from ucp.secure.bundle import KeySet, load_bundle, load_public, write_bundle, write_public
 from ucp.secure.crypto_suite import verify
 from ucp.secure.keyfile import MAX_FILE_BYTES, KeyFileError
@@ -26,7 +26,7 @@ def path(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_bundle_is_read_as_it_was_written_by_its_owner_alone(path: Path) -> None:
+def test_written_bundle_is_read_back_and_only_its_owner_can_read_it(path: Path) -> None:
     assert load_bundle(path) == BUNDLE
     assert path.stat().st_mode & 0o777 == 0o600
     later = BUNDLE.at_epoch(3, bytes(32))
@@ -35,20 +35,20 @@ def test_a_bundle_is_read_as_it_was_written_by_its_owner_alone(path: Path) -> No
     assert [*path.parent.iterdir()] == [path]
 
 
-def test_public_keys_are_read_as_they_were_written(tmp_path: Path) -> None:
+def test_written_public_keys_are_read_back(tmp_path: Path) -> None:
     for public in (KEYS.public, replace(KEYS.public, depot=None, epoch_s=30.5)):
         write_public(tmp_path / "public.json", public)
         assert load_public(tmp_path / "public.json") == public
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o601])
-def test_a_bundle_that_others_can_read_is_refused(path: Path, mode: int) -> None:
+def test_bundle_that_other_users_can_read_is_rejected(path: Path, mode: int) -> None:
     path.chmod(mode)
     with pytest.raises(KeyFileError, match="chmod 600"):
         load_bundle(path)
 
 
-def test_equal_seeds_make_equal_keys_and_no_two_keys_are_the_same() -> None:
+def test_equal_seeds_give_equal_keys_and_different_seeds_share_none() -> None:
     assert KeySet.derived(b"a seed".ljust(32), (1, 7, 28), seals=True) == KEYS
     other = KeySet.derived(b"another".ljust(32), (1, 7, 28), seals=True)
     every = [key for keys in (KEYS, other) for key in (*secrets_of(keys), *keys.public.vehicles.values())]
@@ -60,7 +60,7 @@ def secrets_of(keys: KeySet) -> list[bytes]:
     return [keys.authority, keys.depot, keys.group_secret, *keys.vehicles.values()]
 
 
-def test_nothing_secret_is_in_a_representation() -> None:
+def test_repr_of_keys_contains_no_secret() -> None:
     shown = repr(KEYS) + repr(BUNDLE)
     for secret in secrets_of(KEYS):
         assert secret.hex() not in shown
@@ -90,7 +90,7 @@ WRONG: list[tuple[str, Any, str]] = [
 
 
 @pytest.mark.parametrize(("key", "value", "sentence"), WRONG)
-def test_what_is_wrong_is_refused_without_a_secret(path: Path, key: str, value: Any, sentence: str) -> None:
+def test_error_for_a_wrong_value_names_it_without_a_secret(path: Path, key: str, value: Any, sentence: str) -> None:
     path.write_text(json.dumps({**BUNDLE.to_json(), key: value}))
     with pytest.raises(KeyFileError, match=sentence) as refused:
         load_bundle(path)
@@ -101,13 +101,13 @@ def test_what_is_wrong_is_refused_without_a_secret(path: Path, key: str, value: 
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff", b"[" * 100_000, b"[]", b"7" * 5000, bytes(MAX_FILE_BYTES + 1)])
-def test_what_is_no_bundle_is_refused(path: Path, content: bytes) -> None:
+def test_file_that_is_not_a_bundle_is_rejected(path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(KeyFileError):
         load_bundle(path)
 
 
-def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+def test_path_that_is_not_a_regular_file_is_rejected(tmp_path: Path) -> None:
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo, 0o600)
     for path in (tmp_path, tmp_path / "none", fifo, Path("a\0b")):
@@ -115,19 +115,19 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
             load_bundle(path)
 
 
-def test_a_block_is_its_makers_in_its_mission_alone() -> None:
+def test_block_signature_is_valid_only_for_its_maker_and_mission() -> None:
     maker = Ed25519PrivateKey.from_private_bytes(BUNDLE.private_key)
     mission, public = KEYS.public.mission, KEYS.public.vehicles
     signature = sign_block(maker, mission, b"BD")
-    assert verify(claim_of_block(public[7], mission, b"BD", signature))
-    assert not verify(claim_of_block(public[1], mission, b"BD", signature))
-    assert not verify(claim_of_block(public[7], bytes(16), b"BD", signature))
-    assert not verify(claim_of_block(public[7], mission, b"BE", signature))
-    assert not verify(claim_of_block(public[7], mission, b"BD", signature[:-1]))
-    assert not verify(claim_of_block(b"short", mission, b"BD", signature))
+    assert verify(block_claim(public[7], mission, b"BD", signature))
+    assert not verify(block_claim(public[1], mission, b"BD", signature))
+    assert not verify(block_claim(public[7], bytes(16), b"BD", signature))
+    assert not verify(block_claim(public[7], mission, b"BE", signature))
+    assert not verify(block_claim(public[7], mission, b"BD", signature[:-1]))
+    assert not verify(block_claim(b"short", mission, b"BD", signature))
 
 
-def test_a_revocation_is_the_authoritys_alone() -> None:
+def test_revocation_is_valid_only_if_the_authority_signed_it() -> None:
     mission, authority = KEYS.public.mission, KEYS.public.authority
     revocation = Revocation.signed(Ed25519PrivateKey.from_private_bytes(KEYS.authority), mission, 2, {28, 1})
     body = revocation.encode()

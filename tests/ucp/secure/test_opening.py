@@ -1,4 +1,4 @@
-"""What crossed the air can be read afterwards by who has keys, in scapy's layers; by nobody else."""
+"""A reader with a bundle can open captured datagrams as scapy layers. A reader without keys cannot."""
 
 from collections.abc import Iterator
 
@@ -16,15 +16,15 @@ from tests.ucp.secure.swarm import KEYS, session
 from ucp.messages import ChainContainQuery, Message, encode
 from ucp.scapy import UCP, Revocation, Sealed, SecuredUCP, message_of, opened
 from ucp.secure.bundle import KeySet
-from ucp.secure.envelope import CLEAR, CLEAR_FIELDS, MalformedDatagramError, read_clear
+from ucp.secure.envelope import CLEAR, CLEAR_FIELDS, MalformedDatagramError, read_clear_header
 from ucp.secure.opening import EPOCHS_AHEAD, Opener
-from ucp.secure.revocation import Revocation as Signed
-from ucp.secure.secured_agent import boot_of
+from ucp.secure.revocation import Revocation as SignedRevocation
+from ucp.secure.secured_agent import make_boot
 from ucp.secure.session import Session
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _scapy_raises_what_it_would_hide() -> Iterator[None]:
+def _scapy_raises_dissector_errors() -> Iterator[None]:
     conf.debug_dissector, before = True, conf.debug_dissector
     yield
     conf.debug_dissector = before
@@ -39,7 +39,7 @@ def opener(keys: KeySet = KEYS) -> Opener:
 
 
 @given(all_messages)
-def test_scapy_shows_the_header_in_clear_and_opens_the_rest_with_a_bundle(message: Message) -> None:
+def test_scapy_shows_the_clear_header_and_opens_the_body_with_a_bundle(message: Message) -> None:
     datagram = sealed(message)
     air = Ether(src="02:00:00:00:00:02", dst="ff:ff:ff:ff:ff:ff") / IP(src="10.77.0.2", dst="10.77.255.255")
     packet = Ether(bytes(air / UDP(sport=14600, dport=14600) / Raw(datagram)))
@@ -53,7 +53,7 @@ def test_scapy_shows_the_header_in_clear_and_opens_the_rest_with_a_bundle(messag
 
 
 @given(st.data(), all_messages)
-def test_who_lacks_the_keys_opens_nothing_and_what_was_altered_is_told(data: st.DataObject, message: Message) -> None:
+def test_opener_rejects_datagrams_of_other_keys_and_altered_datagrams(data: st.DataObject, message: Message) -> None:
     datagram = sealed(message)
     with pytest.raises(MalformedDatagramError, match="not authentic"):
         opener(KeySet.derived(bytes(31) + b"1", (1, 2, 3))).open(datagram)
@@ -63,28 +63,28 @@ def test_who_lacks_the_keys_opens_nothing_and_what_was_altered_is_told(data: st.
         opener().open(altered)
 
 
-def test_later_epochs_are_opened_and_others_are_not() -> None:
+def test_opener_opens_later_epochs_and_rejects_earlier_and_far_ones() -> None:
     kept = [KEYS.bundle(2)]
-    sender, reads = Session(kept[0], boot_of(1, bytes(8)), kept.append), opener()
+    sender, reads = Session(kept[0], make_boot(1, bytes(8)), kept.append), opener()
     message = ChainContainQuery(bytes(32))
     datagrams = []
     for sequence, epoch in enumerate((0, 1, 5)):
-        sender.epochs.look_at(epoch * KEYS.public.epoch_s)
+        sender.epochs.set_clock(epoch * KEYS.public.epoch_s)
         datagrams.append(sealed(message, sequence, sender))
     for sequence, datagram in reversed(list(enumerate(datagrams))):  # in any order, and twice
-        assert reads.open(datagram).said == reads.open(datagram).said == (2, sequence, message)
+        assert reads.open(datagram).datagram == reads.open(datagram).datagram == (2, sequence, message)
     assert kept[-1].epoch == 5
     with pytest.raises(MalformedDatagramError, match="epoch out of range"):
         Opener(kept[-1]).open(datagrams[0])
-    far = read_clear(datagrams[0])._replace(epoch=EPOCHS_AHEAD + 1)
+    far = read_clear_header(datagrams[0])._replace(epoch=EPOCHS_AHEAD + 1)
     with pytest.raises(MalformedDatagramError, match="epoch out of range"):
         reads.open(far.pack(len(datagrams[0]) - CLEAR.size) + datagrams[0][CLEAR.size :])
 
 
-def test_a_revocation_is_read_by_anybody() -> None:
+def test_scapy_reads_a_revocation_without_keys() -> None:
     authority = Ed25519PrivateKey.from_private_bytes(KEYS.authority)
-    body = Signed.signed(authority, KEYS.public.mission, 3, [2, 9]).encode()
-    datagram = session(1).tell(3, body)
+    body = SignedRevocation.signed(authority, KEYS.public.mission, 3, [2, 9]).encode()
+    datagram = session(1).revocation_datagram(3, body)
     packet = UCP(datagram)
     assert (packet[Revocation].number, packet[Revocation].count, packet[Revocation].revoked) == (3, 2, [2, 9])
     crafted = SecuredUCP(sender=1, boot=packet.boot, revocations=3) / Revocation(bytes(packet[Revocation]))
@@ -94,6 +94,6 @@ def test_a_revocation_is_read_by_anybody() -> None:
 
 
 @given(st.binary(max_size=200), st.integers(0, 10))
-def test_whatever_claims_to_be_secured_is_shown_and_never_raises(noise: bytes, code: int) -> None:
+def test_scapy_shows_random_secured_datagrams_without_an_error(noise: bytes, code: int) -> None:
     datagram = b"UC\2" + bytes([code]) + noise
     assert bytes(UCP(datagram)) == datagram

@@ -1,19 +1,19 @@
-"""Sealed event data: HPKE as RFC 9180 says it, which the library opens, and the depot alone."""
+"""Sealed event data is HPKE (RFC 9180), and only the depot can open it."""
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
 from ucp.sealed import SEAL_BYTES, seal_to, sealed_to
 from ucp.secure.bundle import KeySet
-from ucp.secure.sealing import Depot, NotOpenedError, key_schedule, seal_of
+from ucp.secure.sealing import Depot, NotOpenedError, key_schedule, make_seal
 
 KEYS = KeySet.derived(b"a seed".ljust(32), (1, 7), seals=True)
 DEPOT = Depot(KEYS.public.mission, KEYS.depot or b"")
 EVENTS = b"what vehicle 7 logged"
 
 
-def test_keys_are_those_of_rfc_9180() -> None:
-    """Its test vector A.2.1: DHKEM(X25519, HKDF-SHA256), HKDF-SHA256, ChaCha20-Poly1305, base mode."""
+def test_key_schedule_gives_the_keys_of_rfc_9180() -> None:
+    """Test vector A.2.1 of RFC 9180: DHKEM(X25519, HKDF-SHA256), HKDF-SHA256, ChaCha20-Poly1305, base mode."""
     ephemeral = X25519PrivateKey.from_private_bytes(
         bytes.fromhex("f4ec9b33b792c372c1d2c2063507b684ef925b8c75a42dbcbf57d63ccd381600")
     )
@@ -27,19 +27,19 @@ def test_keys_are_those_of_rfc_9180() -> None:
 
 
 def seal(event_data: bytes, timestamp_us: int, agent_id: int = 7) -> bytes:
-    how = seal_of(KEYS.bundle(agent_id))
-    assert how is not None
-    return how(event_data, timestamp_us)
+    seal_event_data = make_seal(KEYS.bundle(agent_id))
+    assert seal_event_data is not None
+    return seal_event_data(event_data, timestamp_us)
 
 
 @pytest.mark.parametrize("events", [b"", EVENTS, bytes(976)])
-def test_the_librarys_hpke_opens_what_is_sealed(events: bytes) -> None:
+def test_hpke_of_the_library_opens_sealed_event_data(events: bytes) -> None:
     sealed = seal(events, 5)
     assert len(sealed) == len(events) + SEAL_BYTES
     assert DEPOT.open(sealed, 7, 5) == events
 
 
-def test_equal_blocks_are_equal_bytes_and_others_share_no_key() -> None:
+def test_equal_blocks_give_equal_bytes_and_others_use_other_keys() -> None:
     assert seal(EVENTS, 5) == seal(EVENTS, 5)
     ephemeral = {
         sealed[:32] for sealed in (seal(EVENTS, 5), seal(EVENTS, 6), seal(EVENTS + b".", 5), seal(EVENTS, 5, 1))
@@ -47,7 +47,7 @@ def test_equal_blocks_are_equal_bytes_and_others_share_no_key() -> None:
     assert len(ephemeral) == 4
 
 
-def test_nothing_else_opens_it() -> None:
+def test_other_keys_blocks_and_altered_bytes_do_not_open() -> None:
     sealed = seal(EVENTS, 5)
     assert EVENTS not in sealed
     others = KeySet.derived(b"another".ljust(32), (1, 7), seals=True)
@@ -65,7 +65,7 @@ def test_nothing_else_opens_it() -> None:
             depot.open(data, agent_id, timestamp_us)
 
 
-def test_the_inception_block_says_to_whom() -> None:
+def test_inception_block_contains_the_public_key_of_the_depot() -> None:
     assert sealed_to(b"a mission") is None
     assert sealed_to(b"") is None
     public = DEPOT.public_key
@@ -74,6 +74,6 @@ def test_the_inception_block_says_to_whom() -> None:
     assert sealed_to(public) is None
 
 
-def test_without_a_depot_nothing_is_sealed() -> None:
-    assert seal_of(KeySet.derived(bytes(32), [7]).bundle(7)) is None
+def test_mission_without_a_depot_key_does_not_seal() -> None:
+    assert make_seal(KeySet.derived(bytes(32), [7]).bundle(7)) is None
     assert "private_key" not in repr(DEPOT)

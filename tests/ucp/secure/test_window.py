@@ -1,11 +1,11 @@
-"""The window of RFC 6479, against a set that forgets nothing."""
+"""The replay window of RFC 6479, compared with a set that keeps all numbers."""
 
 from random import Random
 
 from ucp.secure._window import WINDOW, ReplayWindow
 
 
-def test_a_number_counts_once_and_not_when_it_is_older_than_the_window() -> None:
+def test_sequence_number_is_accepted_once_and_only_within_the_window() -> None:
     for seed in range(20):
         draw, window, came, newest = Random(seed), ReplayWindow(), set[int](), -1
         at = 0
@@ -19,7 +19,7 @@ def test_a_number_counts_once_and_not_when_it_is_older_than_the_window() -> None
                 newest = max(newest, at)
 
 
-def test_a_leap_over_the_whole_ring_forgets_what_was_there() -> None:
+def test_jump_over_the_whole_ring_clears_the_window() -> None:
     window = ReplayWindow()
     for sequence in (0, 63, 64, 2**32 - 1):
         window.accept(sequence)

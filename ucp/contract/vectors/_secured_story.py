@@ -15,7 +15,7 @@ from ucp.secure.envelope import REQUEST_OF, REVOCATION
 from ucp.secure.opening import Opener
 from ucp.secure.revocation import Revocation
 from ucp.secure.sealed_datagrams import Request
-from ucp.secure.secured_agent import boot_of
+from ucp.secure.secured_agent import make_boot
 from ucp.secure.session import Session
 from ucp.trace import in_base64
 
@@ -31,7 +31,7 @@ class SecuredStory(Story):
         self.initial_data = seal_to(INITIAL_DATA, KEYS.public.depot)
         self._lives = 0
         self._opener = Opener(KEYS.bundle(AGENT_ID))
-        self._peers = {peer: Session(KEYS.bundle(peer), boot_of(peer, b"a chance")) for peer in ROSTER}
+        self._peers = {peer: Session(KEYS.bundle(peer), make_boot(peer, b"a chance")) for peer in ROSTER}
         self._asked: dict[int, Request] = {}
         super().__init__(max_block_bytes=MAX_BLOCK_BYTES)
 
@@ -63,7 +63,7 @@ class SecuredStory(Story):
 
     def _of_life(self) -> dict[str, Any]:
         self._lives += 1
-        boot = boot_of(1_795_258_278_064_591 + self._lives, b"a chance")
+        boot = make_boot(1_795_258_278_064_591 + self._lives, b"a chance")
         return {"bundle": KEYS.bundle(AGENT_ID).to_json(), "boot": boot.hex()}
 
     def _encoded(self, sender: int, sequence: int, message: Message) -> bytes:
@@ -78,4 +78,4 @@ class SecuredStory(Story):
             return None
         opened = self._opener.open(datagram)
         self._asked[opened.clear.type] = Request(AGENT_ID, opened.clear.boot, opened.clear.sequence)
-        return opened.said.message
+        return opened.datagram.message

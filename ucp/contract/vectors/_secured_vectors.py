@@ -12,14 +12,14 @@ from ucp.secure.bundle import KeySet
 from ucp.secure.crypto_suite import expand
 from ucp.secure.envelope import CLEAR, REQUEST_OF
 from ucp.secure.sealed_datagrams import Request
-from ucp.secure.secured_agent import SecuredAgent, boot_of
+from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
 
 AGENT_ID, OTHER = 7, 28
 ROSTER = tuple(sorted({AGENT_ID, *(sender for sender, _, _ in MESSAGES), *(block.agent_id for block in BLOCKS)}))
 KEYS = KeySet.derived(bytes(range(32)), ROSTER)
 OTHER_KEYS = KeySet.derived(bytes(32), ROSTER)
-BOOT = boot_of(1_795_258_278_064_591, b"a chance")
+BOOT = make_boot(1_795_258_278_064_591, b"a chance")
 EPOCH = 3
 NOW = EPOCH * KEYS.public.epoch_s
 
@@ -27,7 +27,7 @@ NOW = EPOCH * KEYS.public.epoch_s
 def session(agent_id: int, keys: KeySet = KEYS) -> Session:
     """A life of that agent in the epoch of the vectors."""
     begun = Session(keys.bundle(agent_id), BOOT)
-    begun.epochs.look_at(NOW)
+    begun.epochs.set_clock(NOW)
     return begun
 
 
@@ -59,7 +59,7 @@ def cases() -> Iterator[tuple[str, bytes]]:
     yield "an answer to what was not asked", other.seal(2, BlockAddResponse(BLOCK_HASH, True), stale, None, 0)
     forged = CommitBlock(Block(1, 5, b"never made"), BLOCK_HASH)
     yield "a block that its maker did not sign", other.seal(3, forged, None, bytes(64), 0)
-    yield "type 10, by nobody", other.tell(1, bytes(72))
+    yield "type 10, by nobody", other.revocation_datagram(1, bytes(72))
 
 
 def vectors() -> dict[str, Any]:

@@ -9,9 +9,9 @@ from harness.play.simulation.foreign._answer import AgentLacksError, Outcome
 from harness.play.simulation.foreign._foreign_agent import ForeignAgent
 from ucp.messages import MalformedDatagramError
 from ucp.secure.bundle import Bundle
-from ucp.secure.envelope import REVOCATION, read_clear
+from ucp.secure.envelope import REVOCATION, read_clear_header
 from ucp.secure.opening import Opener
-from ucp.secure.secured_agent import Outgoing
+from ucp.secure.secured_agent import OutgoingDatagram
 from ucp.trace import in_base64
 
 HIDDEN = "(a secret)"
@@ -26,19 +26,19 @@ class SecuredForeignAgent(ForeignAgent):
         self._secrets = [secret.hex() for secret in (bundle.private_key, bundle.group_secret)]
         super().__init__(*arguments, **options)
 
-    def sealed_to_send(self) -> Iterator[Outgoing]:
+    def sealed_to_send(self) -> Iterator[OutgoingDatagram]:
         """What it broadcasts since it was last asked, in order; what nobody can open is no message of its own."""
         sent, self._sent = self._sent, []
         for data, _ in sent:
             try:
-                self.messages_sent -= read_clear(data).type == REVOCATION  # which is none of its messages
+                self.messages_sent -= read_clear_header(data).type == REVOCATION  # which is none of its messages
                 opened = self._opener.open(data)
             except MalformedDatagramError:
-                yield Outgoing(data)
+                yield OutgoingDatagram(data)
                 continue
-            said = opened.said
+            said = opened.datagram
             is_its_own = said.sender == self.agent_id
-            yield Outgoing(data, said.sequence, said.message if is_its_own else None, opened.recorded)
+            yield OutgoingDatagram(data, said.sequence, said.message if is_its_own else None, opened.recorded)
 
     def revoke(self, body: bytes, now: float) -> None:
         """The authority says whose keys are revoked."""
