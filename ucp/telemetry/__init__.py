@@ -2,7 +2,8 @@
 
 `TelemetryEvents` is the translator: bytes from the vehicle in, (event ID, data) out, with time as an argument.
 `VehicleConnection` is the thin connection that feeds it. `describe` turns an event's data back into words,
-`position_of` into a position. A mission chooses what is logged, by kind (`EVENT_KINDS`).
+`position_of` into a position. `mode_name` returns the name of a flight mode. A mission chooses what is logged, by kind
+(`EVENT_KINDS`).
 
     ID  kind      event             data, big-endian (MAVLink messages it comes from)
     1   mode      mode change       `>IBII`   vehicle time ms, MAV_TYPE, mode before (0xFFFFFFFF: unknown), mode
@@ -42,6 +43,7 @@ charged or changed. A vehicle that does not know its percentage has no levels; i
 from ucp.events import DEFAULT_LOG, EventKind
 from ucp.telemetry._connection import VehicleConnection
 from ucp.telemetry._event_text import describe
+from ucp.telemetry._mode_names import mode_name
 from ucp.telemetry._records import (
     ARMED,
     BATTERY,
@@ -75,5 +77,6 @@ __all__ = [
     "TelemetryEvents",
     "VehicleConnection",
     "describe",
+    "mode_name",
     "position_of",
 ]

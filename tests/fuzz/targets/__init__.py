@@ -18,6 +18,7 @@ run_record  run.json
 network     network.jsonl, the record of who could reach whom
 tracks      tracks.jsonl, where the vehicles were
 capture     pcapng and pcap
+flight_log  DataFlash and telemetry logs of vehicles
 csv         records of others in CSV
 bag         ROS bags of both versions, by any storage and packing
 packed      a trace that gzip packed
@@ -37,7 +38,7 @@ NAMES = (
     *("datagram", "agent", "store", "mission", "control", "answer", "virtual", "foreign"),
     *("telemetry", "scenario", "story", "trace", "events", "export", "run_record", "network"),
     *("tracks", "capture", "csv", "bag", "packed", "depot", "matrix", "by_hand", "keys"),
-    *("secured", "signed"),
+    *("secured", "signed", "flight_log"),
 )
 
 

@@ -1,0 +1,54 @@
+"""Flight logs of ArduPilot: DataFlash (`.bin`), which the autopilot writes, and telemetry (`.tlog`), which a ground
+station or the harness writes.
+
+`read_flight_log` reads either format into a `FlightLog`, with the records of each vehicle in the order of the file:
+
+    log = read_flight_log(Path("00000012.BIN"))
+    for vehicle in log.vehicles:
+        print(vehicle.vehicle, vehicle.type_name, len(vehicle.positions))
+
+Two times belong to each record. `at_us` is the time on the clock of the log: since the boot of the autopilot (`.bin`),
+or since the Unix epoch on the recording computer (`.tlog`). `utc_us` is the same moment in microseconds since the Unix
+epoch by GPS. It is None if the log has no GPS time. GPS time arrives late by the delay of the receiver or the link,
+usually 0.1 to 0.3 s.
+
+The readers of pymavlink index a whole file, print to the terminal, and may raise or loop for a damaged file. So this
+package reads the files itself, in one pass, and uses only the message definitions of pymavlink. Bytes that are no
+message are skipped and counted. Size, messages, damaged parts and records are limited. `FlightLog.problems` has a
+sentence for each problem.
+"""
+
+from harness.field.flight_logs._reading import flight_log_kind, read_flight_log
+from harness.field.flight_logs._records import (
+    Arming,
+    Battery,
+    ClockJump,
+    EkfStatus,
+    FlightLog,
+    GpsStatus,
+    GpsTime,
+    LogKind,
+    ModeChange,
+    Parameter,
+    Position,
+    RadioStatus,
+    VehicleLog,
+)
+
+__all__ = [
+    "Arming",
+    "Battery",
+    "ClockJump",
+    "EkfStatus",
+    "FlightLog",
+    "GpsStatus",
+    "GpsTime",
+    "LogKind",
+    "ModeChange",
+    "Parameter",
+    "Position",
+    "RadioStatus",
+    "VehicleLog",
+    "flight_log_kind",
+    "read_flight_log",
+]

@@ -1,0 +1,159 @@
+"""Collect the records of a log: detect jumps of its clock, and convert times to UTC.
+
+A clock segment is the part of a log between two jumps of its clock. In each segment, a time is converted by straight
+lines through the medians of GPS time in each ten seconds. Medians ignore single late or damaged records. The lines
+follow the drift of the clock, and the rate of a simulated vehicle that flies faster than real time.
+"""
+
+from bisect import bisect_left
+from collections.abc import Hashable
+from statistics import median
+from typing import Any, TypeVar
+
+from harness.field.flight_logs._records import ClockJump, FlightRecord, GpsTime
+
+MAX_RECORDS = 500_000
+"""Maximum number of records in a file. A copter logs about 60,000 per hour."""
+MAX_TIME_US = 2**53
+_BACK_US, _AHEAD_US = 1_000_000, 60_000_000
+_BIN_US = 10_000_000
+_MAX_DRIFT = 0.01
+"""Difference in rate from which a clock counts as that of a simulated vehicle. Real clocks differ by 0.0001 or less."""
+_SECOND_US = 1_000_000
+_UNKNOWN = object()
+
+Kind = TypeVar("Kind", bound=FlightRecord)
+
+
+class LogClock:
+    """The clock of a log. A single record with a wrong time is dropped; consistent new times are a jump."""
+
+    def __init__(self) -> None:
+        self.jumps: list[ClockJump] = []
+        self.dropped = 0
+        self._last_us: int | None = None
+        self._candidate_us: int | None = None
+
+    @property
+    def has_time(self) -> bool:
+        return self._last_us is not None
+
+    def accepts(self, at_us: int) -> bool:
+        """Return whether a record with this time may be used. The caller compares `jumps` to detect a new segment."""
+        if not 0 <= at_us <= MAX_TIME_US:
+            self.dropped += 1
+            return False
+        if self._last_us is not None and not _consistent(self._last_us, at_us):
+            if self._candidate_us is None or not _consistent(self._candidate_us, at_us):
+                self._candidate_us = at_us
+                self.dropped += 1
+                return False
+            self.jumps.append(ClockJump(self._last_us, at_us - self._last_us))
+        self._last_us, self._candidate_us = at_us, None
+        return True
+
+
+def _consistent(before_us: int, after_us: int) -> bool:
+    return -_BACK_US <= after_us - before_us <= _AHEAD_US
+
+
+class Budget:
+    """The number of records that may still be kept from a file."""
+
+    def __init__(self) -> None:
+        self.left = MAX_RECORDS
+
+    def take(self) -> bool:
+        self.left -= 1
+        return self.left >= 0
+
+
+class Collector:
+    """The records of one source, such as a vehicle."""
+
+    def __init__(self, budget: Budget) -> None:
+        self._budget = budget
+        self._records: dict[type[Any], list[Any]] = {}
+        self._converted: dict[type[Any], int] = {}
+        self._times: dict[int, list[tuple[int, int]]] = {}
+        self._last_sample: dict[Hashable, tuple[int, Hashable]] = {}
+        self._last_state: dict[type[Any], Hashable] = {}
+
+    def add(self, record: FlightRecord) -> bool:
+        """Keep a record. Its UTC follows at the end of the segment. Return False if the limit is reached."""
+        kept = self._budget.take()
+        if kept:
+            self._records.setdefault(type(record), []).append(record)
+        return kept
+
+    def add_gps_time(self, time: GpsTime) -> bool:
+        """Keep the time, at most once per second. Return whether it was kept."""
+        if not self._is_due(GpsTime, time.at_us, None) or not self.add(time):
+            return False
+        self.use_gps_time(time)
+        return True
+
+    def use_gps_time(self, time: GpsTime) -> None:
+        """Use the time to convert the records of this collector, without keeping it as a record."""
+        self._times.setdefault(time.at_us // _BIN_US, []).append((time.at_us, time.utc_us))
+
+    def add_sample(self, record: FlightRecord, source: Hashable, state: Hashable = None) -> None:
+        """Keep a record if the last one of this source is a second old or has another state."""
+        if self._is_due((type(record), source), record.at_us, state):
+            self.add(record)
+
+    def add_change(self, record: FlightRecord, state: Hashable) -> None:
+        """Keep a record if its state differs from that of the last one of its type."""
+        if self._last_state.get(type(record), _UNKNOWN) != state:
+            self._last_state[type(record)] = state
+            self.add(record)
+
+    def _is_due(self, source: Hashable, at_us: int, state: Hashable) -> bool:
+        last = self._last_sample.get(source)
+        if last is not None and last[1] == state and 0 <= at_us - last[0] < _SECOND_US:
+            return False
+        self._last_sample[source] = (at_us, state)
+        return True
+
+    def end_segment(self) -> None:
+        """Convert the times of all records since the last call to UTC."""
+        to_utc = (
+            _Line(
+                [
+                    (round(median(at for at, _ in times)), round(median(utc for _, utc in times)))
+                    for _, times in sorted(self._times.items())
+                ]
+            )
+            if self._times
+            else None
+        )
+        self._times.clear()
+        for kind, records in self._records.items():
+            start = self._converted.get(kind, 0)
+            self._converted[kind] = len(records)
+            if kind is GpsTime or to_utc is None:
+                continue
+            for index in range(start, len(records)):
+                records[index] = records[index]._replace(utc_us=to_utc(records[index].at_us))
+
+    def records_of(self, kind: type[Kind]) -> list[Kind]:
+        """Return the records of a type in the order of the file."""
+        return self._records.get(kind, [])
+
+
+class _Line:
+    """Straight lines through points (time on the log's clock, UTC), continued before the first and after the last."""
+
+    def __init__(self, points: list[tuple[int, int]]) -> None:
+        self._points = points
+        (first_at, first_utc), (last_at, last_utc) = points[0], points[-1]
+        rate = (last_utc - first_utc) / (last_at - first_at) if last_at > first_at else 1.0
+        self._rate = rate if abs(rate - 1) > _MAX_DRIFT else 1.0
+
+    def __call__(self, at_us: int) -> int:
+        after = bisect_left(self._points, (at_us, 0))
+        if 0 < after < len(self._points):
+            (before_at, before_utc), (after_at, after_utc) = self._points[after - 1 : after + 1]
+            return before_utc + round((at_us - before_at) * (after_utc - before_utc) / (after_at - before_at))
+        near_at, near_utc = self._points[min(after, len(self._points) - 1)]
+        return near_utc + round((at_us - near_at) * self._rate)

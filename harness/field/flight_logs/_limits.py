@@ -1,0 +1,51 @@
+"""Damaged parts of a log, and plausible values."""
+
+import math
+from dataclasses import dataclass
+
+MAX_SEARCHES = 500_000
+"""Maximum number of searches for the next message in a file."""
+_NO_PLACE_DEG = 0.01
+_ALTITUDES_M = (-1000.0, 100_000.0)
+
+
+@dataclass
+class Damage:
+    """The bytes of a file that are no message."""
+
+    searches: int = 0
+    skipped_bytes: int = 0
+    first_at: int | None = None
+    unusable: int = 0
+    """Number of messages with an unknown layout or impossible values."""
+
+    def skip(self, at: int, size: int) -> None:
+        self.searches += 1
+        self.skipped_bytes += size
+        if self.first_at is None:
+            self.first_at = at
+
+    def sentences(self) -> list[str]:
+        """Return a sentence for each kind of damage."""
+        sentences = []
+        if self.skipped_bytes:
+            sentences.append(
+                f"{self.skipped_bytes:,} bytes are no whole message and are skipped, first at byte {self.first_at:,}"
+            )
+        if self.unusable:
+            messages = "1 message has" if self.unusable == 1 else f"{self.unusable:,} messages have"
+            sentences.append(f"{messages} an unknown layout or impossible values and are left out")
+        return sentences
+
+
+def is_place(lat_deg: float, lon_deg: float, alt_m: float) -> bool:
+    """Return whether these are a position on Earth.
+
+    A vehicle that does not know its position yet reports a place near 0° N, 0° E.
+    """
+    return (
+        -90 <= lat_deg <= 90
+        and -180 <= lon_deg <= 180
+        and _ALTITUDES_M[0] <= alt_m <= _ALTITUDES_M[1]
+        and math.hypot(lat_deg, lon_deg) > _NO_PLACE_DEG
+    )

@@ -1,0 +1,181 @@
+"""The records of a flight log. The times of a record are explained in the docstring of the package."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple, TypeAlias
+
+LogKind = Literal["DataFlash", "telemetry"]
+
+
+class Position(NamedTuple):
+    """The estimated position of the vehicle."""
+
+    at_us: int
+    utc_us: int | None
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    """Altitude above mean sea level."""
+    relative_alt_m: float | None
+    """Altitude above the home position."""
+
+
+class ModeChange(NamedTuple):
+    """A flight mode that begins, and the mode at the beginning of the log."""
+
+    at_us: int
+    utc_us: int | None
+    number: int
+    name: str
+    """The name of the mode, or its number if it has no known name."""
+
+
+class Arming(NamedTuple):
+    """The vehicle is armed or disarmed. The state at the beginning of the log is included."""
+
+    at_us: int
+    utc_us: int | None
+    armed: bool
+
+
+class Battery(NamedTuple):
+    """The state of a battery, at most one record per second for each battery."""
+
+    at_us: int
+    utc_us: int | None
+    instance: int
+    voltage_v: float
+    current_a: float | None
+    remaining_percent: float | None
+
+
+class GpsStatus(NamedTuple):
+    """The state of a GPS receiver, at most one record per second for each receiver and fix type."""
+
+    at_us: int
+    utc_us: int | None
+    instance: int
+    fix: int
+    """GPS_FIX_TYPE: 0 or 1 no fix, 2 two dimensions, 3 three dimensions, 4 differential, 5 and 6 RTK."""
+    satellites: int
+    hdop: float | None
+
+
+class EkfStatus(NamedTuple):
+    """The state of the EKF in use, at most one record per second for the same flags.
+
+    A variance is the square root of the normalised innovation test ratio. Above 1 the EKF rejects the measurement.
+    """
+
+    at_us: int
+    utc_us: int | None
+    flags: int
+    """EKF_STATUS_FLAGS in bits 0 to 9. A DataFlash log may have more bits."""
+    velocity_variance: float
+    position_variance: float
+    height_variance: float
+    compass_variance: float
+
+
+class GpsTime(NamedTuple):
+    """GPS time at a moment of the log's clock, at most one record per second."""
+
+    at_us: int
+    utc_us: int
+    """UTC according to this record alone. The `utc_us` of other records are from the median of many of these."""
+    week: int
+    week_ms: int
+    leap_seconds: int
+    """GPS time minus UTC at this time, from a table, because the logs do not have it."""
+
+
+class RadioStatus(NamedTuple):
+    """The state of a telemetry radio (SiK, RFD900). RSSI and noise have the units of the radio, usually 0.5 dB."""
+
+    at_us: int
+    utc_us: int | None
+    rssi: int
+    remote_rssi: int
+    noise: int
+    remote_noise: int
+    tx_buffer_percent: int
+    """Free space in the transmit buffer."""
+    rx_errors: int
+    fixed: int
+    """Number of packets that error correction repaired."""
+
+
+class Parameter(NamedTuple):
+    """The value of a parameter, at the beginning of the log and after each change."""
+
+    at_us: int
+    utc_us: int | None
+    name: str
+    value: float
+
+
+class ClockJump(NamedTuple):
+    """A jump of the log's clock: two records with consistent new times follow a record with the old time.
+
+    A restart of the autopilot, a corrected clock of the computer, and a pause of the log look the same. Only a clock
+    that goes back is certainly wrong.
+    """
+
+    at_us: int
+    """The last time before the jump."""
+    by_us: int
+
+
+FlightRecord: TypeAlias = (
+    Position | ModeChange | Arming | Battery | GpsStatus | EkfStatus | GpsTime | RadioStatus | Parameter
+)
+
+
+@dataclass(frozen=True)
+class VehicleLog:
+    """The records of one vehicle in a log."""
+
+    vehicle: int | None
+    """The MAVLink system ID. None if a DataFlash log does not have the parameter."""
+    mav_type: int | None
+    """MAV_TYPE: 1 plane, 2 quadcopter, 10 rover. A DataFlash log gives 2 for every kind of copter."""
+    positions: list[Position]
+    modes: list[ModeChange]
+    arming: list[Arming]
+    battery: list[Battery]
+    gps: list[GpsStatus]
+    ekf: list[EkfStatus]
+    gps_times: list[GpsTime]
+    parameters: list[Parameter]
+
+    @property
+    def type_name(self) -> str:
+        """Return "plane", "copter" or "rover", or "vehicle" for another or unknown type."""
+        return _TYPE_NAMES.get(self.mav_type or 0, "vehicle")
+
+    def latest_parameters(self) -> dict[str, float]:
+        """Return the last value of each parameter."""
+        return {parameter.name: parameter.value for parameter in self.parameters}
+
+
+@dataclass(frozen=True)
+class FlightLog:
+    """The content of one file."""
+
+    path: Path
+    kind: LogKind
+    vehicles: list[VehicleLog]
+    """One vehicle for DataFlash. One or more for telemetry, in order of their system IDs."""
+    radio: list[RadioStatus]
+    """The radio at the autopilot (DataFlash), or at the recording computer (telemetry)."""
+    clock_jumps: list[ClockJump]
+    problems: list[str]
+    """Sentences without the name of the file."""
+
+
+_TYPE_NAMES = {
+    1: "plane",
+    **dict.fromkeys((2, 3, 4, 13, 14, 15, 29), "copter"),
+    **dict.fromkeys((10, 11), "rover"),
+    **dict.fromkeys(range(19, 26), "plane"),
+}
