@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from harness.archive.bounded_file import JsonLines
 from harness.archive.tracks import MissionSeconds
-from harness.scenario.faults import named
+from harness.scenario.faults import fault_class
 from netem.conditions import NetworkConditions
 from netem.link import GilbertElliott, LinkConditions
 from netem.radio import components
@@ -160,9 +160,9 @@ class NetworkReplay:
         self._radio_losses |= losses
         self._out_of_range -= losses.keys()
         self._out_of_range |= {pair for pair, loss in losses.items() if loss == 1.0}
-        if (fault := named(line.what)).takes_the_vehicle:
+        if (fault := fault_class(line.what)).removes_vehicle:
             self.lost |= set(line.agents) & set(self.vehicles)
-        elif fault.brings_a_vehicle:
+        elif fault.adds_vehicle:
             self.lost -= set(line.agents)
 
     def losses(self, at_s: float) -> Losses:
@@ -247,7 +247,7 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
         toggled_pairs, toggled_vehicles = cut_before ^ network.cut, lost_before ^ network.lost
         _toggle(cut, toggled_pairs, now_s)
         _toggle(lost, toggled_vehicles, now_s)
-        if (fault := named(line.what)).ends_a_life and not fault.takes_the_vehicle:
+        if (fault := fault_class(line.what)).ends_incarnation and not fault.removes_vehicle:
             reboots += [(now_s, vehicle) for vehicle in line.agents if vehicle in network.vehicles]
         lost_now = network.losses(now_s)
         if not losses or (lost_now.mean, lost_now.worst) != (losses[-1].mean, losses[-1].worst):

@@ -160,7 +160,7 @@ def history_of(
     """Return the history of a run that ended at mission second `end_s`. With `whole=False` it has no messages."""
     ends: dict[int, list[float]] = defaultdict(list)
     for fault in faults:
-        if fault.kind.ends_a_life:
+        if fault.kind.ends_incarnation:
             for agent in fault.agents or ():
                 ends[agent].append(fault.at_s)
     history = History([], [], [], [], [] if whole else None)

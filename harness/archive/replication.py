@@ -77,7 +77,7 @@ class _Chains:
         if fault.loses_data:
             self._empty(agent)
             self._paths.pop(agent, None)
-        elif fault.kind.begins_a_life:
+        elif fault.kind.begins_incarnation:
             self._mutual = 0 if agent not in self._paths else self._mutual
             self._paths.setdefault(agent, [])
 

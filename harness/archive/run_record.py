@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from harness.backend_names import BackendName
 from harness.scenario import Scenario, faults
 from harness.scenario.agent_options import Stagger
-from harness.scenario.faults import Disk
-from harness.scenario.verdict_names import BESIDE, CharacteristicVerdict, Verdict
+from harness.scenario.faults import DiskState
+from harness.scenario.verdict_names import FURTHER_CHECKS, CharacteristicVerdict, Verdict
 
 SCHEMA = "ucp-run/1"
 
@@ -77,7 +77,7 @@ class FaultRecord(_Model):
     detail: str
     fully_connected: bool | None = None
     agents: list[int] | None = None
-    disk: Disk | None = None
+    disk: DiskState | None = None
     """State of the disk after a reboot."""
     by_hand: bool = False
     """True if a user requested it during the run. The timeline of the recorded scenario contains it."""
@@ -87,7 +87,7 @@ class FaultRecord(_Model):
     @property
     def kind(self) -> type[faults.Fault]:
         """The class of the fault."""
-        return faults.named(self.what)
+        return faults.fault_class(self.what)
 
     @property
     def loses_data(self) -> bool:
@@ -370,7 +370,7 @@ class JudgedRecord(_Model):
     @property
     def switched_off(self) -> dict[int, float]:
         """Agent ID -> mission second at which the agent exported its chain and ended, before the end of the run."""
-        off = (fault for fault in self.faults if fault.kind.leaves_an_export)
+        off = (fault for fault in self.faults if fault.kind.exports_chain)
         return {agent_id: fault.at_s for fault in off for agent_id in fault.agents or ()}
 
     def end_of(self, agent_id: int) -> float | None:
@@ -458,7 +458,7 @@ class RunRecord(JudgedRecord):
     @property
     def judgements(self) -> dict[str, CharacteristicRecord | JudgementRecord]:
         """The judgements on the characteristics by number, and those of the further checks by key."""
-        further = {key: judgement for key in BESIDE if (judgement := getattr(self, key)) is not None}
+        further = {key: judgement for key in FURTHER_CHECKS if (judgement := getattr(self, key)) is not None}
         return {**self.characteristics, **further}
 
     def to_json(self) -> dict[str, Any]:

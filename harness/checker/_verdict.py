@@ -22,7 +22,7 @@ from harness.checker.judgement import Judgement
 from harness.checker.records import cross_examine
 from harness.checker.records._doubt import in_doubt
 from harness.errors import INCOMPLETE, VIOLATED
-from harness.scenario.verdict_names import JUDGED, UNFINISHED
+from harness.scenario.verdict_names import ALL_CHECKS, UNFINISHED
 
 CHECKS = {
     "1": _distributed.check,
@@ -33,7 +33,7 @@ CHECKS = {
     "6": uniform_chain.check,
 }
 
-BESIDE: dict[str, Callable[[Evidence], Judgement]] = {
+FURTHER_CHECKS: dict[str, Callable[[Evidence], Judgement]] = {
     "steps": steps.check,
     "records": records.check,
     "liveness": _liveness.check,
@@ -99,13 +99,13 @@ def check(run: Evidence | RunArchive) -> Result:
     chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()}
     if evidence.record is not None and evidence.record.outcome == "not supported":
         reason = evidence.record.outcome_detail or "not supported by an agent"
-        unjudged = {key: Judgement(name, "not applicable", reason) for key, name in JUDGED.items()}
-        beside = {key: unjudged.pop(key) for key in BESIDE}
+        unjudged = {key: Judgement(name, "not applicable", reason) for key, name in ALL_CHECKS.items()}
+        beside = {key: unjudged.pop(key) for key in FURTHER_CHECKS}
         return Result(unjudged, figures(evidence), beside, evidence.errors, chains)
     return Result(
         {number: in_doubt(number, judge(evidence), evidence.once(cross_examine)) for number, judge in CHECKS.items()},
         figures(evidence),
-        {key: judge(evidence) for key, judge in BESIDE.items()},
+        {key: judge(evidence) for key, judge in FURTHER_CHECKS.items()},
         evidence.errors,
         chains,
     )

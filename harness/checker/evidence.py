@@ -235,9 +235,9 @@ class Evidence:
         for fault in self.record.faults if self.record else ():
             if agent_id not in (fault.agents or ()):
                 continue
-            if fault.kind.stands_still:
+            if fault.kind.suspends_agent:
                 since = fault.at_s
-            elif since is not None and fault.kind.leads_to is not None:
+            elif since is not None and fault.kind.state_after is not None:
                 if since <= until_s and fault.at_s >= from_s:
                     return True
                 since = None

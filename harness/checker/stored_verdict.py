@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from harness.archive.run_record import RunRecord, Survival
 from harness.checker._verdict import Result
-from harness.scenario.verdict_names import CHARACTERISTICS, JUDGED
+from harness.scenario.verdict_names import ALL_CHECKS, CHARACTERISTICS
 
 
 def differences(record: RunRecord, result: Result, survived: Survival) -> Iterator[str]:
@@ -18,7 +18,7 @@ def differences(record: RunRecord, result: Result, survived: Survival) -> Iterat
     for key, judgement in result.judgements.items():
         stored = record.judgements.get(key)
         if stored is not None and stored.verdict != judgement.verdict:
-            name = f"characteristic {key}" if key in CHARACTERISTICS else f"`{JUDGED[key]}`"
+            name = f"characteristic {key}" if key in CHARACTERISTICS else f"`{ALL_CHECKS[key]}`"
             yield f"run.json has {stored.verdict!r} for {name}, but its files give {judgement.verdict!r}"
     for name, figure in result.figures.items():
         if name in record.figures and record.figures[name] != figure:

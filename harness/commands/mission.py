@@ -15,7 +15,7 @@ from harness.errors import WRONG_REQUEST, MachineError
 from harness.field.depot.mission_comparison import compare
 from harness.field.depot.mission_files import MissionFileError, Plan, write
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.agent_options import in_words
+from harness.scenario.agent_options import quirks_in_words
 from harness.scenario.load import parse
 from ucp.messages import PORT
 from ucp.sealed import seal_to
@@ -82,7 +82,7 @@ def new_command(
         data = data if depot is None else seal_to(data, depot)
     if asked.has_wrong_agents:
         complain(
-            f"{scenario}: its quirks ({', '.join(in_words(asked.quirks))}) are left out, because mission files "
+            f"{scenario}: its quirks ({', '.join(quirks_in_words(asked.quirks))}) are left out, because mission files "
             "have no quirks"
         )
     plan = Plan(

@@ -26,7 +26,7 @@ from harness.report.facts import gaps
 from harness.report.live.server_process import live_page
 from harness.run.run import Run, run
 from harness.scenario import Scenario
-from harness.scenario.agent_options import in_words
+from harness.scenario.agent_options import quirks_in_words
 from harness.scenario.agent_programs import Programs, command_keys, programs_of
 from harness.scenario.load import explain
 
@@ -141,7 +141,7 @@ def run_command(
         console.print("Booting User Mode Linux.", style="dim")
         raise typer.Exit(run_inside(["run", *given, "--", str(scenario)]))
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
-    if wrong := ", ".join(in_words(request.quirks)):
+    if wrong := ", ".join(quirks_in_words(request.quirks)):
         console.print(f"deliberate mistakes: {wrong}", style="dim", highlight=False)
     if remark := BACKENDS[backend].remark(request):
         console.print(remark, style="dim")

@@ -103,8 +103,8 @@ def scenarios_command() -> None:
     For example, `ucp-harness run loss_15` plays one of them.
     """
     table = Table.grid(padding=(0, 2))
-    for name in load.names():
-        table.add_row(Text(name, style="bold", no_wrap=True), Text(load.opening(name)))
+    for name in load.scenario_names():
+        table.add_row(Text(name, style="bold", no_wrap=True), Text(load.first_sentence(name)))
     console = Console()
     console.print(table)
-    console.print(f"in {load.FOLDER}, to copy and edit", highlight=False, soft_wrap=True, style="dim")
+    console.print(f"in {load.LIBRARY}, to copy and edit", highlight=False, soft_wrap=True, style="dim")

@@ -15,7 +15,7 @@ from harness.play.machine.running_runs import enter_command, running
 from harness.play.machine.uml_kernel import enter, runs_inside
 from harness.play.request_socket import ask_run
 from harness.report.stories.sentences import VERBS, StoryEntries
-from harness.scenario.scenario_file import in_a_line
+from harness.scenario.scenario_file import in_one_line
 
 _TIME: list[tuple[re.Pattern[str], str, str | None]] = [
     (re.compile("pause"), "pause", None),
@@ -80,7 +80,7 @@ def _show(state: dict[str, Any]) -> None:
     pace = "as fast as it can" if state["factor"] is None else f"{state['factor']:g} mission seconds per second"
     typer.echo(f"{state['at_s']:.3f} s, {'paused' if state['paused'] else pace}")
     for entry in state["by_hand"]:
-        typer.echo(f"  {in_a_line(entry)}")
+        typer.echo(f"  {in_one_line(entry)}")
     if state["closed"] is not None:
         typer.echo(state["closed"])
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from harness.conformance.results import BESIDE, TITLES, Results, Row
+from harness.conformance.results import FURTHER_CHECKS, TITLES, Results, Row
 from harness.conformance.results_table import headline
 from harness.errors import HarnessError
 from harness.report import html
@@ -61,7 +61,7 @@ def to_html(results: Mapping[str, Results | str]) -> str:
     """The page. Of an agent that could not be tested there is a sentence instead of results."""
     tested = {name: result for name, result in results.items() if isinstance(result, Results)}
     rows = {name: {row.algorithm: row for row in result.rows()} for name, result in tested.items()}
-    numbers = [number for number in (*sorted(TITLES), BESIDE) if any(number in each for each in rows.values())]
+    numbers = [number for number in (*sorted(TITLES), FURTHER_CHECKS) if any(number in each for each in rows.values())]
     failed = sum(len(result.failures) for result in tested.values())
     return html.render(
         _TEMPLATE,

@@ -22,7 +22,7 @@ from harness.conformance._suite import (
     Tally,
 )
 from harness.conformance._udp_lab import Air
-from harness.conformance.results import BESIDE, Case, Results, Row
+from harness.conformance.results import FURTHER_CHECKS, Case, Results, Row
 from harness.conformance.vectors import Vectors, generate
 from harness.errors import MachineError
 
@@ -121,7 +121,7 @@ def _case(failure: Failure, evidence: Evidence) -> Case:
     if failure.unexplained_end is not None:
         return Case(
             f"{failure.unexplained_end}; its incarnation had {len(failure.way)} inputs",
-            BESIDE,
+            FURTHER_CHECKS,
             "failed",
             reason=failure.unexplained_end,
             settings=failure.variant,

@@ -13,7 +13,7 @@ SCHEMA = "ucp-conformance/1"
 
 Verdict = Literal["passed", "failed", "not applicable", "not tried"]
 TITLES = {handler.algorithm: handler.title for handler in HANDLERS.values()}
-BESIDE = 0
+FURTHER_CHECKS = 0
 """In the place of an Algorithm: what none of them is about."""
 
 
@@ -100,7 +100,7 @@ class Results:
     interrupted: bool = False
 
     def rows(self) -> list[Row]:
-        rows = {number: Row(number) for number in (*sorted(TITLES), BESIDE)}
+        rows = {number: Row(number) for number in (*sorted(TITLES), FURTHER_CHECKS)}
         for number, counted in self.counted.items():
             rows[number] = Row(number, counted.passed, counted.failed, counted.not_applicable, counted.not_tried)
         for case in self.cases:

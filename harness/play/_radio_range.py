@@ -80,7 +80,7 @@ def _track(scenario: Scenario, vehicle: int, index: int) -> Track:
         north_m, east_m = place_in_field(index, vehicles.spacing_m)
     return track(
         vehicles.type_of(vehicle),
-        flight.planned() if flight else None,
+        flight.to_plan() if flight else None,
         (north_m, east_m, up_m),
         heading_deg=home.heading_deg,
         takeoff_altitude_m=vehicles.takeoff_altitude_m,

@@ -35,7 +35,7 @@ from harness.play.mission import Swarm
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, NetworkChange, timeline_of
 from harness.scenario.load import parse
-from harness.scenario.network_states import changed
+from harness.scenario.network_states import changed_values
 from harness.scenario.timeline import TimelineEntry
 
 INSTANT_S = 0.001
@@ -325,7 +325,7 @@ class Interventions(GrowingTimeline):
             return  # what is wrong with it is said by whoever checks the scenario
         for number, earlier in enumerate(self.scenario.timeline):
             is_under_way = earlier.for_s is not None and earlier.at_s < entry.at_s < earlier.ends_at_s
-            if is_under_way and entry.for_s is None and {*changed(earlier)} <= {*changed(entry)}:
+            if is_under_way and entry.for_s is None and {*changed_values(earlier)} <= {*changed_values(entry)}:
                 timeline[number]["for_s"] = round(entry.at_s - earlier.at_s, 6)
 
     def _refuse_what_nobody_is_ready_for(self, entry: TimelineEntry) -> None:
@@ -345,10 +345,10 @@ class Interventions(GrowingTimeline):
         ready = {
             agent_id
             for fault in self._begun_with.faults_in_order()
-            if fault.disk_left == "kept"
+            if fault.disk_after == "kept"
             for agent_id in fault.agents
         }
-        if (fault := entry.fault) is not None and fault.disk_left == "kept" and (diskless := {*fault.agents} - ready):
+        if (fault := entry.fault) is not None and fault.disk_after == "kept" and (diskless := {*fault.agents} - ready):
             raise ScenarioError(
                 f"agent {min(diskless)} has no disk: in a swarm with other agents than the harness's own an agent has "
                 "a disk only if the timeline of its scenario reboots it with `disk: kept`; use `disk: lost`"
@@ -358,7 +358,7 @@ class Interventions(GrowingTimeline):
         entry = self._by_hand.get(change.at_s)
         if entry is None:
             return change
-        its_own = entry.disturbs if isinstance(change, NetworkChange) else change.what in entry.model_fields_set
+        its_own = entry.network_key if isinstance(change, NetworkChange) else change.what in entry.model_fields_set
         return replace(change, by_hand=True) if its_own else change
 
 

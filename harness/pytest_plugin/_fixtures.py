@@ -16,7 +16,7 @@ from harness.pytest_plugin.findings import Findings
 from harness.pytest_plugin.swarm_in_test import Swarm
 from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.load import find, parse
+from harness.scenario.load import find_file, parse
 
 DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1}
 
@@ -74,7 +74,7 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
             '@pytest.mark.scenario("loss_15.yaml", backend="sim", seed=3)'
         )
     path = node.path.parent / marker.args[0]
-    included = find(Path(marker.args[0]))
+    included = find_file(Path(marker.args[0]))
     return path if path.exists() or not included.is_absolute() else included, {**DEFAULTS, **marker.kwargs}
 
 

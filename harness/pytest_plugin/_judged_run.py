@@ -18,7 +18,7 @@ from harness.pytest_plugin.findings import JudgementInTest
 from harness.report.agent_programs import in_sentence, programs
 from harness.run.run import Run
 from harness.scenario import Scenario
-from harness.scenario.agent_options import in_words
+from harness.scenario.agent_options import quirks_in_words
 from harness.scenario.expect import Expect
 
 
@@ -63,12 +63,12 @@ class Trial:
                 lines += [f"    expected: {expected}"] if expected else []
         deviating = [(finding.agent_id, finding.handler) for finding in finished.result.beside["steps"].evidence]
         lines += self._expect.out_of_range(finished.result.figures)
-        lines += self._expect.other_common(finished.result.chains)
-        lines += self._expect.other_deviations(deviating)
+        lines += self._expect.unexpected_common_blocks(finished.result.chains)
+        lines += self._expect.unexpected_deviations(deviating)
         lines += self._other_chains(finished)
         if not lines:
             return []
-        wrong = ", ".join(in_words(self._quirks))
+        wrong = ", ".join(quirks_in_words(self._quirks))
         ran = in_sentence(programs(finished.record))
         return [*lines, *([f"deliberate mistakes: {wrong}"] if wrong else []), *([ran] if ran else [])]
 
@@ -76,7 +76,7 @@ class Trial:
         if not self._expect.chains:
             return []
         exports = RunArchive(finished.directory).exports.by_agent
-        return [*self._expect.other_chains({agent: export.top_chain_hash for agent, export in exports.items()})]
+        return [*self._expect.unexpected_chains({agent: export.top_chain_hash for agent, export in exports.items()})]
 
 
 def _report_lines(finished: Run) -> list[str]:

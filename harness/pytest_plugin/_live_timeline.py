@@ -210,7 +210,7 @@ class LiveTimeline(GrowingTimeline):
         for fault in self.scenario.faults_in_order():
             if fault.stops_events:
                 silent.update(fault.agents)
-            elif fault.begins_a_life:
+            elif fault.begins_incarnation:
                 silent.difference_update(fault.agents)
         return silent
 

@@ -8,7 +8,7 @@ from harness.archive.exports import name_blocks
 from harness.checker import Result
 from harness.checker.judgement import Finding, Judgement
 from harness.errors import ScenarioError
-from harness.scenario.verdict_names import BESIDE, Verdict, kind_of
+from harness.scenario.verdict_names import FURTHER_CHECKS, Verdict, kind_of
 
 EVIDENCE_SHOWN = 5
 
@@ -30,7 +30,7 @@ class JudgementInTest:
     @property
     def title(self) -> str:
         """ "characteristic 6, one uniform chain" or "steps"."""
-        return self.key if self.key in BESIDE else f"characteristic {self.key}, {self.name}"
+        return self.key if self.key in FURTHER_CHECKS else f"characteristic {self.key}, {self.name}"
 
     @property
     def holds(self) -> bool:
@@ -72,7 +72,7 @@ class Findings:
         __tracebackhide__ = True
         judgement = self.result.beside.get(key)
         if judgement is None:
-            raise ScenarioError(f"no judgement {key!r}: use one of {', '.join(BESIDE)}")
+            raise ScenarioError(f"no judgement {key!r}: use one of {', '.join(FURTHER_CHECKS)}")
         return JudgementInTest.of(key, judgement)
 
     @property

@@ -24,10 +24,10 @@ from harness.pytest_plugin._live_timeline import Action, LiveTimeline
 from harness.pytest_plugin.findings import Findings, JudgementInTest
 from harness.run.run import Recording, Run
 from harness.scenario import Scenario
-from harness.scenario.faults import ASKED_FOR
+from harness.scenario.faults import TIMELINE_FAULTS
 from harness.scenario.injection import INJECTIONS
 
-_VERBS = [*(kind.what for kind in ASKED_FOR), *INJECTIONS]
+_VERBS = [*(kind.what for kind in TIMELINE_FAULTS), *INJECTIONS]
 
 
 class RunEndedError(Exception):
@@ -163,7 +163,7 @@ class Swarm:
         `flood(for_s=10, per_s=50)`.
         """
         __tracebackhide__ = True
-        fault = next((kind for kind in ASKED_FOR if kind.what == verb), None)
+        fault = next((kind for kind in TIMELINE_FAULTS if kind.what == verb), None)
         if verb in INJECTIONS:
             return partial(self._inject, verb)
         if fault is None:
@@ -171,7 +171,7 @@ class Swarm:
 
         def happen(*agents: int, **further: Any) -> None:
             __tracebackhide__ = True
-            self._change(**fault.told(*agents, **further))
+            self._change(**fault.entry_keys(*agents, **further))
 
         happen.__doc__ = fault.__doc__
         return happen

@@ -106,10 +106,10 @@ def _cases(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> Iterator[C
         figures: dict[str, float | None] = {name: record.figures.get(name) for name in expect.figures}
         yield Case("expected figures", list(expect.out_of_range(figures)))
     if expect.common:
-        yield Case("expected chains", list(expect.other_common(chains)))
+        yield Case("expected chains", list(expect.unexpected_common_blocks(chains)))
     if expect.deviations:
         found = [(finding.agent_id, finding.handler) for finding in (record.steps.evidence if record.steps else ())]
-        yield Case("expected deviations", list(expect.other_deviations(found)))
+        yield Case("expected deviations", list(expect.unexpected_deviations(found)))
 
 
 def _wrong_with_run(record: RunRecord) -> Iterator[str]:

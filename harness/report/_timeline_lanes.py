@@ -261,14 +261,14 @@ def _running_background(agent: int, faults: Sequence[FaultRecord], lane_height: 
     since_s: float | None = 0.0
     paused_s: float | None = None
     for fault in (fault for fault in faults if agent in (fault.agents or ())):
-        if fault.kind.ends_a_life and since_s is not None:
+        if fault.kind.ends_incarnation and since_s is not None:
             ran.append((since_s, fault.at_s))
             since_s = None
-        elif fault.kind.begins_a_life and since_s is None:
+        elif fault.kind.begins_incarnation and since_s is None:
             since_s = fault.at_s
-        elif fault.kind.stands_still and paused_s is None:
+        elif fault.kind.suspends_agent and paused_s is None:
             paused_s = fault.at_s
-        if not fault.kind.stands_still and paused_s is not None:
+        if not fault.kind.suspends_agent and paused_s is not None:
             paused.append((paused_s, fault.at_s))
             paused_s = None
     ran += [(since_s, end_s)] if since_s is not None else []

@@ -11,7 +11,7 @@ from harness.play.backends import in_virtual_time
 from harness.present import text
 from harness.report.agent_programs import programs
 from harness.report.chain_tree import ranges
-from harness.scenario.agent_options import in_words
+from harness.scenario.agent_options import quirks_in_words
 from harness.scenario.scenario_file import to_yaml
 from sitl.vehicle import VehicleType
 
@@ -56,7 +56,7 @@ def summary(record: RunRecord, exports: Exports) -> list[str]:
         parts.append(f"{text.duration(scenario.duration_s)} mission")
         if isinstance(scenario.network.loss, float):
             parts.append(f"{text.percent(scenario.network.loss)} loss")
-        parts += in_words(scenario.quirks)
+        parts += quirks_in_words(scenario.quirks)
         if not in_virtual_time(record.backend):
             parts.append(f"speedup {text.value(scenario.speedup)}")
     played = {"seed": record.seed, "backend": record.backend, "engine": record.engine}

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.archive.run_record import CharacteristicRecord, FindingRecord, JudgementRecord, RunRecord
-from harness.scenario.verdict_names import BESIDE, CHARACTERISTICS, JUDGED, kind_of
+from harness.scenario.verdict_names import ALL_CHECKS, CHARACTERISTICS, FURTHER_CHECKS, kind_of
 
 STATEMENTS = {
     "1": "The protocol is distributed, event driven and asynchronous.",
@@ -63,15 +63,15 @@ def verdicts(record: RunRecord) -> list[Verdict]:
         return []
     judged = record.judgements
     keys = sorted({*record.characteristics, *CHARACTERISTICS}, key=lambda key: (len(key), key))
-    return [_verdict(key, judged.get(key)) for key in [*keys, *(key for key in BESIDE if key in judged)]]
+    return [_verdict(key, judged.get(key)) for key in [*keys, *(key for key in FURTHER_CHECKS if key in judged)]]
 
 
 def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None) -> Verdict:
     kind, evidence = kind_of(judged.verdict) if judged else "unknown", judged.evidence if judged else []
     return Verdict(
         key=key,
-        number="" if key in BESIDE else key,
-        name=judged.name if judged else JUDGED[key],
+        number="" if key in FURTHER_CHECKS else key,
+        name=judged.name if judged else ALL_CHECKS[key],
         statement=STATEMENTS.get(key, ""),
         verdict=judged.verdict if judged else "not judged",
         icon=ICONS[kind] if judged else "?",

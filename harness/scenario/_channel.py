@@ -133,6 +133,6 @@ class ChannelModel(Model):
         return {key: value for key, value in given.items() if key not in OWN_KEYS}
 
     @model_validator(mode="after")
-    def _means_something(self) -> "ChannelModel":
+    def _check_values(self) -> "ChannelModel":
         self.radio()
         return self

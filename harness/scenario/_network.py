@@ -26,7 +26,7 @@ class HardRange(Model):
     """Range in metres, above 0. The default is a typical outdoor range of IEEE 802.11n."""
 
     @model_validator(mode="after")
-    def _means_something(self) -> "HardRange":
+    def _check_values(self) -> "HardRange":
         radio.HardRange(self.range_m)
         return self
 
@@ -46,7 +46,7 @@ class LogDistance(Model):
     """Carrier frequency in hertz, above 0."""
 
     @model_validator(mode="after")
-    def _means_something(self) -> "LogDistance":
+    def _check_values(self) -> "LogDistance":
         radio.LogDistance(**self.model_dump())
         return self
 
@@ -74,7 +74,7 @@ class RadioModel(Model):
         return self
 
 
-class Bursts(Model):
+class BurstLoss(Model):
     """Loss in bursts by the Gilbert-Elliott model, as `loss gemodel p r 1-h 1-k` of tc-netem(8).
 
     Each link has its own state, good or bad, and starts in the good state. After each message the state may change.
@@ -93,7 +93,7 @@ class Bursts(Model):
 DelaySeconds = Annotated[float, Field(ge=0, le=MAX_DELAY_S, allow_inf_nan=False)]
 
 
-class Jitter(Model):
+class RandomDelay(Model):
     """A random delay, as `delay` and `distribution` of tc-netem(8). Times are mission seconds."""
 
     mean_s: DelaySeconds
@@ -104,7 +104,7 @@ class Jitter(Model):
     """Distribution of the delay. A negative delay becomes 0."""
 
     @model_validator(mode="after")
-    def _means_something(self) -> "Jitter":
+    def _check_values(self) -> "RandomDelay":
         Delay(**self.model_dump())
         return self
 
@@ -129,9 +129,9 @@ BitsPerSecond = Annotated[float, Field(ge=8, allow_inf_nan=False)]
 Packets = Annotated[int, Field(ge=1, le=MAX_LIMIT, strict=True)]
 Rate = Annotated[BitsPerSecond | Literal["none"], _or_none(BitsPerSecond)]
 Limit = Annotated[Packets | Literal["none"], _or_none(Packets)]
-Loss = Annotated[Probability | Bursts, _number_or(Bursts, Probability)]
-DelayTime = Annotated[DelaySeconds | Jitter, _number_or(Jitter, DelaySeconds)]
-Vehicles = Annotated[
+Loss = Annotated[Probability | BurstLoss, _number_or(BurstLoss, Probability)]
+DelayTime = Annotated[DelaySeconds | RandomDelay, _number_or(RandomDelay, DelaySeconds)]
+VehicleIds = Annotated[
     list[VehicleId],
     Field(min_length=1, max_length=MAX_AGENTS),
     BeforeValidator(
@@ -140,7 +140,7 @@ Vehicles = Annotated[
 ]
 
 
-class Difference(Model):
+class ConditionOverrides(Model):
     """Conditions that replace those of the layer below. A missing key keeps the value of the layer below."""
 
     loss: Loss | None = None
@@ -164,14 +164,14 @@ class Difference(Model):
         return {key: value for key in KEYS if (value := getattr(self, key)) is not None}
 
 
-KEYS = tuple(Difference.model_fields)
+KEYS = tuple(ConditionOverrides.model_fields)
 
 
-class Receiver(Difference):
+class ReceiverOverrides(ConditionOverrides):
     """Conditions of all messages to one vehicle. A missing key keeps the value of the whole network."""
 
 
-class Link(Difference):
+class LinkOverrides(ConditionOverrides):
     """Conditions of the links from each vehicle of `from` to each vehicle of `to`.
 
     A missing key keeps the value of the receiver. Two entries for the same link are an error.
@@ -179,9 +179,9 @@ class Link(Difference):
 
     model_config = ConfigDict(serialize_by_alias=True)
 
-    from_: Vehicles = Field(alias="from")
+    from_: VehicleIds = Field(alias="from")
     """Sender, or a list of senders."""
-    to: Vehicles
+    to: VehicleIds
     """Receiver, or a list of receivers. A vehicle that is a sender too is an error."""
     both: bool = False
     """True if the conditions also apply to the opposite direction."""
@@ -193,36 +193,36 @@ class Link(Difference):
                 yield receiver, sender
 
 
-Where = None | int | tuple[int, int]
+Scope = None | int | tuple[int, int]
 """Scope of a condition: None for all links, a receiver, or a link as (sender, receiver)."""
-NetworkValues = dict[Where, dict[str, Any]]
+NetworkValues = dict[Scope, dict[str, Any]]
 """The conditions of a network, or a change of them: scope -> key -> value."""
 
 
-class NetworkLayer(Difference):
-    """A change of the network: keys for all links, single receivers and single links. Needs at least one key."""
+class NetworkLayer(ConditionOverrides):
+    """A change of the network for all links, single receivers or single links. Needs at least one key."""
 
-    receivers: dict[VehicleKey, Receiver] = {}
+    receivers: dict[VehicleKey, ReceiverOverrides] = {}
     """Conditions of single receivers, by vehicle ID."""
-    links: Annotated[list[Link], Field(max_length=10_000)] = []
+    links: Annotated[list[LinkOverrides], Field(max_length=10_000)] = []
     """Conditions of single links, at most 10,000 entries."""
 
     @model_validator(mode="after")
-    def _says_something(self) -> "NetworkLayer":
-        if self.whole() == {None: {}}:
+    def _check_values(self) -> "NetworkLayer":
+        if self.by_scope() == {None: {}}:
             raise ValueError(f"needs at least one of {', '.join(f'`{key}`' for key in type(self).model_fields)}")
         return self
 
-    def whole(self) -> NetworkValues:
+    def by_scope(self) -> NetworkValues:
         """Return the conditions by scope. Raises ConditionsError if two entries concern the same link."""
         return {None: self.given(), **_values_of(self.receivers, self.links)}
 
-    def named(self) -> Iterator[tuple[str, int]]:
+    def named_vehicles(self) -> Iterator[tuple[str, int]]:
         """Yield each vehicle ID, with the key that contains it."""
         return _named(self.receivers, self.links)
 
 
-class Disturbance(Model):
+class NetworkDisturbance(Model):
     """A change of the network, as timeline entries and schedules contain it."""
 
     loss: Loss | None = None
@@ -233,15 +233,15 @@ class Disturbance(Model):
     """Other conditions of the network. Keys that it does not contain stay as they are."""
 
     @model_validator(mode="after")
-    def _says_no_loss_twice(self) -> "Disturbance":
+    def _check_loss(self) -> "NetworkDisturbance":
         if self.loss is not None and self.network is not None and self.network.loss is not None:
             raise ValueError("`loss` and `network.loss` are the same setting: leave out one of them")
         return self
 
     def changes(self) -> NetworkValues:
         """Return the changed conditions, without the partition."""
-        values: NetworkValues = self.network.whole() if self.network else {}
-        return values if self.loss is None else laid_over(values, {None: {"loss": self.loss}})
+        values: NetworkValues = self.network.by_scope() if self.network else {}
+        return values if self.loss is None else overlay(values, {None: {"loss": self.loss}})
 
     @property
     def groups(self) -> tuple[frozenset[int], ...]:
@@ -267,9 +267,9 @@ class NetworkModel(Model):
     limit: Limit = "none"
     """Number of messages from one sender to one receiver that may wait for delay or rate, 1 to 100,000. Further
     messages are lost. `none`: no limit. It needs a `delay` or a `rate`."""
-    receivers: dict[VehicleKey, Receiver] = {}
+    receivers: dict[VehicleKey, ReceiverOverrides] = {}
     """Conditions of single receivers, by vehicle ID."""
-    links: Annotated[list[Link], Field(max_length=10_000)] = []
+    links: Annotated[list[LinkOverrides], Field(max_length=10_000)] = []
     """Conditions of single links, at most 10,000 entries."""
     radio: RadioModel | None = None
     """Additional loss that depends on the distance between two vehicles. Without it, distance has no effect."""
@@ -277,33 +277,33 @@ class NetworkModel(Model):
     """A radio channel that all vehicles share. Without it, all vehicles may send at the same time."""
 
     @model_validator(mode="after")
-    def _means_something(self) -> "NetworkModel":
+    def _check_values(self) -> "NetworkModel":
         self.conditions()
         if self.radio is not None and self.channel is not None:
             raise ValueError("`radio` and `channel` both compute the loss over distance: leave out one of them")
         return self
 
-    def named(self) -> Iterator[tuple[str, int]]:
+    def named_vehicles(self) -> Iterator[tuple[str, int]]:
         """Yield each vehicle ID, with the key that contains it."""
         return _named(self.receivers, self.links)
 
-    def whole(self) -> NetworkValues:
+    def by_scope(self) -> NetworkValues:
         """Return the conditions by scope. Raises ConditionsError if two entries concern the same link."""
         return {None: {key: getattr(self, key) for key in KEYS}, **_values_of(self.receivers, self.links)}
 
     def conditions(self, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
         """Return the conditions of this model. Raises ConditionsError if they contradict each other."""
-        return conditions_of(self.whole(), partition)
+        return conditions_of(self.by_scope(), partition)
 
 
-def _named(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> Iterator[tuple[str, int]]:
+def _named(receivers: Mapping[int, ReceiverOverrides], links: Sequence[LinkOverrides]) -> Iterator[tuple[str, int]]:
     yield from (("receivers", vehicle) for vehicle in receivers)
     for index, link in enumerate(links):
         yield from ((f"links.{index}.from", vehicle) for vehicle in link.from_)
         yield from ((f"links.{index}.to", vehicle) for vehicle in link.to)
 
 
-def _values_of(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> NetworkValues:
+def _values_of(receivers: Mapping[int, ReceiverOverrides], links: Sequence[LinkOverrides]) -> NetworkValues:
     differences: NetworkValues = {vehicle: receiver.given() for vehicle, receiver in receivers.items()}
     for index, link in enumerate(links):
         keys = link.given()
@@ -318,47 +318,47 @@ def _values_of(receivers: Mapping[int, Receiver], links: Sequence[Link]) -> Netw
     return differences
 
 
-def laid_over(network: NetworkValues, layer: NetworkValues) -> NetworkValues:
+def overlay(network: NetworkValues, layer: NetworkValues) -> NetworkValues:
     """Return the network with the values of the layer. Other values stay."""
-    return {where: network.get(where, {}) | layer.get(where, {}) for where in (*network, *layer)}
+    return {scope: network.get(scope, {}) | layer.get(scope, {}) for scope in (*network, *layer)}
 
 
-def of_whom(where: Where) -> str:
+def scope_in_words(scope: Scope) -> str:
     """Return the scope in words to put after a key, as in "loss from 1 to 2"."""
-    if where is None:
+    if scope is None:
         return ""
-    return f" from {where[0]} to {where[1]}" if isinstance(where, tuple) else f" to {where}"
+    return f" from {scope[0]} to {scope[1]}" if isinstance(scope, tuple) else f" to {scope}"
 
 
 def conditions_of(network: NetworkValues, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
     """Return the conditions of a network. Raises ConditionsError if its keys contradict each other."""
     for_all = network[None]
-    conditions: dict[Where, LinkConditions] = {}
+    conditions: dict[Scope, LinkConditions] = {}
     known: dict[tuple[Any, ...], LinkConditions] = {}  # of many links there are few kinds
-    for where, keys in network.items():
-        receiver = where[1] if isinstance(where, tuple) else where
+    for scope, keys in network.items():
+        receiver = scope[1] if isinstance(scope, tuple) else scope
         last = for_all | network.get(receiver, {}) | keys
         values = tuple(last[key] for key in KEYS)
         if values not in known:
             try:
                 known[values] = _conditions(last)
             except ConditionsError as error:
-                raise ConditionsError(f"{_key(where)}{error}") from None
-        conditions[where] = known[values]
-    receivers = {where: link for where, link in conditions.items() if isinstance(where, int)}
-    links = {where: link for where, link in conditions.items() if isinstance(where, tuple)}
+                raise ConditionsError(f"{_key(scope)}{error}") from None
+        conditions[scope] = known[values]
+    receivers = {scope: link for scope, link in conditions.items() if isinstance(scope, int)}
+    links = {scope: link for scope, link in conditions.items() if isinstance(scope, tuple)}
     return NetworkConditions(conditions[None], receivers, links, partition)
 
 
-def _key(where: Where) -> str:
-    if where is None:
+def _key(scope: Scope) -> str:
+    if scope is None:
         return ""
-    return f"links from {where[0]} to {where[1]}: " if isinstance(where, tuple) else f"receivers.{where}: "
+    return f"links from {scope[0]} to {scope[1]}: " if isinstance(scope, tuple) else f"receivers.{scope}: "
 
 
 def _conditions(keys: dict[str, Any]) -> LinkConditions:
     loss, delay = keys["loss"], keys["delay"]
     values = keys | {key: None for key in ("rate", "limit") if keys[key] == "none"}
-    values["loss"] = GilbertElliott(**loss.model_dump()) if isinstance(loss, Bursts) else loss
-    values["delay"] = Delay(**delay.model_dump()) if isinstance(delay, Jitter) else Delay(delay)
+    values["loss"] = GilbertElliott(**loss.model_dump()) if isinstance(loss, BurstLoss) else loss
+    values["delay"] = Delay(**delay.model_dump()) if isinstance(delay, RandomDelay) else Delay(delay)
     return LinkConditions(**values)

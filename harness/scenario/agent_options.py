@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
-from harness.scenario.strict_model import Data, Instant, Model, Seconds, VehicleId, VehicleKey
+from harness.scenario.strict_model import Data, MissionSecond, Model, Seconds, VehicleId, VehicleKey
 from ucp.block import MAX_AGENT_ID
 from ucp.events import MAX_MEAN_S, LoggableEvent
 from ucp.quirks import QUIRKS, Quirks, check_quirk
@@ -61,7 +61,7 @@ def _is_command(words: Any) -> bool:
 AgentCommand = Annotated[Command | dict[VehicleKey, Command] | None, BeforeValidator(_commands)]
 
 
-class OfSome(Model):
+class QuirkOfAgents(Model):
     """A quirk of some agents only."""
 
     agents: Annotated[list[VehicleId], Field(min_length=1)]
@@ -85,39 +85,39 @@ def _schema() -> dict[str, Any]:
     return {"type": "object", "properties": known, "additionalProperties": False}
 
 
-Asked = Annotated[
-    bool | float | OfSome,
-    BeforeValidator(lambda value: OfSome.model_validate(value) if isinstance(value, Mapping) else value),
+QuirkValue = Annotated[
+    bool | float | QuirkOfAgents,
+    BeforeValidator(lambda value: QuirkOfAgents.model_validate(value) if isinstance(value, Mapping) else value),
 ]
-AskedQuirks = Annotated[dict[str, Asked], WithJsonSchema(_schema())]
+QuirkValues = Annotated[dict[str, QuirkValue], WithJsonSchema(_schema())]
 """Quirk -> its value for all agents, or the agents that have it."""
 
 
-def check(asked: Mapping[Any, Any]) -> None:
+def check_quirks(asked: Mapping[Any, Any]) -> None:
     """Raise ValueError if a quirk does not exist or cannot have its value."""
-    for name, said in asked.items():
-        value = said.get("value", True) if isinstance(said, Mapping) else said
-        check_quirk(str(name), value.value if isinstance(value, OfSome) else value)
+    for name, quirk in asked.items():
+        value = quirk.get("value", True) if isinstance(quirk, Mapping) else quirk
+        check_quirk(str(name), value.value if isinstance(value, QuirkOfAgents) else value)
 
 
-def of_agent(asked: Mapping[str, bool | float | OfSome], agent_id: int) -> Quirks:
+def quirks_of_agent(asked: Mapping[str, bool | float | QuirkOfAgents], agent_id: int) -> Quirks:
     """Return the quirks in the mission file of this agent."""
     own: Quirks = {}
     for name, value in asked.items():
-        if not isinstance(value, OfSome):
+        if not isinstance(value, QuirkOfAgents):
             own[name] = value
         elif agent_id in value.agents:
             own[name] = value.value
     return own
 
 
-def in_words(asked: Mapping[str, bool | float | OfSome]) -> Iterator[str]:
+def quirks_in_words(asked: Mapping[str, bool | float | QuirkOfAgents]) -> Iterator[str]:
     """Yield each quirk in force with its agents, such as "ignore_commit 0.2 (all agents)"."""
-    for name, said in asked.items():
-        value = said.value if isinstance(said, OfSome) else said
+    for name, quirk in asked.items():
+        value = quirk.value if isinstance(quirk, QuirkOfAgents) else quirk
         if value:
             named = name if value is True else f"{name} {value:g}"
-            yield f"{named} ({_agents(sorted({*said.agents})) if isinstance(said, OfSome) else 'all agents'})"
+            yield f"{named} ({_agents(sorted({*quirk.agents})) if isinstance(quirk, QuirkOfAgents) else 'all agents'})"
 
 
 def _agents(ids: list[int]) -> str:
@@ -158,7 +158,7 @@ MAX_DATA_CHARACTERS = 1400
 class ScriptedEvent(Model):
     """One event that an agent logs: zero bytes of a given number, or the data of a recorded event."""
 
-    at_s: Instant
+    at_s: MissionSecond
     """Mission second at which the agent logs the event."""
     agent: VehicleId
     """ID of the agent."""
@@ -185,7 +185,7 @@ class ScriptedEvent(Model):
         return LoggableEvent(self.timestamp_us, self.event_id, self.event_data)
 
     @model_validator(mode="after")
-    def _sealed_is_of_a_flight(self) -> "ScriptedEvent":
+    def _sealed_data_has_a_timestamp(self) -> "ScriptedEvent":
         if self.sealed is not None and self.timestamp_us is None:
             raise ValueError("`sealed` is of an event of a flight, and that has a `timestamp_us`")
         return self

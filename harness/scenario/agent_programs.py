@@ -8,7 +8,7 @@ from typing import Any
 from harness.errors import ScenarioError
 from harness.scenario.scenario import Scenario
 
-_OF_ONE = re.compile(r"(?P<agent>[0-9]{1,5})=")
+_AGENT_PREFIX = re.compile(r"(?P<agent>[0-9]{1,5})=")
 
 Programs = Mapping[int | None, list[str]]
 """Agent ID -> command. The key None has the command of all agents without a command of their own here."""
@@ -18,11 +18,11 @@ def programs_of(options: Iterable[str]) -> Programs:
     """Return the programs that the options name. Raises ScenarioError."""
     programs: dict[int | None, list[str]] = {}
     for option in options:
-        of_one = _OF_ONE.match(option)
-        agent_id = int(of_one["agent"]) if of_one else None
+        prefix = _AGENT_PREFIX.match(option)
+        agent_id = int(prefix["agent"]) if prefix else None
         if agent_id in programs:
-            raise ScenarioError(f"--ucp-agent names two programs for {of_one['agent'] if of_one else 'all'}")
-        programs[agent_id] = _words(option[of_one.end() :] if of_one else option)
+            raise ScenarioError(f"--ucp-agent names two programs for {prefix['agent'] if prefix else 'all'}")
+        programs[agent_id] = _split_command(option[prefix.end() :] if prefix else option)
     return programs
 
 
@@ -38,7 +38,7 @@ def command_keys(scenario: Scenario, programs: Programs) -> dict[str, Any]:
     }
 
 
-def _words(command: str) -> list[str]:
+def _split_command(command: str) -> list[str]:
     try:
         words = shlex.split(command)
     except ValueError as error:

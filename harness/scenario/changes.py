@@ -11,7 +11,7 @@ from typing import Any
 
 from harness.scenario import Scenario
 from harness.scenario.faults import Fault
-from harness.scenario.faults.fault import planned
+from harness.scenario.faults.fault import planned_key
 from harness.scenario.injection import Injection, InjectionName
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 
@@ -49,13 +49,13 @@ class NetworkChange:
             "detail": self.detail,
             "fully_connected": self.conditions.fully_connected and self.channel is None,
             **({"losses": dict(self.losses)} if self.losses else {}),
-            **({} if self.what in (RANGE, FINAL_RECONCILE) else planned(self.at_s, at_s)),
+            **({} if self.what in (RANGE, FINAL_RECONCILE) else planned_key(self.at_s, at_s)),
             **_hand(self.by_hand),
         }
 
 
 @dataclass(frozen=True)
-class Injected:
+class TimedInjection:
     """An injection, which starts at mission second `at_s`. Injections are numbered from 1 in time order."""
 
     at_s: float
@@ -71,14 +71,14 @@ class Injected:
     def to_json(self, at_s: float) -> dict[str, Any]:
         """Return the record of this injection with a start at mission second `at_s`."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail}
-        return {**record, **planned(self.at_s, at_s), **_hand(self.by_hand)}
+        return {**record, **planned_key(self.at_s, at_s), **_hand(self.by_hand)}
 
 
 def _hand(by_hand: bool) -> dict[str, Any]:
     return {"by_hand": True} if by_hand else {}
 
 
-Change = NetworkChange | Fault | Injected
+Change = NetworkChange | Fault | TimedInjection
 
 
 def timeline_of(scenario: Scenario) -> list[Change]:
@@ -90,13 +90,13 @@ def timeline_of(scenario: Scenario) -> list[Change]:
     ]
 
 
-def injections_of(scenario: Scenario) -> list[Injected]:
+def injections_of(scenario: Scenario) -> list[TimedInjection]:
     """Return the injections of the scenario in time order."""
     entries = [(entry.at_s, *entry.injection) for entry in scenario.timeline_in_order() if entry.injection]
-    return [Injected(at_s, what, injection, number) for number, (at_s, what, injection) in enumerate(entries, 1)]
+    return [TimedInjection(at_s, what, injection, number) for number, (at_s, what, injection) in enumerate(entries, 1)]
 
 
-def injected_nothing(begun: Sequence[Injected], sent: Mapping[int, int]) -> list[str]:
+def silent_injections(begun: Sequence[TimedInjection], sent: Mapping[int, int]) -> list[str]:
     """Return a sentence for each injection that sent nothing. `sent` maps the number of an injection to its
     datagrams."""
     return [

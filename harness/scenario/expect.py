@@ -23,8 +23,8 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from harness.backend_names import BackendName
 from harness.scenario.strict_model import Model, VehicleId, VehicleKey
 from harness.scenario.verdict_names import (
-    BESIDE,
     CHARACTERISTICS,
+    FURTHER_CHECKS,
     CharacteristicVerdict,
     LivenessVerdict,
     RecordsVerdict,
@@ -55,7 +55,7 @@ FigureName = Literal[
 ]
 """The figures that `harness.checker._figures` computes."""
 
-NUMBERS = {number: int(number) for number in CHARACTERISTICS}
+CHARACTERISTIC_NUMBERS = {number: int(number) for number in CHARACTERISTICS}
 """Number of a characteristic as a JSON key -> as an integer."""
 
 ChainHash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -64,7 +64,7 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 def _known_number(key: Any) -> int:
-    number = NUMBERS.get(str(key))
+    number = CHARACTERISTIC_NUMBERS.get(str(key))
     if number is None or isinstance(key, float):
         raise ValueError(f"no characteristic {shown(key)}: use 1 to 6")
     return number
@@ -79,7 +79,7 @@ class Range(Model):
     """Highest allowed value."""
 
     @model_validator(mode="after")
-    def _means_something(self) -> "Range":
+    def _check_values(self) -> "Range":
         if self.min is None and self.max is None:
             raise ValueError("needs `min` or `max`")
         if self.min is not None and self.max is not None and self.min > self.max:
@@ -109,7 +109,7 @@ def _exactly(value: Any) -> Any:
 Count = Annotated[Range, BeforeValidator(_exactly)]
 
 
-class Common(Model):
+class CommonBlocks(Model):
     """The expected length of the common part of several chains, or of the chain of one agent."""
 
     agents: Annotated[list[VehicleId], Field(min_length=1)]
@@ -136,7 +136,7 @@ class Expect(Model):
     """Expected figures of the run, by name, as a number or a range."""
     chains: dict[VehicleKey, ChainHash] = {}
     """Expected top chain hash at the end, by agent ID. It identifies the whole chain."""
-    common: Annotated[list[Common], Field(max_length=1000)] = []
+    common: Annotated[list[CommonBlocks], Field(max_length=1000)] = []
     """Expected lengths of chains, and of the common parts of chains."""
     deviations: dict[VehicleKey, str] = {}
     """Agent ID -> the handler in which the agent first deviates from the algorithms. Other agents must not deviate. Any
@@ -171,7 +171,7 @@ class Expect(Model):
         return deviations
 
     @model_validator(mode="after")
-    def _who_deviates_is_found(self) -> "Expect":
+    def _deviations_are_expected(self) -> "Expect":
         if self.deviations and self.steps not in (None, "deviates"):
             raise ValueError(f"`deviations` need `steps: deviates`, not {self.steps}")
         return self
@@ -185,12 +185,12 @@ class Expect(Model):
 
     def verdict(self, key: str) -> str | None:
         """Return the expected verdict of a check. None if the scenario does not name one."""
-        if key in BESIDE:
+        if key in FURTHER_CHECKS:
             expected: str | None = getattr(self, key)
             if key == "steps" and self.deviations:
                 return "deviates"
             return expected
-        return self.characteristics.get(NUMBERS.get(key, 0))
+        return self.characteristics.get(CHARACTERISTIC_NUMBERS.get(key, 0))
 
     def as_expected(self, key: str, verdict: str) -> bool:
         expected = self.verdict(key)
@@ -204,7 +204,7 @@ class Expect(Model):
                 shown = "not known" if figure is None else f"{figure:g}"
                 yield f"{name.replace('_', ' ')} is {shown}, and should be {wanted.describe()}"
 
-    def other_chains(self, top_chain_hashes: Mapping[int, str]) -> Iterator[str]:
+    def unexpected_chains(self, top_chain_hashes: Mapping[int, str]) -> Iterator[str]:
         """Yield a sentence for each agent with an unexpected chain. `top_chain_hashes` come from the exports."""
         for agent_id, wanted in self.chains.items():
             ended = top_chain_hashes.get(agent_id)
@@ -213,14 +213,14 @@ class Expect(Model):
             elif ended != wanted:
                 yield f"agent {agent_id} ends with the chain hash {ended[:12]} on top, but must end with {wanted[:12]}"
 
-    def named(self) -> Iterator[tuple[str, int]]:
+    def named_agents(self) -> Iterator[tuple[str, int]]:
         """Yield each agent ID, with the key that contains it."""
         yield from (("chains", agent) for agent in self.chains)
         yield from (("deviations", agent) for agent in self.deviations)
         for index, common in enumerate(self.common):
             yield from ((f"common.{index}.agents", agent) for agent in common.agents)
 
-    def other_common(self, chains: Mapping[int, Sequence[str]]) -> Iterator[str]:
+    def unexpected_common_blocks(self, chains: Mapping[int, Sequence[str]]) -> Iterator[str]:
         """Yield a sentence for each chain, or common part of chains, with an unexpected length."""
         for common in self.common:
             there = all(agent in chains for agent in common.agents)
@@ -231,7 +231,7 @@ class Expect(Model):
                 common_to = f"the {'common ' if len(common.agents) > 1 else ''}chain of {whose}"
                 yield f"{common_to} {_has(shared)}, and should have {common.blocks.describe()}"
 
-    def other_deviations(self, found: Iterable[tuple[int, str | None]]) -> Iterator[str]:
+    def unexpected_deviations(self, found: Iterable[tuple[int, str | None]]) -> Iterator[str]:
         """Yield a sentence for each agent with an unexpected first deviation.
 
         `found` has an agent and a handler for each deviation, in time order.

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from harness.scenario.strict_model import Arrivals, Instant, Model, VehicleId
+from harness.scenario.strict_model import Arrivals, MissionSecond, Model, VehicleId
 
 MessageName = Literal[
     "Block Add Request",
@@ -66,16 +66,16 @@ class Fate(Model):
     """Block that the message is about: an agent and the number of its block, as in "4.11", in quotes."""
     count: Annotated[int, Field(ge=1)] | list[Annotated[int, Field(ge=1)]] | None = None
     """Position among the matching messages, from 1, or a list of positions. Default: all of them."""
-    from_s: Instant | None = None
+    from_s: MissionSecond | None = None
     """Mission second from which the message is sent."""
-    until_s: Instant | None = None
+    until_s: MissionSecond | None = None
     """Mission second before which the message is sent, after `from_s`."""
 
     drop: Literal[True] | None = None
     """The message is lost."""
     delay_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     """The message arrives after this number of mission seconds, regardless of the network conditions."""
-    hold_until_s: Instant | None = None
+    hold_until_s: MissionSecond | None = None
     """The message arrives at this mission second if it would arrive earlier."""
     after: FateName | None = None
     """The message arrives directly after the message of the fate with this `name`."""
@@ -87,7 +87,7 @@ class Fate(Model):
     """Name of the fate, for `after`. Two fates with the same name are an error."""
 
     @property
-    def as_chance_says(self) -> bool:
+    def left_to_chance(self) -> bool:
         return all(getattr(self, key) is None for key in OUTCOMES)
 
     @property

@@ -23,7 +23,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from harness.scenario.fates import MessageName
-from harness.scenario.strict_model import Data, Instant, Model, Seconds, VehicleId, VehicleKey
+from harness.scenario.strict_model import Data, MissionSecond, Model, Seconds, VehicleId, VehicleKey
 
 InjectionName = Literal["replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie"]
 INJECTIONS: tuple[InjectionName, ...] = ("replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie")
@@ -33,7 +33,7 @@ MAX_FLOOD = 100_000
 """Datagrams of one flood."""
 
 
-class _Matching(Model):
+class _MatchingMessages(Model):
     """The messages of one type and one sender, among those that the rogue node receives."""
 
     message: MessageName | None = None
@@ -54,7 +54,7 @@ class _Matching(Model):
         return f"{self.message or 'every message'}{whose}"
 
 
-class Replay(_Matching):
+class Replay(_MatchingMessages):
     """The rogue node sends the last matching messages again, byte for byte."""
 
     count: Annotated[int, Field(ge=1, le=1000)] = 1
@@ -64,7 +64,7 @@ class Replay(_Matching):
         return f"the last {self.count} of {super().in_words()}"
 
 
-class _Lasting(_Matching):
+class _LastingInjection(_MatchingMessages):
     for_s: Seconds
     """Duration in mission seconds."""
 
@@ -76,7 +76,7 @@ class _Lasting(_Matching):
         return f"{super().in_words()} for {self.for_s:g} s"
 
 
-class Duplicate(_Lasting):
+class Duplicate(_LastingInjection):
     """The rogue node repeats each matching message at once."""
 
     copies: Annotated[int, Field(ge=1, le=100)] = 1
@@ -86,7 +86,7 @@ class Duplicate(_Lasting):
         return f"{super().in_words()}, {self.copies} more of each"
 
 
-class DelayedCopy(_Lasting):
+class DelayedCopy(_LastingInjection):
     """The rogue node repeats each matching message later."""
 
     by_s: Seconds
@@ -100,7 +100,7 @@ class DelayedCopy(_Lasting):
         return f"{super().in_words()}, again {self.by_s:g} s later"
 
 
-class Corrupt(_Lasting):
+class CorruptedCopy(_LastingInjection):
     """The rogue node repeats each matching message at once, with flipped bits and a valid UDP checksum."""
 
     bits: Annotated[int, Field(ge=1, le=1000)] = 1
@@ -110,7 +110,7 @@ class Corrupt(_Lasting):
         return f"{super().in_words()}, {self.bits} bit{'s' if self.bits > 1 else ''} flipped"
 
 
-class Forge(Model):
+class Forgery(Model):
     """The rogue node sends messages in the name of an agent.
 
     A forged Commit Block is sent once. It contains a new block in the name of `sender`, on top of the last chain that
@@ -135,7 +135,7 @@ class Forge(Model):
         return self.for_s or 0.0
 
     @model_validator(mode="after")
-    def _means_something(self) -> "Forge":
+    def _check_values(self) -> "Forgery":
         if (self.for_s is None) != (self.message == "Commit Block"):
             raise ValueError(f"`for_s` is needed by forged answers ({', '.join(self.ANSWERS)}), and by nothing else")
         if self.approve is not None and self.message not in self.ANSWERS[:2]:
@@ -143,12 +143,12 @@ class Forge(Model):
         return self
 
     def in_words(self) -> str:
-        says = "" if self.message not in self.ANSWERS[:2] else f" saying {'yes' if self.approve else 'no'}"
+        vote = "" if self.message not in self.ANSWERS[:2] else f" saying {'yes' if self.approve else 'no'}"
         span = "" if self.for_s is None else f" to every question for {self.for_s:g} s"
-        return f"{self.message} from {self.sender}{says}{span}"
+        return f"{self.message} from {self.sender}{vote}{span}"
 
 
-class Flood(_Lasting):
+class Flood(_LastingInjection):
     """The rogue node sends well-formed messages with random content in the names of random agents.
 
     More than 100,000 messages are an error.
@@ -177,7 +177,7 @@ class Lie(Model):
     additional key is an error.
     """
 
-    NEEDS: ClassVar[dict[str, tuple[str, ...]]] = {
+    REQUIRED_KEYS: ClassVar[dict[str, tuple[str, ...]]] = {
         "Block Add Request": ("block", "chain"),
         "Block Add Response": ("block", "approve"),
         "Commit Block": ("block", "chain"),
@@ -188,7 +188,7 @@ class Lie(Model):
         "Request for Block": ("block",),
         "Block Response": ("block",),
     }
-    MAY_HAVE: ClassVar[dict[str, tuple[str, ...]]] = {
+    OPTIONAL_KEYS: ClassVar[dict[str, tuple[str, ...]]] = {
         "Block Add Response": ("chain",),
         "Next in Sequence Response": ("block",),
     }
@@ -208,7 +208,7 @@ class Lie(Model):
     no chain has. The block of a Commit Block goes on top of this chain."""
     approve: bool | None = None
     """True if the message approves the block, or if the chain of `sender` contains `chain`."""
-    timestamp_s: Instant | None = None
+    timestamp_s: MissionSecond | None = None
     """Timestamp in a Next in Sequence Response, in mission seconds."""
 
     @property
@@ -216,8 +216,8 @@ class Lie(Model):
         return 0.0
 
     @model_validator(mode="after")
-    def _says_all_of_it(self) -> "Lie":
-        needs, may = self.NEEDS[self.message], self.MAY_HAVE.get(self.message, ())
+    def _check_keys(self) -> "Lie":
+        needs, may = self.REQUIRED_KEYS[self.message], self.OPTIONAL_KEYS.get(self.message, ())
         given = {key for key in ("block", "chain", "approve", "timestamp_s") if getattr(self, key) is not None}
         if not {*needs} <= given <= {*needs, *may}:
             allowed = f", and may have {' and '.join(f'`{key}`' for key in may)}" if may else ""
@@ -225,21 +225,21 @@ class Lie(Model):
         return self
 
     def in_words(self) -> str:
-        whom = "" if self.receivers is None else f" to {' and '.join(map(str, self.receivers))} alone"
+        receivers = "" if self.receivers is None else f" to {' and '.join(map(str, self.receivers))} alone"
         about = "" if self.block is None else f" about block {self.block}"
         chain = self.chain if isinstance(self.chain, str) else " ".join(self.chain or ()) or "inception"
         on = "" if self.chain is None else f", chain {chain}"
-        says = "" if self.approve is None else f", saying {'yes' if self.approve else 'no'}"
-        return f"{self.message} from {self.sender}{whom}{about}{on}{says}"
+        vote = "" if self.approve is None else f", saying {'yes' if self.approve else 'no'}"
+        return f"{self.message} from {self.sender}{receivers}{about}{on}{vote}"
 
 
-Injection = Replay | Duplicate | DelayedCopy | Corrupt | Forge | Flood | Lie
+Injection = Replay | Duplicate | DelayedCopy | CorruptedCopy | Forgery | Flood | Lie
 MODELS: dict[str, type[Injection]] = {
     "replay": Replay,
     "duplicate": Duplicate,
     "delay": DelayedCopy,
-    "corrupt": Corrupt,
-    "forge": Forge,
+    "corrupt": CorruptedCopy,
+    "forge": Forgery,
     "flood": Flood,
     "lie": Lie,
 }
@@ -256,5 +256,5 @@ class ScriptedDatagram(Model):
     """Vehicle whose address is the source of the datagram."""
     datagram: Annotated[Data, Field(max_length=MAX_CHARACTERS)]
     """Content, in base64."""
-    reaches: Annotated[dict[VehicleKey, Instant], Field(min_length=1)]
+    reaches: Annotated[dict[VehicleKey, MissionSecond], Field(min_length=1)]
     """ID of each receiver -> mission second of the arrival."""

@@ -15,29 +15,29 @@ from ucp.short_value import shown, shown_key
 
 _PACKAGE = Path(__file__).parents[1]
 _INSIDE = _PACKAGE / "scenarios"
-FOLDER = _INSIDE if _INSIDE.is_dir() else _PACKAGE.parent / "scenarios"
+LIBRARY = _INSIDE if _INSIDE.is_dir() else _PACKAGE.parent / "scenarios"
 """Folder of the scenario library: inside an installed package, or next to the package in a checkout. It may be
 missing."""
 
 
-def names() -> list[str]:
+def scenario_names() -> list[str]:
     """Return the names of all scenarios of the library in alphabetical order."""
-    return sorted(path.stem for path in FOLDER.glob("*.yaml"))
+    return sorted(path.stem for path in LIBRARY.glob("*.yaml"))
 
 
-def find(path: Path) -> Path:
+def find_file(path: Path) -> Path:
     """Return the file of the library with this name. Return `path` itself if it exists, or if the library has no such
     name."""
-    named = f"{path}.yaml"
-    if len(path.parts) != 1 or not FOLDER.is_dir() or named not in (scenario.name for scenario in FOLDER.iterdir()):
+    file_name = f"{path}.yaml"
+    if len(path.parts) != 1 or not LIBRARY.is_dir() or file_name not in (file.name for file in LIBRARY.iterdir()):
         return path
-    return path if path.exists() else FOLDER / named
+    return path if path.exists() else LIBRARY / file_name
 
 
-def opening(name: str) -> str:
+def first_sentence(name: str) -> str:
     """Return the first sentence of the comment at the top of the scenario file."""
     comment = []
-    for line in (FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
+    for line in (LIBRARY / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):
             break
         comment.append(line.removeprefix("#").strip())
@@ -61,7 +61,7 @@ def load_scenario(path: Path | str) -> Scenario:
     if "scenario" in document:
         raise ScenarioError(f"{path}: this is a matrix: play it with `ucp-harness matrix {path}`")
     try:
-        return parse(document, beside=find(path).parent)
+        return parse(document, beside=find_file(path).parent)
     except ScenarioError as error:
         raise ScenarioError(f"{path}: {error}") from None
 
@@ -119,7 +119,7 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
 
     Raises ScenarioError.
     """
-    path = find(path)
+    path = find_file(path)
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
@@ -151,10 +151,10 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     problem = max(problems, key=lambda candidate: (len(candidate["loc"]), candidate["type"] == "extra_forbidden"))
     key = ".".join(shown_key(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
-        there_are = _siblings(model, problem["loc"])
-        nearest = get_close_matches(str(problem["loc"][-1]), there_are, n=1)
+        allowed = _siblings(model, problem["loc"])
+        nearest = get_close_matches(str(problem["loc"][-1]), allowed, n=1)
         meant = f"; did you mean `{nearest[0]}`?" if nearest else ""
-        return f"`{key}` is unknown: use one of {', '.join(there_are)}{meant}"
+        return f"`{key}` is unknown: use one of {', '.join(allowed)}{meant}"
     if problem["type"] == "missing":
         return f"`{key}` is missing"
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ").removeprefix("String ")

@@ -10,24 +10,24 @@ from pydantic import Field, field_validator, model_validator
 from harness.scenario._network import NetworkModel
 from harness.scenario.agent_options import (
     AgentCommand,
-    AskedQuirks,
     Docker,
     Events,
-    OfSome,
+    QuirkOfAgents,
+    QuirkValues,
     Security,
     Stagger,
-    of_agent,
+    check_quirks,
+    quirks_of_agent,
     staggered,
 )
-from harness.scenario.agent_options import check as check_quirks
 from harness.scenario.expect import Expect
 from harness.scenario.fates import Fate
 from harness.scenario.faults import Fault
 from harness.scenario.faults.fault import KILLED, RUNNING
 from harness.scenario.injection import ScriptedDatagram
-from harness.scenario.network_states import Step, refuse_ambiguity, steps
+from harness.scenario.network_states import NetworkStep, network_steps, refuse_ambiguous_overlaps
 from harness.scenario.strict_model import MAX_AGENTS, Data, Lateness, Model, Seconds, VehicleKey
-from harness.scenario.timeline import NEEDED, Schedule, TimelineEntry
+from harness.scenario.timeline import MIN_VEHICLES, Schedule, TimelineEntry
 from harness.scenario.vehicles import Flight, Vehicles
 from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError
@@ -107,7 +107,7 @@ class Scenario(Model):
     agent receives its own durations in its mission file."""
     security: Security | None = None
     """Keys of a secured mission. Without them agents accept every datagram."""
-    quirks: AskedQuirks = {}
+    quirks: QuirkValues = {}
     """Mistakes that all agents, or the listed agents, make on purpose. `ucp.quirks` declares them."""
     clocks: dict[VehicleKey, Clock] = {}
     """Clocks of agents, by agent ID. Other agents have an exact clock. In virtual time only."""
@@ -153,13 +153,13 @@ class Scenario(Model):
 
     def settings_of(self, agent_id: int) -> Settings:
         """Return the settings in the mission file of this agent."""
-        told = staggered(self.settings, self.stagger, self.roster.index(agent_id))
+        settings = staggered(self.settings, self.stagger, self.roster.index(agent_id))
         if self.security is not None and self.security.seal:
-            largest = min(told.max_block_bytes, MAX_EVENT_DATA_BYTES - SEAL_BYTES)
-            told = dataclasses.replace(
-                told, max_block_bytes=largest, max_event_bytes=min(told.max_event_bytes, largest)
+            largest = min(settings.max_block_bytes, MAX_EVENT_DATA_BYTES - SEAL_BYTES)
+            settings = dataclasses.replace(
+                settings, max_block_bytes=largest, max_event_bytes=min(settings.max_event_bytes, largest)
             )
-        return told
+        return settings
 
     @property
     def rogue(self) -> int | None:
@@ -170,7 +170,7 @@ class Scenario(Model):
         return next(vehicle for vehicle in range(MAX_AGENT_ID, 0, -1) if vehicle not in taken)
 
     @property
-    def on_the_air(self) -> tuple[int, ...]:
+    def network_nodes(self) -> tuple[int, ...]:
         """The vehicles, and the rogue node if there is one."""
         return self.roster if self.rogue is None else (*self.roster, self.rogue)
 
@@ -186,7 +186,7 @@ class Scenario(Model):
 
     def quirks_of(self, agent_id: int) -> Quirks:
         """Return the mistakes that this agent makes on purpose."""
-        return of_agent(self.quirks, agent_id)
+        return quirks_of_agent(self.quirks, agent_id)
 
     @property
     def has_wrong_agents(self) -> bool:
@@ -207,12 +207,12 @@ class Scenario(Model):
     def _faults_with_their_keys(self) -> list[tuple[str, Fault]]:
         begun = [(f"timeline.{index}", entry.fault) for index, entry in enumerate(self.timeline) if entry.fault]
         begun.sort(key=lambda keyed: keyed[1].at_s)
-        course = [(f"{where}.{fault.what}", stage) for where, fault in begun for stage in fault.course()]
+        course = [(f"{where}.{fault.what}", stage) for where, fault in begun for stage in fault.stages()]
         return sorted(course, key=lambda keyed: keyed[1].at_s)
 
-    def network_steps(self) -> Iterator[Step]:
+    def network_steps(self) -> Iterator[NetworkStep]:
         """Yield every change of the network by the timeline and the schedules, in time order."""
-        return steps(self.network, self.roster, self.timeline, self.schedule, self.duration_s)
+        return network_steps(self.network, self.roster, self.timeline, self.schedule, self.duration_s)
 
     @field_validator("agents", mode="before")
     @classmethod
@@ -244,9 +244,9 @@ class Scenario(Model):
         return quirks
 
     @model_validator(mode="after")
-    def _names_what_there_is(self) -> "Scenario":
+    def _named_vehicles_exist(self) -> "Scenario":
         roster = set(self.roster)
-        for key, vehicle in self._named():
+        for key, vehicle in self._named_vehicles():
             if vehicle not in roster:
                 raise ValueError(f"{key} names vehicle {vehicle}, which is not on the roster: {_names(roster)}")
         names = Counter(fate.name for fate in self.fates if fate.name is not None)
@@ -257,9 +257,9 @@ class Scenario(Model):
                 raise ValueError(f"fates.{index}.after {fate.after!r} is not the name of a fate")
         return self
 
-    def _named(self) -> Iterator[tuple[str, int]]:
+    def _named_vehicles(self) -> Iterator[tuple[str, int]]:
         """Yield each vehicle ID outside of partitions, with the key that contains it."""
-        yield from ((f"network.{key}", vehicle) for key, vehicle in self.network.named())
+        yield from ((f"network.{key}", vehicle) for key, vehicle in self.network.named_vehicles())
         yield from ((f"events.script.{index}.agent", event.agent) for index, event in enumerate(self.events.script))
         yield from (("clocks", vehicle) for vehicle in self.clocks)
         yield from (("lateness", vehicle) for vehicle in self.lateness)
@@ -269,11 +269,11 @@ class Scenario(Model):
             yield from ((f"datagrams.{index}.reaches", vehicle) for vehicle in datagram.reaches)
         for name, asked in self.quirks.items():
             yield from (
-                (f"quirks.{name}.agents", agent) for agent in (asked.agents if isinstance(asked, OfSome) else ())
+                (f"quirks.{name}.agents", agent) for agent in (asked.agents if isinstance(asked, QuirkOfAgents) else ())
             )
         yield from (("vehicles.types", vehicle) for vehicle in self.vehicles.types)
         yield from (("vehicles.each", vehicle) for vehicle in self.vehicles.each)
-        yield from ((f"expect.{key}", agent) for key, agent in (self.expect.named() if self.expect else ()))
+        yield from ((f"expect.{key}", agent) for key, agent in (self.expect.named_agents() if self.expect else ()))
         for index, flight in enumerate(self.flight):
             yield from ((f"flight.{index}.vehicles", vehicle) for vehicle in flight.vehicles)
         for index, fate in enumerate(self.fates):
@@ -281,13 +281,15 @@ class Scenario(Model):
             yield from ((f"fates.{index}.receiver", vehicle) for vehicle in (fate.receiver,) if vehicle)
             yield from ((f"fates.{index}.block", int(name.split(".")[0])) for name in (fate.block,) if name)
         for index, schedule in enumerate(self.schedule):
-            yield from ((f"schedule.{index}.{key}", vehicle) for key, vehicle in schedule.named())
+            yield from ((f"schedule.{index}.{key}", vehicle) for key, vehicle in schedule.named_vehicles())
         for index, entry in enumerate(self.timeline):
             if entry.fault is not None:
-                named = (*entry.fault.agents, *entry.fault.also_named)
+                named = (*entry.fault.agents, *entry.fault.further_vehicles)
                 yield from ((f"timeline.{index}.{entry.fault.what}", agent) for agent in named)
             if entry.network is not None:
-                yield from ((f"timeline.{index}.network.{key}", vehicle) for key, vehicle in entry.network.named())
+                yield from (
+                    (f"timeline.{index}.network.{key}", vehicle) for key, vehicle in entry.network.named_vehicles()
+                )
             if entry.injection is not None:
                 name, injection = entry.injection
                 yield from ((f"timeline.{index}.{name}.sender", agent) for agent in (injection.sender,) if agent)
@@ -319,7 +321,7 @@ class Scenario(Model):
         for index, flight in enumerate(self.flight):
             for vehicle in flight.vehicles:
                 try:
-                    flight.planned().check(self.vehicles.type_of(vehicle))
+                    flight.to_plan().check(self.vehicles.type_of(vehicle))
                 except PlanError as error:
                     raise ValueError(f"flight.{index}.plan, for vehicle {vehicle}: {error}") from None
         return self
@@ -352,8 +354,10 @@ class Scenario(Model):
                 at_s = getattr(schedule, key)
                 if at_s is not None and at_s > self.duration_s:
                     raise ValueError(f"{where}.{key} {at_s:g} is after the mission's end at {self.duration_s:g} s")
-            if schedule.nemesis is not None and len(self.roster) < NEEDED[schedule.nemesis]:
-                raise ValueError(f"{where}.nemesis {schedule.nemesis!r} needs {NEEDED[schedule.nemesis]} vehicles")
+            if schedule.nemesis is not None and len(self.roster) < MIN_VEHICLES[schedule.nemesis]:
+                raise ValueError(
+                    f"{where}.nemesis {schedule.nemesis!r} needs {MIN_VEHICLES[schedule.nemesis]} vehicles"
+                )
             try:
                 if schedule.repeat is not None:
                     NetworkConditions(partition=schedule.repeat.groups).validate(self.roster)
@@ -363,7 +367,7 @@ class Scenario(Model):
         return self
 
     @model_validator(mode="after")
-    def _somebody_is_captured(self) -> "Scenario":
+    def _captured_agent_exists(self) -> "Scenario":
         captured = self.security.captured if self.security else None
         if captured is not None and captured not in self.roster:
             raise ValueError(f"security.captured {captured} is not one of the agents {sorted(self.roster)}")
@@ -377,7 +381,7 @@ class Scenario(Model):
             if entry.at_s > self.duration_s:
                 raise ValueError(f"{where}.at_s {entry.at_s:g} is after the mission's end at {self.duration_s:g} s")
             if entry.fault is None and entry.ends_at_s > self.duration_s:
-                key = entry.injection[0] if entry.injection else entry.disturbs
+                key = entry.injection[0] if entry.injection else entry.network_key
                 end = f"the mission's end at {self.duration_s:g} s"
                 raise ValueError(f"{where}.{key} would last until {entry.ends_at_s:g} s, after {end}")
             if instants[entry.at_s] > 1:
@@ -386,15 +390,15 @@ class Scenario(Model):
                 NetworkConditions(partition=entry.groups).validate(self.roster)
             except ConditionsError as error:
                 raise ValueError(f"{where}: {error}") from None
-        refuse_ambiguity(self.timeline)
+        refuse_ambiguous_overlaps(self.timeline)
         return self
 
     @model_validator(mode="after")
-    def _network_means_something_all_along(self) -> "Scenario":
+    def _network_is_valid_throughout(self) -> "Scenario":
         for step in self.network_steps():
             where = f"{', '.join(step.keys) or 'network'}, at {step.at_s:g} s"
             try:
-                conditions = step.network.uncut()
+                conditions = step.network.without_partition()
             except ConditionsError as error:
                 raise ValueError(f"{where}: {error}") from None
             for need in conditions.needs() if self.network.channel else ():
@@ -416,11 +420,11 @@ class Scenario(Model):
             if fault.needs_keys and self.security is None:
                 raise ValueError(f"{where} needs a mission with keys: add `security: {{keys: fresh}}`")
             for agent in fault.agents:
-                if state[agent] not in fault.needs:
+                if state[agent] not in fault.states_before:
                     raise ValueError(
-                        f"{where}: agent {agent} is {state[agent]} at that time, not {' or '.join(fault.needs)}"
+                        f"{where}: agent {agent} is {state[agent]} at that time, not {' or '.join(fault.states_before)}"
                     )
-                state[agent] = fault.leads_to or state[agent]
+                state[agent] = fault.state_after or state[agent]
         if set(state.values()) == {KILLED}:
             raise ValueError("the timeline kills all agents: keep or restart at least one")
         return self

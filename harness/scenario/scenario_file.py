@@ -49,24 +49,24 @@ def _lines(key: str, value: Any, remark: Callable[[Document], str | None]) -> It
         yield "events:"
         yield f"  source: {value['source']}"
         yield "  script:"
-        yield from (f"    - {in_a_line(event)}" for event in value["script"])
+        yield from (f"    - {in_one_line(event)}" for event in value["script"])
     elif isinstance(value, list) and value and isinstance(value[0], dict):
         yield f"{key}:"
         for entry in value:
-            beside = remark(entry)
-            yield from _entry(entry, f"  # {beside}" if beside else "")
+            comment = remark(entry)
+            yield from _entry(entry, f"  # {comment}" if comment else "")
     elif isinstance(value, dict) and any(map(_is_long, value.values())):
         yield f"{key}:"
         for name, item in value.items():
-            yield from _item(f"  {in_a_line(name)}", item)
+            yield from _item(f"  {in_one_line(name)}", item)
     else:
-        yield f"{key}: {in_a_line(value)}"
+        yield f"{key}: {in_one_line(value)}"
 
 
-def _entry(entry: Document, beside: str) -> Iterator[str]:
+def _entry(entry: Document, comment: str) -> Iterator[str]:
     """Yield an entry of a list as one line, or as several lines if it contains a long text."""
     if not any(map(_is_long, entry.values())):
-        yield f"  - {in_a_line(entry)}{beside}"
+        yield f"  - {in_one_line(entry)}{comment}"
         return
     begin = "  - "
     for name, item in entry.items():
@@ -77,7 +77,7 @@ def _entry(entry: Document, beside: str) -> Iterator[str]:
 def _item(key: str, value: Any) -> Iterator[str]:
     """Yield a key with its value. A long text takes several lines, in YAML's folded style."""
     if not _is_long(value) or " " not in value:
-        yield f"{key}: {in_a_line(value)}"
+        yield f"{key}: {in_one_line(value)}"
         return
     yield f"{key}: >-"
     indent = " " * (len(key) - len(key.lstrip(" -")) + 2)
@@ -88,7 +88,7 @@ def _is_long(value: Any) -> bool:
     return isinstance(value, str) and len(value) > WIDTH // 2
 
 
-def in_a_line(value: Any) -> str:
+def in_one_line(value: Any) -> str:
     """Return the value as YAML in one line."""
     written: str = yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=1e9, allow_unicode=True)
     return written.strip()[1:-1]

@@ -14,7 +14,7 @@ MAX_AGENTS = 1000
 
 Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Instant = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+MissionSecond = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 """Mission seconds since the start."""
 VehicleId = Annotated[int, Field(ge=1, le=MAX_AGENT_ID, strict=True)]
 
@@ -24,7 +24,7 @@ VehicleKey = Annotated[
 """A vehicle ID as the key of a mapping. In JSON the key is a string."""
 
 
-def _decodable(text: str) -> str:
+def _check_base64(text: str) -> str:
     try:
         base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError):
@@ -32,7 +32,7 @@ def _decodable(text: str) -> str:
     return text
 
 
-Data = Annotated[str, AfterValidator(_decodable)]
+Data = Annotated[str, AfterValidator(_check_base64)]
 """Bytes, in base64."""
 
 
@@ -44,34 +44,38 @@ MAX_CHARACTERS = 1024 * 1024
 _SECONDS = r"\d{1,9}(?:\.\d{1,12})?"
 
 
-def _listed(sign: str) -> str:
+def _pairs_pattern(sign: str) -> str:
     entry = rf"\d{{1,10}}{re.escape(sign)}{_SECONDS}"
     return rf"^{entry}(?: {entry})*$"
 
 
-def numbered(text: str) -> list[tuple[int, float]]:
+def parse_pairs(text: str) -> list[tuple[int, float]]:
     """Return (number, seconds) for each entry, in the order of the text."""
     pairs = (re.split(r"[@+]", entry) for entry in text.split())
     return [(int(number), float(seconds)) for number, seconds in pairs]
 
 
-def in_text(pairs: Iterable[tuple[int, float]], sign: str) -> str:
+def format_pairs(pairs: Iterable[tuple[int, float]], sign: str) -> str:
     """Return the pairs in the notation of a scenario, rounded to microseconds."""
     return " ".join(f"{number}{sign}{seconds:.6f}".rstrip("0").rstrip(".") for number, seconds in pairs)
 
 
-def _listing(sign: str, example: str) -> BeforeValidator:
+def _check_pairs(sign: str, example: str) -> BeforeValidator:
     """Raise an error that shows an example, instead of the regular expression."""
 
     def check(text: Any) -> Any:
-        if isinstance(text, str) and len(text) <= MAX_CHARACTERS and not re.match(_listed(sign), text):
+        if isinstance(text, str) and len(text) <= MAX_CHARACTERS and not re.match(_pairs_pattern(sign), text):
             raise ValueError(f'should be numbers and seconds, as in "{example}"')
         return text
 
     return BeforeValidator(check)
 
 
-Arrivals = Annotated[str, Field(pattern=_listed("@"), max_length=MAX_CHARACTERS), _listing("@", "17@12.345 18@12.5")]
+Arrivals = Annotated[
+    str, Field(pattern=_pairs_pattern("@"), max_length=MAX_CHARACTERS), _check_pairs("@", "17@12.345 18@12.5")
+]
 """Numbers of datagrams, each with the mission second of its arrival."""
-Lateness = Annotated[str, Field(pattern=_listed("+"), max_length=MAX_CHARACTERS), _listing("+", "3+0.25 8+1")]
+Lateness = Annotated[
+    str, Field(pattern=_pairs_pattern("+"), max_length=MAX_CHARACTERS), _check_pairs("+", "3+0.25 8+1")
+]
 """Numbers of timers, each with the number of seconds by which it expires late."""

@@ -19,34 +19,42 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
 
-from harness.scenario._network import DelaySeconds, Disturbance, NetworkLayer, NetworkValues, Where, laid_over, of_whom
-from harness.scenario.faults import ASKED_FOR, Agents, Fault
+from harness.scenario._network import (
+    DelaySeconds,
+    NetworkDisturbance,
+    NetworkLayer,
+    NetworkValues,
+    Scope,
+    overlay,
+    scope_in_words,
+)
+from harness.scenario.faults import TIMELINE_FAULTS, AgentIds, Fault
 from harness.scenario.injection import (
     INJECTIONS,
-    Corrupt,
+    CorruptedCopy,
     DelayedCopy,
     Duplicate,
     Flood,
-    Forge,
+    Forgery,
     Injection,
     InjectionName,
     Lie,
     Replay,
 )
-from harness.scenario.strict_model import Instant, Model, Probability, Seconds, VehicleId
+from harness.scenario.strict_model import MissionSecond, Model, Probability, Seconds, VehicleId
 
 NETWORK_KEYS = ("loss", "partition", "heal", "network")
 """Keys of an entry that change the network."""
 
 
-class _Entry(Disturbance):
+class _Entry(NetworkDisturbance):
     """One change at one instant. An entry needs `at_s` and exactly one kind of change.
 
     A change of the network is `loss`, `partition`, `heal` or `network`. A fault, such as `kill`, has a list of agents.
     An injection, such as `replay`, makes a rogue node send messages. Two entries at the same instant are an error.
     """
 
-    at_s: Instant
+    at_s: MissionSecond
     """Mission second of the change, at most `duration_s`."""
     for_s: Seconds | None = None
     """Mission seconds until the end of a change by `loss`, `partition` or `network`. Default: it lasts until a later
@@ -59,9 +67,9 @@ class _Entry(Disturbance):
     """The rogue node repeats each message at once."""
     delay: DelayedCopy | None = None
     """The rogue node repeats each message later."""
-    corrupt: Corrupt | None = None
+    corrupt: CorruptedCopy | None = None
     """The rogue node repeats each message with flipped bits."""
-    forge: Forge | None = None
+    forge: Forgery | None = None
     """The rogue node sends forged messages in the name of an agent."""
     flood: Flood | None = None
     """The rogue node sends random messages at a high rate."""
@@ -84,13 +92,13 @@ class _Entry(Disturbance):
     @property
     def fault(self) -> Fault | None:
         """The fault of this entry. None if the entry has none."""
-        for kind in ASKED_FOR:
+        for kind in TIMELINE_FAULTS:
             if (agents := getattr(self, kind.what)) is not None:
                 return kind(self.at_s, tuple(agents), **{key: getattr(self, key) for key in kind.further_keys()})
         return None
 
     @property
-    def disturbs(self) -> str | None:
+    def network_key(self) -> str | None:
         """The key that changes the network. None if the entry has none."""
         return next((key for key in NETWORK_KEYS if getattr(self, key) is not None), None)
 
@@ -98,19 +106,19 @@ class _Entry(Disturbance):
     def ends_at_s(self) -> float:
         """Mission second at which the effect of the entry ends."""
         if (fault := self.fault) is not None:
-            return fault.course()[-1].at_s
+            return fault.stages()[-1].at_s
         lasts_s = self.injection[1].lasts_s if self.injection else self.for_s or 0.0
         return round(self.at_s + lasts_s, 6)
 
     @model_validator(mode="after")
     def _one_change(self) -> "TimelineEntry":
-        changes = (*NETWORK_KEYS, *(kind.what for kind in ASKED_FOR), *INJECTIONS)
+        changes = (*NETWORK_KEYS, *(kind.what for kind in TIMELINE_FAULTS), *INJECTIONS)
         if sum(getattr(self, change) is not None for change in changes) != 1:
             named = (f"`{change}{': true' if change == 'heal' else ''}`" for change in changes)
             raise ValueError(f"needs exactly one of {', '.join(named)}")
-        if self.for_s is not None and (self.heal or not self.disturbs):
+        if self.for_s is not None and (self.heal or not self.network_key):
             raise ValueError("`for_s` belongs to `loss`, `partition` and `network`")
-        for kind in ASKED_FOR:
+        for kind in TIMELINE_FAULTS:
             keys, is_meant = kind.further_keys(), getattr(self, kind.what) is not None
             given = [key for key in keys if getattr(self, key) is not None]
             if given and not is_meant:
@@ -125,10 +133,10 @@ def _keys_of_faults() -> dict[str, Any]:
     """Return the fields of an entry for faults: the name of each fault, with a list of agents, and its further keys."""
     annotations: dict[str, Any] = {}
     descriptions: dict[str, str] = {}
-    for kind in ASKED_FOR:
+    for kind in TIMELINE_FAULTS:
         descriptions |= {kind.what: " ".join((kind.__doc__ or "").split()), **kind.key_descriptions}
         hints = get_type_hints(kind, include_extras=True)
-        annotations |= {kind.what: Agents, **{key: hints[key] for key in kind.further_keys()}}
+        annotations |= {kind.what: AgentIds, **{key: hints[key] for key in kind.further_keys()}}
     return {
         key: (annotation | None, Field(None, description=descriptions.get(key)))
         for key, annotation in annotations.items()
@@ -158,9 +166,9 @@ class Layer:
     """Pairs of a sender and a receiver. All messages from this sender to this receiver are lost."""
 
 
-UNTOUCHED = Layer()
+EMPTY_LAYER = Layer()
 
-Step = tuple[float, str, Layer]
+LayerStep = tuple[float, str, Layer]
 """Mission second, name of the change, and the layer from this second on."""
 
 
@@ -175,42 +183,42 @@ class Ramp(Model):
     """First and last network conditions. Both need the same keys, and each value must be a number."""
 
     @model_validator(mode="after")
-    def _of_something(self) -> "Ramp":
+    def _check_values(self) -> "Ramp":
         if self.loss is None and self.delay is None and self.network is None:
             raise ValueError("needs `loss`, `delay` or `network`: [from, to]")
         if self.network is not None:
-            first, last = ({(where, key): value for where, key, value in _values(end)} for end in self._ends())
-            for where, key in first.keys() ^ last.keys():
-                raise ValueError(f"{key}{of_whom(where)} is in one `network` of the ramp only: give it in both")
-            for (where, key), value in [*first.items(), *last.items()]:
-                if where is None and getattr(self, key, None) is not None:
+            first, last = ({(scope, key): value for scope, key, value in _values(end)} for end in self._ends())
+            for scope, key in first.keys() ^ last.keys():
+                raise ValueError(f"{key}{scope_in_words(scope)} is in one `network` of the ramp only: give it in both")
+            for (scope, key), value in [*first.items(), *last.items()]:
+                if scope is None and getattr(self, key, None) is not None:
                     raise ValueError(f"`{key}` and `network.{key}` are the same setting: leave out one of them")
                 if not isinstance(value, float):
-                    raise ValueError(f"{key}{of_whom(where)} is {value!r}: a ramp needs two numbers")
+                    raise ValueError(f"{key}{scope_in_words(scope)} is {value!r}: a ramp needs two numbers")
         return self
 
     def _ends(self) -> tuple[NetworkValues, NetworkValues]:
         """Return the first and the last network."""
-        return (self.network[0].whole(), self.network[1].whole()) if self.network else ({}, {})
+        return (self.network[0].by_scope(), self.network[1].by_scope()) if self.network else ({}, {})
 
     def at(self, share: float) -> NetworkValues:
         """Return the conditions after this share, 0 to 1, of the ramp."""
         short = {key: ends for key in ("loss", "delay") if (ends := getattr(self, key)) is not None}
         first, last = (
-            laid_over({None: {key: ends[number] for key, ends in short.items()}}, end)
+            overlay({None: {key: ends[number] for key, ends in short.items()}}, end)
             for number, end in enumerate(self._ends())
         )
         return {
-            where: {key: value + (last[where][key] - value) * share for key, value in keys.items()}
-            for where, keys in first.items()
+            scope: {key: value + (last[scope][key] - value) * share for key, value in keys.items()}
+            for scope, keys in first.items()
         }
 
 
-def _values(end: NetworkValues) -> Iterator[tuple[Where, str, Any]]:
-    return ((where, key, value) for where, keys in end.items() for key, value in keys.items())
+def _values(end: NetworkValues) -> Iterator[tuple[Scope, str, Any]]:
+    return ((scope, key, value) for scope, keys in end.items() for key, value in keys.items())
 
 
-class Repeated(Disturbance):
+class Repeated(NetworkDisturbance):
     """A temporary change of the network. Needs at least one key."""
 
     partition: Groups | None = None
@@ -219,7 +227,7 @@ class Repeated(Disturbance):
     """Delay in mission seconds, 0 to 60."""
 
     @model_validator(mode="after")
-    def _of_something(self) -> "Repeated":
+    def _check_values(self) -> "Repeated":
         if all(value is None for value in (self.loss, self.delay, self.partition, self.network)):
             raise ValueError("needs at least one of `loss`, `delay`, `partition` or `network`")
         if self.delay is not None and self.network is not None and self.network.delay is not None:
@@ -228,7 +236,7 @@ class Repeated(Disturbance):
 
     def changes(self) -> NetworkValues:
         values = super().changes()
-        return values if self.delay is None else laid_over(values, {None: {"delay": self.delay}})
+        return values if self.delay is None else overlay(values, {None: {"delay": self.delay}})
 
 
 Nemesis = Literal["halves", "isolate", "majorities ring", "bridge", "flapping"]
@@ -246,9 +254,9 @@ class Schedule(Model):
     halves. `isolate` cuts off one vehicle. `majorities ring` lets each vehicle hear a different majority, as the
     nemesis of Jepsen does. `bridge` splits the swarm into two halves, and one vehicle hears both. `flapping` cuts one
     pair of vehicles."""
-    from_s: Instant = 0.0
+    from_s: MissionSecond = 0.0
     """Mission second of the start."""
-    until_s: Instant | None = None
+    until_s: MissionSecond | None = None
     """Mission second of the end, after `from_s`. Default: the end of the mission."""
     every_s: Seconds | None = None
     """Mission seconds between two changes. Needed for `repeat` and `nemesis`. Default of a ramp: 10 s."""
@@ -275,14 +283,14 @@ class Schedule(Model):
             )
         return self
 
-    def named(self) -> Iterator[tuple[str, int]]:
+    def named_vehicles(self) -> Iterator[tuple[str, int]]:
         """Yield each vehicle ID outside of partitions, with the key that contains it."""
         if self.repeat is not None and self.repeat.network is not None:
-            yield from ((f"repeat.network.{key}", vehicle) for key, vehicle in self.repeat.network.named())
+            yield from ((f"repeat.network.{key}", vehicle) for key, vehicle in self.repeat.network.named_vehicles())
         for number, end in enumerate((self.ramp.network if self.ramp else None) or ()):
-            yield from ((f"ramp.network.{number}.{key}", vehicle) for key, vehicle in end.named())
+            yield from ((f"ramp.network.{number}.{key}", vehicle) for key, vehicle in end.named_vehicles())
 
-    def steps(self, roster: Sequence[int], end_s: float) -> list[Step]:
+    def steps(self, roster: Sequence[int], end_s: float) -> list[LayerStep]:
         """Return the steps of the schedule in time order. Raises ValueError above MAX_STEPS."""
         until = end_s if self.until_s is None else self.until_s
         every = self.every_s or 10.0
@@ -291,11 +299,11 @@ class Schedule(Model):
         if self.ramp is not None:
             return _ramp(self.ramp, self.from_s, until, every)
         rng = Random(f"{self.seed}/{self.nemesis}")
-        steps: list[Step] = []
+        steps: list[LayerStep] = []
         count = 0
         while (at_s := self.from_s + count * every) < until:
             steps.append((at_s, self.nemesis or "repeat", self._layer(roster, rng)))
-            steps.append((min(at_s + (self.for_s or 0.0), until), "undone", UNTOUCHED))
+            steps.append((min(at_s + (self.for_s or 0.0), until), "undone", EMPTY_LAYER))
             count += 1
         return steps
 
@@ -306,9 +314,9 @@ class Schedule(Model):
         return NEMESES[self.nemesis](rng.sample(list(roster), len(roster)))
 
 
-def _ramp(ramp: Ramp, from_s: float, until: float, every: float) -> list[Step]:
+def _ramp(ramp: Ramp, from_s: float, until: float, every: float) -> list[LayerStep]:
     count = max(1, round((until - from_s) / every))
-    steps: list[Step] = []
+    steps: list[LayerStep] = []
     for number in range(count + 1):
         share = number / count
         steps.append((from_s + (until - from_s) * share, "ramp", Layer(ramp.at(share))))
@@ -353,5 +361,5 @@ NEMESES: dict[Nemesis, Callable[[list[int]], Layer]] = {
 }
 """Nemesis -> function that turns the vehicles in random order into a layer."""
 
-NEEDED: dict[Nemesis, int] = {"halves": 2, "isolate": 2, "majorities ring": 4, "bridge": 3, "flapping": 2}
+MIN_VEHICLES: dict[Nemesis, int] = {"halves": 2, "isolate": 2, "majorities ring": 4, "bridge": 3, "flapping": 2}
 """Nemesis -> minimum number of vehicles."""

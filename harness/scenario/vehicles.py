@@ -21,12 +21,12 @@ VehicleKind = Literal["ardupilot", "embedded", "none"]
 
 MAX_ARGUMENTS = 100
 LONG_OPTIONS = ("instance", "home", "model", "speedup", "console", "defaults", "sysid", "base-port", "uartA", "uartB")
-SET_BY_US = frozenset({*(f"--{name}" for name in LONG_OPTIONS), *(f"--serial{port}" for port in range(3))})
-SHORT_AND_SET_BY_US = frozenset({"-I", "-O", "-M", "-s", "-C"})
+RESERVED_LONG_OPTIONS = frozenset({*(f"--{name}" for name in LONG_OPTIONS), *(f"--serial{port}" for port in range(3))})
+RESERVED_SHORT_OPTIONS = frozenset({"-I", "-O", "-M", "-s", "-C"})
 """Options that the harness sets on the command line of ArduPilot."""
 
 
-def _read(read: Callable[[str, Path], Any], written_out: Any) -> BeforeValidator:
+def _from_file(read: Callable[[str, Path], Any], written_out: Any) -> BeforeValidator:
     """Replace a text by the content of the file with this name, in the directory of the scenario file.
 
     `read` reads the file. `written_out` is the type of a value that is no text.
@@ -46,12 +46,12 @@ def _read(read: Callable[[str, Path], Any], written_out: Any) -> BeforeValidator
     return BeforeValidator(value, json_schema_input_type=str | written_out)
 
 
-def _named(name: str, beside: Path) -> list[float]:
+def _named_place(name: str, beside: Path) -> list[float]:
     home = start_places.named(name, beside, os.environ)
     return [home.lat_deg, home.lon_deg, home.alt_m, home.heading_deg]
 
 
-def _sound(values: dict[str, float]) -> dict[str, float]:
+def _checked(values: dict[str, float]) -> dict[str, float]:
     try:
         parameters.check(values)
     except VehicleError as error:
@@ -59,21 +59,21 @@ def _sound(values: dict[str, float]) -> dict[str, float]:
     return values
 
 
-def _flown_here(frame: str) -> str:
+def _check_frame(frame: str) -> str:
     if program := NOT_FLOWN.get(frame):
         raise ValueError(f"has the type {program}, which is unknown: use copter, plane or rover")
     return frame
 
 
-def _no_options_of_ours(arguments: list[str]) -> list[str]:
+def _check_arguments(arguments: list[str]) -> list[str]:
     for argument in arguments:
-        is_ours = argument.partition("=")[0] in SET_BY_US or argument[:2] in SHORT_AND_SET_BY_US
+        is_ours = argument.partition("=")[0] in RESERVED_LONG_OPTIONS or argument[:2] in RESERVED_SHORT_OPTIONS
         if is_ours or "\0" in argument:
             raise ValueError(f"has {argument!r}, which the harness sets: leave it out")
     return arguments
 
 
-def _on_earth(home: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+def _check_place(home: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
     latitude, longitude, _, _ = home
     if not all(math.isfinite(value) for value in home) or abs(latitude) > 90 or abs(longitude) > 180:
         raise ValueError("needs latitude -90..90, longitude -180..180, altitude (m) and heading (degrees)")
@@ -83,20 +83,22 @@ def _on_earth(home: tuple[float, float, float, float]) -> tuple[float, float, fl
 
 
 Coordinates = tuple[float, float, float, float]
-Place = Annotated[Coordinates, AfterValidator(_on_earth), _read(_named, Coordinates)]
+Place = Annotated[Coordinates, AfterValidator(_check_place), _from_file(_named_place, Coordinates)]
 """Latitude and longitude in degrees, altitude in metres, heading in degrees. Or a name in a `locations.txt`."""
 
 Pairs = dict[str, float]
-Parameters = Annotated[Pairs, AfterValidator(_sound), _read(lambda name, beside: parameters.read(beside / name), Pairs)]
+Parameters = Annotated[
+    Pairs, AfterValidator(_checked), _from_file(lambda name, beside: parameters.read(beside / name), Pairs)
+]
 """Parameter -> value, or the name of a parameter file."""
 
 Offsets = dict[Annotated[int, Field(ge=0, le=start_places.MAX_INSTANCE)], Offset]
-Swarm = Annotated[Offsets, _read(lambda name, beside: start_places.swarm(beside / name), Offsets)]
+SwarmOffsets = Annotated[Offsets, _from_file(lambda name, beside: start_places.swarm(beside / name), Offsets)]
 """Instance, from 0 -> offset, or the name of a file of offsets."""
 
-Frame = Annotated[str, Field(pattern=r"^[A-Za-z0-9+][A-Za-z0-9_.+-]{0,63}$"), AfterValidator(_flown_here)]
+Frame = Annotated[str, Field(pattern=r"^[A-Za-z0-9+][A-Za-z0-9_.+-]{0,63}$"), AfterValidator(_check_frame)]
 Arguments = Annotated[
-    list[Annotated[str, Field(max_length=1000)]], Field(max_length=MAX_ARGUMENTS), AfterValidator(_no_options_of_ours)
+    list[Annotated[str, Field(max_length=1000)]], Field(max_length=MAX_ARGUMENTS), AfterValidator(_check_arguments)
 ]
 
 
@@ -166,7 +168,7 @@ class Vehicles(Model):
     binary."""
     spacing_m: Annotated[float, Field(gt=0, le=10_000)] = SPACING_M
     """Approximate distance in metres between homes. The homes form a field around the home of the first vehicle."""
-    swarm: Swarm = {}
+    swarm: SwarmOffsets = {}
     """Homes of single vehicles, relative to `home`: [east, north, up in metres, heading in degrees]. Or the name of a
     file like ArduPilot's swarminit.txt. Keys are ArduPilot's instance numbers: 0 is the vehicle with the lowest ID.
     Other vehicles start in the field."""
@@ -243,7 +245,7 @@ class Leg(Model):
             raise ValueError("`altitude_m` and `speed_ms` belong to a `go_to`")
         return self
 
-    def planned(self) -> PlannedLeg:
+    def to_planned_leg(self) -> PlannedLeg:
         if self.take_off is not None:
             return TakeOff(self.take_off)
         if self.go_to is not None:
@@ -262,5 +264,5 @@ class Flight(Model):
     plan: Annotated[list[Leg], Field(min_length=1, max_length=MAX_LEGS)]
     """Legs in order. A leg that the type of vehicle cannot fly is an error."""
 
-    def planned(self) -> Plan:
-        return Plan(tuple(leg.planned() for leg in self.plan))
+    def to_plan(self) -> Plan:
+        return Plan(tuple(leg.to_planned_leg() for leg in self.plan))

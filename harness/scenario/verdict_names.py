@@ -23,10 +23,10 @@ LivenessVerdict = Literal["finished", "not finished", "never finishes", "not app
 
 Verdict = CharacteristicVerdict | StepsVerdict | RecordsVerdict | LivenessVerdict
 
-BESIDE = {"steps": "every step", "records": "every record", "liveness": "liveness"}
+FURTHER_CHECKS = {"steps": "every step", "records": "every record", "liveness": "liveness"}
 """Key of a further check -> short name."""
 
-JUDGED = {**CHARACTERISTICS, **BESIDE}
+ALL_CHECKS = {**CHARACTERISTICS, **FURTHER_CHECKS}
 """All checks in the order of the report: number or key -> short name."""
 
 BAD_IN_WORDS = {

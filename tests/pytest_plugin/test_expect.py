@@ -6,7 +6,7 @@ import pytest
 
 from harness.checker._verdict import CHECKS
 from harness.run.simulate import simulate
-from harness.scenario.expect import NUMBERS, Expect, FigureName
+from harness.scenario.expect import CHARACTERISTIC_NUMBERS, Expect, FigureName
 from tests.harness.virtual import scenario
 
 
@@ -14,7 +14,7 @@ def test_expect_accepts_all_figures_and_characteristics() -> None:
     asked = scenario(agents=2, duration_s=60, network={"channel": {"preset": "wifi_1"}}, final_reconcile=True)
     simulated = simulate(asked, 1)
     assert list(get_args(FigureName)) == list(simulated.result.figures)
-    assert NUMBERS.keys() == CHECKS.keys()
+    assert CHARACTERISTIC_NUMBERS.keys() == CHECKS.keys()
 
 
 def test_a_characteristic_that_is_not_named_may_be_anything_but_violated() -> None:
@@ -80,17 +80,17 @@ CHAINS = {10: "abcd", 28: "abcd", 32: "ab", 118: "abx"}
     ],
 )
 def test_chains_are_compared_with_what_they_should_be(wanted: dict[str, Any], sentences: list[str]) -> None:
-    assert list(Expect.model_validate(wanted).other_common(CHAINS)) == sentences
+    assert list(Expect.model_validate(wanted).unexpected_common_blocks(CHAINS)) == sentences
 
 
 def test_expect_accepts_deviating_agents_with_their_handlers() -> None:
     expect = Expect.model_validate({"deviations": {32: "reconcile_phase_3"}})
     assert expect.as_expected("steps", "deviates") and not expect.as_expected("steps", "as specified")
-    assert list(expect.other_deviations([(32, "reconcile_phase_3"), (32, "reconcile_phase_2")])) == []
-    assert list(expect.other_deviations([(32, "reconcile_phase_2"), (10, None)])) == [
+    assert list(expect.unexpected_deviations([(32, "reconcile_phase_3"), (32, "reconcile_phase_2")])) == []
+    assert list(expect.unexpected_deviations([(32, "reconcile_phase_2"), (10, None)])) == [
         "agent 10 deviates first in no known handler, and should not",
         "agent 32 deviates first in reconcile_phase_2, and should in reconcile_phase_3",
     ]
-    assert list(expect.other_deviations([])) == ["agent 32 does not deviate, and should in reconcile_phase_3"]
+    assert list(expect.unexpected_deviations([])) == ["agent 32 does not deviate, and should in reconcile_phase_3"]
     with pytest.raises(ValueError, match="the nearest are reconcile_phase_3"):
         Expect.model_validate({"deviations": {32: "reconcile_phase_33"}})

@@ -96,7 +96,7 @@ def _mission_s(trace: Trace, wall_s: float) -> float:
 
 def _killed_at(evidence: Evidence, agent_id: int) -> list[float]:
     faults = evidence.record.faults if evidence.record else ()
-    return [fault.at_s for fault in faults if fault.kind.ends_a_life and agent_id in (fault.agents or ())]
+    return [fault.at_s for fault in faults if fault.kind.ends_incarnation and agent_id in (fault.agents or ())]
 
 
 def _sent_at(evidence: Evidence) -> list[float]:

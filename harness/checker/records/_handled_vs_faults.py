@@ -64,13 +64,13 @@ def stopped(evidence: Evidence, agent_id: int, slack_s: float) -> list[Stop]:
         if agent_id not in (fault.agents or ()):
             continue
         ends_s = fault.at_s if fault.planned_s is None else min(fault.at_s, fault.planned_s)
-        if since is not None and kind.leads_to is not None:
+        if since is not None and kind.state_after is not None:
             stops.append((since[0] + slack_s, ends_s - slack_s, since[1]))
             since = None
-        if kind.ends_a_life or kind.stands_still:
+        if kind.ends_incarnation or kind.suspends_agent:
             since = fault.at_s, f"its {kind.what} at {fault.at_s:g} s"
             # The harness wakes a paused agent at the end of the run, for its export.
-            end_s = (evidence.ended_at_s or 0.0) - slack_s if kind.stands_still else inf
+            end_s = (evidence.ended_at_s or 0.0) - slack_s if kind.suspends_agent else inf
     if since is not None:
         stops.append((since[0] + slack_s, end_s, since[1]))
     return [stop for stop in stops if stop[0] < stop[1]]

@@ -201,7 +201,7 @@ def subject_of(path: Path, seed: int | None, agent: int | None) -> Subject:
     A YAML file, a library name, or a run directory of virtual time is a scenario. Every other path is a record. Raises
     HarnessError.
     """
-    path = load.find(path)
+    path = load.find_file(path)
     if path.suffix in YAML or (path.is_file() and _is_scenario(path)):
         scenario = load_scenario(path)
         own = scenario.expect.seeds[0] if scenario.expect else 1

@@ -12,7 +12,7 @@ from harness.field.reconstruct._known_mission import Mission
 from harness.field.reconstruct._rehearsal import Rehearsal
 from harness.field.reconstruct._timetable import DIGITS, MIN_GAP_S, IncarnationTimes, TimedInput, Timetable
 from harness.scenario.scenario_file import Document
-from harness.scenario.strict_model import in_text
+from harness.scenario.strict_model import format_pairs
 from ucp.messages import MalformedDatagramError, decode
 from ucp.quirks import Quirks
 from ucp.settings import Settings
@@ -53,7 +53,7 @@ def scenario_document(
         "events": {"source": "scripted", "script": _events(table, sealed)},
         "fates": fates,
         "datagrams": strays.documents(),
-        "lateness": {agent: in_text(sorted(late.items()), "+") for agent, late in table.lateness.items() if late},
+        "lateness": {agent: format_pairs(sorted(late.items()), "+") for agent, late in table.lateness.items() if late},
     }
     return {key: value for key, value in document.items() if value not in ({}, [])}
 
@@ -173,7 +173,7 @@ def _fates(
             else:
                 strays.add(received.datagram, receiver, timed_input.at_s)
     for (sender, receiver), numbered in sorted(arrivals.items()):
-        yield {"sender": sender, "receiver": receiver, "arrivals": in_text(sorted(numbered), "@")}
+        yield {"sender": sender, "receiver": receiver, "arrivals": format_pairs(sorted(numbered), "@")}
     senders = [agent for agent, sent in table.sent.items() if sent]
     if any((sender, receiver) not in arrivals for sender in senders for receiver in roster if receiver != sender):
         yield {"drop": True}

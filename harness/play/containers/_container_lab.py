@@ -130,7 +130,7 @@ class ContainerLab:
                 networks[vehicle] = await self._engine.in_thread(self._open_network, identity)
             self._networks = {os.fstat(descriptor).st_ino for descriptor in networks.values()}
             self.network = await Lab.open(
-                scenario.on_the_air, needs=network_needs(scenario), networks=networks, log=log
+                scenario.network_nodes, needs=network_needs(scenario), networks=networks, log=log
             )
         finally:
             for descriptor in networks.values():

@@ -443,4 +443,4 @@ class AgentProcess:
 
 def reboots_with_disk(agent_id: int, scenario: Scenario) -> bool:
     """Return whether a fault of the scenario reboots the agent with the data on its disk."""
-    return any(fault.disk_left == "kept" and agent_id in fault.agents for fault in scenario.faults_in_order())
+    return any(fault.disk_after == "kept" and agent_id in fault.agents for fault in scenario.faults_in_order())

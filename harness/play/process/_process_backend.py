@@ -46,7 +46,7 @@ class Processes(Backend):
         from harness.play.process.process_preflight import network_needs
         from netem.lab import Lab
 
-        return await Lab.open(scenario.on_the_air, needs=network_needs(scenario), log=rundir.lab_log)
+        return await Lab.open(scenario.network_nodes, needs=network_needs(scenario), log=rundir.lab_log)
 
     def open(
         self,

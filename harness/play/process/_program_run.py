@@ -28,7 +28,7 @@ from harness.play.process._watchers import Watchers, open_unless_interrupted
 from harness.play.process.process_preflight import add_rogue_listener
 from harness.play.progress import Progress, Snapshot
 from harness.scenario import Scenario
-from harness.scenario.changes import Change, Injected, NetworkChange, describe, injected_nothing
+from harness.scenario.changes import Change, NetworkChange, TimedInjection, describe, silent_injections
 from harness.scenario.fates import Fate
 from harness.scenario.faults import Fault
 from netem.capture import LiveCapture
@@ -48,7 +48,7 @@ MIN_FOLLOW_S = 0.1
 
 
 class ProgramRun:
-    """One run, which implements `harness.play.mission.Swarm` and `harness.scenario.faults.Lives`. Open it once."""
+    """One run, which implements `harness.play.mission.Swarm` and `harness.scenario.faults.AgentOperations`. Open it once."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class ProgramRun:
         self._fleet = Fleet(scenario, kinds, rundir, self.clock, self._watchers)
         self._lag: LagMeter | None = None
         self._udp_before_start: Mapping[int, UdpCounters] = {}
-        self._injected: list[Injected] = []
+        self._injected: list[TimedInjection] = []
         """The injections that the rogue node was ordered to make."""
         self._waited_until_s = 0.0
         """Mission second at which the last `until` or `until_run` ended."""
@@ -220,7 +220,7 @@ class ProgramRun:
         if isinstance(change, NetworkChange):
             await self._apply_conditions(self._reach.ask(change), asked=change.conditions)
             return
-        if isinstance(change, Injected):
+        if isinstance(change, TimedInjection):
             if self._rogue is None:
                 raise ScenarioError(
                     f"`{change.what}` needs a rogue node; a run with real processes has one only if the timeline of "
@@ -250,15 +250,15 @@ class ProgramRun:
     async def _strike(self, fault: Fault, agent_id: int) -> None:
         if agent_id in self._starting:
             await self._starting.pop(agent_id)
-        await fault.strike(self, agent_id)
+        await fault.apply(self, agent_id)
 
-    # The methods of harness.scenario.faults.Lives
+    # The methods of harness.scenario.faults.AgentOperations
 
-    async def end_life(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
+    async def end_incarnation(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
         shot_down = [self._fleet.shoot_down(agent_id)] if with_vehicle else []
         await asyncio.gather(self._kill(self._agent(agent_id), disk_kept=disk_kept), *shot_down)
 
-    async def begin_life(self, agent_id: int, *, new_vehicle: bool = False) -> None:
+    async def begin_incarnation(self, agent_id: int, *, new_vehicle: bool = False) -> None:
         agent = self._agent(agent_id)
         start = self._restart_with_vehicle(agent) if new_vehicle else self._start_agent(agent, self._lab)
         self._starting[agent_id] = self._watchers.create_task(start)
@@ -285,7 +285,7 @@ class ProgramRun:
         hearers = [agent for agent in self.agents if agent.agent_id in heard_by and agent.awake]
         await asyncio.gather(*(agent.ask("revoke", revocation=revocation) for agent in hearers))
 
-    async def befall(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
+    async def set_circumstance(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
         if not self._fleet:
             raise ScenarioError(f"`{what}` needs vehicles, but this run has none")
         at_s = round(self.clock.now(), 3)
@@ -491,7 +491,7 @@ class ProgramRun:
         except MachineError as error:
             if self.played.outcome == "completed":
                 self._end_early(error)
-        self.played.unmatched_fates += injected_nothing(self._injected, rogue.sent)
+        self.played.unmatched_fates += silent_injections(self._injected, rogue.sent)
 
     def _show(self, stage: str) -> None:
         self.stage = stage

@@ -14,7 +14,7 @@ from harness.archive.directory import ROGUE_CONTROL, RunDirectory
 from harness.errors import MachineError
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
 from harness.scenario import Scenario
-from harness.scenario.changes import Injected
+from harness.scenario.changes import TimedInjection
 from netem.lab import Lab, LabProcess
 
 START_LIMIT_S = 30.0
@@ -67,7 +67,7 @@ class RogueProcess:
             "start", epoch_us=epoch_us, speedup=scenario.speedup, roster=roster, seed=self._seed, captured=keys
         )
 
-    async def inject(self, injected: Injected) -> None:
+    async def inject(self, injected: TimedInjection) -> None:
         """Order an injection. Raises MachineError."""
         await self._ask(
             "inject", what=injected.what, number=injected.number, injection=injected.injection.model_dump(mode="json")

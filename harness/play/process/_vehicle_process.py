@@ -120,7 +120,7 @@ class VehicleProcess:
     def prepare(self, flight: Flight | None, altitude_m: float) -> None:
         """Set the flight: the plan, or a climb to `altitude_m` if there is no plan."""
         assert self.pilot is not None
-        self._flight = self.pilot.flight(flight.planned(), flight.by) if flight else self.pilot.ascent(altitude_m)
+        self._flight = self.pilot.flight(flight.to_plan(), flight.by) if flight else self.pilot.ascent(altitude_m)
 
     async def _introduce(self) -> None:
         """Set the given parameters, and read version and parameters of the vehicle into the record. Do this once.

@@ -86,7 +86,7 @@ def refuse_unsupported_network(scenario: Scenario) -> None:
         return
 
     async def attempt(folder: str) -> None:
-        async with await Lab.open(scenario.on_the_air, needs=needs, log=Path(folder, "lab.log")) as lab:
+        async with await Lab.open(scenario.network_nodes, needs=needs, log=Path(folder, "lab.log")) as lab:
             for network in uncertain:
                 await lab.apply(network)
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from harness.play.rogue import _crafted
 from harness.play.rogue.lies import KnownBlocks, UnknownBlockError
 from harness.play.rogue.rogue_line import forged_sequence, line_of
-from harness.scenario.injection import Corrupt, DelayedCopy, Duplicate, Flood, Forge, Injection, Lie, Replay
+from harness.scenario.injection import CorruptedCopy, DelayedCopy, Duplicate, Flood, Forgery, Injection, Lie, Replay
 from ucp.block import HASH_BYTES, next_chain_hash
 from ucp.clock import MICROSECONDS
 from ucp.messages import (
@@ -163,7 +163,7 @@ class Rogue:
         self.sent[number] += 0
         if isinstance(injection, Replay):
             self._replay(number, injection)
-        elif isinstance(injection, Forge) and injection.for_s is None:
+        elif isinstance(injection, Forgery) and injection.for_s is None:
             self._forge_commit(number, injection, now)
         elif isinstance(injection, Lie):
             self._lie(number, injection, now)
@@ -193,7 +193,7 @@ class Rogue:
 
     def _react(self, window: _Window, received: "_ReceivedDatagram", now: float) -> None:
         injection, sender, datagram = window.injection, received.sender, received.datagram
-        if isinstance(injection, Forge):
+        if isinstance(injection, Forgery):
             answer = None if received.message is None else self._answer(injection, received.message)
             if sender != injection.sender and answer is not None:
                 self._forge(window.number, "forge", injection.sender, answer, now, received.request)
@@ -202,7 +202,7 @@ class Rogue:
         elif isinstance(injection, Duplicate):
             for _ in range(injection.copies):
                 self._send(RogueDatagram(window.number, "duplicate", sender, datagram))
-        elif isinstance(injection, Corrupt):
+        elif isinstance(injection, CorruptedCopy):
             changed = _crafted.corrupted(datagram, injection.bits, self._rng)
             self._send(RogueDatagram(window.number, "corrupt", sender, changed))
         elif (
@@ -215,7 +215,7 @@ class Rogue:
             copy = RogueDatagram(window.number, "delay", sender, datagram)
             heappush(self._waiting, (now + injection.by_s, self._made, copy))
 
-    def _answer(self, forge: Forge, query: Message) -> Message | None:
+    def _answer(self, forge: Forgery, query: Message) -> Message | None:
         """Return the forged answer to a message, or None if this forgery does not answer it."""
         approve = bool(forge.approve)
         match query:
@@ -244,7 +244,7 @@ class Rogue:
         request = next((self._queries[agent, query] for agent in asking if (agent, query) in self._queries), None)
         self._forge(number, "lie", lie.sender, message, now, request, lie.receivers)
 
-    def _forge_commit(self, number: int, forge: Forge, now: float) -> None:
+    def _forge_commit(self, number: int, forge: Forgery, now: float) -> None:
         if self._secured and self._top_chain_hash is None:
             self._top_chain_hash = bytes(HASH_BYTES)  # the top chain hash is sealed, so it can only guess
         if self._top_chain_hash is None:

@@ -93,7 +93,7 @@ def _drops_nothing(scenario: Scenario) -> bool:
         or scenario.network.radio
         or scenario.settings.asks_after_commit
         or any(entry.fault or entry.injection for entry in scenario.timeline)
-        or any(step.network.uncut().needs() for step in scenario.network_steps())
+        or any(step.network.without_partition().needs() for step in scenario.network_steps())
         or min(timers.vote_timeout_s, timers.phase1_timeout_s, timers.phase2_timeout_s, timers.phase3_timeout_s)
         <= 2 * (LATENCY.mean_s + LATENCY.jitter_s)
     )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from harness.play.rogue._journal import Journal
 from harness.play.rogue._rogue import Rogue
 from harness.play.simulation.air import StrayDatagram, VirtualAir
-from harness.scenario.changes import Injected
+from harness.scenario.changes import TimedInjection
 from netem.medium import LATENCY
 from ucp.messages import Message, encode
 
@@ -51,7 +51,7 @@ class VirtualRogue:
         self._rogue.receive(datagram, now)
         self._send(now)
 
-    def begin(self, injected: Injected, now: float) -> None:
+    def begin(self, injected: TimedInjection, now: float) -> None:
         self._rogue.begin(injected.number, injected.injection, now)
         self._send(now)
 

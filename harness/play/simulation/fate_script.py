@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from harness.scenario.fates import Fate
-from harness.scenario.strict_model import numbered
+from harness.scenario.strict_model import parse_pairs
 from netem.medium import RandomDraws
 from ucp.messages import Message, block_named
 from ucp.state import AgentState
@@ -33,7 +33,7 @@ class _Part:
     holds: bool = False
 
     def __post_init__(self) -> None:
-        for number, at_s in numbered(self.fate.arrivals or ""):
+        for number, at_s in parse_pairs(self.fate.arrivals or ""):
             self.arrivals.setdefault(number, []).append(at_s)
 
 
@@ -99,7 +99,7 @@ class FateScript:
             if not hears(receiver):
                 continue
             fate = part.fate
-            if part.holds or not fate.as_chance_says:
+            if part.holds or not fate.left_to_chance:
                 self.last_s = now
             if part.holds:
                 decided.held += [(part.index, receiver, at) for at in arrivals]
@@ -181,7 +181,7 @@ class LateTimers:
     def __init__(self, text: str = "") -> None:
         self.running: dict[str, Running] = {}
         """By name."""
-        self._late_by_s = dict(numbered(text))
+        self._late_by_s = dict(parse_pairs(text))
         self._started = 0
 
     def look(self, state: AgentState) -> None:

@@ -33,9 +33,9 @@ class Restored(Simulation):
         state = life.state
         now = StoredState.of(state)
         deque = [block for block in self._stored[agent_id].deque if not state.holds(block.block_hash)]
-        await self.end_life(agent_id)
+        await self.end_incarnation(agent_id)
         self._disks[self._number[agent_id]] = replace(now, deque=[*now.deque, *deque])
-        await self.begin_life(agent_id)
+        await self.begin_incarnation(agent_id)
 
     def _start(self, number: int, stored: Stored | None = None) -> None:
         first = self._stored.get(self.roster[number])

@@ -26,7 +26,7 @@ from harness.play.simulation.fate_script import FateScript, NameOf
 from harness.play.simulation.incarnations import Incarnation
 from harness.play.simulation.run_files import Recorder
 from harness.scenario import Scenario
-from harness.scenario.changes import Change, Injected, NetworkChange, disconnected_until, injected_nothing
+from harness.scenario.changes import Change, NetworkChange, TimedInjection, disconnected_until, silent_injections
 from harness.scenario.fates import Fate
 from harness.scenario.faults import VehicleFault
 from netem.radio import Place
@@ -104,7 +104,7 @@ class Simulation(Clockwork):
         self._moves_at = NEVER
         self.lost_vehicles: set[int] = set()
         """Those that fly no more."""
-        self._injected: list[Injected] = []
+        self._injected: list[TimedInjection] = []
         """What the rogue node was told."""
 
     @property
@@ -198,14 +198,14 @@ class Simulation(Clockwork):
             raise ScenarioError(no_vehicles([change.what]))
         record = change.to_json(round(self._now, 3))
         self.played.record(record)
-        if isinstance(change, Injected):
+        if isinstance(change, TimedInjection):
             self._injected.append(change)
             if self._rogue is None:
                 self._rogue = self._late_rogue()
             self._rogue.begin(change, self._now)
             return
         for agent_id in change.agents:
-            await change.strike(self, agent_id)
+            await change.apply(self, agent_id)
         self._recorder.changed(record)
 
     def _put_into_force(self, change: NetworkChange, **more: Any) -> None:
@@ -360,7 +360,7 @@ class Simulation(Clockwork):
         return {"model": asked.to_json(), **self._channel.totals.to_json()}
 
     def _injected_nothing(self) -> list[str]:
-        return injected_nothing(self._injected, self._rogue.sent) if self._rogue is not None else []
+        return silent_injections(self._injected, self._rogue.sent) if self._rogue is not None else []
 
     # What is there
 
@@ -426,9 +426,9 @@ class Simulation(Clockwork):
         counted = status.handled if life.state is None else life.handler_runs
         return {"counted": counted, "from_s": round(at_s, 3), "until_s": round(at_s, 3)}
 
-    # What faults do to it: harness.scenario.faults.Lives
+    # What faults do to it: harness.scenario.faults.AgentOperations
 
-    async def end_life(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
+    async def end_incarnation(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
         number = self._number[agent_id]
         if with_vehicle:
             self.lost_vehicles.add(agent_id)
@@ -443,7 +443,7 @@ class Simulation(Clockwork):
         self._alive[number] = None
         self._air.is_gone(number)
 
-    async def begin_life(self, agent_id: int, *, new_vehicle: bool = False) -> None:
+    async def begin_incarnation(self, agent_id: int, *, new_vehicle: bool = False) -> None:
         number = self._number[agent_id]
         self.lost_vehicles.discard(agent_id)
         self._start(number, self._disks.pop(number, None))
@@ -462,7 +462,7 @@ class Simulation(Clockwork):
                 life.secured.revoke(revocation, life.local_s(self._now))
                 self._after(number, life)
 
-    async def befall(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
+    async def set_circumstance(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
         raise AssertionError("was refused")
 
     async def pause(self, agent_id: int) -> None:
@@ -485,7 +485,7 @@ class Simulation(Clockwork):
     async def switch_off(self, agent_id: int) -> None:
         number = self._number[agent_id]
         life = self._alive[number]
-        await self.end_life(agent_id, with_vehicle=True)
+        await self.end_incarnation(agent_id, with_vehicle=True)
         if life is not None:
             self._switched_off[number] = life
 

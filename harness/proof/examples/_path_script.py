@@ -20,7 +20,7 @@ from harness.proof.model._global_states import AGENTS, Move
 from harness.proof.model._instant import Action, Wave
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._snapshot import Step
-from harness.scenario.strict_model import in_text
+from harness.scenario.strict_model import format_pairs
 from netem.medium import LATENCY
 
 LATENCY_S = 0.02
@@ -108,7 +108,7 @@ class Script:
             self._wording.word()
         bounds = self._swarm.bounds
         lateness = {
-            agent_id: in_text(sorted(late.items()), "+") for agent_id, late in sorted(self._late.items()) if late
+            agent_id: format_pairs(sorted(late.items()), "+") for agent_id, late in sorted(self._late.items()) if late
         }
         return {
             "name": name,

@@ -12,7 +12,7 @@ from harness.archive.tracks import TRACKS_FILE, TrackLine
 from harness.report.live._agent_course import Change
 from harness.report.live._live_trace import GrowingFile
 from harness.scenario.changes import RANGE
-from harness.scenario.faults import named
+from harness.scenario.faults import fault_class
 from harness.scenario.faults.fault import PAUSED, Fault
 
 MAX_DETAIL = 300
@@ -121,8 +121,8 @@ class Surroundings:
             raise ValueError("the record begins with conditions")
         network = self._network
         network.apply(line)
-        fault = named(line.what)
-        whole = line.asked is not None or fault.takes_the_vehicle or fault.brings_a_vehicle
+        fault = fault_class(line.what)
+        whole = line.asked is not None or fault.removes_vehicle or fault.adds_vehicle
         pairs = [*combinations(network.vehicles, 2)] if whole else [_pair(name) for name in line.losses]
         losses = {pair: _rounded(network.directions(pair)) for pair in pairs}
         changed = [[*pair, *loss] for pair, loss in losses.items() if self._losses.get(pair) != loss]
@@ -145,11 +145,11 @@ class Surroundings:
 def _state_after(fault: type[Fault]) -> str:
     """Return the state of agents after a fault in one word, or "" if the fault does not change it."""
     states = {
-        "gone": fault.takes_the_vehicle,
-        "down": fault.ends_a_life,
-        "back": fault.begins_a_life,
-        "still": fault.stands_still,
-        "awake": PAUSED in fault.needs,
+        "gone": fault.removes_vehicle,
+        "down": fault.ends_incarnation,
+        "back": fault.begins_incarnation,
+        "still": fault.suspends_agent,
+        "awake": PAUSED in fault.states_before,
     }
     return next((state for state, is_so in states.items() if is_so), "")
 

@@ -38,7 +38,7 @@ from harness.present.colours import inks
 from harness.report.facts import link_qualities
 from harness.report.live._agent_course import AgentCourse, Change, Receipt, SentMessage
 from harness.report.live._surroundings import Surroundings
-from harness.scenario.faults import ASKED_FOR, VehicleFault
+from harness.scenario.faults import TIMELINE_FAULTS, VehicleFault
 from harness.scenario.verdict_names import kind_of
 
 MAX_VEHICLES = 200
@@ -109,7 +109,9 @@ class Feed:
                 "live": live,
                 "all_heard": self._all_receipts_recorded,
                 "flown": self._is_flown(),
-                "troubles": [[kind.what, kind.unless_told] for kind in ASKED_FOR if issubclass(kind, VehicleFault)],
+                "troubles": [
+                    [kind.what, kind.default_values] for kind in TIMELINE_FAULTS if issubclass(kind, VehicleFault)
+                ],
             },
         ]
 

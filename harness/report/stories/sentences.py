@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 from harness.errors import ScenarioError
-from harness.scenario.faults import ASKED_FOR
+from harness.scenario.faults import TIMELINE_FAULTS
 from harness.scenario.load import parse_yaml
 
 EVENT_BYTES = 256
@@ -18,7 +18,7 @@ _JOINED = re.compile(rf"{_IDS} reach(?:es)? {_IDS} again")
 _PARTITION = re.compile(rf"partition {_IDS}((?: \| {_IDS})+)")
 _VERB = re.compile(rf"(\w+) {_IDS}")
 
-VERBS = [kind.what for kind in ASKED_FOR if not kind.further_keys()]
+VERBS = [kind.what for kind in TIMELINE_FAULTS if not kind.further_keys()]
 SENTENCES = (
     "`1 2 log` or `1 logs 100 bytes`, `1 does not reach 2 3`, `1 reaches 2 3 again`, `partition 1 2 | 3`, `heal`, "
     f"{', '.join(f'`{verb} 1`' for verb in VERBS)}, an entry of a timeline such as `{{loss: 0.5}}`, `chains`, or `end`"

@@ -7,10 +7,19 @@ from collections.abc import Iterator
 from importlib import import_module
 from pkgutil import iter_modules
 
-from harness.scenario.faults.fault import Agents, Disk, Fault, Lives
+from harness.scenario.faults.fault import AgentIds, AgentOperations, DiskState, Fault
 from harness.scenario.faults.vehicle_fault import VehicleFault
 
-__all__ = ["ASKED_FOR", "KINDS", "Agents", "Disk", "Fault", "Lives", "VehicleFault", "named"]
+__all__ = [
+    "KINDS",
+    "TIMELINE_FAULTS",
+    "AgentIds",
+    "AgentOperations",
+    "DiskState",
+    "Fault",
+    "VehicleFault",
+    "fault_class",
+]
 
 for file in iter_modules(__path__):
     import_module(f"{__name__}.{file.name}")
@@ -25,12 +34,12 @@ def _below(kind: type[Fault]) -> Iterator[type[Fault]]:
 
 
 KINDS: tuple[type[Fault], ...] = tuple(_below(Fault))
-ASKED_FOR: tuple[type[Fault], ...] = tuple(kind for kind in KINDS if kind.is_asked_for)
+TIMELINE_FAULTS: tuple[type[Fault], ...] = tuple(kind for kind in KINDS if kind.is_timeline_key)
 """Faults that are keys of a timeline entry."""
 
 _BY_NAME = {kind.what: kind for kind in KINDS}
 
 
-def named(what: str) -> type[Fault]:
+def fault_class(what: str) -> type[Fault]:
     """Return the class of the fault with this name, or `Fault`, which does nothing, for an unknown name."""
     return _BY_NAME.get(what, Fault)

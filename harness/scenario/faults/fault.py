@@ -1,7 +1,7 @@
 """A fault: what happens to agents and their vehicles at an instant, as a value.
 
 The class of a fault holds everything about it: its name in YAML, in records and in pytest, the states of an agent
-before and after it, its effect on lives, vehicles and data, the calls to the backend, and the texts of the report.
+before and after it, its effect on agents, vehicles and data, the calls to the backend, and the texts of the report.
 Other modules ask the class and do not compare names. To add a fault, add a class to a file in this directory.
 """
 
@@ -15,8 +15,8 @@ from harness.scenario.strict_model import VehicleId
 from harness.scenario.vehicles import Vehicles
 from sitl.circumstances import Circumstance
 
-Agents = Annotated[list[VehicleId], Field(min_length=1)]
-Disk = Literal["kept", "lost"]
+AgentIds = Annotated[list[VehicleId], Field(min_length=1)]
+DiskState = Literal["kept", "lost"]
 
 RUNNING, PAUSED, KILLED, REBOOTING, SWITCHED_OFF = "running", "paused", "killed", "rebooting", "switched off"
 """States of an agent. A fault may define a further one."""
@@ -30,13 +30,13 @@ BAR = "M0-6v12"
 """Marks: SVG paths around the origin."""
 
 
-class Lives(Protocol):
+class AgentOperations(Protocol):
     """The operations of a backend on an agent and its vehicle. None of them waits for mission time to pass."""
 
-    async def end_life(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
+    async def end_incarnation(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
         """End the agent, and its vehicle if `with_vehicle` is true. `disk_kept` keeps the data on its disk."""
 
-    async def begin_life(self, agent_id: int, *, new_vehicle: bool = False) -> None:
+    async def begin_incarnation(self, agent_id: int, *, new_vehicle: bool = False) -> None:
         """Start the agent again, with the kept data of its disk, and on a new vehicle if `new_vehicle` is true."""
 
     async def fall(self, agent_id: int) -> None:
@@ -59,7 +59,7 @@ class Lives(Protocol):
     async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
         """Send the revocation of the agent's keys from the ground to the vehicles in `heard_by`."""
 
-    async def befall(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
+    async def set_circumstance(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
         """Make the vehicle of the agent simulate a circumstance. The run record says whether it did."""
 
 
@@ -78,24 +78,24 @@ class Fault:
 
     what: ClassVar[str] = ""
     """The key of a timeline entry, the word in records, and the verb in pytest."""
-    is_asked_for: ClassVar[bool] = True
+    is_timeline_key: ClassVar[bool] = True
     """True if the fault is a key of a timeline entry. False if another fault causes it."""
-    needs: ClassVar[tuple[str, ...]] = ()
+    states_before: ClassVar[tuple[str, ...]] = ()
     """States of an agent in which the fault is possible."""
-    leads_to: ClassVar[str | None] = RUNNING
+    state_after: ClassVar[str | None] = RUNNING
     """State of the agent after the fault. None: unchanged."""
     needs_keys: ClassVar[bool] = False
     """True if the fault needs the keys of a secured mission."""
-    ends_a_life: ClassVar[bool] = False
+    ends_incarnation: ClassVar[bool] = False
     """The agent loses the data in its memory."""
-    begins_a_life: ClassVar[bool] = False
-    takes_the_vehicle: ClassVar[bool] = False
+    begins_incarnation: ClassVar[bool] = False
+    removes_vehicle: ClassVar[bool] = False
     """The vehicle leaves the mission, with all data of the agent."""
-    leaves_an_export: ClassVar[bool] = False
+    exports_chain: ClassVar[bool] = False
     """The agent exports its data before it ends. The data is not lost."""
-    brings_a_vehicle: ClassVar[bool] = False
+    adds_vehicle: ClassVar[bool] = False
     """The agent gets a new vehicle."""
-    stands_still: ClassVar[bool] = False
+    suspends_agent: ClassVar[bool] = False
     """The agent stays alive but does nothing until the next fault."""
     stops_events: ClassVar[bool] = False
     """The agent logs no further events until it starts again."""
@@ -103,17 +103,17 @@ class Fault:
     """The further keys in words, for an error about a missing key."""
     key_descriptions: ClassVar[Mapping[str, str]] = {}
     """Further key -> its description for the scenario reference and the JSON Schema."""
-    unless_told: ClassVar[Mapping[str, Any]] = {}
+    default_values: ClassVar[Mapping[str, Any]] = {}
     """Default values of the further keys in pytest."""
     mark: ClassVar[str] = ""
     """Mark in the timeline of the report: an SVG path around the origin. Without a mark, the report omits the fault."""
     meaning: ClassVar[str] = ""
     """Meaning of the mark. Faults with the same meaning share a mark."""
 
-    async def strike(self, lives: Lives, agent_id: int) -> None:
+    async def apply(self, operations: AgentOperations, agent_id: int) -> None:
         """Apply the fault to one of the agents."""
 
-    def course(self) -> "Sequence[Fault]":
+    def stages(self) -> "Sequence[Fault]":
         """Return all faults of this timeline entry, in time order."""
         return [self]
 
@@ -121,19 +121,19 @@ class Fault:
         """Raise ValueError if these vehicles cannot have the fault. The message names an alternative."""
 
     @property
-    def also_named(self) -> Sequence[int]:
+    def further_vehicles(self) -> Sequence[int]:
         """Vehicle IDs in the further keys."""
         return ()
 
     @property
-    def disk_left(self) -> Disk | None:
+    def disk_after(self) -> DiskState | None:
         """State of the disks after the fault. None if the fault does not concern disks."""
         return None
 
     @classmethod
-    def loses_data(cls, disk: Disk | None) -> bool:
+    def loses_data(cls, disk: DiskState | None) -> bool:
         """True if the agents lose all their data, given the state of their disks."""
-        return cls.ends_a_life and not cls.leaves_an_export and disk != "kept"
+        return cls.ends_incarnation and not cls.exports_chain and disk != "kept"
 
     @classmethod
     def further_keys(cls) -> list[str]:
@@ -141,27 +141,27 @@ class Fault:
         return [field.name for field in fields(cls) if field.name not in Fault.__dataclass_fields__]
 
     @classmethod
-    def told(cls, *agents: int, **further: Any) -> dict[str, Any]:
+    def entry_keys(cls, *agents: int, **further: Any) -> dict[str, Any]:
         """Return the keys of a timeline entry for the call of a test."""
-        return {cls.what: list(agents), **cls.unless_told, **further}
+        return {cls.what: list(agents), **cls.default_values, **further}
 
     @property
     def detail(self) -> str:
-        who = f"agent{'s' if len(self.agents) > 1 else ''} {' '.join(map(str, self.agents))}"
-        return who if self.disk_left is None else f"{who}, disk {self.disk_left}"
+        agents = f"agent{'s' if len(self.agents) > 1 else ''} {' '.join(map(str, self.agents))}"
+        return agents if self.disk_after is None else f"{agents}, disk {self.disk_after}"
 
     def to_json(self, at_s: float) -> dict[str, Any]:
         """The record of this fault, made at `at_s`."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
         hand = {"by_hand": True} if self.by_hand else {}
-        disk = {} if self.disk_left is None else {"disk": self.disk_left}
-        return {**record, **disk, **planned(self.at_s, at_s), **hand}
+        disk = {} if self.disk_after is None else {"disk": self.disk_after}
+        return {**record, **disk, **planned_key(self.at_s, at_s), **hand}
 
 
 SAME_TIME_S = 0.001
 """Records round times to milliseconds."""
 
 
-def planned(planned_s: float, at_s: float) -> dict[str, float]:
+def planned_key(planned_s: float, at_s: float) -> dict[str, float]:
     """Return the key `planned_s` of a record, if the change was made later than planned."""
     return {} if abs(planned_s - at_s) < SAME_TIME_S else {"planned_s": planned_s}

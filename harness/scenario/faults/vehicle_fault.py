@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from harness.scenario.faults.fault import RUNNING, Fault, Lives
+from harness.scenario.faults.fault import RUNNING, AgentOperations, Fault
 from harness.scenario.vehicles import Vehicles
 from sitl.circumstances import (
     COMPASS_LOST,
@@ -18,20 +18,20 @@ from sitl.circumstances import (
     Circumstance,
     battery,
 )
-from sitl.circumstances import wind as of_wind
+from sitl.circumstances import wind as wind_circumstance
 from sitl.vehicle import VEHICLE_TYPES, VehicleType
 
 FALLING = "M-5-2l5 6 5-6M0-6v4"
 """Marks of the faults in this module: the start of a problem of a vehicle, and its end."""
 RISING = "M-5 4l5-6 5 6"
-TROUBLED, WELL_AGAIN = "its vehicle has a fault", "its vehicle has recovered"
+HAS_FAULT, RECOVERED = "its vehicle has a fault", "its vehicle has recovered"
 
 
 class VehicleFault(Fault):
     """A fault of the vehicles of `agents`. A vehicle flies on, or its failsafe acts. The agents continue to run."""
 
-    needs = (RUNNING,)
-    of_types: ClassVar[tuple[VehicleType, ...]] = VEHICLE_TYPES
+    states_before = (RUNNING,)
+    vehicle_types: ClassVar[tuple[VehicleType, ...]] = VEHICLE_TYPES
     """Types of vehicles that can have this fault."""
 
     @property
@@ -43,20 +43,20 @@ class VehicleFault(Fault):
         if vehicles.kind == "none":
             raise ValueError("needs vehicles, but `vehicles.kind` is none")
         for vehicle in self.agents:
-            if (kind := vehicles.type_of(vehicle)) not in self.of_types:
-                raise ValueError(f"befalls a {' or a '.join(self.of_types)}, and vehicle {vehicle} is a {kind}")
+            if (kind := vehicles.type_of(vehicle)) not in self.vehicle_types:
+                raise ValueError(f"befalls a {' or a '.join(self.vehicle_types)}, and vehicle {vehicle} is a {kind}")
 
-    async def strike(self, lives: Lives, agent_id: int) -> None:
-        await lives.befall(agent_id, self.what, self.circumstance, by_hand=self.by_hand)
+    async def apply(self, operations: AgentOperations, agent_id: int) -> None:
+        await operations.set_circumstance(agent_id, self.what, self.circumstance, by_hand=self.by_hand)
 
     @property
-    def whose(self) -> str:
+    def vehicles_in_words(self) -> str:
         """The vehicles in words: "vehicles 1 2"."""
         return f"vehicle{'s' if len(self.agents) > 1 else ''} {' '.join(map(str, self.agents))}"
 
     @property
     def detail(self) -> str:
-        return self.whose
+        return self.vehicles_in_words
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,10 @@ class Battery(VehicleFault):
     key_descriptions = {"volts": "Voltage of the batteries of `battery`."}
 
     what = "battery"
-    unless_told = {"volts": 10.4}
+    default_values = {"volts": 10.4}
     keys_in_words = "`volts`, for example 10.4"
     mark = FALLING
-    meaning = TROUBLED
+    meaning = HAS_FAULT
 
     @property
     def circumstance(self) -> Circumstance:
@@ -79,7 +79,7 @@ class Battery(VehicleFault):
 
     @property
     def detail(self) -> str:
-        return f"{self.whose}, {self.volts:g} V"
+        return f"{self.vehicles_in_words}, {self.volts:g} V"
 
 
 class LoseCompass(VehicleFault):
@@ -87,7 +87,7 @@ class LoseCompass(VehicleFault):
 
     what = "lose_compass"
     mark = FALLING
-    meaning = TROUBLED
+    meaning = HAS_FAULT
 
     @property
     def circumstance(self) -> Circumstance:
@@ -99,7 +99,7 @@ class RegainCompass(VehicleFault):
 
     what = "regain_compass"
     mark = RISING
-    meaning = WELL_AGAIN
+    meaning = RECOVERED
 
     @property
     def circumstance(self) -> Circumstance:
@@ -111,7 +111,7 @@ class LoseGps(VehicleFault):
 
     what = "lose_gps"
     mark = FALLING
-    meaning = TROUBLED
+    meaning = HAS_FAULT
 
     @property
     def circumstance(self) -> Circumstance:
@@ -123,7 +123,7 @@ class RegainGps(VehicleFault):
 
     what = "regain_gps"
     mark = RISING
-    meaning = WELL_AGAIN
+    meaning = RECOVERED
 
     @property
     def circumstance(self) -> Circumstance:
@@ -134,9 +134,9 @@ class StopMotor(VehicleFault):
     """One motor of each of these copters stops. A copter with four motors falls."""
 
     what = "stop_motor"
-    of_types = ("copter",)
+    vehicle_types = ("copter",)
     mark = FALLING
-    meaning = TROUBLED
+    meaning = HAS_FAULT
 
     @property
     def circumstance(self) -> Circumstance:
@@ -156,15 +156,15 @@ class Wind(VehicleFault):
     }
 
     what = "wind"
-    unless_told = {"wind_ms": 10.0, "from_deg": 0.0}
+    default_values = {"wind_ms": 10.0, "from_deg": 0.0}
     keys_in_words = "`wind_ms`, in metres per second, and `from_deg`, clockwise from north"
     mark = FALLING
-    meaning = TROUBLED
+    meaning = HAS_FAULT
 
     @property
     def circumstance(self) -> Circumstance:
-        return of_wind(self.wind_ms, self.from_deg)
+        return wind_circumstance(self.wind_ms, self.from_deg)
 
     @property
     def detail(self) -> str:
-        return f"{self.whose}, {self.wind_ms:g} m/s from {self.from_deg:g}°"
+        return f"{self.vehicles_in_words}, {self.wind_ms:g} m/s from {self.from_deg:g}°"

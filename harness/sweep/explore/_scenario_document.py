@@ -8,9 +8,9 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 from harness.scenario import Scenario
-from harness.scenario.faults import ASKED_FOR
+from harness.scenario.faults import TIMELINE_FAULTS
 from harness.scenario.injection import INJECTIONS
-from harness.scenario.strict_model import in_text, numbered
+from harness.scenario.strict_model import format_pairs, parse_pairs
 from harness.sweep.explore._recording import Logged, Lost
 
 Document = dict[str, Any]
@@ -196,7 +196,7 @@ def _entry(entry: Document, kept: Collection[int]) -> Document | None:
     named = {sender for name in INJECTIONS if (sender := at(entry, f"{name}.sender")) is not None}
     if not named.union(at(entry, "lie.receivers") or ()) <= {*kept}:
         return None
-    faults = [kind.what for kind in ASKED_FOR]
+    faults = [kind.what for kind in TIMELINE_FAULTS]
     entry = _filter_lists(entry, faults, kept)
     return entry if all(entry.get(fault) != [] for fault in faults) else None
 
@@ -272,7 +272,10 @@ def _move_fate_times(fate: Document, to: Callable[[float], float]) -> Document:
     """Move the arrival times of a fate. Fates without arrival times keep their time windows."""
     if "arrivals" not in fate:
         return fate
-    return {**fate, "arrivals": in_text(((number, to(at_s)) for number, at_s in numbered(fate["arrivals"])), "@")}
+    return {
+        **fate,
+        "arrivals": format_pairs(((number, to(at_s)) for number, at_s in parse_pairs(fate["arrivals"])), "@"),
+    }
 
 
 def _move_datagram_times(datagram: Document, to: Callable[[float], float]) -> Document:

@@ -1,7 +1,7 @@
 """The runs of a matrix as a polars DataFrame, for notebooks."""
 
 from harness.present.polars import pl
-from harness.scenario.verdict_names import BESIDE, CHARACTERISTICS
+from harness.scenario.verdict_names import CHARACTERISTICS, FURTHER_CHECKS
 from harness.sweep.matrix.matrix_outputs import run_rows
 from harness.sweep.matrix.matrix_run import Finished
 
@@ -10,7 +10,7 @@ _TYPES = {
     "backend": pl.String,
     "seed": pl.Int64,
     **{f"characteristic_{number}": pl.String for number in CHARACTERISTICS},
-    **dict.fromkeys(BESIDE, pl.String),
+    **dict.fromkeys(FURTHER_CHECKS, pl.String),
     "failed": pl.String,
     "unsupported": pl.String,
 }

@@ -21,7 +21,7 @@ from typing import Any
 
 from harness.errors import MachineError
 from harness.present.junit import Case, to_xml
-from harness.scenario.verdict_names import BESIDE, CHARACTERISTICS, JUDGED
+from harness.scenario.verdict_names import ALL_CHECKS, CHARACTERISTICS, FURTHER_CHECKS
 from harness.sweep.matrix._cell import Cell, Run
 from harness.sweep.matrix._cell_scenarios import write_scenarios
 from harness.sweep.matrix._estimate import METRICS
@@ -89,7 +89,7 @@ def _cell_row(cell: Cell) -> dict[str, Any]:
     for metric in METRICS:
         estimate = cell.estimates[metric.name]
         row |= {metric.name: estimate.mean, f"{metric.name}_low": estimate.low, f"{metric.name}_high": estimate.high}
-    return row | {f"violated_{key}": len(cell.violated.get(key, [])) for key in JUDGED}
+    return row | {f"violated_{key}": len(cell.violated.get(key, [])) for key in ALL_CHECKS}
 
 
 def _place(point: Point) -> dict[str, Any]:
@@ -106,7 +106,7 @@ def run_rows(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
             "seed": run.seed,
             **{name: run.figures.get(name) for name in figures},
             **{f"characteristic_{number}": run.verdicts.get(number) for number in CHARACTERISTICS},
-            **{key: run.verdicts.get(key) for key in BESIDE},
+            **{key: run.verdicts.get(key) for key in FURTHER_CHECKS},
             "failed": run.failed,
             "unsupported": run.unsupported,
         }

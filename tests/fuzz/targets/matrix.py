@@ -5,7 +5,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from harness.errors import HarnessError
-from harness.scenario.load import FOLDER
+from harness.scenario.load import LIBRARY
 from harness.sweep.matrix._comparison import compare
 from harness.sweep.matrix._matrix_file import Matrix, load_matrix
 from harness.sweep.matrix._results_file import FILE, opened
@@ -53,7 +53,7 @@ def _results(directory: Path, data: bytes) -> None:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    for path in sorted(FOLDER.glob("*_matrix.yaml")):
+    for path in sorted(LIBRARY.glob("*_matrix.yaml")):
         yield path.read_bytes()
     yield b"name: Short\nloss: [0, 0.5]\nagents: [2, 3]\nseeds: [1, 2]\nscenario: {duration_s: 60}\n"
     with TemporaryDirectory() as directory:

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from harness.errors import HarnessError
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
-from harness.scenario.load import FOLDER, load_scenario, parse
+from harness.scenario.load import LIBRARY, load_scenario, parse
 from harness.scenario.scenario_file import ORDER, to_yaml
 from tests.fuzz.finding import require, sound
 
@@ -95,7 +95,7 @@ def _short(scenario: Scenario) -> bool:
 
 def seeds(flown: Path) -> Iterator[bytes]:
     """What comes along with the harness, and a short one that names every list."""
-    for scenario in sorted(FOLDER.glob("*.yaml")):
+    for scenario in sorted(LIBRARY.glob("*.yaml")):
         if scenario.stat().st_size < LARGEST_SEED:
             yield scenario.read_bytes()
     yield SHORT.encode()

@@ -68,7 +68,7 @@ def test_written_scenario_meets_its_expectations(tmp_path: Path) -> None:
     assert scenario.expect is not None
     assert simulated.played.unmatched_fates == []
     tops = {agent: export.top_chain_hash for agent, export in simulated.evidence.exports.items()}
-    assert [*scenario.expect.other_chains(tops)] == []
+    assert [*scenario.expect.unexpected_chains(tops)] == []
     assert all(scenario.expect.as_expected(key, of.verdict) for key, of in simulated.result.judgements.items())
 
 

@@ -1,4 +1,4 @@
-"""Scripted fates: single messages decided, so that what the thesis could not force happens every time."""
+"""Scripted fates decide about single messages. They cause events that the experiments of the thesis could not force."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def played(
 
 
 def arrivals(simulated: Simulated, agent_id: int, message: str) -> list[tuple[float, int]]:
-    """(mission seconds, sender) of every such message that reached the agent."""
+    """Return (mission second, sender) of each message of this type that reached the agent."""
     runs = simulated.evidence.traces[agent_id].runs
     return [
         (run.t, run.trigger.sender)
@@ -43,8 +43,8 @@ def branches(simulated: Simulated, agent_id: int, handler: str) -> list[str]:
     return [run.branch for run in simulated.evidence.traces[agent_id].runs if run.handler == handler]
 
 
-def test_a_single_commit_can_be_lost_to_a_single_agent() -> None:
-    """Figure 4.2: agent 2 misses the commit of agent 4's last block, and nobody finds out."""
+def test_fate_drops_one_commit_for_one_receiver() -> None:
+    """Figure 4.2: agent 2 misses the commit of agent 4's last block, and no agent detects the missing block."""
     simulated = simulate(load_scenario(SCENARIOS / "lost_last_commit.yaml"), 1, tracing=True)
     chains = {agent_id: len(export.chain) for agent_id, export in simulated.evidence.exports.items()}
     assert chains == {1: 4, 2: 3, 3: 4, 4: 4, 5: 4}
@@ -52,13 +52,13 @@ def test_a_single_commit_can_be_lost_to_a_single_agent() -> None:
     assert simulated.result.characteristics["6"].verdict == "not applicable"
 
 
-def test_a_tie_in_phase_2_can_be_forced_and_ends_at_the_oldest_timestamp() -> None:
+def test_fates_force_a_tie_that_the_oldest_timestamp_decides() -> None:
     simulated = simulate(load_scenario(SCENARIOS / "forced_tie.yaml"), 1, tracing=True)
     assert branches(simulated, 1, "reconcile_phase_2_timer_expiration")[0] == "tie: top of chain"
     assert {one.verdict for one in simulated.result.characteristics.values()} == {"holds"}
 
 
-def test_the_field_tests_crash_on_a_tie_is_found_out() -> None:
+def test_checker_finds_the_crash_on_a_tie_of_the_field_test() -> None:
     one = load_scenario(SCENARIOS / "forced_tie.yaml")
     one = one.model_validate({**one.model_dump(), "quirks": {"crash_on_tie": True}})
     simulated = simulate(one, 1, tracing=True)
@@ -68,14 +68,14 @@ def test_the_field_tests_crash_on_a_tie_is_found_out() -> None:
     assert (distributed.evidence[0].agent_id, simulated.played.settled) == (1, False)
 
 
-def test_chains_can_be_made_to_diverge_by_50_blocks() -> None:
+def test_fates_make_chains_diverge_by_50_blocks() -> None:
     simulated = simulate(load_scenario(SCENARIOS / "large_divergence.yaml"), 1, tracing=True)
     stacks = [run.state.stack for trace in simulated.evidence.traces.values() for run in trace.runs]
     assert max(stacks) >= 50
     assert {one.verdict for one in simulated.result.characteristics.values()} == {"holds"}
 
 
-def test_a_fate_picks_messages_by_type_sender_receiver_and_count() -> None:
+def test_fate_selects_by_type_sender_receiver_and_count() -> None:
     drop = {"message": "Block Add Response", "sender": 2, "receiver": 1, "count": 1, "drop": True}
     script = [*BLOCK_OF_1, *({"at_s": at_s, "agent": 1} for at_s in (21, 22, 23))]
     heard = arrivals(played([drop], script), 1, "Block Add Response")
@@ -83,7 +83,7 @@ def test_a_fate_picks_messages_by_type_sender_receiver_and_count() -> None:
     assert sorted(sender for t, sender in heard if t > 20) == [2, 3]
 
 
-def test_a_block_is_called_the_same_whether_or_not_its_agent_rebooted_before() -> None:
+def test_block_ordinal_counts_across_a_reboot() -> None:
     script = [*BLOCK_OF_1, *({"at_s": at_s, "agent": 1} for at_s in (30, 31, 32))]
     reboot = [{"at_s": 20, "reboot": [1], "down_s": 5, "disk": "kept"}]
     missed = [{"message": "Commit Block", "block": "1.2", "receiver": 2, "drop": True}]
@@ -92,7 +92,7 @@ def test_a_block_is_called_the_same_whether_or_not_its_agent_rebooted_before() -
     assert [len(export.chain) for export in simulated.evidence.exports.values()] == [2, 1, 2]
 
 
-def test_a_fate_picks_messages_by_block_and_by_when_they_are_sent() -> None:
+def test_fate_selects_by_block_and_sending_time() -> None:
     script = [*BLOCK_OF_1, *({"at_s": at_s, "agent": 1} for at_s in (21, 22, 23))]
     by_block = arrivals(played([{"block": "1.2", "sender": 1, "drop": True}], script), 2, "Block Add Request")
     by_time = arrivals(played([{"from_s": 20, "until_s": 30, "drop": True}], script), 2, "Block Add Request")
@@ -101,7 +101,7 @@ def test_a_fate_picks_messages_by_block_and_by_when_they_are_sent() -> None:
     assert len(arrivals(early, 2, "Block Add Request")) == 1
 
 
-def test_a_message_can_be_delayed_and_everything_from_an_agent_held() -> None:
+def test_fate_delays_a_message_or_holds_all_messages_of_an_agent() -> None:
     delayed = played([{"message": "Block Add Request", "receiver": 2, "delay_s": 4}])
     assert arrivals(delayed, 2, "Block Add Request") == [(7.0, 1)]
     held = played([{"sender": 1, "hold_until_s": 30}])
@@ -112,7 +112,7 @@ def test_a_message_can_be_delayed_and_everything_from_an_agent_held() -> None:
     assert 3.002 <= at_s <= 3.05
 
 
-def test_two_responses_can_be_delivered_in_either_order() -> None:
+def test_fates_deliver_two_responses_in_either_order() -> None:
     for first, second in ((2, 3), (3, 2)):
         fates = [
             {"message": "Block Add Response", "sender": first, "receiver": 1, "name": "first"},
@@ -122,7 +122,7 @@ def test_two_responses_can_be_delivered_in_either_order() -> None:
         assert heard == [first, second]
 
 
-def test_the_first_fate_that_fits_decides_and_chance_decides_the_rest() -> None:
+def test_first_matching_fate_decides_and_the_network_decides_the_rest() -> None:
     fates = [
         {"message": "Commit Block", "receiver": 2, "delay_s": 1},
         {"message": "Commit Block", "drop": True},
@@ -135,14 +135,14 @@ def test_the_first_fate_that_fits_decides_and_chance_decides_the_rest() -> None:
     assert arrivals(everything_lost, 2, "Block Add Request") == []
 
 
-def test_a_partition_stands_whatever_is_scripted() -> None:
+def test_fate_does_not_cross_a_partition() -> None:
     cut = [{"at_s": 0, "partition": [[1, 3], [2]]}]
     simulated = played([{"message": "Commit Block", "delay_s": 1}], timeline=cut)
     assert arrivals(simulated, 2, "Commit Block") == []
     assert arrivals(simulated, 3, "Commit Block") == [(14.0, 1)]
 
 
-def test_a_fate_that_never_matched_is_reported_and_the_run_is_no_proof(tmp_path: Path) -> None:
+def test_unmatched_fate_is_reported_and_the_run_has_status_2(tmp_path: Path) -> None:
     fates = [
         {"message": "Commit Block", "block": "3.7", "receiver": 2, "drop": True},
         {"message": "Block Response", "name": "never"},
@@ -174,6 +174,6 @@ def test_a_fate_that_never_matched_is_reported_and_the_run_is_no_proof(tmp_path:
         ({"count": 0, "drop": True}, "greater than or equal to 1"),
     ],
 )
-def test_a_fate_that_means_nothing_is_refused(fate: dict[str, Any], sentence: str) -> None:
+def test_invalid_fate_is_refused(fate: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValidationError, match=sentence):
         scenario(agents=3, fates=[fate])

@@ -1,4 +1,4 @@
-"""What a scenario can do to agents: kill, crash, restart, pause, resume, reboot, and clocks that are wrong."""
+"""Faults of agents in a scenario: kill, crash, restart, pause, resume, reboot, switch off, and wrong clocks."""
 
 from itertools import pairwise
 from random import Random
@@ -36,7 +36,7 @@ def verdicts(simulated: Simulated) -> set[str]:
     return {one.verdict for one in simulated.result.characteristics.values()}
 
 
-def test_a_killed_agent_is_gone_with_all_that_it_held() -> None:
+def test_killed_agent_leaves_no_export() -> None:
     simulated = played([{"at_s": 300, "kill": [2, 5]}], final_reconcile=True)
     assert sorted(simulated.evidence.exports) == [1, 3, 4]
     assert simulated.played.agents["2"]["outcome"] == "killed"
@@ -47,7 +47,7 @@ def test_a_killed_agent_is_gone_with_all_that_it_held() -> None:
     assert simulated.result.characteristics["5"].reason == f"all {left} completed blocks are in every chain{gone}"
 
 
-def test_blocks_that_only_a_killed_agent_held_are_told_and_no_violation() -> None:
+def test_blocks_lost_with_a_killed_agent_are_no_violation() -> None:
     alone = [{"at_s": 0, "partition": [[1], [2, 3]]}, {"at_s": 400, "kill": [1]}, {"at_s": 401, "heal": True}]
     simulated = played(alone, agents=3, final_reconcile=True)
     everywhere = simulated.result.characteristics["5"]
@@ -56,7 +56,7 @@ def test_blocks_that_only_a_killed_agent_held_are_told_and_no_violation() -> Non
     assert simulated.result.figures["copies_min"] == 0
 
 
-def test_a_restarted_agent_begins_with_nothing_and_gets_everything_back() -> None:
+def test_restarted_agent_starts_empty_and_recovers_the_chain() -> None:
     simulated = played([{"at_s": 300, "kill": [2]}, {"at_s": 330, "restart": [2]}], final_reconcile=True)
     trace = simulated.evidence.traces[2]
     first, second = ([run for _, run in life] for life in trace.incarnations())
@@ -68,7 +68,7 @@ def test_a_restarted_agent_begins_with_nothing_and_gets_everything_back() -> Non
     assert verdicts(simulated) == {"holds"}
 
 
-def test_a_restarted_agent_hears_nothing_that_was_sent_before() -> None:
+def test_restarted_agent_receives_no_message_sent_before_its_start() -> None:
     slow = {"delay": 10.0}
     simulated = played([{"at_s": 300, "kill": [2]}, {"at_s": 301, "restart": [2]}], network=slow)
     heard = [run.t for run in simulated.evidence.traces[2].runs if run.trigger.kind == "message"]
@@ -77,8 +77,8 @@ def test_a_restarted_agent_hears_nothing_that_was_sent_before() -> None:
     assert agent_seed(4, 2) != agent_seed(4, 2, life=2)
 
 
-def test_a_restarted_agent_logs_its_own_events_only() -> None:
-    """What its first life was about to log died with it."""
+def test_restarted_agent_logs_no_event_of_its_first_incarnation() -> None:
+    """The events that its first incarnation had yet to log are lost."""
     simulated = played([{"at_s": 300, "kill": [2]}, {"at_s": 300.5, "restart": [2]}])
     source = RandomEvents(Random(agent_seed(4, 2, life=2)), mean_s=10)
     expected = [t for t in (300.5 + source.next()[0] for _ in range(100)) if t <= 600]
@@ -88,7 +88,7 @@ def test_a_restarted_agent_logs_its_own_events_only() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_reboot_with_its_disk_loses_no_block(seed: int) -> None:
+def test_reboot_with_kept_disk_loses_no_block(seed: int) -> None:
     reboots = [
         {"at_s": 203.0, "reboot": [2, 3], "down_s": 20, "disk": "kept"},
         {"at_s": 411.0, "reboot": [2], "down_s": 1, "disk": "kept"},
@@ -108,7 +108,7 @@ def test_a_reboot_with_its_disk_loses_no_block(seed: int) -> None:
     assert [fault["what"] for fault in simulated.played.faults[:4]] == ["reboot", "boot", "reboot", "boot"]
 
 
-def test_a_reboot_whose_disk_is_lost_is_a_kill_and_a_restart() -> None:
+def test_reboot_with_lost_disk_equals_kill_and_restart() -> None:
     rebooted = played([{"at_s": 300, "reboot": [2], "down_s": 30, "disk": "lost"}], final_reconcile=True)
     killed = played([{"at_s": 300, "kill": [2]}, {"at_s": 330, "restart": [2]}], final_reconcile=True)
     assert rebooted.played.agents == killed.played.agents
@@ -117,13 +117,13 @@ def test_a_reboot_whose_disk_is_lost_is_a_kill_and_a_restart() -> None:
     assert verdicts(rebooted) == {"holds"}
 
 
-def test_a_crash_is_a_kill_in_virtual_time() -> None:
+def test_crash_equals_kill_in_virtual_time() -> None:
     crashed, killed = played([{"at_s": 300, "crash": [2]}]), played([{"at_s": 300, "kill": [2]}])
     assert crashed.evidence.exports == killed.evidence.exports
     assert crashed.played.agents == killed.played.agents
 
 
-def test_a_chain_hash_that_was_not_computed_anew_is_not_genuine() -> None:
+def test_stale_chain_hash_violates_characteristic_4() -> None:
     simulated = played([], network={"loss": 0.3}, quirks={"stale_chain_hash": True})
     genuine = simulated.result.characteristics["4"]
     assert genuine.verdict == "violated"
@@ -133,8 +133,8 @@ def test_a_chain_hash_that_was_not_computed_anew_is_not_genuine() -> None:
     assert all("receive_response_block_for_hash: the top chain hash" in detail for detail in traced)
 
 
-def test_losing_a_block_over_a_brown_out_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A disk that is kept excuses nothing."""
+def test_block_lost_in_a_brown_out_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An agent whose disk is kept must not lose blocks."""
     alone = [{"at_s": 0, "partition": [[2], [1, 3, 4, 5]]}, {"at_s": 400, "heal": True}]
     reboot = {"at_s": 300, "reboot": [2], "down_s": 30, "disk": "kept"}
     assert verdicts(played([*alone, reboot], final_reconcile=True)) == {"holds"}
@@ -142,17 +142,17 @@ def test_losing_a_block_over_a_brown_out_is_a_violation(monkeypatch: pytest.Monk
     assert played([*alone, reboot], final_reconcile=True).result.characteristics["5"].verdict == "violated"
 
 
-def test_a_reconcile_that_a_brown_out_ended_gives_no_chance_to_agree() -> None:
-    """What ends it after the boot is no answer of the others."""
+def test_reconcile_ended_by_a_brown_out_counts_as_no_chance_to_agree() -> None:
+    """The agent ends this reconcile after its boot, without answers of other agents."""
     began = {"handler": "reconcile_begin", "algorithm": 7, "branch": "begun", "reconciling": True}
     ended = {"handler": "reconcile_finalize", "algorithm": 20, "branch": "done", "reconciling": False}
     runs = [run_of(10.0, **began), run_of(20.0, **ended)]
     connected = [{"at_s": 0.0, "what": "start", "detail": "", "fully_connected": True}]
     record = JudgedRecord.model_validate({"roster": [1], "network": connected})
     header = Header(agent_id=1, roster=[1], settings={}, clock={})
-    one_life, two_lives = Trace(header, runs), Trace(header, runs, starts=[1])
-    assert had_a_chance(Evidence({}, {1: one_life}, record), {1}) == {1}
-    assert had_a_chance(Evidence({}, {1: two_lives}, record), {1}) == set()
+    without_boot, with_boot = Trace(header, runs), Trace(header, runs, starts=[1])
+    assert had_a_chance(Evidence({}, {1: without_boot}, record), {1}) == {1}
+    assert had_a_chance(Evidence({}, {1: with_boot}, record), {1}) == set()
 
 
 def run_of(t: float, *, handler: str, algorithm: int, branch: str, reconciling: bool) -> HandlerRun:
@@ -168,7 +168,7 @@ def run_of(t: float, *, handler: str, algorithm: int, branch: str, reconciling: 
     )
 
 
-def test_without_traces_a_restarted_agents_blocks_are_known_all_the_same() -> None:
+def test_blocks_of_a_restarted_agent_are_known_without_traces() -> None:
     one = scenario(
         duration_s=600,
         events={"source": "random", "mean_s": 10},
@@ -177,7 +177,7 @@ def test_without_traces_a_restarted_agents_blocks_are_known_all_the_same() -> No
     assert simulate(one, 4).result.characteristics["4"].verdict == "holds"
 
 
-def test_a_paused_agent_handles_what_waited_when_it_resumes() -> None:
+def test_resumed_agent_handles_the_messages_that_waited() -> None:
     simulated = played([{"at_s": 200, "pause": [3]}, {"at_s": 320, "resume": [3]}], final_reconcile=True)
     times = [run.t for run in simulated.evidence.traces[3].runs]
     assert not [t for t in times if 200 < t < 320]
@@ -185,7 +185,7 @@ def test_a_paused_agent_handles_what_waited_when_it_resumes() -> None:
     assert verdicts(simulated) == {"holds"}
 
 
-def test_a_vote_may_last_longer_while_its_agent_is_paused() -> None:
+def test_vote_lasts_longer_while_its_agent_is_paused() -> None:
     script = [{"at_s": at_s, "agent": 1} for at_s in (1, 2, 3)]
     pause = [{"at_s": 5, "pause": [1]}, {"at_s": 60, "resume": [1]}]
     simulated = played(pause, events={"source": "scripted", "script": script}, duration_s=100)
@@ -193,7 +193,7 @@ def test_a_vote_may_last_longer_while_its_agent_is_paused() -> None:
     assert verdicts(simulated) == {"holds"}
 
 
-def test_an_agent_that_stays_paused_leaves_the_run_unsettled() -> None:
+def test_agent_that_stays_paused_leaves_the_run_unsettled() -> None:
     simulated = played([{"at_s": 500, "pause": [1]}], final_reconcile=True)
     assert not simulated.played.settled
     assert simulated.played.final_reconcile is not None
@@ -202,8 +202,8 @@ def test_an_agent_that_stays_paused_leaves_the_run_unsettled() -> None:
 
 
 @pytest.mark.parametrize(("offset_s", "drift"), [(-1000, 0.0), (1000, 0.0), (0, 0.01), (-50, -0.2)])
-def test_agents_agree_whatever_their_clocks_show(offset_s: float, drift: float) -> None:
-    """Timers run at the drifting clock's pace, and timestamps are the clock's: 0 before the run's start."""
+def test_agents_agree_with_wrong_and_drifting_clocks(offset_s: float, drift: float) -> None:
+    """Timers and timestamps follow the drifting clock. A timestamp before the start of the run is 0."""
     simulated = played([], clocks={2: {"offset_s": offset_s, "drift": drift}}, final_reconcile=True)
     assert verdicts(simulated) == {"holds"}
     own = [block for block in simulated.evidence.exports[1].chain if block.agent_id == 2]
@@ -250,41 +250,41 @@ def test_agents_agree_whatever_their_clocks_show(offset_s: float, drift: float) 
         ([{"at_s": 10, "kill": [1, 2, 3]}, {"at_s": 20, "crash": [4, 5]}], "the timeline kills all agents"),
     ],
 )
-def test_faults_that_cannot_be_played_are_refused(timeline: list[dict[str, Any]], sentence: str) -> None:
+def test_impossible_faults_are_refused(timeline: list[dict[str, Any]], sentence: str) -> None:
     with pytest.raises(ValidationError, match=sentence):
         scenario(timeline=timeline)
 
 
-def test_what_follows_in_the_instant_of_a_boot_finds_the_agent_running() -> None:
+def test_fault_at_the_instant_of_a_boot_follows_the_boot() -> None:
     scenario(timeline=[{"at_s": 30, "kill": [1]}, REBOOT])
 
 
-def test_without_vehicles_nothing_can_crash() -> None:
+def test_crash_without_vehicles_is_refused() -> None:
     crash = [{"at_s": 10, "crash": [1]}]
     with pytest.raises(ValidationError, match=r"timeline\.0\.crash needs vehicles that can fall"):
         scenario(timeline=crash, vehicles={"kind": "none"})
     scenario(timeline=crash)
 
 
-def test_a_word_on_record_that_is_no_known_fault_is_one_that_does_nothing() -> None:
+def test_unknown_fault_in_a_record_has_no_effect() -> None:
     unknown = FaultRecord(at_s=1.0, what="earthquake", detail="agent 1", agents=[1])
     assert not unknown.loses_data
-    assert not (unknown.kind.ends_a_life or unknown.kind.takes_the_vehicle or unknown.kind.mark)
+    assert not (unknown.kind.ends_incarnation or unknown.kind.removes_vehicle or unknown.kind.mark)
 
 
 @pytest.mark.parametrize(("disk", "loses"), [("kept", False), ("lost", True)])
-def test_a_reboot_loses_what_its_disk_does_not_keep(disk: Any, loses: bool) -> None:
+def test_reboot_loses_data_only_with_its_disk(disk: Any, loses: bool) -> None:
     assert FaultRecord(at_s=1.0, what="reboot", detail="agent 1", agents=[1], disk=disk).loses_data == loses
 
 
-def test_a_landed_agent_logs_nothing_more_and_takes_part_as_before() -> None:
+def test_landed_agent_logs_no_events_and_still_votes() -> None:
     simulated = played([{"at_s": 300, "stop_events": [2, 5]}], network={"loss": 0.2})
     assert not [run.t for run in simulated.evidence.traces[2].runs if run.trigger.kind == "event" and run.t > 300]
     assert [run.t for run in simulated.evidence.traces[1].runs if run.trigger.kind == "event" and run.t > 300]
     assert [run for run in simulated.evidence.traces[2].runs if run.branch == "committed" and run.t > 320]
 
 
-def test_an_agent_that_is_switched_off_leaves_its_chain_and_loses_nothing() -> None:
+def test_switched_off_agent_exports_its_chain_and_loses_nothing() -> None:
     simulated = played([{"at_s": 300, "switch_off": [2, 5]}], final_reconcile=True)
     assert sorted(simulated.evidence.exports) == [1, 2, 3, 4, 5]
     assert simulated.evidence.exports[2].exported_at_us == 300_000_000
@@ -297,7 +297,7 @@ def test_an_agent_that_is_switched_off_leaves_its_chain_and_loses_nothing() -> N
     assert simulated.result.beside["liveness"].verdict == "finished"
 
 
-def test_what_only_a_switched_off_agent_holds_is_at_home_with_it_and_no_violation() -> None:
+def test_block_held_only_by_a_switched_off_agent_is_no_violation() -> None:
     alone = [{"at_s": 0, "partition": [[1], [2, 3]]}, {"at_s": 400, "switch_off": [1]}, {"at_s": 401, "heal": True}]
     simulated = played(alone, agents=3, final_reconcile=True)
     assert not simulated.result.bad
@@ -306,8 +306,8 @@ def test_what_only_a_switched_off_agent_holds_is_at_home_with_it_and_no_violatio
     )
 
 
-def test_nobody_has_to_finish_who_is_switched_off() -> None:
-    """Everybody is, one after another, in the middle of what they do."""
+def test_liveness_does_not_apply_to_switched_off_agents() -> None:
+    """Switch off one agent after another, while they vote."""
     off = [{"at_s": 580 + agent, "switch_off": [agent]} for agent in range(1, 6)]
     simulated = played(off, network={"loss": 0.3})
     assert not simulated.result.bad
@@ -316,6 +316,6 @@ def test_nobody_has_to_finish_who_is_switched_off() -> None:
     assert simulated.result.characteristics["6"].verdict == "not applicable"
 
 
-def test_who_is_switched_off_stays_off() -> None:
+def test_switched_off_agent_cannot_restart() -> None:
     with pytest.raises(ValidationError, match="agent 2 is switched off at that time, not killed"):
         faulty([{"at_s": 300, "switch_off": [2]}, {"at_s": 400, "restart": [2]}])

@@ -11,45 +11,45 @@ from pathlib import Path
 HARNESS = Path(__file__).parents[3] / "harness"
 
 STUN = '''
-"""A lightning stroke: an agent stands still, and comes to by itself."""
+"""Lightning: an agent stops, and continues after some time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from harness.scenario.faults.fault import RUNNING, Fault, Lives
+from harness.scenario.faults.fault import RUNNING, Fault, AgentOperations
 from harness.scenario.strict_model import Seconds
 
 
 @dataclass(frozen=True)
 class Stun(Fault):
-    """They are struck by lightning, and come to after `dazed_s`."""
+    """Lightning strikes these agents. They stop for `dazed_s`."""
 
     dazed_s: Seconds
 
     what = "stun"
-    needs = (RUNNING,)
-    leads_to = "stunned"
-    stands_still = True
+    states_before = (RUNNING,)
+    state_after = "stunned"
+    suspends_agent = True
     keys_in_words = "`dazed_s`, in mission seconds"
     mark = "M-1-6l2 6h-3l2 6"
     meaning = "struck by lightning"
 
-    def course(self) -> Sequence[Fault]:
-        return [self, ComeTo(self.at_s + self.dazed_s, self.agents)]
+    def stages(self) -> Sequence[Fault]:
+        return [self, EndOfStun(self.at_s + self.dazed_s, self.agents)]
 
-    async def strike(self, lives: Lives, agent_id: int) -> None:
-        await lives.pause(agent_id)
+    async def apply(self, operations: AgentOperations, agent_id: int) -> None:
+        await operations.pause(agent_id)
 
 
-class ComeTo(Fault):
-    """The end of it."""
+class EndOfStun(Fault):
+    """The end of a stun."""
 
     what = "come to"
-    is_asked_for = False
-    needs = ("stunned",)
+    is_timeline_key = False
+    states_before = ("stunned",)
 
-    async def strike(self, lives: Lives, agent_id: int) -> None:
-        await lives.resume(agent_id)
+    async def apply(self, operations: AgentOperations, agent_id: int) -> None:
+        await operations.resume(agent_id)
 '''
 SCENARIO = """
 name: stunned
@@ -60,14 +60,14 @@ timeline:
 final_reconcile: true
 """
 IN_PYTEST = """
-def test_a_stroke(swarm):
+def test_lightning(swarm):
     swarm.run_until(100)
     swarm.stun(2, dazed_s=50)
     swarm.run_for(60)
 """
 
 
-def test_a_new_fault_is_one_file(tmp_path: Path) -> None:
+def test_new_fault_needs_one_file(tmp_path: Path) -> None:
     shutil.copytree(HARNESS, tmp_path / "harness", ignore=shutil.ignore_patterns("__pycache__", "*.png"))
     (tmp_path / "harness/scenario/faults/stun.py").write_text(STUN)
     (tmp_path / "stunned.yaml").write_text(SCENARIO)
@@ -81,7 +81,7 @@ def test_a_new_fault_is_one_file(tmp_path: Path) -> None:
     played = python(*run, "run")
     assert played.returncode == 0, played.stdout + played.stderr
     record = json.loads((tmp_path / "run/run.json").read_text())
-    told = {
+    unchanged = {
         "detail": "agent 2",
         "agents": [2],
         "fully_connected": None,
@@ -89,7 +89,10 @@ def test_a_new_fault_is_one_file(tmp_path: Path) -> None:
         "by_hand": False,
         "planned_s": None,
     }
-    assert record["faults"][:2] == [{"at_s": 100, "what": "stun", **told}, {"at_s": 150, "what": "come to", **told}]
+    assert record["faults"][:2] == [
+        {"at_s": 100, "what": "stun", **unchanged},
+        {"at_s": 150, "what": "come to", **unchanged},
+    ]
     lines = (tmp_path / "run/agents/2.trace.jsonl").read_text().splitlines()
     times = [float(found[1]) for line in lines if (found := re.search(r'"t":([\d.]+)', line))]
     assert [at_s for at_s in times if at_s < 100]
@@ -107,5 +110,5 @@ def test_a_new_fault_is_one_file(tmp_path: Path) -> None:
     assert "a stun needs `dazed_s`, in mission seconds" in mistaken.stderr
 
     (tmp_path / "test_stroke.py").write_text(IN_PYTEST)
-    told = python("-m", "pytest", "-q", "-p", "no:cacheprovider", "test_stroke.py")
-    assert told.returncode == 0, told.stdout + told.stderr
+    tested = python("-m", "pytest", "-q", "-p", "no:cacheprovider", "test_stroke.py")
+    assert tested.returncode == 0, tested.stdout + tested.stderr

@@ -1,4 +1,4 @@
-"""Scenario files: a mistake is told with the key, the value and what is allowed."""
+"""Scenario files: an error names the key, the value and the allowed values."""
 
 from pathlib import Path
 
@@ -20,12 +20,12 @@ def write(tmp_path: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
-def test_every_scenario_of_the_library_is_valid_and_says_what_it_shows(path: Path) -> None:
+def test_library_scenario_is_valid_and_has_a_description(path: Path) -> None:
     assert load_scenario(path).about
     assert path.read_text().startswith("#")
 
 
-def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> None:
+def test_scenario_with_only_a_name_is_the_experiment_of_the_thesis(tmp_path: Path) -> None:
     scenario = load_scenario(write(tmp_path, "name: x"))
     assert (scenario.roster, scenario.duration_s, scenario.network.loss) == ((1, 2, 3, 4, 5), 1200, 0)
 
@@ -157,7 +157,7 @@ def test_a_name_is_enough_and_gives_the_thesis_s_experiment(tmp_path: Path) -> N
         ("!!python/object/apply:os.system ['true']", "not YAML"),
     ],
 )
-def test_a_mistake_names_the_key_the_value_and_what_is_allowed(tmp_path: Path, text: str, sentence: str) -> None:
+def test_error_names_the_key_its_value_and_the_allowed_values(tmp_path: Path, text: str, sentence: str) -> None:
     path = write(tmp_path, text)
     with pytest.raises(ScenarioError) as caught:
         load_scenario(path)
@@ -167,7 +167,7 @@ def test_a_mistake_names_the_key_the_value_and_what_is_allowed(tmp_path: Path, t
     assert "\n" not in message
 
 
-def test_an_alias_bomb_is_refused_at_once(tmp_path: Path) -> None:
+def test_alias_bomb_is_refused_with_a_short_error(tmp_path: Path) -> None:
     lines = ["x0: &x0 [lol, lol]"] + [f"x{n}: &x{n} [{', '.join([f'*x{n - 1}'] * 9)}]" for n in range(1, 40)]
     bomb = write(tmp_path, "\n".join(lines) + "\nname: *x39")
     with pytest.raises(ScenarioError) as caught:
@@ -175,14 +175,14 @@ def test_an_alias_bomb_is_refused_at_once(tmp_path: Path) -> None:
     assert len(str(caught.value)) < 1000
 
 
-def test_a_missing_or_oversized_file_is_told(tmp_path: Path) -> None:
+def test_missing_or_oversized_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="no such file or scenario; `ucp-harness scenarios` lists"):
         load_scenario(tmp_path / "none.yaml")
     with pytest.raises(ScenarioError, match="larger than"):
         load_scenario(write(tmp_path, "#" * 9_000_000))
 
 
-def test_the_timeline_is_the_sequence_of_network_states() -> None:
+def test_timeline_lists_the_network_states_in_time_order() -> None:
     scenario = Scenario.model_validate(
         {
             "name": "x",
@@ -209,7 +209,7 @@ def conditions_of(tmp_path: Path, network: str) -> NetworkConditions:
     return load_scenario(write(tmp_path, f"name: x\nnetwork: {network}")).network.conditions()
 
 
-def test_a_number_is_enough_where_there_is_more_to_say(tmp_path: Path) -> None:
+def test_single_number_replaces_a_mapping(tmp_path: Path) -> None:
     short = conditions_of(tmp_path, "{loss: 0.1, delay: 0.05, duplicate: 0.01, reorder: 0.02}")
     assert short == NetworkConditions(LinkConditions(0.1, Delay(0.05), 0.01, 0.02))
     long = conditions_of(
@@ -218,7 +218,7 @@ def test_a_number_is_enough_where_there_is_more_to_say(tmp_path: Path) -> None:
     assert long == NetworkConditions(LinkConditions(GilbertElliott(0.02, 0.3), Delay(0.05, 0.02, "normal")))
 
 
-def test_the_timeline_changes_the_loss_of_those_who_have_none_of_their_own() -> None:
+def test_loss_in_the_timeline_spares_receivers_with_their_own_loss() -> None:
     network = {"loss": 0.1, "receivers": {2: {"delay": 1}, 3: {"loss": 0.5}}}
     timeline = [{"at_s": 1, "loss": {"p": 0.02, "r": 0.3}}]
     scenario = Scenario.model_validate({"name": "x", "network": network, "timeline": timeline})
@@ -229,7 +229,7 @@ def test_the_timeline_changes_the_loss_of_those_who_have_none_of_their_own() -> 
     assert change.conditions.link(1, 3) == LinkConditions(0.5)
 
 
-def test_what_a_receiver_or_a_link_does_not_name_it_takes_from_the_layer_below(tmp_path: Path) -> None:
+def test_missing_key_of_a_receiver_or_link_comes_from_the_layer_below(tmp_path: Path) -> None:
     conditions = conditions_of(
         tmp_path,
         "{loss: 0.1, delay: 0.05, receivers: {3: {loss: 0.5}, 4: {delay: 0}},"
@@ -246,7 +246,7 @@ def test_what_a_receiver_or_a_link_does_not_name_it_takes_from_the_layer_below(t
     assert conditions.link(5, 4) == LinkConditions(0)
 
 
-def test_a_layer_may_have_no_rate_where_the_layer_below_has_one(tmp_path: Path) -> None:
+def test_receiver_may_remove_the_rate_of_the_network(tmp_path: Path) -> None:
     network = "{corrupt: 0.1, rate: 1e5, limit: 50, receivers: {2: {rate: none, limit: none}, 3: {rate: 9600}}}"
     conditions = conditions_of(tmp_path, network)
     assert conditions.default == LinkConditions(corrupt=0.1, rate=100_000, limit=50)
@@ -269,7 +269,7 @@ def test_a_scenario_as_resolved_means_the_same_when_read_again(tmp_path: Path) -
         assert again.network.conditions() == scenario.network.conditions()
 
 
-def test_conditions_are_told_in_words() -> None:
+def test_conditions_have_a_description_in_words() -> None:
     late = Delay(0.05, 0.02, "normal")
     bursts = GilbertElliott(0.02, 0.3)
     assert describe(NetworkConditions()) == "loss 0 %"
@@ -294,7 +294,7 @@ def test_conditions_are_told_in_words() -> None:
     )
 
 
-def test_many_links_are_told_in_few_words() -> None:
+def test_description_of_many_links_is_short() -> None:
     pairs = [(sender, receiver) for sender in range(1, 31) for receiver in range(1, 31) if sender != receiver]
     mesh = NetworkConditions(links={pair: LinkConditions(0.9) for pair in pairs if pair[0] <= 3 and pair[1] <= 3})
     assert describe(mesh) == "loss 0 %, loss 90 % from 1 to 2 3, loss 90 % from 2 to 1 3, loss 90 % from 3 to 1 2"
@@ -302,7 +302,7 @@ def test_many_links_are_told_in_few_words() -> None:
     assert describe(large).endswith(", 22 more differences of links")
 
 
-def test_a_change_at_mission_second_0_is_the_network_s_first_state() -> None:
+def test_change_at_mission_second_0_is_the_first_network_state() -> None:
     scenario = Scenario.model_validate({"name": "x", "timeline": [{"at_s": 0, "partition": [[1], [2]]}]})
     (change,) = timeline_of(scenario)
     assert change.what == "partition"

@@ -1,4 +1,4 @@
-"""The library: every scenario, played in virtual time, shows what its first lines say that it shows."""
+"""Every scenario of the library, played in virtual time, has the effect that its first lines describe."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -15,15 +15,15 @@ from harness.checker.uniform_chain import common_prefix
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
 from harness.scenario.changes import RANGE
-from harness.scenario.expect import NUMBERS
+from harness.scenario.expect import CHARACTERISTIC_NUMBERS
 from tests.harness.command import harness
 from ucp.trace import Commanded, StateSummary
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 MATRIX = SCENARIOS / "thesis_matrix.yaml"
 SEEDS = (1, 2, 3)
-FEW = 5
-"""Blocks; the most that the last votes of 20 minutes leave open."""
+MAX_UNDECIDED_BLOCKS = 5
+"""Maximum number of blocks that are still undecided at the end of a mission of 20 minutes."""
 
 
 @cache
@@ -32,31 +32,31 @@ def played(name: str, seed: int) -> Simulated:
 
 
 def chains(run: Simulated) -> dict[int, list[str]]:
-    """Each agent's chain by names of blocks, as the mission left it."""
+    """Return the names of the blocks in the chain of each agent, before the final reconcile."""
     exports = run.evidence.before_final_reconcile or run.evidence.exports
     return {agent: [run.evidence.name(it) for it in one.chain_of_block_hashes] for agent, one in exports.items()}
 
 
-def mutual(run: Simulated) -> int:
+def mutual_length(run: Simulated) -> int:
     return common_prefix(list(chains(run).values()))
 
 
-def tail(run: Simulated) -> int:
-    """How far the longest chain goes beyond the mutual chain."""
-    return max(map(len, chains(run).values())) - mutual(run)
+def blocks_beyond_mutual(run: Simulated) -> int:
+    """Return the number of blocks by which the longest chain exceeds the mutual chain."""
+    return max(map(len, chains(run).values())) - mutual_length(run)
 
 
-def distinct(run: Simulated) -> int:
+def distinct_chains(run: Simulated) -> int:
     return len(set(map(tuple, chains(run).values())))
 
 
 def copies(run: Simulated) -> Counter[str]:
-    """In how many chains each block was, as the mission left them."""
+    """Return the number of chains that contain each block, before the final reconcile."""
     return Counter(block for chain in chains(run).values() for block in chain)
 
 
 def reconciles(run: Simulated, *agents: int) -> int:
-    """How often agents, or these, began one in the mission."""
+    """Return the number of reconciles of all agents, or of `agents`, before the final reconcile."""
     final = run.played.final_reconcile
     return sum(
         step.branch == "begun" and (final is None or round(step.t, 3) < final.at_s)
@@ -67,54 +67,54 @@ def reconciles(run: Simulated, *agents: int) -> int:
 
 
 def state(run: Simulated, agent: int, at_s: float) -> StateSummary:
-    """What the agent held just before that mission second."""
+    """Return the state of the agent just before that mission second."""
     return [step.state for step in run.evidence.traces[agent].runs if step.t < at_s][-1]
 
 
 def longest_stack(run: Simulated) -> int:
-    """The most blocks that an agent had taken off its chain at once."""
+    """Return the greatest length of the reconcile stack of any agent."""
     return max(step.state.stack for trace in run.evidence.traces.values() for step in trace.runs)
 
 
 def perfect(run: Simulated, seed: int) -> None:
     assert reconciles(run) == 0
-    assert distinct(run) == 1
+    assert distinct_chains(run) == 1
 
 
 def missed_commit(run: Simulated, seed: int) -> None:
     assert reconciles(run) > 0
-    assert tail(run) <= FEW
+    assert blocks_beyond_mutual(run) <= MAX_UNDECIDED_BLOCKS
 
 
 def loss_10(run: Simulated, seed: int) -> None:
     assert 0 < reconciles(run) < reconciles(played("loss_15", seed))
-    assert tail(run) <= FEW
+    assert blocks_beyond_mutual(run) <= MAX_UNDECIDED_BLOCKS
 
 
 def loss_15(run: Simulated, seed: int) -> None:
     assert reconciles(run) > 0
-    assert tail(run) <= FEW
+    assert blocks_beyond_mutual(run) <= MAX_UNDECIDED_BLOCKS
 
 
 def loss_25(run: Simulated, seed: int) -> None:
-    assert distinct(run) > 1
-    assert mutual(run) > len(run.evidence.completed_blocks()) / 2
+    assert distinct_chains(run) > 1
+    assert mutual_length(run) > len(run.evidence.completed_blocks()) / 2
     assert reconciles(run) > reconciles(played("loss_15", seed))
 
 
 def loss_30(run: Simulated, seed: int) -> None:
-    assert distinct(run) > 1
-    assert any(common_prefix(list(pair)) > mutual(run) for pair in combinations(chains(run).values(), 2))
+    assert distinct_chains(run) > 1
+    assert any(common_prefix(list(pair)) > mutual_length(run) for pair in combinations(chains(run).values(), 2))
 
 
 def loss_50(run: Simulated, seed: int) -> None:
-    assert mutual(run) < len(run.evidence.completed_blocks()) / 5
-    assert distinct(run) == 5
+    assert mutual_length(run) < len(run.evidence.completed_blocks()) / 5
+    assert distinct_chains(run) == 5
     assert reconciles(run) > len(run.evidence.completed_blocks())
 
 
 def loss_75(run: Simulated, seed: int) -> None:
-    assert mutual(run) == 0
+    assert mutual_length(run) == 0
     assert list(copies(run).values()).count(1) > 0.8 * len(copies(run))
     assert any(max(copies(played("loss_75", seed)).values()) > 1 for seed in SEEDS)
 
@@ -131,7 +131,7 @@ def partition_heal(run: Simulated, seed: int) -> None:
     assert min(one.chain, other.chain) > 0
     assert one.top != other.top
     assert reconciles(run) > 0
-    assert distinct(run) == 1
+    assert distinct_chains(run) == 1
 
 
 def rolling_partitions(run: Simulated, seed: int) -> None:
@@ -142,8 +142,8 @@ def rolling_partitions(run: Simulated, seed: int) -> None:
         assert not two & three
         agreed += (len(two) == 1) + (len(three) == 1)
     assert agreed > len(apart)
-    assert reconciles(run) > FEW
-    assert distinct(run) == 1
+    assert reconciles(run) > MAX_UNDECIDED_BLOCKS
+    assert distinct_chains(run) == 1
 
 
 def late_joiner(run: Simulated, seed: int) -> None:
@@ -152,7 +152,7 @@ def late_joiner(run: Simulated, seed: int) -> None:
     assert before > 0
     assert reconciles(run, 5) > 0
     assert len(chains(run)[5]) > before
-    assert distinct(run) == 1
+    assert distinct_chains(run) == 1
 
 
 def shared_channel(run: Simulated, seed: int) -> None:
@@ -160,7 +160,7 @@ def shared_channel(run: Simulated, seed: int) -> None:
     assert channel is not None
     assert all(count > 100 for count in channel["lost"]["collision"].values())
     assert len(channel["lost"]["collision"]) == 20
-    assert distinct(run) == 1
+    assert distinct_chains(run) == 1
 
 
 def asymmetric_links(run: Simulated, seed: int) -> None:
@@ -172,7 +172,7 @@ def asymmetric_links(run: Simulated, seed: int) -> None:
 
 def flapping(run: Simulated, seed: int) -> None:
     assert reconciles(run) > 0
-    assert distinct(run) == 1
+    assert distinct_chains(run) == 1
 
 
 def attrition(run: Simulated, seed: int) -> None:
@@ -184,7 +184,7 @@ def attrition(run: Simulated, seed: int) -> None:
     ]
     lives = {agent: (one["outcome"], one["restarts"], one["reboots"]) for agent, one in run.played.agents.items()}
     assert (lives["2"], lives["3"], lives["4"]) == (("exported", 1, 0), ("exported", 0, 1), ("killed", 0, 0))
-    assert survival(run.evidence).gone < FEW
+    assert survival(run.evidence).gone < MAX_UNDECIDED_BLOCKS
 
 
 def forced_tie(run: Simulated, seed: int) -> None:
@@ -193,13 +193,13 @@ def forced_tie(run: Simulated, seed: int) -> None:
 
 def large_divergence(run: Simulated, seed: int) -> None:
     assert longest_stack(run) >= 50
-    assert distinct(run) == 1
+    assert distinct_chains(run) == 1
 
 
 def split_rejoin(run: Simulated, seed: int) -> None:
     assert any(change["what"] == RANGE for change in run.played.network)
     assert longest_stack(run) > 1
-    assert tail(run) <= FEW
+    assert blocks_beyond_mutual(run) <= MAX_UNDECIDED_BLOCKS
 
 
 def lost_last_commit(run: Simulated, seed: int) -> None:
@@ -209,39 +209,39 @@ def lost_last_commit(run: Simulated, seed: int) -> None:
 
 
 def in_step(run: Simulated, seed: int) -> None:
-    assert going_round(run) == (11.0, 15.0)
+    assert livelock(run) == (11.0, 15.0)
 
 
 def refused_by_the_third(run: Simulated, seed: int) -> None:
-    assert going_round(run) == (21.0, 20.0)
+    assert livelock(run) == (21.0, 20.0)
 
 
 def refused_for_ever(run: Simulated, seed: int) -> None:
-    assert going_round(run) == (41.0, 20.0)
+    assert livelock(run) == (41.0, 20.0)
 
 
 def three_losses(run: Simulated, seed: int) -> None:
-    assert going_round(run) == (42.1, 20.0)
+    assert livelock(run) == (42.1, 20.0)
 
 
 def two_losses(run: Simulated, seed: int) -> None:
-    assert going_round(run) == (48.0, 20.5)
+    assert livelock(run) == (48.0, 20.5)
 
 
 def in_resonance(run: Simulated, seed: int) -> None:
-    assert going_round(run) == (37.6, 26.0)
+    assert livelock(run) == (37.6, 26.0)
 
 
 def drawn_in(run: Simulated, seed: int) -> None:
-    assert going_round(run) == (71.06, 25.0)
+    assert livelock(run) == (71.06, 25.0)
 
 
 def by_turns(run: Simulated, seed: int) -> None:
-    assert going_round(run) == (26.011, 30.0)
+    assert livelock(run) == (26.011, 30.0)
 
 
-def going_round(run: Simulated) -> tuple[float, float | None]:
-    """Since when, and with which period."""
+def livelock(run: Simulated) -> tuple[float, float | None]:
+    """Return the mission second at which the cycle began, and its period in seconds."""
     assert run.result.bad == ("5", "6", "liveness")
     cycle = run.evidence.once(cycle_of)
     assert cycle is not None and cycle.proven
@@ -268,13 +268,13 @@ def rogue(run: Simulated, seed: int) -> None:
 
 
 def field_test_2020(run: Simulated, seed: int) -> None:
-    """Figure 4.7, and both bugs."""
+    """Figure 4.7 of the thesis, with both bugs of the field test."""
     whole = chains(run)[10]
     assert chains(run)[28] == whole
     assert max(len(chains(run)[agent]) for agent in (32, 122)) < 0.7 * len(whole)
     aligned = common_prefix([whole, chains(run)[118], chains(run)[120]])
     assert 0.4 * len(whole) < aligned < len(whole)
-    assert seed != 76 or whole[aligned - 1] == "10.8", "the very block of the figure"
+    assert seed != 76 or whole[aligned - 1] == "10.8", "not the block of Figure 4.7"
     assert run.evidence.switched_off == {118: 1740, 120: 1740, 122: 1740, 28: 1770, 32: 1770, 10: 1785}
     last_event_s = {
         agent: max(step.t for step in trace.runs if step.trigger.kind == "event")
@@ -291,7 +291,7 @@ def field_test_2020(run: Simulated, seed: int) -> None:
 
 
 def captured(run: Simulated, seed: int) -> None:
-    """Who has vehicle 3's keys is believed in its name, and in no other."""
+    """Agents accept messages that the attacker signs with the keys of vehicle 3, and only in the name of vehicle 3."""
     violated = {number: one for number, one in run.result.characteristics.items() if one.verdict == "violated"}
     assert set(violated) == {"1", "4"}
     assert {finding.agent_id for finding in violated["4"].evidence} == {1, 2, 4, 5}
@@ -302,11 +302,11 @@ def captured(run: Simulated, seed: int) -> None:
     assert all(finding.detail.startswith(never_made) for finding in violated["4"].evidence)
     unsigned = {"not signed by its sender": 1}
     dropped = {agent_id for agent_id, agent in run.played.agents.items() if agent["dropped"] == unsigned}
-    assert dropped == {"1", "4", "5"}, "who hears a block in vehicle 2's name"
+    assert dropped == {"1", "4", "5"}, "agents that receive a block in the name of vehicle 2 drop it"
 
 
 def secure(run: Simulated, seed: int) -> None:
-    """Whoever has no keys gets nothing in."""
+    """Agents accept no message of a rogue node without keys."""
     dropped = sum((Counter(agent["dropped"]) for agent in run.played.agents.values()), Counter[str]())
     assert dropped["replayed"]
     assert dropped["not secured"]
@@ -315,7 +315,7 @@ def secure(run: Simulated, seed: int) -> None:
 
 
 def revoked_in_partition(run: Simulated, seed: int) -> None:
-    """All that live hear of the revocation, once they can, and tell who comes later."""
+    """All running agents receive the revocation when they can, and forward it to agents that start later."""
     heard_s = {}
     for agent_id, trace in run.evidence.traces.items():
         heard = [aside.t for _, aside in trace.asides if isinstance(aside, Commanded) and aside.command == "revoke"]
@@ -367,7 +367,7 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
 }
 SEEDS_OF = {"field_test_2020": (3, 8, 76), "captured": (1,)}
 PLAYED = [(name, seed) for name in CLAIMS for seed in SEEDS_OF.get(name, SEEDS)]
-"""Each scenario, and the seeds with which it shows what it says."""
+"""Each scenario with each seed for which its claim holds."""
 
 
 LIVELOCKS = (
@@ -382,19 +382,19 @@ LIVELOCKS = (
 )
 BAD = ("rogue", "captured", *LIVELOCKS, "missed_commit", "field_test_2020")
 
-RECONCILED = [
+WITH_FINAL_RECONCILE = [
     name
     for name in CLAIMS
     if name not in ("rogue", "captured") and load_scenario(SCENARIOS / f"{name}.yaml").final_reconcile
 ]
 
 
-def test_every_scenario_of_the_library_claims_something() -> None:
+def test_every_library_scenario_has_a_claim() -> None:
     assert {path.stem for path in SCENARIOS.glob("*.yaml") if not path.stem.endswith("_matrix")} == set(CLAIMS)
 
 
 @pytest.mark.parametrize(("name", "seed"), PLAYED)
-def test_a_scenario_shows_what_it_says(name: str, seed: int) -> None:
+def test_run_of_a_library_scenario_shows_its_claim(name: str, seed: int) -> None:
     run = played(name, seed)
     assert run.played.settled == (name not in LIVELOCKS)
     assert bool(run.result.bad) == (name in BAD)
@@ -403,42 +403,42 @@ def test_a_scenario_shows_what_it_says(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "seed"), PLAYED)
-def test_a_scenario_is_what_it_expects_of_itself(name: str, seed: int) -> None:
+def test_run_of_a_library_scenario_meets_its_expectations(name: str, seed: int) -> None:
     run, expect = played(name, seed), load_scenario(SCENARIOS / f"{name}.yaml").expect
     assert expect is not None
-    assert set(expect.characteristics) == set(NUMBERS.values())
+    assert set(expect.characteristics) == set(CHARACTERISTIC_NUMBERS.values())
     assert expect.figures
     for number, found in run.result.characteristics.items():
         assert expect.as_expected(number, found.verdict)
     assert expect.as_expected("liveness", run.result.beside["liveness"].verdict)
     assert not list(expect.out_of_range(run.result.figures))
-    assert not list(expect.other_common(run.result.chains))
+    assert not list(expect.unexpected_common_blocks(run.result.chains))
     steps = run.result.beside["steps"].evidence
-    assert not list(expect.other_deviations((finding.agent_id, finding.handler) for finding in steps))
+    assert not list(expect.unexpected_deviations((finding.agent_id, finding.handler) for finding in steps))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("name", RECONCILED)
-def test_a_final_reconcile_makes_one_chain_of_all_that_is_left(name: str, seed: int) -> None:
+@pytest.mark.parametrize("name", WITH_FINAL_RECONCILE)
+def test_final_reconcile_makes_one_chain_of_all_surviving_blocks(name: str, seed: int) -> None:
     run = played(name, seed)
     assert run.result.figures["distinct_chains"] == 1
     assert run.result.figures["mutual_chain"] == len(run.evidence.completed_blocks()) - survival(run.evidence).gone
     assert {one.verdict for one in run.result.characteristics.values()} == {"holds"}
 
 
-def test_there_is_a_scenario_for_every_rate_of_the_thesis() -> None:
+def test_library_has_a_scenario_for_every_loss_rate_of_the_thesis() -> None:
     lossy = {path.stem: load_scenario(path).network.loss for path in SCENARIOS.glob("loss_*.yaml")}
     assert lossy == {f"loss_{rate * 100:.0f}": rate for rate in yaml.safe_load(MATRIX.read_text())["loss"] if rate}
 
 
-def test_the_library_is_there_by_name_from_anywhere(tmp_path: Path) -> None:
+def test_library_scenario_loads_by_name_from_any_directory(tmp_path: Path) -> None:
     listed = harness("scenarios", cwd=tmp_path).stdout
     for path in SCENARIOS.glob("*.yaml"):
         assert path.stem in listed
     assert load_scenario(Path("loss_15")) == load_scenario(SCENARIOS / "loss_15.yaml")
 
 
-def test_a_file_comes_before_a_scenario_that_comes_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_takes_precedence_over_a_library_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "loss_15").write_text("name: mine")
     monkeypatch.chdir(tmp_path)
     assert load_scenario(Path("loss_15")).name == "mine"

@@ -1,4 +1,4 @@
-"""Schedules are worked out before the run, compose, and mean the same to every backend."""
+"""Schedules: ramps, repeated changes, and nemeses. They are computed before the run."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ def states(one: Scenario) -> list[NetworkChange]:
 
 
 def heard(state: NetworkChange, roster: tuple[int, ...]) -> dict[int, set[int]]:
-    """Whom each vehicle hears, itself included."""
+    """Return the vehicles that each vehicle hears, itself included."""
     conditions = state.conditions
     return {
         receiver: {
@@ -35,7 +35,7 @@ def scheduled(*schedule: dict[str, Any], **keys: Any) -> Scenario:
     return scenario(schedule=list(schedule), **{"duration_s": 300, **keys})
 
 
-def test_a_ramp_goes_in_equal_steps_and_stays() -> None:
+def test_ramp_changes_in_equal_steps_and_keeps_its_last_value() -> None:
     one = scheduled({"ramp": {"loss": [0, 0.4], "delay": [0, 2]}, "from_s": 100, "until_s": 140})
     seen = [(state.at_s, state.conditions.default.loss) for state in states(one)]
     assert seen == [(0, 0), *((100 + 10 * step, pytest.approx(0.1 * step)) for step in range(5))]
@@ -44,7 +44,7 @@ def test_a_ramp_goes_in_equal_steps_and_stays() -> None:
     assert last.mean_s == 2
 
 
-def test_what_is_repeated_is_undone_each_time() -> None:
+def test_repeated_change_is_undone_each_time() -> None:
     one = scheduled({"repeat": {"partition": [[1, 2]], "loss": 0.5}, "every_s": 100, "for_s": 30, "from_s": 50})
     assert [(state.at_s, state.what, state.detail) for state in states(one)] == [
         (0, "start", "loss 0 %"),
@@ -59,31 +59,31 @@ def test_what_is_repeated_is_undone_each_time() -> None:
 
 @pytest.mark.parametrize("nemesis", NEMESES)
 @pytest.mark.parametrize("agents", [4, 5, 6, 7, 10])
-def test_a_nemesis_does_what_its_name_says(nemesis: str, agents: int) -> None:
+def test_nemesis_cuts_the_links_that_its_name_promises(nemesis: str, agents: int) -> None:
     one = scheduled({"nemesis": nemesis, "every_s": 20, "for_s": 10}, agents=agents)
-    everybody = set(one.roster)
-    struck = [heard(state, one.roster) for state in states(one) if state.what == nemesis]
-    assert len(struck) == 15
-    assert len({str(who) for who in struck}) >= 3  # drawn anew each time
-    for who in struck:
-        assert all((a in who[b]) == (b in who[a]) for a in everybody for b in everybody)
-        groups = {frozenset(ears) for ears in who.values()}
+    roster = set(one.roster)
+    changes = [heard(state, one.roster) for state in states(one) if state.what == nemesis]
+    assert len(changes) == 15
+    assert len({str(senders) for senders in changes}) >= 3  # each change draws other vehicles
+    for senders in changes:
+        assert all((a in senders[b]) == (b in senders[a]) for a in roster for b in roster)
+        groups = {frozenset(heard_by_one) for heard_by_one in senders.values()}
         match nemesis:
             case "halves":
                 assert sorted(map(len, groups)) == [agents // 2, agents - agents // 2]
             case "isolate":
                 assert sorted(map(len, groups)) == [1, agents - 1]
             case "majorities ring":
-                assert all(len(ears) > agents / 2 for ears in who.values())
+                assert all(len(heard_by_one) > agents / 2 for heard_by_one in senders.values())
                 assert len(groups) == agents
             case "bridge":
-                assert sum(ears == everybody for ears in who.values()) == 1
+                assert sum(heard_by_one == roster for heard_by_one in senders.values()) == 1
             case "flapping":
-                assert sum(len(everybody - ears) for ears in who.values()) == 2
+                assert sum(len(roster - heard_by_one) for heard_by_one in senders.values()) == 2
     assert all(state.conditions.fully_connected for state in states(one) if state.what == "undone")
 
 
-def test_a_nemesis_is_its_seed_s() -> None:
+def test_nemesis_depends_on_its_seed_alone() -> None:
     def details(seed: int) -> list[str]:
         return [
             state.detail for state in states(scheduled({"nemesis": "halves", "every_s": 20, "for_s": 5, "seed": seed}))
@@ -92,7 +92,7 @@ def test_a_nemesis_is_its_seed_s() -> None:
     assert details(1) == details(1) != details(2)
 
 
-def test_layers_compose_with_each_other_and_with_the_timeline() -> None:
+def test_schedules_compose_with_each_other_and_with_the_timeline() -> None:
     one = scheduled(
         {"repeat": {"partition": [[1, 2, 3]]}, "every_s": 200, "for_s": 100},
         {"repeat": {"partition": [[1], [2, 3, 4, 5]]}, "every_s": 200, "for_s": 100, "from_s": 50},
@@ -110,7 +110,7 @@ def test_layers_compose_with_each_other_and_with_the_timeline() -> None:
 
 
 @pytest.mark.parametrize("nemesis", NEMESES)
-def test_agents_survive_every_nemesis(nemesis: str) -> None:
+def test_agents_reach_one_chain_after_every_nemesis(nemesis: str) -> None:
     one = scheduled({"nemesis": nemesis, "every_s": 60, "for_s": 40}, duration_s=600, final_reconcile=True)
     simulated = simulate(one, 1, tracing=True)
     assert {one.verdict for one in simulated.result.characteristics.values()} == {"holds"}
@@ -136,6 +136,6 @@ def test_agents_survive_every_nemesis(nemesis: str) -> None:
         ({"nemesis": "majorities ring", "every_s": 5, "for_s": 1}, "'majorities ring' needs 4 vehicles"),
     ],
 )
-def test_a_schedule_that_means_nothing_is_refused(schedule: dict[str, Any], sentence: str) -> None:
+def test_invalid_schedule_is_refused(schedule: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValidationError, match=sentence):
         scheduled(schedule, agents=3)

@@ -20,7 +20,7 @@ from tests.harness.play.test_recurrence import in_step
 from tests.harness.scenario.test_scenarios import SCENARIOS
 
 
-def test_each_agent_is_told_timers_of_its_own_and_records_agree() -> None:
+def test_each_agent_gets_its_own_timers_and_records_agree() -> None:
     document = {"name": "a", "agents": [3, 7, 9], "duration_s": 100, "stagger": {"vote_timeout_s": 0.5}}
     simulated = simulate(parse(document), 1, tracing=True)
     timers = {
@@ -33,7 +33,7 @@ def test_each_agent_is_told_timers_of_its_own_and_records_agree() -> None:
     assert len([*_headers.compare_headers(simulated.evidence)]) == 1
 
 
-def test_agents_in_step_get_out_of_step() -> None:
+def test_stagger_ends_the_livelock_of_agents_in_step() -> None:
     scenario = in_step()
     assert simulate(scenario, 1).result.judgements["liveness"].verdict == "never finishes"
     for timer in ("vote_timeout_s", "phase1_timeout_s"):
@@ -41,8 +41,8 @@ def test_agents_in_step_get_out_of_step() -> None:
         assert simulate(staggered, 1).result.judgements["liveness"].verdict == "finished"
 
 
-def test_staggered_two_losses_are_enough_for_one_that_all_refuse() -> None:
-    """Each of them is; but not with timers that are alike, nor where phase 2 needs a majority."""
+def test_two_losses_livelock_a_staggered_swarm() -> None:
+    """Neither loss alone causes the livelock. Equal timers, or a majority in phase 2, prevent it too."""
     scenario = load_scenario(SCENARIOS / "two_losses.yaml")
     first, second = scenario.fates
 
@@ -56,8 +56,8 @@ def test_staggered_two_losses_are_enough_for_one_that_all_refuse() -> None:
     assert liveness(settings=majority) == "finished"
 
 
-def test_where_phase_1_alone_is_staggered_agents_may_go_round_in_resonance() -> None:
-    """Two of one's phases 1 are as long as one of another's with a phase 3: whatever the stagger, and the messages."""
+def test_staggered_phase_1_alone_allows_a_livelock_in_resonance() -> None:
+    """Two phases 1 of one agent last as long as phases 1 and 3 of another agent, with any stagger."""
     scenario = load_scenario(SCENARIOS / "in_resonance.yaml")
 
     def liveness(seed: int = 1, **changes: Any) -> str:
@@ -71,13 +71,13 @@ def test_where_phase_1_alone_is_staggered_agents_may_go_round_in_resonance() -> 
 
 
 @pytest.mark.parametrize("stagger", [{"vote_timeout_s": 0.5}, {"phase1_timeout_s": 0.5}, STAGGER])
-def test_nobody_is_left_in_step_within_bounds(stagger: Stagger) -> None:
+def test_stagger_leaves_no_livelock_within_bounds(stagger: Stagger) -> None:
     graph = explore(Swarm(Bounds(2, 3, "lossy", stagger=stagger)), most_bytes=4e9, most_s=60)
     assert graph.ended == "complete"
     assert not look(graph).cycles
 
 
-def test_what_cannot_be_staggered() -> None:
+def test_invalid_stagger_is_refused() -> None:
     with pytest.raises(ScenarioError, match="the last agent's vote_timeout_s"):
         parse({"name": "a", "agents": 5, "stagger": {"vote_timeout_s": 9e8}})
     with pytest.raises(BoundsError, match="--stagger must be seconds"):

@@ -1,4 +1,4 @@
-"""The timeline takes any key of the network, for all, receivers and links, for good or for a while."""
+"""Changes of the network in a timeline: any key, for all links, receivers or single links, lasting or temporary."""
 
 import json
 from pathlib import Path
@@ -20,13 +20,13 @@ from tests.harness.virtual import scenario
 ONE_WAY = {"links": [{"from": 1, "to": 2, "loss": 0.9}]}
 
 
-def told(*timeline: dict[str, Any], **keys: Any) -> list[tuple[float, str, str]]:
-    """(mission seconds, what, in words) of each state of the network."""
+def network_states(*timeline: dict[str, Any], **keys: Any) -> list[tuple[float, str, str]]:
+    """Return (mission second, name, description) of each state of the network."""
     changes = timeline_of(scenario(timeline=list(timeline), **keys))
     return [(change.at_s, change.what, change.detail) for change in changes if isinstance(change, NetworkChange)]
 
 
-def test_any_key_of_the_network_is_laid_over_what_stands() -> None:
+def test_timeline_entry_changes_any_key_of_the_network() -> None:
     standing = {"loss": 0.1, "rate": 9600, "receivers": {2: {"loss": 0.5}}, "links": [{"from": 3, "to": 2, "limit": 5}]}
     layer = {
         "delay": {"mean_s": 0.5, "jitter_s": 0.1},
@@ -43,8 +43,8 @@ def test_any_key_of_the_network_is_laid_over_what_stands() -> None:
     assert change.conditions.link(1, 4) == LinkConditions(1.0, late)
 
 
-def test_what_is_for_a_while_passes_and_leaves_what_lasts() -> None:
-    seen = told(
+def test_temporary_change_ends_and_lasting_changes_stay() -> None:
+    seen = network_states(
         {"at_s": 300, "network": ONE_WAY, "for_s": 60},
         {"at_s": 330, "loss": 0.2},
         {"at_s": 340, "partition": [[1, 2]], "for_s": 100},
@@ -59,8 +59,8 @@ def test_what_is_for_a_while_passes_and_leaves_what_lasts() -> None:
     ]
 
 
-def test_within_a_change_another_may_pass_and_then_the_outer_one_holds_again() -> None:
-    seen = told(
+def test_outer_change_applies_again_after_an_inner_change() -> None:
+    seen = network_states(
         {"at_s": 100, "loss": 0.5, "for_s": 100},
         {"at_s": 120, "network": {"loss": 1}, "for_s": 10},
         {"at_s": 150, "partition": [[1]], "for_s": 100},
@@ -127,7 +127,7 @@ def test_within_a_change_another_may_pass_and_then_the_outer_one_holds_again() -
         ),
     ],
 )
-def test_what_means_nothing_or_two_things_is_refused(timeline: list[dict[str, Any]], sentence: str) -> None:
+def test_invalid_or_ambiguous_timeline_is_refused(timeline: list[dict[str, Any]], sentence: str) -> None:
     with pytest.raises(ValidationError, match=sentence):
         scenario(timeline=timeline)
 
@@ -144,7 +144,7 @@ def test_what_means_nothing_or_two_things_is_refused(timeline: list[dict[str, An
         ),
     ],
 )
-def test_a_mistake_names_the_key_and_what_is_allowed(tmp_path: Path, entry: str, sentence: str) -> None:
+def test_error_names_the_key_and_the_allowed_values(tmp_path: Path, entry: str, sentence: str) -> None:
     path = tmp_path / "scenario.yaml"
     path.write_text(f"name: x\ntimeline: [{entry}]")
     with pytest.raises(ScenarioError) as caught:
@@ -152,18 +152,18 @@ def test_a_mistake_names_the_key_and_what_is_allowed(tmp_path: Path, entry: str,
     assert sentence in str(caught.value)
 
 
-def test_what_an_engine_lacks_is_known_before_anything_starts() -> None:
+def test_network_needs_include_conditions_of_later_changes() -> None:
     late = {"links": [{"from": 1, "to": 2, "delay": 0.5}]}
     assert network_needs(scenario(timeline=[{"at_s": 9, "network": late, "for_s": 1}])) == ["links 1>2 delay"]
     assert network_needs(scenario(schedule=[{"repeat": {"network": late}, "every_s": 9, "for_s": 1}]))
     assert not network_needs(scenario(timeline=[{"at_s": 9, "network": ONE_WAY, "for_s": 1}]))
 
 
-def test_schedules_speak_the_language_of_the_timeline() -> None:
+def test_schedule_may_change_the_same_keys_as_the_timeline() -> None:
     repeat = {"repeat": {"network": ONE_WAY}, "every_s": 100, "for_s": 30, "from_s": 50}
     ends = [{"links": [{"from": 1, "to": 2, "loss": loss}]} for loss in (0, 0.4)]
     ramp = {"ramp": {"network": ends, "delay": [0, 1]}, "from_s": 210, "until_s": 230}
-    seen = told(network={"loss": 0.1}, schedule=[repeat, ramp], duration_s=240)
+    seen = network_states(network={"loss": 0.1}, schedule=[repeat, ramp], duration_s=240)
     assert seen == [
         (0, "start", "loss 10 %"),
         (50, "repeat", "loss 10 %, loss 90 % from 1 to 2"),
@@ -190,12 +190,12 @@ def test_schedules_speak_the_language_of_the_timeline() -> None:
         ({"repeat": {"network": {"limit": 9}}, "every_s": 9, "for_s": 1}, "schedule.0, at 0 s: limit: 9 needs a delay"),
     ],
 )
-def test_a_schedule_of_a_network_that_means_nothing_is_refused(schedule: dict[str, Any], sentence: str) -> None:
+def test_schedule_with_an_invalid_network_is_refused(schedule: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValidationError, match=sentence):
         scenario(schedule=[schedule])
 
 
-def test_a_link_that_loses_everything_for_a_while_is_silent_in_virtual_time() -> None:
+def test_link_with_full_loss_is_silent_in_virtual_time() -> None:
     dead = {"links": [{"from": 1, "to": 2, "loss": 1}]}
     one = scenario(
         agents=3,
@@ -221,7 +221,7 @@ def test_a_scenario_as_resolved_means_the_same_when_read_again() -> None:
         assert Scenario.model_validate(document) == one
 
 
-def test_exploring_cuts_a_network_s_changes_to_pieces() -> None:
+def test_explore_shrinks_changes_of_the_network() -> None:
     links = {"loss": 0.5, "links": [{"from": [1, 4], "to": 2, "loss": 0.9}], "receivers": {4: {"loss": 1}}}
     only_4 = {"receivers": {4: {"loss": 1}}}
     document = document_of(
@@ -251,7 +251,7 @@ def test_exploring_cuts_a_network_s_changes_to_pieces() -> None:
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_a_link_loses_for_a_while_as_processes(tmp_path: Path) -> None:
+def test_link_with_full_loss_is_silent_between_processes(tmp_path: Path) -> None:
     path = write_scenario(
         tmp_path,
         agents=3,
@@ -283,7 +283,7 @@ def test_a_link_loses_for_a_while_as_processes(tmp_path: Path) -> None:
     triggers = [(run["t"], run["trigger"]) for run in receiver if run.get("trigger", {}).get("from") == 1]
     datagram = [(at_s, sent_s[trigger["seq"]]) for at_s, trigger in triggers]
     assert not [at_s for at_s, since_s in datagram if since_s > applied_s and at_s < 80], (
-        "sent and heard while all is lost"
+        "a message arrived although all messages were lost"
     )
     assert [at_s for at_s, _ in datagram if at_s < 40]
     assert [at_s for at_s, _ in datagram if at_s > undone_s]

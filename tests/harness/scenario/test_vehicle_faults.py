@@ -1,4 +1,4 @@
-"""What a timeline can have befall vehicles: their GPS, compasses, motors, batteries, and wind."""
+"""Faults of vehicles in a timeline: GPS, compasses, motors, batteries, and wind."""
 
 import json
 import re
@@ -11,11 +11,11 @@ from pydantic import ValidationError
 
 from harness.archive.run_record import FaultRecord
 from harness.scenario import Scenario, explain
-from harness.scenario.faults import ASKED_FOR, VehicleFault
+from harness.scenario.faults import TIMELINE_FAULTS, VehicleFault
 from sitl.modes import MODES
 from tests.harness.command import harness, sentences, write_scenario
 
-TROUBLE: list[dict[str, Any]] = [
+FAULTS: list[dict[str, Any]] = [
     {"at_s": 20, "lose_gps": [1]},
     {"at_s": 50, "regain_gps": [1]},
     {"at_s": 25, "battery": [2], "volts": 10.4},
@@ -28,8 +28,8 @@ def scenario(timeline: list[dict[str, Any]], **vehicles: Any) -> dict[str, Any]:
     return {"name": "trouble", "agents": 2, "duration_s": 60, "timeline": timeline, "vehicles": kind}
 
 
-def test_all_of_them_are_there_and_their_records_are_known() -> None:
-    words = [kind.what for kind in ASKED_FOR if issubclass(kind, VehicleFault)]
+def test_every_vehicle_fault_is_a_timeline_key_with_a_record() -> None:
+    words = [kind.what for kind in TIMELINE_FAULTS if issubclass(kind, VehicleFault)]
     assert sorted(words) == [
         "battery",
         "lose_compass",
@@ -43,7 +43,7 @@ def test_all_of_them_are_there_and_their_records_are_known() -> None:
     (fault,) = Scenario.model_validate(scenario([entry])).faults_in_order()
     record = FaultRecord.model_validate(fault.to_json(5.01))
     assert record.detail == "vehicles 1 2, 12 m/s from 270°"
-    assert not (record.kind.ends_a_life or record.kind.takes_the_vehicle or record.loses_data)
+    assert not (record.kind.ends_incarnation or record.kind.removes_vehicle or record.loses_data)
 
 
 @pytest.mark.parametrize(
@@ -56,23 +56,25 @@ def test_all_of_them_are_there_and_their_records_are_known() -> None:
         ({"lose_gps": [7]}, {}, "names vehicle 7, which is not on the roster"),
     ],
 )
-def test_what_cannot_be_is_one_sentence(entry: dict[str, Any], vehicles: dict[str, Any], sentence: str) -> None:
+def test_impossible_vehicle_fault_is_refused_in_one_sentence(
+    entry: dict[str, Any], vehicles: dict[str, Any], sentence: str
+) -> None:
     with pytest.raises(ValidationError) as refused:
         Scenario.model_validate(scenario([{"at_s": 5, **entry}], **vehicles))
     assert sentence in explain(refused.value, Scenario)
 
 
-def test_virtual_time_refuses_it(tmp_path: Path) -> None:
-    (tmp_path / "trouble.yaml").write_text(yaml.safe_dump(scenario(TROUBLE)))
+def test_virtual_time_refuses_vehicle_faults(tmp_path: Path) -> None:
+    (tmp_path / "trouble.yaml").write_text(yaml.safe_dump(scenario(FAULTS)))
     run = harness("run", tmp_path / "trouble.yaml", "--backend", "sim", "--out", tmp_path / "run")
     assert run.returncode == 2
     assert "`lose_gps`, `battery`, `lose_compass`, `regain_gps` need flying vehicles" in run.stderr
 
 
 @pytest.mark.lab
-def test_a_run_in_which_vehicles_are_in_trouble_goes_on_and_says_what_they_cannot(tmp_path: Path) -> None:
+def test_run_continues_and_reports_faults_that_no_vehicle_simulated(tmp_path: Path) -> None:
     goes_home = {"parameters": {"BATT_FS_LOW_ACT": 2}}
-    written = write_scenario(tmp_path, **{**scenario(TROUBLE, each={2: goes_home}), "duration_s": 80, "speedup": 20})
+    written = write_scenario(tmp_path, **{**scenario(FAULTS, each={2: goes_home}), "duration_s": 80, "speedup": 20})
     out = tmp_path / "run"
     done = harness("run", written, "--out", out)
     assert done.returncode == 2, done.stderr
@@ -81,16 +83,16 @@ def test_a_run_in_which_vehicles_are_in_trouble_goes_on_and_says_what_they_canno
     (unmatched,) = record["unmatched_fates"]
     assert "vehicle 2 (embedded copter) cannot simulate the loss of its compasses" in unmatched
     assert unmatched in " ".join(sentences(done.stderr))
-    told = {vehicle: it["befallen"] for vehicle, it in record["vehicles"].items()}
-    assert [(it["what"], it["parameters"]) for it in told["1"]] == [
+    faults = {vehicle: entry["befallen"] for vehicle, entry in record["vehicles"].items()}
+    assert [(fault["what"], fault["parameters"]) for fault in faults["1"]] == [
         ("lose_gps", {"SIM_GPS1_ENABLE": 0.0}),
         ("regain_gps", {"SIM_GPS1_ENABLE": 1.0}),
     ]
-    assert [(it["what"], it["parameters"]) for it in told["2"]] == [
+    assert [(fault["what"], fault["parameters"]) for fault in faults["2"]] == [
         ("battery", {"SIM_BATT_VOLTAGE": pytest.approx(10.4)}),
         ("lose_compass", {}),
     ]
-    modes = {vehicle: it["mode"] for vehicle, it in record["vehicles"].items()}
+    modes = {vehicle: entry["mode"] for vehicle, entry in record["vehicles"].items()}
     assert modes == {"1": MODES["copter"]["LAND"], "2": MODES["copter"]["RTL"]}
     assert [fault["what"] for fault in record["faults"]] == ["lose_gps", "battery", "lose_compass", "regain_gps"]
     report = (out / "report.html").read_text()

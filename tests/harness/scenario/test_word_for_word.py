@@ -1,4 +1,4 @@
-"""What a scenario can say of a flight word for word: events, arrivals, late timers, datagrams, the chains expected."""
+"""Scenario keys that repeat a recorded flight: events, arrivals, late timers, datagrams, and expected chains."""
 
 import base64
 from typing import Any
@@ -9,7 +9,7 @@ from harness.errors import ScenarioError
 from harness.run.simulate import Simulated, simulate
 from harness.scenario.expect import Expect
 from harness.scenario.load import parse
-from harness.scenario.strict_model import in_text, numbered
+from harness.scenario.strict_model import format_pairs, parse_pairs
 from tests.harness.virtual import scenario
 from ucp.block import Block, InceptionBlock, next_chain_hash
 from ucp.events import LoggableEvent
@@ -30,20 +30,20 @@ def times_of(simulated: Simulated, agent: int, handler: str) -> list[float]:
     return [run.t for run in simulated.evidence.traces[agent].runs if run.handler == handler]
 
 
-def test_an_event_and_the_inception_block_are_those_of_the_flight() -> None:
+def test_recorded_event_and_initial_data_give_the_expected_chain() -> None:
     simulated = played(initial_data=base64.b64encode(b"begin").decode())
     block = Block(1, 123, LoggableEvent(123, 7, b"seen").encode())
     top = next_chain_hash(InceptionBlock(b"begin").chain_hash, block.block_hash).hex()
     assert {export.top_chain_hash for export in simulated.evidence.exports.values()} == {top}
     expect = Expect.model_validate({"chains": {1: top, 2: "0" * 64, 3: top}})
     tops = {agent: export.top_chain_hash for agent, export in simulated.evidence.exports.items()}
-    assert [*expect.other_chains(tops)] == [
+    assert [*expect.unexpected_chains(tops)] == [
         f"agent 2 ends with the chain hash {top[:12]} on top, but must end with 000000000000",
         f"agent 3 has no chain, but must end with {top[:12]} on top",
     ]
 
 
-def test_what_arrives_and_when_is_as_the_fate_says_and_no_more() -> None:
+def test_arrivals_deliver_exactly_the_listed_datagrams() -> None:
     fates = [
         {"sender": 1, "receiver": 2, "arrivals": "0@11.5 0@12.25"},
         {"sender": 2, "receiver": 1, "arrivals": "0@13"},
@@ -55,19 +55,19 @@ def test_what_arrives_and_when_is_as_the_fate_says_and_no_more() -> None:
     assert simulated.played.unmatched_fates == []
 
 
-def test_a_datagram_that_never_left_is_told() -> None:
+def test_arrival_of_a_datagram_that_was_never_sent_is_reported() -> None:
     simulated = played(fates=[{"sender": 1, "receiver": 2, "arrivals": "0@11 70@12 90@13"}])
     (sentence,) = simulated.played.unmatched_fates
     assert sentence.endswith("2 of its datagrams, the first number 70, never left")
 
 
-def test_a_timer_ends_as_late_as_is_said() -> None:
+def test_timer_expires_late_by_the_listed_seconds() -> None:
     assert times_of(played(), 1, "vote_timer_expiration") == [20.0]
     assert times_of(played(lateness={1: "0+2.5"}), 1, "vote_timer_expiration") == [22.5]
     assert times_of(played(lateness={1: "1+2.5"}), 1, "vote_timer_expiration") == [20.0]
 
 
-def test_a_datagram_that_nobody_sends_is_heard() -> None:
+def test_scripted_datagram_reaches_its_receiver() -> None:
     block = Block(2, 5, LoggableEvent(5, 1, b"x").encode())
     top = next_chain_hash(InceptionBlock(b"").chain_hash, block.block_hash)
     datagram = base64.b64encode(encode(2, 0, CommitBlock(block, top))).decode()
@@ -79,14 +79,14 @@ def test_a_datagram_that_nobody_sends_is_heard() -> None:
     assert simulated.result.characteristics["4"].verdict == "not applicable"
 
 
-def test_the_operator_asks_for_a_reconcile_in_flight() -> None:
+def test_fault_reconcile_starts_a_reconcile() -> None:
     simulated = played(timeline=[{"at_s": 30, "reconcile": [2]}])
     assert times_of(simulated, 2, "reconcile_begin") == [30.0]
 
 
-def test_seconds_by_number_are_written_as_they_are_read() -> None:
+def test_pairs_of_number_and_seconds_survive_writing_and_reading() -> None:
     pairs = [(0, 12.5), (3, 0.000001), (1234567890, 86400.0)]
-    assert numbered(in_text(pairs, "@")) == pairs
+    assert parse_pairs(format_pairs(pairs, "@")) == pairs
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_seconds_by_number_are_written_as_they_are_read() -> None:
         ({"expect": {"chains": {1: "abc"}}}, "expect.chains.1"),
     ],
 )
-def test_what_means_nothing_is_told(keys: dict[str, Any], sentence: str) -> None:
+def test_invalid_scripted_key_is_refused_with_a_sentence(keys: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ScenarioError) as error:
         parse({"name": "test", "agents": 3, **keys})
     assert sentence in str(error.value)

@@ -9,7 +9,7 @@ from random import Random
 from typing import NamedTuple, get_args
 
 from harness.scenario.fates import MessageName
-from harness.scenario.strict_model import in_text, numbered
+from harness.scenario.strict_model import format_pairs, parse_pairs
 from harness.sweep.explore._scenario_document import Document, at, keep_agents, script, timeline, with_key
 from ucp.settings import CHOICES, Settings
 
@@ -214,9 +214,9 @@ def _delay_timer(document: Document, rng: Random) -> Document:
         return _delay_message(document, rng)
     agent = str(rng.choice(document["agents"]))
     lateness: Document = dict(document.get("lateness", {}))
-    late = dict(numbered(lateness.get(agent, "")))
+    late = dict(parse_pairs(lateness.get(agent, "")))
     late[rng.randrange(12)] = rng.choice(LATE_S)
-    lateness[agent] = in_text(sorted(late.items()), "+")
+    lateness[agent] = format_pairs(sorted(late.items()), "+")
     return {**document, "lateness": lateness}
 
 

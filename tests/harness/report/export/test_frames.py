@@ -18,7 +18,7 @@ from harness.api import (
     run_matrix,
 )
 from harness.report.export import frames
-from harness.scenario.verdict_names import JUDGED
+from harness.scenario.verdict_names import ALL_CHECKS
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +76,8 @@ def test_table_of_a_matrix_has_a_row_for_each_run(tmp_path: Path) -> None:
         (0.5, 2, "sim", 2),
     ]
     assert table["mutual_chain"].to_list() == [each.figures["mutual_chain"] for each in finished.runs]
-    names = [f"characteristic_{key}" if key.isdigit() else key for key in JUDGED]
-    assert table.select(names).row(0) == tuple(finished.runs[0].verdicts[key] for key in JUDGED)
+    names = [f"characteristic_{key}" if key.isdigit() else key for key in ALL_CHECKS]
+    assert table.select(names).row(0) == tuple(finished.runs[0].verdicts[key] for key in ALL_CHECKS)
 
 
 def test_table_without_polars_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

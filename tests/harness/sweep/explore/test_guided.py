@@ -19,7 +19,7 @@ from harness.errors import RunDirectoryError
 from harness.proof.coverage import Reached
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.load import find
+from harness.scenario.load import find_file
 from harness.sweep.explore._scenario_document import document_of, script
 from harness.sweep.explore.guided import Night, spend
 from harness.sweep.explore.guided._corpus import MOST_BYTES, opened
@@ -90,7 +90,7 @@ def test_blocks_are_completed_when_a_timer_ended() -> None:
 
 
 def test_trial_records_ends_of_timers_and_failed_votes() -> None:
-    round_about = play_trial(load_scenario(find(Path("refused_by_the_third"))), 1)
+    round_about = play_trial(load_scenario(find_file(Path("refused_by_the_third"))), 1)
     assert 11.0 in round_about.timers_ended_s
     assert round_about.timers_ended_s == tuple(sorted(round_about.timers_ended_s))
     assert len(round_about.failed_votes) == 2
@@ -145,7 +145,7 @@ def test_livelocks_differ_by_their_cycles_of_timers() -> None:
 
 
 def test_identity_of_a_livelock_does_not_depend_on_the_moment() -> None:
-    drawn_in = load_scenario(find(Path("drawn_in"))).model_dump(exclude={"expect"}, exclude_unset=True)
+    drawn_in = load_scenario(find_file(Path("drawn_in"))).model_dump(exclude={"expect"}, exclude_unset=True)
     shapes = set()
     for later_s in range(0, 25, 5):
         scenario = Scenario.model_validate({**drawn_in, "duration_s": 106 + later_s})
