@@ -48,7 +48,7 @@ MIN_FOLLOW_S = 0.1
 
 
 class ProgramRun:
-    """One run, which implements `harness.play.mission.Swarm` and `harness.scenario.faults.AgentOperations`. Open it once."""
+    """One run. It implements `mission.Swarm` and `faults.AgentOperations`. Open it once."""
 
     def __init__(
         self,
