@@ -44,6 +44,7 @@ from collections.abc import Container, Iterable, Sequence
 from typing import Any
 
 from ucp import commit, reconcile
+from ucp.answer_spread import Outgoing, WaitingAnswers
 from ucp.block import MAX_AGENT_ID
 from ucp.core import Core, Seal
 from ucp.events import LoggableEvent
@@ -144,6 +145,8 @@ class Agent:
         self.dropped: Counter[str] = Counter()
         self._core = Core(agent_id, initial_data, settings or Settings(), tracing=tracing, seal=seal)
         self.state: AgentState = self._core
+        spread_s = self.state.settings.answer_spread_s
+        self._waiting_answers = WaitingAnswers(agent_id, spread_s) if spread_s else None
         self._tracing = tracing
         self._trace: list[Entry] = []
         self._traced_state = self._state_now()
@@ -201,9 +204,17 @@ class Agent:
             raise ValueError(f"an event of {event.encoded_bytes} bytes is more than max_event_bytes {largest}")
 
     def next_timer(self) -> float | None:
-        """Return the mission second of the next timer, when `handle_timer` is due; None if no timer runs."""
+        """Return the mission second at which `handle_timer` is due. None if no timer runs and no answer waits."""
         timer = self._soonest()
-        return None if timer is None else timer.deadline
+        deadline = None if timer is None else timer.deadline
+        answer_s = self.next_answer()
+        if answer_s is None or deadline is None:
+            return answer_s if deadline is None else deadline
+        return min(answer_s, deadline)
+
+    def next_answer(self) -> float | None:
+        """Return the mission second at which the next waiting answer is due. None if none waits."""
+        return None if self._waiting_answers is None else self._waiting_answers.next_s()
 
     def _soonest(self) -> Timer | None:
         """Return the timer that expires next. None if no timer runs."""
@@ -226,9 +237,15 @@ class Agent:
         return None
 
     def handle_timer(self, now: float) -> None:
-        """Run the handlers of all timers that have expired by `now`, earliest first."""
+        """Run the handlers of all timers that have expired by `now`, earliest first, and release due answers."""
         while (timer := self._soonest()) is not None and timer.deadline is not None and timer.deadline <= now:
             self.end_timer(timer, now)
+        self.release_answers(now)
+
+    def release_answers(self, now: float) -> None:
+        """Let `datagrams_to_send` return the answers that have waited until `now`."""
+        if self._waiting_answers is not None:
+            self._core.now = now
 
     def end_timer(self, timer: Timer, now: float) -> None:
         """End a running timer at `now`, and run its handler."""
@@ -252,18 +269,26 @@ class Agent:
         self._handle(now, OperatorTrigger("reconcile"), None, self._on_local_event["Reconcile Begin"])
 
     def messages_to_send(self) -> list[tuple[int, Message]]:
-        """Return the messages to broadcast, in order, as (sequence, message), and empty the outbox."""
+        """Return the messages of the handlers that ran, in order, as (sequence, message), and empty the outbox.
+
+        `answer_spread_s` has no effect on them. A driver of the network calls `datagrams_to_send`.
+        """
         return [(sequence, message) for sequence, message, _ in self._taken_from_outbox()]
 
-    def _taken_from_outbox(self) -> list[tuple[int, Message, Recorded | None]]:
+    def _taken_from_outbox(self) -> list[Outgoing]:
         outbox = self._core.outbox
         if outbox:
             self._core.outbox = []
         return outbox
 
+    def _due_to_send(self) -> list[Outgoing]:
+        """Return the messages to broadcast now, in order. Answers wait by `answer_spread_s`."""
+        outbox = self._taken_from_outbox()
+        return outbox if self._waiting_answers is None else self._waiting_answers.exchange(outbox, self._core.now)
+
     def datagrams_to_send(self) -> list[bytes]:
-        """Return the datagrams to broadcast, in order, and empty the outbox."""
-        return [encode(self.agent_id, sequence, message) for sequence, message in self.messages_to_send()]
+        """Return the datagrams to broadcast now, in order. Answers wait by `answer_spread_s`."""
+        return [encode(self.agent_id, sequence, message) for sequence, message, _ in self._due_to_send()]
 
     def trace(self) -> list[Entry]:
         """Return the handler runs and dropped datagrams since the last call, in order."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from ucp.sealed import sealed_to
-from ucp.settings import ALTERNATIVES
+from ucp.settings import ALTERNATIVES, NUMBERS
 
 CONTRACT = 2
 """The version of contract/CONTRACT.md by which mission files are written."""
@@ -22,6 +22,10 @@ def _has(name: str, value: bool | str) -> Callable[[Mapping[str, Any]], bool]:
     return lambda mission: mission["settings"].get(name) == value
 
 
+def _is_not_zero(name: str) -> Callable[[Mapping[str, Any]], bool]:
+    return lambda mission: mission["settings"].get(name, 0) != 0
+
+
 FEATURES: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     "store": lambda mission: mission.get("store") is not None,
     "telemetry": lambda mission: mission["events"]["source"] == "mavlink",
@@ -29,6 +33,7 @@ FEATURES: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     "sealed": lambda mission: sealed_to(b64decode(mission["initial_data"])) is not None,
     "quirks": lambda mission: any(mission["quirks"].values()),
     **{feature: _has(name, value) for feature, (name, value) in ALTERNATIVES.items()},
+    **{name: _is_not_zero(name) for name, number in NUMBERS.items() if number.is_feature},
 }
 """Feature -> whether a mission file that has all keys needs it, but those of `ucp.settings.ADDED`."""
 

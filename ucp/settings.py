@@ -21,7 +21,7 @@ MAX_TIMER_S = 1e9
 
 @dataclass(eq=False, frozen=True, slots=True)
 class Number:
-    """The declaration of a setting that is a number. An agent needs no feature for any value."""
+    """The declaration of a setting that is a number."""
 
     sentence: str
     """What the setting does, for the table in contract/CONTRACT.md."""
@@ -30,6 +30,9 @@ class Number:
     low: float
     high: float
     whole: bool = False
+    is_feature: bool = False
+    """An agent needs a feature with the name of the setting for each value except the default. Missions and traces
+    leave out the default."""
 
 
 @dataclass(eq=False, frozen=True, slots=True)
@@ -135,6 +138,18 @@ class Settings:
         ),
     ] = "oldest"
 
+    answer_spread_s: Annotated[
+        float,
+        Number(
+            "Greatest wait before an answer is sent (Algorithms 3, 9, 13 and 17). Each answer waits for its own share "
+            "of this time, so that the answers of many agents do not collide on a shared channel. 0 is no wait.",
+            "at least 0 seconds, less than each of the four timers",
+            0,
+            MAX_TIMER_S,
+            is_feature=True,
+        ),
+    ] = 0.0
+
     def __post_init__(self) -> None:
         for name, number in NUMBERS.items():
             value = getattr(self, name)
@@ -142,6 +157,10 @@ class Settings:
             kinds = (int,) if number.whole else (int, float)
             if type(value) not in kinds or not number.low <= value <= high:
                 raise ValueError(f"{name} must be {number.allowed}, not {shown(value)}")
+        timers = self.vote_timeout_s, self.phase1_timeout_s, self.phase2_timeout_s, self.phase3_timeout_s
+        if 0 < self.answer_spread_s >= min(timers):
+            allowed = NUMBERS["answer_spread_s"].allowed
+            raise ValueError(f"answer_spread_s must be {allowed}, not {shown(self.answer_spread_s)}")
         for name, choice in CHOICES.items():
             value = getattr(self, name)
             if not isinstance(value, type(choice.values[0])) or value not in choice.values:
@@ -161,7 +180,10 @@ DECLARED: dict[str, Number | Choice] = {name: kind.__metadata__[0] for name, kin
 """Name of each setting -> its declaration."""
 NUMBERS = {name: declared for name, declared in DECLARED.items() if isinstance(declared, Number)}
 CHOICES = {name: declared for name, declared in DECLARED.items() if isinstance(declared, Choice)}
-ADDED = tuple(name for name, choice in CHOICES.items() if not choice.always_written)
+ADDED = (
+    *(name for name, choice in CHOICES.items() if not choice.always_written),
+    *(name for name, number in NUMBERS.items() if number.is_feature),
+)
 """Settings that the first agents of contract 2 do not have."""
 ALTERNATIVES: dict[str, tuple[str, bool | str]] = {
     name if value is True else f"{name}={value}": (name, value)

@@ -57,6 +57,17 @@ ASKING_MISSIONS: tuple[Mission, ...] = ("busy", "split")
 LINES = ((5, 200.0), (10, 100.0))
 """Number of vehicles in a line, and the metres between neighbours."""
 LINE_SPREADS_S = (0.0005, 0.005, 0.5)
+ANSWER_SPREADS_S = (0.0, 0.05, 0.5, 2.0)
+"""Values of the setting `answer_spread_s`."""
+ANSWERING: tuple[tuple[Mission, str, int, float | None], ...] = (
+    ("steady", "wifi_1", 50, None),
+    ("steady", "wifi_6", 50, None),
+    ("busy", "wifi_6", 20, None),
+    ("busy", "rfd900", 10, None),
+    ("busy", "lora_sf7", 5, None),
+    ("steady", "wifi_6", 10, 100.0),
+)
+"""Mission, radio, number of agents, and metres between neighbours in a line, in the table over `answer_spread_s`."""
 
 HEAD, PANEL_HEIGHT, FOOT = 96, 210, 26
 DISTURBED = ("collision", "half_duplex")
@@ -73,6 +84,7 @@ class Cell(NamedTuple):
     asks_after_commit: bool = False
     line_m: float | None = None
     """Metres between neighbours in a line. None: the vehicles form a field with 5 m between them."""
+    answer_spread_s: float = 0.0
 
 
 class Run(NamedTuple):
@@ -107,7 +119,7 @@ def cells() -> list[Cell]:
         for spread_s in SPREADS_S
     ]
     without = [Cell(mission, None, agents) for mission, numbers in MISSIONS.items() for agents in numbers]
-    return [*grid, *without, *_asking(True), *_lines()]
+    return [*grid, *without, *_asking(True), *_lines(), *_answering()]
 
 
 def scenario(cell: Cell, seed: int) -> Scenario:
@@ -130,6 +142,7 @@ def scenario(cell: Cell, seed: int) -> Scenario:
             "max_block_bytes": MAX_BLOCK_BYTES,
             "max_event_bytes": MAX_BLOCK_BYTES,
             "asks_after_commit": cell.asks_after_commit,
+            "answer_spread_s": cell.answer_spread_s,
         },
         "vehicles": {"swarm": line},
         "network": {"channel": {"preset": cell.radio, "processing_s": cell.spread_s}} if cell.radio else {},
@@ -193,6 +206,19 @@ def tables(runs: Runs) -> dict[str, str]:
             (
                 [cell.mission, str(cell.agents), _radio(cell), _seconds(cell.spread_s), *_figures(runs[cell])]
                 for cell in spread_cells
+            ),
+        ),
+        "answers": _markdown(
+            ["mission", "N", "radio", "`answer_spread_s`", *COLUMNS],
+            (
+                [
+                    f"{cell.mission}, in a line" if cell.line_m else cell.mission,
+                    str(cell.agents),
+                    _radio(cell),
+                    _seconds(cell.answer_spread_s),
+                    *_figures(runs[cell]),
+                ]
+                for cell in _answering()
             ),
         ),
         "asking": _asking_table(runs),
@@ -316,6 +342,14 @@ def _lines() -> list[Cell]:
         Cell("steady", "wifi_6", agents, spread_s, line_m=line_m)
         for agents, line_m in LINES
         for spread_s in LINE_SPREADS_S
+    ]
+
+
+def _answering() -> list[Cell]:
+    return [
+        Cell(mission, radio, agents, line_m=line_m, answer_spread_s=spread_s)
+        for mission, radio, agents, line_m in ANSWERING
+        for spread_s in ANSWER_SPREADS_S
     ]
 
 

@@ -25,6 +25,7 @@ from harness.archive.traces import Trace
 from harness.archive.vocabulary import Kind, UnknownNames, first_unknown, unknown_names
 from harness.checker._trace_replay import Incarnation, replay
 from harness.checker.reference.state import State
+from harness.checker.sent_times import sent_at, spread_of
 from harness.errors import RunDirectoryError
 from harness.play.rogue.rogue_line import OF_NO_INJECTION
 from harness.play.variant import VariantError, variant_in_use
@@ -186,9 +187,10 @@ class Evidence:
         sendings: dict[Any, Sendings] = {}
         for agent_id, trace in self.traces.items():
             of_agent: Sendings = defaultdict(dict)
+            spread_s = spread_of(trace)
             for run in trace.runs:
                 for message in run.sent:
-                    of_type, sending = of_agent[message.message], (run.t, message)
+                    of_type, sending = of_agent[message.message], (sent_at(run, message, spread_s), message)
                     earlier = of_type.get(message.seq)
                     of_type[message.seq] = (sending,) if earlier is None else (*earlier, sending)
             sendings[agent_id] = dict(of_agent)

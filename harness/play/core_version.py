@@ -19,6 +19,7 @@ import ucp
 FILES = (
     "_dataclass",
     "agent",
+    "answer_spread",
     "block",
     "chain",
     "commit",

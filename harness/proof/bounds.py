@@ -99,6 +99,10 @@ class Bounds:
         for name in self.settings:
             if name not in names:
                 raise BoundsError(f"--settings {name} is unknown: use one of {', '.join(names)}")
+        if self.settings.get("answer_spread_s"):
+            raise BoundsError(
+                "--settings answer_spread_s has no meaning here, because messages arrive at any time: leave it out"
+            )
         try:
             self.agent_settings(self.agents)
             for name, value in self.quirks.items():

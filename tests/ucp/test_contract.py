@@ -144,7 +144,7 @@ def test_mission_files_fit_their_schema_and_name_the_features_that_they_need() -
         {
             "name": "rich",
             "quirks": {"ignore_commit": 0.5},
-            "settings": dict(ALTERNATIVES.values()),
+            "settings": {**dict(ALTERNATIVES.values()), "answer_spread_s": 0.5},
             "events": {"source": "mavlink"},
         }
     )

@@ -129,8 +129,9 @@ class SecuredAgent(Agent):
         return [outgoing.sealed for outgoing in self.sealed_to_send()]
 
     def sealed_to_send(self) -> Sequence[OutgoingDatagram]:
-        """Return the datagrams to broadcast in order, and empty the outbox."""
-        if not self._revocation_due and not self._core.outbox:
+        """Return the datagrams to broadcast now, in order. Answers wait by `answer_spread_s`."""
+        due = self._due_to_send()
+        if not self._revocation_due and not due:
             return ()
         self.session.epochs.set_clock(self.state.now)
         outgoing = []
@@ -139,7 +140,7 @@ class SecuredAgent(Agent):
             outgoing.append(
                 OutgoingDatagram(self.session.revocation_datagram(self.revocation.number, self.revocation.encode()))
             )
-        for sequence, message, plain in self._taken_from_outbox():
+        for sequence, message, plain in due:
             if sequence > LAST_SEQUENCE:
                 self.problem = "the agent has used all sequence numbers of this boot: restart it so that it sends again"
                 continue

@@ -11,6 +11,7 @@ from harness.archive.packets.pcap import INBOUND, OUTBOUND
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import times
 from harness.checker.records.contradiction import Contradiction, of_agent, slack_s
+from harness.checker.sent_times import sent_at, spread_of
 from ucp.trigger import MessageTrigger
 
 COUNTS_DATAGRAMS = "nftables"
@@ -67,11 +68,23 @@ def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams
 
 
 def _not_sent(evidence: Evidence, agent_id: int) -> int:
-    """Return the number of messages in its trace that an agent may not have sent, because of an error or its kill."""
+    """Return the number of messages in its trace that an agent may not have sent, because of an error or its end.
+
+    A killed agent does not send the messages of its last input. An agent that ends sends no answer that still waits.
+    """
     recorded = evidence.recorded(agent_id)
     incarnations = evidence.incarnations[agent_id]
     killed = incarnations if recorded is None or recorded.outcome != "exported" else incarnations[:-1]
     last = sum(len(run.sent) for incarnation in killed for run in incarnation.runs if run.t == incarnation.runs[-1].t)
+    if spread_s := spread_of(evidence.traces[agent_id]):
+        ends = [(incarnation.runs, incarnation.runs[-1].t) for incarnation in incarnations if incarnation.runs]
+        last += sum(
+            run.t < end_s <= sent_at(run, message, spread_s)
+            for runs, end_s in ends
+            for run in runs
+            if run.t >= end_s - spread_s
+            for message in run.sent
+        )
     return last + ((recorded.send_failures or 0) if recorded else 0)
 
 
@@ -104,4 +117,6 @@ def _sent_by(evidence: Evidence, agent_id: int, mission_s: float) -> int:
     """Return the least number of messages that an agent had sent when the kernel's counters were read."""
     trace = evidence.traces[agent_id]
     by = mission_s - slack_s(trace)
-    return sum(len(run.sent) for run in trace.runs if run.t < by) - _not_sent(evidence, agent_id)
+    spread_s = spread_of(trace)
+    sent = (sent_at(run, message, spread_s) for run in trace.runs for message in run.sent)
+    return sum(sent_s < by for sent_s in sent) - _not_sent(evidence, agent_id)

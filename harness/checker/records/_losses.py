@@ -25,6 +25,7 @@ from harness.checker.evidence import Evidence
 from harness.checker.records._captures_vs_traces import COUNTS_DATAGRAMS
 from harness.checker.records._handled_vs_faults import stopped
 from harness.checker.records.contradiction import Contradiction, in_virtual_time, of_agent, slack_s
+from harness.checker.sent_times import sent_at, spread_of
 from harness.scenario.changes import RANGE
 from harness.scenario.faults.fault import SAME_TIME_S
 from netem.link import GilbertElliott, LinkConditions
@@ -149,11 +150,12 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
         for sender, of_sender in evidence.traces.items():
             if (sender, receiver) not in known:
                 continue
+            spread_s = spread_of(of_sender)
             for run in of_sender.runs:
                 for message in run.sent:
                     if ready is not None and not ready.handles(message.message, run.t):
                         continue
-                    around = history.around((sender, receiver), run.t)
+                    around = history.around((sender, receiver), sent_at(run, message, spread_s))
                     seen.add(over_cuts if over_cuts is not None and around[1] == 1.0 else around)
                     key = sender, message.message, message.seq
                     if handled[key] > 0:

@@ -29,6 +29,7 @@ class Settings:
     phase2_tie: str = "oldest"  # or "block"
     asks_after_commit: bool = False  # extends the thesis
     top_needs_majority: bool = False  # extends the thesis
+    answer_spread_s: float = 0.0  # extends the thesis: handlers send answers as usual, and the driver delays them
 
     @classmethod
     def of(cls, settings: object) -> "Settings":

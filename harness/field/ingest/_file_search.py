@@ -17,7 +17,8 @@ _IMPORT_FILE = "import.json"
 MAX_FILES = 10_000
 MAX_DEPTH = 16
 _HARNESS_FILES = {
-    *(RUN_FILE, BEFORE_FINAL_RECONCILE, "vehicles", "network.jsonl", "tracks.jsonl", "rogue.jsonl"),
+    *(RUN_FILE, BEFORE_FINAL_RECONCILE, "vehicles", "network.jsonl", "tracks.jsonl", "rogue.jsonl", "lag.jsonl"),
+    "channel.jsonl",
     *("report.html", "report.md", "junit.xml", "chains.svg"),
 }
 """Files in a run directory that the harness wrote, as opposed to agents."""

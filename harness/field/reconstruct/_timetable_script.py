@@ -47,7 +47,8 @@ def scenario_document(
         "duration_s": float(max(1, math.ceil(last_s + MIN_GAP_S))),
         "initial_data": _base64(mission.initial_data),
         "clocks": _clocks(table),
-        "settings": _settings(mission.settings),
+        # The fates have the time at which each answer arrives, so answers need not wait.
+        "settings": _settings(dataclasses.replace(mission.settings, answer_spread_s=0.0)),
         "quirks": _quirks({agent: rehearsal.quirks for agent, rehearsal in rehearsals.items()}),
         "timeline": _with_unique_times(entries),
         "events": {"source": "scripted", "script": _events(table, sealed)},

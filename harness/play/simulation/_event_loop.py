@@ -87,6 +87,7 @@ class Clockwork:
         anything_counts = self._anybody_is_unknown or (self._keys is not None and not self._keys.nothing_is_dropped)
         anything_counts = anything_counts or bool(edited_files()) or variant_in_use() is not None
         self._deliver_all = deliver_all = deliver_all or anything_counts
+        self._answers_wait = scenario.settings.answer_spread_s > 0
         self._now = 0.0
         self._generating = True
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
@@ -206,7 +207,7 @@ class Clockwork:
             now = self._now if life.clock is None else life.local_s(self._now)
             self._give(life.agent, flight, now)
             self._say(number, life)
-            if self._deliver_all or state is None or state.reconcile_in_progress:
+            if self._deliver_all or self._answers_wait or state is None or state.reconcile_in_progress:
                 self._wait(number, life)  # of the right handlers of messages only a reconcile's touch timers
 
     def _give(self, agent: VirtualAgent, flight: InFlight, now: float) -> None:
@@ -326,12 +327,15 @@ class Clockwork:
         late = self._late[number]
         late.look(_own(life).state)
         ends = late.next(life.mission_s)
-        assert ends is not None, "a timer runs"
-        return ends[0]
+        answer_s = _own(life).next_answer()
+        times_s = [*([] if ends is None else [ends[0]]), *([] if answer_s is None else [life.mission_s(answer_s)])]
+        return min(times_s)
 
     def _late_timer_ends(self, number: int, life: Incarnation) -> None:
         ends = self._late[number].next(life.mission_s)
-        assert ends is not None, "it was expected to end now"
+        if ends is None or ends[0] > self._now:
+            _own(life).release_answers(life.local_s(self._now))
+            return
         name, _, deadline = ends[1]
         agent = _own(life)
         timer = next(timer for timer in agent.state.timers if timer.name == name)

@@ -100,7 +100,7 @@ class OwnAgent(Agent):
         return self.state.chain_changed_at
 
     def outgoing(self) -> Sequence[Outgoing]:
-        return self._taken_from_outbox()
+        return self._due_to_send()
 
     def status(self) -> Status:
         state = self.state

@@ -256,7 +256,8 @@ class Simulation(Clockwork):
         moving = bool(self._tracks) and self.scenario.network.radio and self.played.final_reconcile is None
         delays = self._medium.certain_delays()
         unknown = self._anybody_is_unknown or self._rogue is not None
-        if self._generating or moving or unknown or delays is None or self._channel is not None:
+        spread = self.scenario.settings.answer_spread_s > 0  # answers wait differently each time
+        if self._generating or moving or unknown or delays is None or self._channel is not None or spread:
             return None
         return Recurrence(delays)
 

@@ -60,6 +60,13 @@ def test_flight_with_typical_faults_is_reproduced(tmp_path: Path) -> None:
     ]
 
 
+def test_flight_whose_answers_waited_is_reproduced(tmp_path: Path) -> None:
+    spread = {"settings": {"answer_spread_s": 0.5}}
+    reconstruction = reconstruct_from(field_records(tmp_path / "home", flown(tmp_path / "run", **FIELD, **spread)))
+    assert reconstruction.problems == []
+    assert reconstruction.reproduced == FIELD["agents"]
+
+
 def test_written_scenario_meets_its_expectations(tmp_path: Path) -> None:
     reconstruction = reconstruct_from(field_records(tmp_path / "home", flown(tmp_path / "run", **FIELD)))
     write(reconstruction, tmp_path / "again.yaml", [tmp_path / "home"], [])

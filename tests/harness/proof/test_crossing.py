@@ -84,3 +84,8 @@ def test_played_as_scenarios_ways_lead_to_as_many_chains() -> None:
 def test_where_messages_take_as_long_as_they_like_they_cross() -> None:
     with pytest.raises(BoundsError, match=r"--no-crossing does not apply to --network any"):
         Bounds(2, 2, "any", crossing=False)
+
+
+def test_proof_refuses_a_spread_of_answers() -> None:
+    with pytest.raises(BoundsError, match="answer_spread_s has no meaning here"):
+        Bounds(2, 1, settings={"answer_spread_s": 0.5})

@@ -314,6 +314,26 @@ def asks_after_commit() -> Story:
     return story
 
 
+def answer_spread() -> Story:
+    """With the setting `answer_spread_s`: each answer is sent after its own wait, all other messages at once."""
+    story = Story(answer_spread_s=2.0)
+    block = others_block(A, 1, at_s=1)
+    chain = chain_of(block)
+    story.hear(A, BlockAddRequest(block.block_hash, chain_of().top_chain_hash))
+    story.hear(B, ChainHashSuccessorQuery(chain_of().top_chain_hash))
+    story.hear(A, CommitBlock(block, chain.top_chain_hash))
+    story.hear(C, RequestForBlock(block.block_hash))
+    story.hear(B, ChainContainQuery(chain.top_chain_hash))
+    while story.timer is not None:
+        story.wait()
+    story.hear(B, ChainContainQuery(STRANGE))
+    story.complete_a_block()
+    story.vote((A, True))
+    story.wait()
+    story.command("export")
+    return story
+
+
 def top_needs_majority() -> Story:
     """With the setting `top_needs_majority`: what follows is taken unless, with us, more say that nothing does."""
     story = Story(top_needs_majority=True)
@@ -468,6 +488,7 @@ MISSIONS: dict[str, Callable[[], Story]] = {
         ties,
         ties_read_otherwise,
         asks_after_commit,
+        answer_spread,
         top_needs_majority,
         votes_name_chains,
         offered_what_it_holds,

@@ -1,0 +1,33 @@
+"""The mission second at which an agent sent a message of its trace.
+
+A trace has the time of the handler run. With the setting `answer_spread_s`, an answer is sent later, after a wait that
+CONTRACT.md defines. This module computes the wait on its own, because the agent under test computes it too.
+"""
+
+from base64 import b64decode
+from binascii import Error
+from hashlib import sha256
+
+from harness.archive.traces import Trace
+from ucp.trace import HandlerRun, Sent
+
+ANSWERS = frozenset(
+    ("Block Add Response", "Chain Contain Response", "Next in Sequence Response", "Block Response"),
+)
+
+
+def spread_of(trace: Trace) -> float:
+    """Return `answer_spread_s` of the agent in mission seconds. 0 if its header has none, or an impossible value."""
+    spread_s = trace.header.settings.get("answer_spread_s", 0.0)
+    return float(spread_s) if isinstance(spread_s, int | float) and spread_s > 0 else 0.0
+
+
+def sent_at(run: HandlerRun, message: Sent, spread_s: float) -> float:
+    """Return the mission second at which a message of the run is sent."""
+    if not spread_s or message.message not in ANSWERS or message.datagram is None:
+        return run.t
+    try:
+        datagram = b64decode(message.datagram.text, validate=True)
+    except (Error, ValueError):
+        return run.t
+    return run.t + spread_s * (int.from_bytes(sha256(datagram).digest()[:8], "big") / 2**64)

@@ -1,0 +1,69 @@
+"""The wait of answers before they are sent, by the setting `answer_spread_s`.
+
+One agent asks, and all others answer at the same moment. On a radio channel that they share, many of these answers
+collide. With `answer_spread_s`, each answer waits for its own share of this time.
+
+The share is computed from the datagram, so an agent draws no random number, a rerun sends at the same times, and anyone
+can check the wait. A hash of the datagram is as good as a random number here: no two datagrams are equal, because each
+has its sender and its sequence number.
+"""
+
+from hashlib import sha256
+from heapq import heappop, heappush
+
+from ucp.messages import (
+    BlockAddResponse,
+    BlockResponse,
+    ChainContainResponse,
+    Message,
+    NextInSequenceResponse,
+    encode,
+)
+from ucp.trace import Recorded
+
+ANSWERS = frozenset((BlockAddResponse, ChainContainResponse, NextInSequenceResponse, BlockResponse))
+"""The messages that wait. Algorithms 3, 9, 13 and 17 send them."""
+
+Outgoing = tuple[int, Message, Recorded | None]
+"""Sequence number, message, and the datagram as the trace has it. None without a trace."""
+
+
+def answer_wait_s(datagram: bytes, spread_s: float) -> float:
+    """Return the mission seconds, from 0 to `spread_s`, that an answer waits.
+
+    `datagram` is the encoded message. In a secured mission, it is the message before encryption.
+    """
+    return spread_s * (int.from_bytes(sha256(datagram).digest()[:8], "big") / 2**64)
+
+
+class WaitingAnswers:
+    """The answers of one agent that are not sent yet."""
+
+    def __init__(self, agent_id: int, spread_s: float) -> None:
+        self._agent_id = agent_id
+        self._spread_s = spread_s
+        self._waiting: list[tuple[float, int, Outgoing]] = []
+        self._count = 0
+
+    def next_s(self) -> float | None:
+        """Return the mission second at which the next answer is due. None if none waits."""
+        return self._waiting[0][0] if self._waiting else None
+
+    def exchange(self, outbox: list[Outgoing], now: float) -> list[Outgoing]:
+        """Keep the answers of `outbox` until they are due. Return all messages to send now, in order.
+
+        An answer that has waited comes before the messages of the last input.
+        """
+        others = []
+        for outgoing in outbox:
+            sequence, message, _ = outgoing
+            if type(message) in ANSWERS:
+                wait_s = answer_wait_s(encode(self._agent_id, sequence, message), self._spread_s)
+                self._count += 1
+                heappush(self._waiting, (now + wait_s, self._count, outgoing))
+            else:
+                others.append(outgoing)
+        due = []
+        while self._waiting and self._waiting[0][0] <= now:
+            due.append(heappop(self._waiting)[2])
+        return due + others
