@@ -84,7 +84,9 @@ def test_timer_that_expires_earlier_comes_first() -> None:
 
 @pytest.mark.parametrize("spread_s", [-1.0, 5.0, float("nan"), float("inf"), True, "1"])
 def test_impossible_spread_is_refused(spread_s: object) -> None:
-    with pytest.raises(ValueError, match="answer_spread_s must be at least 0 seconds, less than each of the four timers"):
+    with pytest.raises(
+        ValueError, match="answer_spread_s must be at least 0 seconds, less than each of the four timers"
+    ):
         Settings(answer_spread_s=spread_s)  # type: ignore[arg-type]
 
 
