@@ -16,7 +16,7 @@ from harness.proof import Bounds
 from harness.proof.coverage import Existing, Reached, existing
 from harness.scenario import Scenario
 from harness.sweep.explore.guided._hunt import Candidate, Hunt
-from harness.sweep.explore.guided._hunt_trial import beginnings, tried
+from harness.sweep.explore.guided._hunt_trial import initial_documents, play_trial
 
 LOSS = {"network": {"loss": 0.15}}
 SCENARIOS = {
@@ -37,7 +37,7 @@ def seeds_alone(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[i
     """Return the number of runs, and the local states that they reached."""
     reached, runs, ends_s = Reached(), 0, time.process_time() + budget_s
     while time.process_time() < ends_s:
-        reached.add(tried(scenario, first_seed + runs).reached)
+        reached.add(play_trial(scenario, first_seed + runs).reached)
         runs += 1
     return runs, reached
 
@@ -45,7 +45,7 @@ def seeds_alone(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[i
 def hunted(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, Reached]:
     """Return the number of runs, and the local states that they reached. The budget includes the start of the hunt."""
     ends_s = time.process_time() + budget_s
-    limits, begun = beginnings(scenario, range(first_seed, first_seed + 4))
+    limits, begun = initial_documents(scenario, range(first_seed, first_seed + 4))
     hunt = Hunt(limits, Random(first_seed))
     playing = hunt.begin([Candidate(*each) for each in begun], 1)
     while time.process_time() < ends_s:

@@ -18,7 +18,7 @@ from random import Random
 from typing import Any
 
 from harness.play.simulation.air import StrayDatagram, VirtualAir
-from harness.run.simulate import InMemory, simulate, simulate_in_memory
+from harness.run.simulate import MemoryRecorder, simulate, simulate_in_memory
 from harness.scenario import Scenario
 from ucp.block import Block
 from ucp.messages import BlockAddRequest, BlockResponse, ChainContainResponse, CommitBlock, Message, encode
@@ -239,7 +239,7 @@ def replays(runs: int, loss: float) -> tuple[int, int, list[str]]:
     for seed in range(runs):
         request = flying(300, network={"loss": loss}, final_reconcile=True)
         plain = simulate(request, seed, deliver_all=True)
-        run = simulate_in_memory(InMemory(loss > 0), request, seed, deliver_all=True, air=ReplayingAir)
+        run = simulate_in_memory(MemoryRecorder(loss > 0), request, seed, deliver_all=True, air=ReplayingAir)
         same += run.result.chains == plain.result.chains
         dropped += sum(agent["dropped"].get("replayed", 0) for agent in run.played.agents.values())
         bad += run.result.bad

@@ -21,7 +21,7 @@ from harness.archive.directory import RunDirectory
 from harness.field.replay import Player, Record, open_record
 from harness.gc_pause import gc_paused
 from harness.play import mission
-from harness.play.simulation.run_files import OnDisk
+from harness.play.simulation.run_files import DiskRecorder
 from harness.play.simulation.simulation import Simulation
 
 AGENTS, AGENT = 20, 3
@@ -33,7 +33,7 @@ BACKS = 200
 def fly(directory: Path) -> None:
     """Play two hours and deliver all messages, so that each trace has all inputs of its agent."""
     asked = scenario(AGENTS).model_copy(update={"duration_s": DURATION_S})
-    simulation = Simulation(asked, 1, OnDisk(RunDirectory(directory)), deliver_all=True)
+    simulation = Simulation(asked, 1, DiskRecorder(RunDirectory(directory)), deliver_all=True)
     story = mission.play(simulation, asked)
     try:
         story.send(None)

@@ -1,1 +1,1 @@
-"""How a scenario is played: the story of a mission, and the backends that tell it, by programs or in virtual time."""
+"""The mission of a scenario, and the backends that play it with real programs or in virtual time."""

@@ -1,4 +1,4 @@
-"""Whether a scenario's ground station can be reached, found out before anything starts."""
+"""The check before a run that the ground station of the scenario can be reached."""
 
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
@@ -7,7 +7,7 @@ from sitl.vehicle import VehicleError
 
 
 def refuse_unreachable_ground_station(scenario: Scenario) -> None:
-    """Raises ScenarioError if there is no way to the scenario's ground station, or nothing for it to see."""
+    """Raise ScenarioError if the ground station cannot be reached, or if the scenario has no vehicles for it."""
     if scenario.gcs is None:
         return
     if scenario.vehicles.kind == "none":

@@ -1,4 +1,4 @@
-"""How fast virtual time goes: as fast as it can, at a real-time factor, or not at all but for single steps."""
+"""The speed of virtual time: unlimited, limited by a real-time factor, or paused with single steps."""
 
 import asyncio
 import math
@@ -8,118 +8,124 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 
 TICK_S = 0.05
-"""Wall time between two looks at the clock."""
+"""Wall time between two checks of the clock."""
 CATCH_UP_S = 1.0
-"""Who is later than this, in wall time, does not try to make up for it."""
+"""Wall time. A simulation that is later than this does not catch up. It continues with the factor from now on."""
 NEXT_RUN = math.inf
-"""A step of this length ends with the next handler run of any agent."""
+"""Length of a step that ends with the next handler run of any agent."""
 
 
 class Pace:
-    """Of one run; of its event loop only. Virtual time asks it before it goes on, and is told how far it may go."""
+    """The pace of one run, for use in the event loop of the run only.
+
+    Before virtual time advances, the simulation calls `allowed_until` for the time that it may reach.
+    """
 
     def __init__(self, factor: float | None = None, *, paused: bool = False) -> None:
-        """`factor`: mission seconds per second of wall time; None: as fast as it can."""
+        """`factor`: mission seconds per second of wall time. None: unlimited."""
         self.factor = factor
         self.paused = paused
         self._step: Future[float] | None = None
         self._step_to_s = 0.0
         self._now_s = 0.0
-        self._heeded = True
+        self._limited = True
         self._anchor: tuple[float, float] | None = None
-        """A moment of wall time, and the mission second of that moment; None: it is the next one."""
-        self._changed = asyncio.Event()
+        """Wall time and mission second from which the factor counts. None: they are set at the next check."""
+        self._pace_changed = asyncio.Event()
 
     @property
-    def wants_run(self) -> bool:
-        """Whether it is to stop at the next handler run."""
+    def stops_at_next_run(self) -> bool:
+        """True during a step to the next handler run."""
         return self._step is not None and self._step_to_s == NEXT_RUN
 
-    def set(self, factor: float | None) -> None:
-        """From now on go so fast."""
+    def set_factor(self, factor: float | None) -> None:
+        """Set the factor. None: unlimited."""
         self.factor = factor
-        self._turn()
+        self._change()
 
     def pause(self) -> None:
-        """Stand still."""
+        """Stop virtual time."""
         self.paused = True
-        self._turn()
+        self._change()
 
-    def go_on(self) -> None:
+    def resume(self) -> None:
         self.paused = False
-        self._turn()
+        self._change()
 
     def step(self, to_s: float, done: "Future[float]") -> None:
-        """Pause, but go on until then, or with `NEXT_RUN` until the next handler run.
+        """Pause after a step to mission second `to_s`, or with `NEXT_RUN` to the next handler run.
 
-        `done`, which is running, has when it stands again.
+        `done` receives the mission second at the end of the step. It must be in the state "running".
         """
         self.paused = True
-        self._turn()
+        self._change()
         self._step, self._step_to_s = done, to_s
 
     @contextmanager
-    def unheeded(self) -> Iterator[None]:
-        """Inside, time goes as fast as it can: for what is done in no time."""
-        self._heeded = False
+    def unlimited(self) -> Iterator[None]:
+        """Lift all limits inside the context. An intervention needs this, because it takes no mission time."""
+        self._limited = False
         try:
             yield
         finally:
-            self._heeded = True
+            self._limited = True
 
-    def stop_stepping(self) -> None:
-        """A step that is under way ends here."""
+    def end_step(self) -> None:
+        """End the current step, if there is one."""
         if self._step is not None:
             self._step.set_result(self._now_s)
         self._step = None
 
-    def ran(self, now_s: float) -> None:
-        """A handler has run, which ends a step that was to go so far."""
+    def record_run(self, now_s: float) -> None:
+        """Record that a handler has run. This ends the current step."""
         self._now_s = now_s
-        self.stop_stepping()
+        self.end_step()
 
-    async def allows(self, now_s: float) -> float | None:
-        """Until when, in mission seconds, time may go on; None, after a moment, if it may not."""
+    async def allowed_until(self, now_s: float) -> float | None:
+        """Return the mission second up to which time may advance.
+
+        If time may not advance now, wait for a short time and return None.
+        """
         self._now_s = now_s
-        if not self._heeded:
+        if not self._limited:
             return math.inf
         if self._step is not None:
             if self._step_to_s > now_s:
                 return self._step_to_s
-            self.stop_stepping()
+            self.end_step()
         if self.paused:
             self._anchor = None
             await self._wait()
             return None
         if self.factor is None:
             return math.inf
-        return await self._in_time(now_s, self.factor)
+        return await self._allowed_by_factor(now_s, self.factor)
 
-    async def _in_time(self, now_s: float, factor: float) -> float | None:
-        if self._anchor is None or time.monotonic() - self._due(now_s, factor) > CATCH_UP_S:
+    async def _allowed_by_factor(self, now_s: float, factor: float) -> float | None:
+        if self._anchor is None or time.monotonic() - self._wall_time_of(now_s, factor) > CATCH_UP_S:
             self._anchor = time.monotonic(), now_s
-        if self._due(now_s, factor) > time.monotonic() - TICK_S:
+        if self._wall_time_of(now_s, factor) > time.monotonic() - TICK_S:
             await self._wait()
             if self._anchor is None:
-                return None  # it goes otherwise by now
+                return None  # the pace has changed meanwhile
         wall_s, since_s = self._anchor
         allowed_s = since_s + (time.monotonic() - wall_s) * factor
         return allowed_s if allowed_s > now_s else None
 
-    def _due(self, mission_s: float, factor: float) -> float:
-        """When, in wall time, it is that mission second."""
+    def _wall_time_of(self, mission_s: float, factor: float) -> float:
+        """Return the wall time at which this mission second is due."""
         assert self._anchor is not None
         wall_s, since_s = self._anchor
         return wall_s + (mission_s - since_s) / factor
 
-    def _turn(self) -> None:
+    def _change(self) -> None:
         self._anchor = None
-        self._changed.set()
-        self.stop_stepping()
+        self._pace_changed.set()
+        self.end_step()
 
     async def _wait(self) -> None:
-        self._changed.clear()
+        self._pace_changed.clear()
         try:
-            await asyncio.wait_for(self._changed.wait(), TICK_S)
+            await asyncio.wait_for(self._pace_changed.wait(), TICK_S)
         except TimeoutError:
             return

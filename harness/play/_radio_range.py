@@ -1,6 +1,7 @@
-"""Who reaches whom: what the timeline asks of the network, and what the radio loses over the distances flown.
+"""The network conditions at the current places of the vehicles: conditions of the timeline, and losses of the radio.
 
-Both backends ask it, so the same flight makes the same network. Without a radio in the scenario places change nothing.
+All backends use this module, so the same flight gives the same network. Without a radio in the scenario, the places
+have no effect.
 """
 
 from collections.abc import Iterable, Mapping
@@ -15,56 +16,59 @@ from sitl.track import Track, track
 from sitl.vehicle import place_in_field
 
 TRACK_S = 1.0
-"""Mission seconds between two looks at where the vehicles are, where no radio asks for another time."""
+"""Mission seconds between two recorded positions of the vehicles, unless the radio sets another interval."""
 
 
 class RadioRange:
-    """The network of one run as it stands."""
+    """The current network conditions of one run."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._roster = scenario.roster
         model = scenario.network.radio
         self._radio: radio.Radio | None = model.radio() if model else None
-        self._asked = NetworkConditions()
+        self._requested = NetworkConditions()
         self._losses: dict[frozenset[int], float] = {}
 
-    def ask(self, change: NetworkChange) -> NetworkChange:
-        """The timeline makes this change: what it comes to at the places where the vehicles are."""
-        self._asked = change.conditions
+    def change_timeline(self, change: NetworkChange) -> NetworkChange:
+        """Return a change of the timeline together with the losses of the radio at the current places."""
+        self._requested = change.conditions
         if change.clears_all:
             self._radio = None
-        return replace(change, losses=self._lose({}) if change.clears_all else {}, conditions=self._conditions())
+        return replace(change, losses=self._set_losses({}) if change.clears_all else {}, conditions=self._conditions())
 
     def move(self, at_s: float, places: Mapping[int, Place]) -> NetworkChange | None:
-        """The vehicles are here now; what that changes, if anything."""
+        """Move the vehicles. Return the change of the network. None if the network stays the same."""
         if self._radio is None:
             return None
         losses = radio.links(self._radio, places)
         if losses == self._losses:
             return None
-        changed = self._lose(losses)
+        changed = self._set_losses(losses)
         conditions = self._conditions()
         return NetworkChange(
-            at_s, RANGE, in_words(radio.components(conditions, self._roster)), conditions, losses=changed
+            at_s, RANGE, groups_text(radio.components(conditions, self._roster)), conditions, losses=changed
         )
 
-    def _lose(self, losses: dict[frozenset[int], float]) -> dict[str, float]:
-        """From now on the radio loses this; what has changed of it, by pair."""
+    def _set_losses(self, losses: dict[frozenset[int], float]) -> dict[str, float]:
+        """Set the losses of the radio. Return the changed ones: pair of vehicles, such as "1-3" -> loss."""
         changed = {pair for pair in losses.keys() | self._losses.keys() if losses.get(pair) != self._losses.get(pair)}
         self._losses = losses
         return {"-".join(map(str, sorted(pair))): losses.get(pair, 0.0) for pair in sorted(changed, key=sorted)}
 
     def _conditions(self) -> NetworkConditions:
-        return radio.over_the_air(self._asked, self._losses)
+        return radio.over_the_air(self._requested, self._losses)
 
 
-def in_words(components: Iterable[Iterable[int]]) -> str:
-    """Who is connected: "1 2 3 | 4 5"."""
+def groups_text(components: Iterable[Iterable[int]]) -> str:
+    """Return the connected groups as text, such as "1 2 3 | 4 5"."""
     return " | ".join(" ".join(map(str, sorted(component))) for component in components)
 
 
 def tracks_of(scenario: Scenario) -> dict[int, Track]:
-    """How the vehicles fly in virtual time; none do where no plan, radio or ground station asks where they are."""
+    """Return the tracks of the vehicles in virtual time.
+
+    Empty if the scenario has no flight, radio, channel or ground station that needs positions.
+    """
     if not (scenario.flight or scenario.network.radio or scenario.network.channel or scenario.gcs):
         return {}
     return {vehicle: _track(scenario, vehicle, index) for index, vehicle in enumerate(scenario.roster)}
@@ -75,7 +79,7 @@ def _track(scenario: Scenario, vehicle: int, index: int) -> Track:
     if index in vehicles.swarm or vehicle in vehicles.each:
         home = vehicles.home_of(vehicle, index)
         north_m, east_m, up_m = vehicles.field.metres_to(home.lat_deg, home.lon_deg, home.alt_m)
-    else:  # as it was meant, and not by way of degrees
+    else:  # without rounding through degrees
         home, up_m = vehicles.field, 0.0
         north_m, east_m = place_in_field(index, vehicles.spacing_m)
     return track(

@@ -1,6 +1,7 @@
-"""The keys of a secured mission's vehicles: fresh ones, or those of a directory; and how they are handed out.
+"""The keys of the vehicles of a secured mission, and their files for agent programs.
 
-Programs find theirs outside of the run directory, which holds no secret, and only while the run goes on.
+Keys are fresh, or come from a directory. Agent programs find their keys in temporary directories, which exist only
+during the run. The run directory contains no secret.
 """
 
 import os
@@ -25,7 +26,7 @@ FRESH_BYTES = 32
 
 @dataclass(frozen=True)
 class MissionKeys:
-    """The keys of a secured mission: each vehicle's bundle, and who revokes them."""
+    """The keys of a secured mission: the bundle of each vehicle, and the authority that revokes keys."""
 
     bundles: Mapping[int, "Bundle"]
     authority: "Authority"
@@ -33,22 +34,23 @@ class MissionKeys:
 
     @property
     def public(self) -> "PublicKeys":
-        """What everybody may know of them."""
+        """The public keys of the mission."""
         return next(iter(self.bundles.values())).public
 
-    def sealed_to_depot(self, initial_data: bytes) -> bytes:
-        """The inception block's data, which says to whom event data is sealed, if it is."""
+    def add_depot_key(self, initial_data: bytes) -> bytes:
+        """Return the data of the inception block. If event data is sealed, it contains the depot's public key."""
         return seal_to(initial_data, self.public.depot) if self.seals and self.public.depot else initial_data
 
     def revoke(self, agent_id: int) -> bytes:
-        """The revocation of this vehicle, as a message's body."""
+        """Return the revocation of this vehicle as the body of a message."""
         return self.authority.revoke(agent_id)
 
 
 def mission_keys(scenario: Scenario, secret: bytes) -> MissionKeys | None:
-    """The mission's keys; None if it is not secured. Fresh ones come of `secret`, 32 bytes.
+    """Return the keys of the mission. None if it is not secured.
 
-    Raises ScenarioError, or MachineError where nothing can be secured.
+    Fresh keys are derived from `secret`, which has 32 bytes. Raises ScenarioError for unusable keys, and MachineError
+    if the package cryptography is missing.
     """
     if scenario.security is None:
         return None
@@ -63,8 +65,8 @@ def mission_keys(scenario: Scenario, secret: bytes) -> MissionKeys | None:
         ) from None
     if security.keys == FRESH:
         fresh = KeySet.derived(secret, scenario.roster, seals=security.seal)
-        handed = {agent_id: fresh.bundle(agent_id) for agent_id in scenario.roster}
-        return MissionKeys(handed, Authority.of(fresh), security.seal)
+        bundles = {agent_id: fresh.bundle(agent_id) for agent_id in scenario.roster}
+        return MissionKeys(bundles, Authority.of(fresh), security.seal)
     directory = Path(security.keys)
     bundles = _bundles_in(directory, scenario.roster)
     if security.seal and any(bundle.public.depot is None for bundle in bundles.values()):
@@ -73,12 +75,12 @@ def mission_keys(scenario: Scenario, secret: bytes) -> MissionKeys | None:
 
 
 def refuse_revocations(scenario: Scenario) -> None:
-    """Raises ScenarioError if its timeline revokes what nobody here can."""
+    """Raise ScenarioError if the timeline has a revocation that this machine cannot sign."""
     mission_keys(scenario, bytes(FRESH_BYTES))
 
 
 def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
-    """By vehicle, from the home of the keys, or from where bundles were handed out. Raises ScenarioError."""
+    """Read the bundles of the vehicles from a directory of keys or of bundles. Raises ScenarioError."""
     from harness.play.keyring.key_directory import VEHICLES_NAME, Home, KeysError
     from ucp.secure.bundle import bundle_name, load_bundle
     from ucp.secure.keyfile import KeyFileError
@@ -104,7 +106,7 @@ def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
 
 
 def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Scenario) -> "Authority":
-    """Who revokes what the timeline says, when it says so. Raises ScenarioError if nobody can."""
+    """Return the authority that signs the revocations of the timeline. Raises ScenarioError if it cannot."""
     from harness.play.keyring.key_directory import REVOCATION_NAME, Authority, Home, KeysError, listed
 
     revoking = [fault.agents for fault in scenario.faults_in_order() if fault.needs_keys]
@@ -122,14 +124,14 @@ def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Sc
 
 
 class KeyDirectories:
-    """A directory for each vehicle with its bundle, which nobody else reads; `keys` are the mission's, if any."""
+    """A directory for each vehicle with its bundle. Other vehicles do not read it. `keys` is None without security."""
 
     def __init__(self, keys: MissionKeys | None, directory: Path) -> None:
         self.keys = keys
         self.directories = {agent_id: directory / str(agent_id) for agent_id in (keys.bundles if keys else ())}
 
-    def hand(self, agent_id: int, *, kept: bool) -> Path | None:
-        """The vehicle's bundle, anew from home unless what it had is `kept`. Raises OSError."""
+    def write_bundle(self, agent_id: int, *, kept: bool) -> Path | None:
+        """Write the bundle of the vehicle, and return its path. `kept` keeps an existing bundle. Raises OSError."""
         if self.keys is None:
             return None
         from ucp.secure.bundle import bundle_name, write_bundle
@@ -142,13 +144,13 @@ class KeyDirectories:
 
 @contextmanager
 def key_directories(scenario: Scenario) -> Iterator[KeyDirectories]:
-    """The vehicles' keys, until the run is over. Raises as `mission_keys`, and OSError."""
+    """Create the key directories, and remove them after the run. Raises as `mission_keys`, and OSError."""
     keys = mission_keys(scenario, os.urandom(FRESH_BYTES))
     if keys is None:
         yield KeyDirectories(None, Path())
         return
     with tempfile.TemporaryDirectory(prefix="ucp-keys-") as directory:
-        handed = KeyDirectories(keys, Path(directory))
-        for vehicle in handed.directories.values():
+        directories = KeyDirectories(keys, Path(directory))
+        for vehicle in directories.directories.values():
             vehicle.mkdir()
-        yield handed
+        yield directories

@@ -20,15 +20,18 @@ from pydantic_core import from_json
 from harness.errors import VIOLATED, HarnessError, ScenarioError
 
 FIRST_LINE_BYTES = 256
-"""So much of it the kernel reads."""
+"""Number of bytes that the kernel reads of a script's first line."""
 
 
 def resolve_command(command: Sequence[str], what: str) -> list[str]:
-    """The command, wherever it is started. Raises ScenarioError, of `what`, if there is no such program."""
+    """Return the command with absolute paths, so that it works in any directory.
+
+    Raises ScenarioError, which starts with `what`, if the program does not exist.
+    """
     program, *arguments = command
     path = shutil.which(program)
     if path is None:
-        raise ScenarioError(f"{what}: {_why_none(program)}")
+        raise ScenarioError(f"{what}: {_missing_program(program)}")
     if (interpreter := _interpreter(Path(path))) is not None and not interpreter.exists():
         raise ScenarioError(f"{what}: the first line of {program} names {interpreter}, which does not exist")
     files = (str(Path(word).absolute()) if Path(word).is_file() else word for word in arguments)
@@ -36,7 +39,7 @@ def resolve_command(command: Sequence[str], what: str) -> list[str]:
 
 
 def _interpreter(program: Path) -> Path | None:
-    """What the first line of a script names; None if it is none, or may not be read."""
+    """Return the interpreter in the first line of a script. None if the file is no readable script."""
     try:
         with program.open("rb") as file:
             line = file.readline(FIRST_LINE_BYTES)
@@ -46,17 +49,17 @@ def _interpreter(program: Path) -> Path | None:
     return Path(os.fsdecode(words[0])) if words else None
 
 
-def _why_none(program: str) -> str:
+def _missing_program(program: str) -> str:
     if Path(program).name != program and Path(program).is_file():
         return f"{program} is not executable: make it executable (chmod +x), or put its interpreter in front of it"
     from_here = "" if Path(program).name == program or Path(program).is_absolute() else f" from {Path.cwd()}"
     return f"{program} is not a program: give a path{from_here}, or a name on PATH"
 
 
-LOOKED_AT_BYTES = 4096
-CHARACTERS = 300
+TAIL_BYTES = 4096
+MAX_CHARACTERS = 300
 
-_OF_A_SHELL = re.compile(
+_SHELL_ERROR = re.compile(
     r"(.+: (line )?\d+: .*(not found|No such file or directory)"  # sh, bash
     r"|\S+: command not found: .*|fish: Unknown command.*"  # zsh, fish
     r"|(\S*/)?env: .*No such file or directory"
@@ -65,24 +68,24 @@ _OF_A_SHELL = re.compile(
 
 
 def last_line_in(log: Path) -> str:
-    """The last line of the file that says something; empty if none does."""
+    """Return the last line of the file that has text. Empty if there is none."""
     try:
         with log.open("rb") as file:
-            file.seek(max(0, log.stat().st_size - LOOKED_AT_BYTES))
+            file.seek(max(0, log.stat().st_size - TAIL_BYTES))
             return last_line(file.read().decode("utf-8", "replace"))
     except OSError:
         return ""
 
 
 def last_line(text: str) -> str:
-    """The last line that says something, as one line for people."""
+    """Return the last line that has text, shortened and with printable characters only."""
     lines = ("".join(filter(str.isprintable, line)).strip() for line in reversed(text.splitlines()))
-    return next(filter(None, lines), "")[:CHARACTERS]
+    return next(filter(None, lines), "")[:MAX_CHARACTERS]
 
 
 def is_shell_error(words: str) -> bool:
-    """Whether a shell, or what else starts programs, says so that it did not find one."""
-    return _OF_A_SHELL.fullmatch(words) is not None
+    """Return whether this is the message of a shell, or of another starter of programs, that a program is missing."""
+    return _SHELL_ERROR.fullmatch(words) is not None
 
 
 ANSWER_LIMIT_BYTES = 1024 * 1024
@@ -91,15 +94,15 @@ ANSWER_LIMIT_BYTES = 1024 * 1024
 VERSION_CHARACTERS = 80
 
 
-def _first_words(version: Any) -> str | None:
-    """What an agent says of its version as a line for people; None if it is no text."""
+def _version_line(version: Any) -> str | None:
+    """Return the version of an agent as one printable line. None if it is no text."""
     if not isinstance(version, str):
         return None
     return " ".join("".join(filter(str.isprintable, word)) for word in version.split())[:VERSION_CHARACTERS] or None
 
 
 class Status(BaseModel):
-    """What ucp/contract/CONTRACT.md promises of an agent's status, and what the default agent says besides."""
+    """The status of an agent, as ucp/contract/CONTRACT.md describes it. Optional fields have a default."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -118,7 +121,7 @@ class Status(BaseModel):
     dropped: dict[str, int] = {}
     send_failures: int | None = None
     trace_problem: str | None = None
-    version: Annotated[str | None, BeforeValidator(_first_words)] = None
+    version: Annotated[str | None, BeforeValidator(_version_line)] = None
 
 
 class AgentSilentError(Exception):
@@ -126,17 +129,20 @@ class AgentSilentError(Exception):
 
 
 class AgentRefusedError(HarnessError):
-    """The agent answered that it cannot: its own sentence."""
+    """The agent refused a command. The message is the agent's sentence."""
 
     exit_status = VIOLATED
 
 
 class AgentUnsupportedError(AgentRefusedError):
-    """The agent answered that it does not have this command, or what it asks for."""
+    """The agent answered that it does not support a command."""
 
 
 class AgentControl:
-    """One connection, made anew when it breaks; one command at a time."""
+    """The connection to the control socket of an agent. It is opened again after a failure.
+
+    One command is sent at a time.
+    """
 
     def __init__(self, socket_path: Path) -> None:
         self._path = socket_path
@@ -144,7 +150,7 @@ class AgentControl:
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def ask(self, command: str, *, timeout_s: float, **arguments: Any) -> dict[str, Any]:
-        """The agent's answer, within `timeout_s` of wall time.
+        """Send a command and return the answer, within `timeout_s` of wall time.
 
         Raises AgentSilentError, AgentRefusedError, AgentUnsupportedError.
         """
@@ -159,7 +165,7 @@ class AgentControl:
                 )
                 raise AgentSilentError(what) from None
             except asyncio.CancelledError:
-                self.close()  # an answer is still to come on this connection, and would be taken for the next one's
+                self.close()  # a late answer on this connection would count as that of the next command
                 raise
         if not answer.get("ok"):
             refused = AgentUnsupportedError if answer.get("unsupported") is True else AgentRefusedError
@@ -189,8 +195,8 @@ class AgentControl:
 
 
 async def connect(socket_path: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """A connection to a socket that answers in lines. Raises OSError."""
-    # A socket's address holds 107 bytes, and run directories lie deep: name it through its directory.
+    """Connect to a socket that answers in lines. Raises OSError."""
+    # The address of a socket has at most 107 bytes, and the path of a run directory may be longer.
     directory = os.open(socket_path.parent, os.O_PATH)
     try:
         return await asyncio.open_unix_connection(

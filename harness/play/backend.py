@@ -47,21 +47,23 @@ class Backend(ABC):
         progress: Progress,
         interrupted: asyncio.Event,
         *,
-        told: bool = False,
+        interactive: bool = False,
         delivers_all: bool = False,
         pace: Pace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
-        """A swarm, opened, for a scenario that has not been refused; it leaves its files in `rundir`.
+        """Return a context manager that opens a swarm. The swarm writes its files to `rundir`.
 
-        Whatever ends the mission early, `interrupted` too, raises inside the block, leaves it, and is on record in
-        `played` then, as is everything else. A mission that is `told` while it is played may yet do what the scenario
-        says nothing of: so any agent can be rebooted with its disk. With `delivers_all` agents hear, and traces have,
-        also what cannot matter to them, as on any real network. Virtual time goes at the `pace`, if there is one; real
-        time heeds none. Raises HarnessError if there is no swarm to be had.
+        `refuse` must have accepted the scenario. An error that ends the mission early is raised inside the context. The
+        context catches it, and records it in `played`. Raises HarnessError if the swarm cannot be opened.
+
+        - `interrupted`: ends the mission early when it is set.
+        - `interactive`: a user may cause faults that the scenario does not contain, so each agent has a disk.
+        - `delivers_all`: in virtual time, agents also receive messages without effect, as in a real network.
+        - `pace`: limits the speed of virtual time. Real time ignores it.
         """
 
 
-def agent_seed(seed: int, agent_id: int, life: int = 1) -> int:
-    """Return the seed of an agent's events and quirks. A restarted agent is in its second `life`."""
-    again = f" life {life}" if life > 1 else ""
+def agent_seed(seed: int, agent_id: int, incarnation: int = 1) -> int:
+    """Return the seed of an agent's events and quirks. It differs for each incarnation, from 1."""
+    again = f" life {incarnation}" if incarnation > 1 else ""
     return Random(f"{seed}/agent {agent_id}{again}").getrandbits(63)

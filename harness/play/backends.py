@@ -1,4 +1,4 @@
-"""The table of backends: what the names stand for that scenarios, records and the command line have."""
+"""The table of backends by their names in scenarios, in records and on the command line."""
 
 from typing import Any
 
@@ -12,5 +12,5 @@ BACKENDS: dict[BackendName, Backend] = {backend.name: backend for backend in (Pr
 
 
 def in_virtual_time(name: Any) -> bool:
-    """Whether the backend that a record names was in virtual time; one that is unknown here was not."""
+    """Return whether this is the name of a backend in virtual time. False for an unknown name."""
     return any(backend.name == name and backend.virtual_time for backend in BACKENDS.values())

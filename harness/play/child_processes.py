@@ -16,7 +16,7 @@ from pathlib import Path
 NAME = "UCP_HARNESS_AGENT"
 GRACE_S = 0.5
 """Wall seconds in which a child may end after its agent."""
-LOOK_AGAIN_S = 0.02
+RETRY_S = 0.02
 MAX_ROUNDS = 20
 """Number of times that children are ended, because they may start others meanwhile."""
 
@@ -46,7 +46,7 @@ class ChildProcesses:
         """End the processes that remain after the end of the agent, and return their names."""
         deadline = time.monotonic() + GRACE_S
         while (left := self.pids()) and time.monotonic() < deadline:
-            time.sleep(LOOK_AGAIN_S)
+            time.sleep(RETRY_S)
         names = sorted(filter(None, map(_name, left)))
         self.end()
         return names

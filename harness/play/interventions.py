@@ -1,17 +1,17 @@
 """Interventions: a user's requests to a running mission, and the timeline that grows by them.
 
-`Interventions` is given to `harness.run.run.run`, and may then be asked from any thread:
+`harness.run.run.run` takes an `Interventions` object. Any thread may then use it:
 
-    hand = Interventions(scenario, virtual_time=True, factor=20.0)
-    hand.ask({"partition": [[1, 2], [3, 4, 5]]}).result()      # -> 312.472, the mission second of it
-    hand.ask({"kill": [2]}), hand.ask({"reboot": [3], "down_s": 30, "disk": "kept"}), hand.ask({"loss": 0.5})
-    hand.pause().result(), hand.step(10.0), hand.step_to_next_run(), hand.go_on(), hand.set_factor(None)
+    interventions = Interventions(scenario, virtual_time=True, factor=20.0)
+    interventions.ask({"partition": [[1, 2], [3, 4, 5]]}).result()      # -> 312.472, the mission second of it
+    interventions.ask({"reboot": [3], "down_s": 30, "disk": "kept"})
+    interventions.pause().result(), interventions.step(10.0), interventions.resume(), interventions.set_factor(None)
 
-What is asked is an entry of the scenario's timeline without its `at_s`, which is now: same keys, same check, same
-sentences, made by the same code as one that was scheduled. It then stands in the timeline of run.json and is marked
-`by_hand` among the faults there; `replay.yaml` in the run's directory plays it all again. What was to last for a while,
-and is changed by hand for good, is over by then. What cannot be is a ScenarioError, one sentence, and changes nothing.
-Every answer comes, if only that the run has ended.
+A request is an entry of the scenario's timeline without `at_s`, because it happens now. The code that checks and
+applies entries of a scenario also handles requests. The timeline in run.json then contains the entry, and its fault has
+the mark `by_hand`. `replay.yaml` in the run directory plays the whole run again. A lasting request ends an earlier
+temporary change of the same conditions. An impossible request raises ScenarioError and changes nothing. Each request
+gets an answer, at the latest when the run ends.
 """
 
 import asyncio
@@ -39,46 +39,46 @@ from harness.scenario.network_states import changed_values
 from harness.scenario.timeline import TimelineEntry
 
 INSTANT_S = 0.001
-"""Of two entries in one instant the second comes a millisecond later."""
+"""Mission seconds between two requests that arrive in the same instant."""
 
 _NAMED = re.compile(r"(?P<list>timeline|fates)\.(?P<number>\d+)(?P<rest>\.|: )?")
 
 
 class GrowingTimeline:
-    """What is played of a scenario by now, and may yet be added to it."""
+    """The timeline of a mission that is being played, and to which entries may be added."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        """With everything in its timeline that was told by now."""
+        """The scenario with all entries that were added so far."""
         self._played_s = 0.0
-        """Until when the timeline has been played."""
+        """Mission second up to which the timeline has been played."""
 
     def next_instant(self, swarm: Swarm) -> float:
-        """The first whole millisecond, in mission seconds, at which something may happen that is told now."""
+        """Return the mission second of an entry that is added now. It is a whole millisecond."""
         return math.ceil(max(swarm.now(), self._played_s + INSTANT_S) * 1000) / 1000
 
-    def retell(self, document: dict[str, Any]) -> None:
-        """From now on this is the scenario. Raises ScenarioError if there can be no such scenario."""
+    def replace_scenario(self, document: dict[str, Any]) -> None:
+        """Replace the scenario. Raises ScenarioError if the new one is invalid."""
         try:
             self.scenario = parse(document)
         except ScenarioError as error:
-            raise ScenarioError(_of_the_last(str(error), document["timeline"])) from None
+            raise ScenarioError(_error_of_last_entry(str(error), document["timeline"])) from None
 
     async def until(self, swarm: Swarm, mission_s: float) -> None:
-        """Go on until then, with what the timeline has in between."""
+        """Play the mission up to `mission_s`, with the changes of the timeline."""
         for change in [change for change in timeline_of(self.scenario) if self._played_s < change.at_s <= mission_s]:
             await swarm.until(change.at_s)
-            await swarm.apply(self.as_asked(change))
+            await swarm.apply(self.with_origin(change))
             self._played_s = change.at_s
         await swarm.until(mission_s)
 
-    def as_asked(self, change: Change) -> Change:
-        """The change, with what is known of who asked for it."""
+    def with_origin(self, change: Change) -> Change:
+        """Return the change, with the mark `by_hand` if a user requested it."""
         return change
 
 
-def _of_the_last(problem: str, timeline: list[dict[str, Any]]) -> str:
-    """What is wrong with a timeline, in the words of whoever told its last entry."""
+def _error_of_last_entry(problem: str, timeline: list[dict[str, Any]]) -> str:
+    """Reword an error in a timeline for the user who added its last entry."""
     last = len(timeline) - 1
 
     def name(named: re.Match[str]) -> str:
@@ -90,54 +90,57 @@ def _of_the_last(problem: str, timeline: list[dict[str, Any]]) -> str:
     return _NAMED.sub(name, problem)
 
 
-MOST_WAITING = 100
-"""Things that are asked for and have not been done yet; more are refused."""
+MAX_WAITING = 100
+"""Maximum number of waiting requests. Further ones are refused."""
 
-MOST_FACTOR = 1e6
-MOST_STEP_S = 31 * 86400.0
+MAX_FACTOR = 1e6
+MAX_STEP_S = 31 * 86400.0
 
 Entry = dict[str, Any]
 
 
 class Interventions(GrowingTimeline):
-    """Of one run; see above. All that is public may be used in any thread."""
+    """The interventions in one run. Any thread may use the public methods and properties."""
 
     def __init__(
         self, scenario: Scenario, *, virtual_time: bool, factor: float | None = None, paused: bool = False
     ) -> None:
-        """In virtual time only: `factor` is as for `set_factor`; `paused`: it stands at second 0, and waits."""
+        """`factor` and `paused` apply to virtual time only. `paused` stops time at second 0."""
         super().__init__(scenario)
-        self._begun_with = scenario
+        self._initial_scenario = scenario
         self.pace = Pace(factor, paused=paused) if virtual_time else None
-        """For the backend's own use."""
-        self.taken_down: Callable[[], None] = lambda: None
-        """Called in the run's thread whenever the timeline has grown."""
+        """The pace of virtual time, for the backend. None in real time."""
+        self.on_entry_added: Callable[[], None] = lambda: None
+        """Function to call in the thread of the run whenever an entry was added."""
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
-        """Of the run, while it goes on."""
+        """The event loop of the run. None before its start and after its end."""
         self._swarm: Swarm | None = None
         self._closed: str | None = "the mission has not started"
-        """Why nothing can happen to the swarm any more, or yet."""
-        self._asked: deque[tuple[Entry, Future[float]]] = deque()
-        self._something_is_asked = asyncio.Event()
+        """Reason why no request is possible. None while requests are possible."""
+        self._requests: deque[tuple[Entry, Future[float]]] = deque()
+        self._request_arrived = asyncio.Event()
         self._by_hand: dict[float, TimelineEntry] = {}
 
-    # For whoever asks, in any thread
+    # For any thread
 
     @property
     def by_hand(self) -> list[TimelineEntry]:
-        """What has been done by now."""
+        """The entries that were added by request so far."""
         return list(self._by_hand.values())
 
     @property
     def closed(self) -> str | None:
-        """Why nothing can happen to the swarm any more, or yet; None if it can."""
+        """Reason why no request is possible. None while requests are possible."""
         return self._closed
 
     @property
-    def readies_all(self) -> bool:
-        """Whether all agents are made ready for what they may be told: ours are; others may lack what that takes."""
-        return not self._begun_with.foreign
+    def prepares_all_agents(self) -> bool:
+        """True if the run prepares all agents for requests, for example with a disk for a reboot.
+
+        False if the swarm has foreign agents, because they may not support this.
+        """
+        return not self._initial_scenario.foreign
 
     @property
     def now_s(self) -> float:
@@ -146,57 +149,57 @@ class Interventions(GrowingTimeline):
 
     @property
     def paused(self) -> bool:
-        """Whether virtual time stands still but for steps."""
+        """True if virtual time is paused, except for steps."""
         return self.pace is not None and self.pace.paused
 
     @property
     def factor(self) -> float | None:
-        """Mission seconds per second of wall time; None: as fast as it can."""
+        """Mission seconds per second of wall time. None: unlimited."""
         return self.pace.factor if self.pace is not None else self.scenario.speedup
 
     def ask(self, entry: Mapping[str, Any]) -> Future[float]:
-        """Have this entry of a timeline, without its `at_s`, happen now; the answer is its mission second.
+        """Request an entry of a timeline, without its `at_s`. The answer is the mission second at which it happens.
 
-        The answer raises ScenarioError if it cannot be, and leaves everything as it is.
+        The answer raises ScenarioError if the entry is impossible. Then it changes nothing.
         """
         answer: Future[float] = Future()
         with self._lock:
             if self._loop is None or self._closed is not None:
                 answer.set_exception(ScenarioError(self._closed or "the run has ended"))
-            elif len(self._asked) >= MOST_WAITING:
-                answer.set_exception(ScenarioError(f"{MOST_WAITING} commands are waiting: repeat this command later"))
+            elif len(self._requests) >= MAX_WAITING:
+                answer.set_exception(ScenarioError(f"{MAX_WAITING} commands are waiting: repeat this command later"))
             else:
-                self._asked.append((dict(entry), answer))
-                self._loop.call_soon_threadsafe(self._something_is_asked.set)
+                self._requests.append((dict(entry), answer))
+                self._loop.call_soon_threadsafe(self._request_arrived.set)
         return answer
 
     def pause(self) -> Future[float]:
-        """Stand still; the answer is the mission second.
+        """Pause virtual time. The answer is the mission second.
 
-        This and what is below raises ScenarioError where time is real, and once the run has ended.
+        The answers of this and the following methods raise ScenarioError in real time, and after the end of the run.
         """
-        return self._at_pace(lambda pace, _: pace.pause())
+        return self._change_pace(lambda pace, _: pace.pause())
 
-    def go_on(self) -> Future[float]:
-        return self._at_pace(lambda pace, _: pace.go_on())
+    def resume(self) -> Future[float]:
+        return self._change_pace(lambda pace, _: pace.resume())
 
     def set_factor(self, factor: float | None) -> Future[float]:
-        """Mission seconds per second of wall time, more than 0; None: as fast as it can."""
-        if factor is not None and not 0 < factor <= MOST_FACTOR:
-            return _refused(f"{factor:g} is not a speed: use a number above 0 and at most {MOST_FACTOR:g}")
-        return self._at_pace(lambda pace, _: pace.set(factor))
+        """Set the mission seconds per second of wall time, above 0. None: unlimited."""
+        if factor is not None and not 0 < factor <= MAX_FACTOR:
+            return _refused(f"{factor:g} is not a speed: use a number above 0 and at most {MAX_FACTOR:g}")
+        return self._change_pace(lambda pace, _: pace.set_factor(factor))
 
     def step(self, seconds: float) -> Future[float]:
-        """Pause, but go on for so many mission seconds; the answer is the mission second at which it stands again."""
-        if not 0 < seconds <= MOST_STEP_S:
-            return _refused(f"{seconds:g} s is not a step: use a time above 0 and at most {MOST_STEP_S:g} s")
-        return self._at_pace(lambda pace, answer: pace.step(self.now_s + seconds, answer), answers=False)
+        """Pause after a step of this many mission seconds. The answer is the mission second at the end of the step."""
+        if not 0 < seconds <= MAX_STEP_S:
+            return _refused(f"{seconds:g} s is not a step: use a time above 0 and at most {MAX_STEP_S:g} s")
+        return self._change_pace(lambda pace, answer: pace.step(self.now_s + seconds, answer), answers=False)
 
     def step_to_next_run(self) -> Future[float]:
-        """As `step`, until an agent has run a handler."""
-        return self._at_pace(lambda pace, answer: pace.step(NEXT_RUN, answer), answers=False)
+        """Pause after the next handler run of any agent. The answer is as for `step`."""
+        return self._change_pace(lambda pace, answer: pace.step(NEXT_RUN, answer), answers=False)
 
-    def _at_pace(self, do: Callable[[Pace, Future[float]], None], *, answers: bool = True) -> Future[float]:
+    def _change_pace(self, do: Callable[[Pace, Future[float]], None], *, answers: bool = True) -> Future[float]:
         answer: Future[float] = Future()
         pace = self.pace
         if pace is None:
@@ -215,21 +218,21 @@ class Interventions(GrowingTimeline):
             self._loop.call_soon_threadsafe(act)
         return answer
 
-    # The story, in the thread that plays it: see harness.play.mission.Story
+    # For the thread of the run. `story` is a harness.play.mission.Story
 
     async def story(self, swarm: Swarm, scenario: Scenario) -> None:
-        """As `harness.play.mission.play`, with what is asked for."""
+        """Play the mission as `harness.play.mission.play` does, with the requests."""
         try:
             first, *_ = timeline_of(self.scenario)
             await swarm.begin(first)
             swarm.enter("mission")
             self._open(swarm)
-            await self._mission(swarm)
+            await self._play_mission(swarm)
             self._close(f"the mission is over: no event is possible after {self.scenario.duration_s:g} s")
             await mission.settle(swarm, self.scenario)
         finally:
             self._close("the run has ended")
-            self._leave()
+            self._detach()
 
     def _open(self, swarm: Swarm) -> None:
         with self._lock:
@@ -238,50 +241,50 @@ class Interventions(GrowingTimeline):
     def _close(self, why: str) -> None:
         with self._lock:
             self._closed = why
-            refused = [answer for _, answer in self._asked if answer.set_running_or_notify_cancel()]
-            self._asked.clear()
+            refused = [answer for _, answer in self._requests if answer.set_running_or_notify_cancel()]
+            self._requests.clear()
         for answer in refused:
             answer.set_exception(ScenarioError(why))
 
-    def _leave(self) -> None:
+    def _detach(self) -> None:
         with self._lock:
             self._loop = None
         if self.pace is not None:
-            self.pace.stop_stepping()
+            self.pace.end_step()
 
-    async def _mission(self, swarm: Swarm) -> None:
+    async def _play_mission(self, swarm: Swarm) -> None:
         end_s = self.scenario.duration_s
         while self._played_s < end_s:
-            until_s = min([end_s, *(change.at_s for change in self._coming())])
-            is_reached = await self._goes_on_until(swarm, until_s)
-            if self._asked:
-                await self._intervene(swarm, *self._asked.popleft())
+            until_s = min([end_s, *(change.at_s for change in self._remaining_changes())])
+            is_reached = await self._play_until(swarm, until_s)
+            if self._requests:
+                await self._intervene(swarm, *self._requests.popleft())
             elif is_reached:
                 await self.until(swarm, until_s)
                 self._played_s = until_s
 
-    def _coming(self) -> list[Change]:
+    def _remaining_changes(self) -> list[Change]:
         return [change for change in timeline_of(self.scenario) if change.at_s > self._played_s]
 
-    async def _goes_on_until(self, swarm: Swarm, mission_s: float) -> bool:
-        """Go on until then, or until something is asked for; whether it is then.
+    async def _play_until(self, swarm: Swarm, mission_s: float) -> bool:
+        """Play until `mission_s`, or until a request arrives. Return whether `mission_s` is reached.
 
-        It may also be woken up for what it has done already, as that had been asked for before it could fall asleep.
+        It may also return early without a new request, because the wake-up of an earlier request can arrive late.
         """
-        if self._asked:
+        if self._requests:
             return False
-        self._something_is_asked.clear()
-        asked = asyncio.create_task(self._something_is_asked.wait())
-        going = asyncio.create_task(_until(swarm, mission_s))
+        self._request_arrived.clear()
+        requested = asyncio.create_task(self._request_arrived.wait())
+        playing = asyncio.create_task(_until(swarm, mission_s))
         try:
-            await asyncio.wait({asked, going}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({requested, playing}, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            asked.cancel()
-            going.cancel()
-            await asyncio.wait({asked, going})
-        if going.cancelled():
+            requested.cancel()
+            playing.cancel()
+            await asyncio.wait({requested, playing})
+        if playing.cancelled():
             return False
-        going.result()
+        playing.result()
         return True
 
     async def _intervene(self, swarm: Swarm, entry: Entry, answer: Future[float]) -> None:
@@ -289,7 +292,7 @@ class Interventions(GrowingTimeline):
             return
         before = self.scenario
         try:
-            at_s = await self._happen(swarm, entry)
+            at_s = await self._apply_entry(swarm, entry)
         except ScenarioError as error:
             self.scenario = before
             answer.set_exception(error)
@@ -297,54 +300,54 @@ class Interventions(GrowingTimeline):
             answer.set_exception(ScenarioError("the run has ended"))
             raise
         else:
-            self.taken_down()
+            self.on_entry_added()
             answer.set_result(at_s)
 
-    async def _happen(self, swarm: Swarm, entry: Entry) -> float:
+    async def _apply_entry(self, swarm: Swarm, entry: Entry) -> float:
         if "at_s" in entry:
             raise ScenarioError("a command acts now: leave out `at_s`")
         at_s, document = self.next_instant(swarm), self.scenario.model_dump()
         document["timeline"].append({"at_s": at_s, **entry})
-        self._end_what_it_takes_the_place_of(document["timeline"])
-        self.retell(document)
-        self._refuse_what_nobody_is_ready_for(self.scenario.timeline[-1])
+        self._end_replaced_changes(document["timeline"])
+        self.replace_scenario(document)
+        self._refuse_unprepared(self.scenario.timeline[-1])
         self._by_hand[at_s] = self.scenario.timeline[-1]
         try:
-            with self.pace.unheeded() if self.pace else nullcontext():
+            with self.pace.unlimited() if self.pace else nullcontext():
                 await self.until(swarm, at_s)
-        except ScenarioError:  # the backend cannot
+        except ScenarioError:  # the backend does not support the entry
             del self._by_hand[at_s]
             raise
         return at_s
 
-    def _end_what_it_takes_the_place_of(self, timeline: list[Entry]) -> None:
-        """What is changed for a while, and by the last entry for good, is over now: to heal ends any partition."""
+    def _end_replaced_changes(self, timeline: list[Entry]) -> None:
+        """End temporary changes that the last entry replaces permanently, such as a partition before `heal`."""
         try:
             entry = TimelineEntry.model_validate(timeline[-1])
         except ValidationError:
-            return  # what is wrong with it is said by whoever checks the scenario
+            return  # the check of the scenario reports the error
         for number, earlier in enumerate(self.scenario.timeline):
             is_under_way = earlier.for_s is not None and earlier.at_s < entry.at_s < earlier.ends_at_s
             if is_under_way and entry.for_s is None and {*changed_values(earlier)} <= {*changed_values(entry)}:
                 timeline[number]["for_s"] = round(entry.at_s - earlier.at_s, 6)
 
-    def _refuse_what_nobody_is_ready_for(self, entry: TimelineEntry) -> None:
-        """Raises ScenarioError for what agents had to be ready for from the start, where some may not have been.
+    def _refuse_unprepared(self, entry: TimelineEntry) -> None:
+        """Raise ScenarioError if the swarm was not prepared for the entry from the start of the run.
 
-        Also for a revocation that nobody here can sign.
+        Also raise it for a revocation that this machine cannot sign.
         """
         if entry.fault is not None and entry.fault.needs_keys:
             refuse_revocations(self.scenario)
-        if self.readies_all:
+        if self.prepares_all_agents:
             return
-        if entry.injection and self._begun_with.rogue is None:
+        if entry.injection and self._initial_scenario.rogue is None:
             raise ScenarioError(
                 f"`{entry.injection[0]}` needs a rogue node; a run with other agents than the harness's own has one "
                 "only if the timeline of its scenario injects something"
             )
         ready = {
             agent_id
-            for fault in self._begun_with.faults_in_order()
+            for fault in self._initial_scenario.faults_in_order()
             if fault.disk_after == "kept"
             for agent_id in fault.agents
         }
@@ -354,12 +357,12 @@ class Interventions(GrowingTimeline):
                 "a disk only if the timeline of its scenario reboots it with `disk: kept`; use `disk: lost`"
             )
 
-    def as_asked(self, change: Change) -> Change:
+    def with_origin(self, change: Change) -> Change:
         entry = self._by_hand.get(change.at_s)
         if entry is None:
             return change
-        its_own = entry.network_key if isinstance(change, NetworkChange) else change.what in entry.model_fields_set
-        return replace(change, by_hand=True) if its_own else change
+        is_own = entry.network_key if isinstance(change, NetworkChange) else change.what in entry.model_fields_set
+        return replace(change, by_hand=True) if is_own else change
 
 
 async def _until(swarm: Swarm, mission_s: float) -> None:

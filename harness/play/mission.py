@@ -63,7 +63,7 @@ class RunOutcome:
 
 
 @dataclass(frozen=True)
-class Sought:
+class SoughtRun:
     """A handler run that a caller waits for. None means any branch, or any agent."""
 
     handler: str
@@ -93,7 +93,7 @@ class Swarm(Protocol):
 
     async def until(self, mission_s: float) -> None: ...
 
-    async def until_run(self, sought: Sought, mission_s: float) -> int | None:
+    async def until_run(self, sought: SoughtRun, mission_s: float) -> int | None:
         """Wait as `until` does, but only until an agent runs this handler. Return its ID, or None at the end.
 
         Handler runs that the last change caused also count, and with processes all runs since the last `until`.

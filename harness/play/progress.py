@@ -1,6 +1,6 @@
-"""What a run shows while it runs: elapsed mission time, chain lengths, who is reconciling.
+"""The display of an active run: elapsed mission time, chain lengths, and agents in a reconcile.
 
-On a terminal a live table; elsewhere (CI logs) a line every few seconds.
+A terminal shows a live table. Other outputs, such as CI logs, get a line every few seconds.
 """
 
 import time
@@ -21,22 +21,25 @@ LINE_EVERY_S = 10.0
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The swarm at one moment: mission seconds, and each agent's last status (None before its first)."""
+    """The swarm at one moment."""
 
     stage: str
     mission_s: float
     duration_s: float
     network: str
     statuses: Mapping[int, Status | None]
+    """Agent -> its last status. None before the first one."""
 
 
 class Progress(Protocol):
+    """A display of the progress of a run."""
+
     def show(self, snapshot: Snapshot) -> None: ...
     def close(self) -> None: ...
 
 
 class Silent:
-    """For programs."""
+    """A display without output, for programs."""
 
     def show(self, snapshot: Snapshot) -> None:
         pass
@@ -46,7 +49,7 @@ class Silent:
 
 
 class Lines:
-    """One line when the stage changes, and every few seconds."""
+    """A display that prints a line at each change of the stage, and every few seconds."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -65,7 +68,7 @@ class Lines:
             chains = " ".join(f"{agent}:{status.chain}" for agent, status in known.items())
             reconciling = [agent for agent, status in known.items() if status.reconcile_in_progress]
             line += f"; chain lengths {chains}; {_reconciling(reconciling)}; {snapshot.network}"
-        if line != self._line:  # time that is paused repeats no line
+        if line != self._line:  # without progress of time, the line is the same
             self._console.print(line, highlight=False, soft_wrap=True)
         self._line = line
 
@@ -74,7 +77,7 @@ class Lines:
 
 
 class Dashboard:
-    """A live table; gone when it is closed."""
+    """A live table, which disappears at the end of the run."""
 
     def __init__(self, console: Console) -> None:
         self._live = Live(console=console, transient=True, auto_refresh=False)

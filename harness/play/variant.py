@@ -158,8 +158,8 @@ def variant_in_use() -> Variant | None:
     return _in_use[-1] if _in_use else None
 
 
-class Numbered(Protocol):
-    """A handler that knows the number of its algorithm."""
+class NumberedHandler(Protocol):
+    """A handler with the number of its algorithm."""
 
     @property
     def algorithm(self) -> int: ...
@@ -172,7 +172,7 @@ def replaced(tables: list[MutableMapping[Any, Any]], new: Mapping[int, Callable[
     made: dict[int, Any] = {}
     for table in tables:
         for key, handler in table.items():
-            number = cast(Numbered, handler).algorithm
+            number = cast(NumberedHandler, handler).algorithm
             if number in new:
                 table[key] = made.setdefault(number, new[number](handler))
     try:

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from harness.errors import ScenarioError
 from harness.play import mission
 from harness.play.interventions import INSTANT_S, GrowingTimeline
-from harness.play.mission import RunOutcome, Sought
+from harness.play.mission import RunOutcome, SoughtRun
 from harness.scenario import Scenario
 from harness.scenario.changes import timeline_of
 from harness.scenario.load import explain
@@ -78,7 +78,7 @@ class LiveTimeline(GrowingTimeline):
         before, document = self.scenario, self.scenario.model_dump()
         document["timeline"].append({"at_s": at_s, **entry})
         document["duration_s"] = max(self.scenario.duration_s, _entry(at_s, entry).ends_at_s)
-        self.retell(document)
+        self.replace_scenario(document)
         try:
             await self.until(swarm, at_s)
         except ScenarioError:  # the backend does not support it
@@ -98,7 +98,7 @@ class LiveTimeline(GrowingTimeline):
         entry["for_s"] = for_s
         document["duration_s"] = max(self.scenario.duration_s, over_s)
         try:
-            self.retell(document)
+            self.replace_scenario(document)
         except ScenarioError:
             raise ScenarioError(
                 "the `with` block cannot undo its change, because the same condition was changed inside it for a "
@@ -117,7 +117,7 @@ class LiveTimeline(GrowingTimeline):
         document = self.scenario.model_dump()
         document["fates"].append({**which, "from_s": _next_instant(now), **_until(_next_instant(now + INSTANT_S))})
         before = self.scenario
-        self.retell(document)
+        self.replace_scenario(document)
         try:
             number = await swarm.hold(self.scenario.fates[-1])
         except ScenarioError:  # the backend does not support it
@@ -144,10 +144,10 @@ class LiveTimeline(GrowingTimeline):
         document = self.scenario.model_dump()
         fate = document["fates"][number]
         fate |= _until(_next_instant(max(swarm.now(), fate["from_s"])))
-        self.retell(document)
+        self.replace_scenario(document)
         await swarm.release(number, self.scenario.fates[number])
 
-    async def until_run(self, swarm: mission.Swarm, sought: Sought, limit_s: float) -> int | None:
+    async def until_run(self, swarm: mission.Swarm, sought: SoughtRun, limit_s: float) -> int | None:
         """Continue until an agent runs this handler and branch. Return its ID, or None after `limit_s`.
 
         Raises ScenarioError for an unknown handler, branch or agent.
@@ -164,7 +164,7 @@ class LiveTimeline(GrowingTimeline):
                 break
         return None
 
-    def _check(self, sought: Sought) -> None:
+    def _check(self, sought: SoughtRun) -> None:
         if sought.handler not in list(HANDLER_BRANCHES):
             raise ScenarioError(f"no handler {sought.handler!r}: use one of {', '.join(HANDLER_BRANCHES)}")
         branches = HANDLER_BRANCHES[sought.handler]

@@ -18,7 +18,7 @@ from harness.errors import HarnessError, ScenarioError
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS
-from harness.play.mission import RunOutcome, Sought
+from harness.play.mission import RunOutcome, SoughtRun
 from harness.play.progress import Silent
 from harness.pytest_plugin._live_timeline import Action, LiveTimeline
 from harness.pytest_plugin.findings import Findings, JudgementInTest
@@ -82,7 +82,7 @@ class Swarm:
         scenario, directory = self._timeline.scenario, self._recording.directory
         with self._runner:
             try:
-                opening = backend.open(scenario, seed, directory, Silent(), self._interrupted, told=True)
+                opening = backend.open(scenario, seed, directory, Silent(), self._interrupted, interactive=True)
                 return self._runner.run(mission.play_on(opening, scenario, self._timeline.play))
             except HarnessError as error:
                 self._recording.fail(error)
@@ -213,7 +213,7 @@ class Swarm:
         __tracebackhide__ = True
         if not 0 <= limit_s < math.inf:
             raise ScenarioError(f"a wait needs a limit of 0 s or more, not {limit_s:g} s")
-        sought = Sought(handler, branch, agent)
+        sought = SoughtRun(handler, branch, agent)
         found = self._act(lambda swarm: self._timeline.until_run(swarm, sought, limit_s))
         if found is None:
             who = "no agent has" if agent is None else f"agent {agent} has not"

@@ -28,7 +28,7 @@ from harness.play.backends import BACKENDS, in_virtual_time
 from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
 from harness.play.progress import Progress, Silent
-from harness.play.request_socket import listening
+from harness.play.request_socket import serve_requests
 from harness.report import facts
 from harness.run.provenance import versions
 from harness.scenario import Scenario
@@ -107,8 +107,8 @@ def run(
     options: dict[str, Any] = {"delivers_all": delivers_all}
     if interventions is not None:
         story = partial(_by_hand, interventions, recording.directory)
-        options |= {"told": interventions.readies_all, "pace": interventions.pace}
-        interventions.taken_down = partial(recording.take_down_by_hand, interventions)
+        options |= {"interactive": interventions.prepares_all_agents, "pace": interventions.pace}
+        interventions.on_entry_added = partial(recording.take_down_by_hand, interventions)
     interrupted = asyncio.Event()
     try:
         played = _outcome_of(
@@ -223,7 +223,7 @@ def _updated(record: RunRecord, **keys: Any) -> RunRecord:
 
 async def _by_hand(hand: Interventions, directory: RunDirectory, swarm: mission.Swarm, scenario: Scenario) -> None:
     """Play a mission in which a user can intervene, also from another process."""
-    async with listening(hand, directory.path):
+    async with serve_requests(hand, directory.path):
         await hand.story(swarm, scenario)
 
 

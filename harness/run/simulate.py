@@ -59,12 +59,12 @@ def simulate(
     Raises ScenarioError if the scenario needs real processes, and HarnessError if an agent fails or behaves
     differently when it gets the same input again.
     """
-    return simulate_in_memory(InMemory(tracing), scenario, seed, again=again, deliver_all=deliver_all)
+    return simulate_in_memory(MemoryRecorder(tracing), scenario, seed, again=again, deliver_all=deliver_all)
 
 
 @gc_paused()
 def simulate_in_memory(
-    memory: "InMemory", scenario: Scenario, seed: int, *, again: bool = False, **options: Any
+    memory: "MemoryRecorder", scenario: Scenario, seed: int, *, again: bool = False, **options: Any
 ) -> Simulated:
     """Simulate as `simulate` does. `memory` stores the run, and `options` go to the simulation."""
     VirtualTime().refuse(scenario)
@@ -75,9 +75,9 @@ def simulate_in_memory(
         evidence = memory.evidence(simulation)
     result = checker.check(evidence)
     if (records := simulation.records()) and (again or result.bad):
-        from harness.play.simulation.foreign.determinism import Again
+        from harness.play.simulation.foreign.determinism import DeterminismCheck
 
-        with closing(Again(patient=again)) as second:
+        with closing(DeterminismCheck(patient=again)) as second:
             for record in records:
                 second.compare(record)
     return Simulated(simulation.played, evidence, result)
@@ -108,7 +108,7 @@ def _header(life: Incarnation) -> Header:
     return Header(**{**named, "schema": SCHEMA, "initial_data": in_base64(named["initial_data"])})
 
 
-class InMemory:
+class MemoryRecorder:
     """A recorder that stores traces and records in memory for the checker."""
 
     def __init__(self, tracing: bool) -> None:

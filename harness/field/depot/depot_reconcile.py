@@ -19,9 +19,9 @@ from harness.field.depot.collected_exports import CollectedExports
 from harness.field.depot.consolidation import Consolidation
 from harness.field.depot.record_lines import ReconcileResult, Vehicle
 from harness.play.mission import reconcile_finally
-from harness.play.simulation.restored import Restored
+from harness.play.simulation.restored_swarm import RestoredSwarm
 from harness.play.simulation.simulation import Simulation
-from harness.run.simulate import InMemory, without_waiting
+from harness.run.simulate import MemoryRecorder, without_waiting
 from harness.scenario import Scenario
 from harness.scenario.changes import timeline_of
 from harness.scenario.load import parse
@@ -53,7 +53,7 @@ def reconcile(record: Consolidation, report_progress: Callable[[str], None] = la
             f"reconciling, {simulation.now():.0f} s in virtual time: {len({*tops.values()})} distinct chains"
         )
 
-    swarm = Restored(_scenario(record), stored, InMemory(tracing=False), breathe=show_progress)
+    swarm = RestoredSwarm(_scenario(record), stored, MemoryRecorder(tracing=False), on_progress=show_progress)
     rounds = without_waiting(_play(swarm, [agent_id for agent_id, state in stored.items() if state.deque]))
     swarm.end()
     exported_at_us = max(export.exported_at_us for export in collected.exports.values()) + round(
@@ -70,7 +70,7 @@ def reconcile(record: Consolidation, report_progress: Callable[[str], None] = la
     return Reconciliation(exports, _line(record, exports, rounds))
 
 
-async def _play(swarm: Restored, agents_with_deque: Iterable[int]) -> int:
+async def _play(swarm: RestoredSwarm, agents_with_deque: Iterable[int]) -> int:
     """Play the reconcile. Returns the number of rounds, in each of which every agent reconciles once."""
     first, *_ = timeline_of(swarm.scenario)
     await swarm.begin(first)
@@ -84,7 +84,7 @@ async def _play(swarm: Restored, agents_with_deque: Iterable[int]) -> int:
     return rounds
 
 
-async def _reconcile(swarm: Restored) -> int:
+async def _reconcile(swarm: RestoredSwarm) -> int:
     await reconcile_finally(swarm, LIMIT_S)
     final_reconcile = swarm.played.final_reconcile
     return 0 if final_reconcile is None else final_reconcile.rounds

@@ -18,7 +18,7 @@ from harness.checker.recorded_inputs import decoded, event_of, sealed_of
 from harness.checker.steps.trace_header import CheckedHeader
 from harness.errors import CaptureError
 from harness.field.ingest import Flight
-from harness.play.simulation.seals import SealsOnRecord
+from harness.play.simulation.recorded_seals import RecordedSeals
 from ucp.block import MAX_EVENT_DATA_BYTES, Block
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent, MalformedEventsError, decode_events
@@ -121,7 +121,7 @@ class OtherRecords:
             max_block_bytes=max_block_bytes,
             max_event_bytes=min(max_block_bytes, header.settings.max_event_bytes),
         )
-        return replace(header, settings=settings, seal=SealsOnRecord(self.sealed[header.agent_id]))
+        return replace(header, settings=settings, seal=RecordedSeals(self.sealed[header.agent_id]))
 
     def events(self, agent_id: int) -> list[LoggableEvent]:
         """Return the known events of an agent in order: those of its blocks, and those of its current block."""

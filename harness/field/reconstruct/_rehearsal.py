@@ -23,7 +23,7 @@ from harness.field.reconstruct._agent_inputs import (
     ReconcileRequested,
     TimerExpired,
 )
-from harness.play.simulation.fate_script import LateTimers, Running
+from harness.play.simulation.fate_script import LateTimers, RunningTimer
 from ucp.agent import Agent, why_not_handled
 from ucp.block import next_chain_hash
 from ucp.interest import MATTERS, ONLY_COUNTED
@@ -155,7 +155,7 @@ class _IncarnationRehearsal:
         self._ignoring = tolerance.ignoring
         self._running_timers: dict[int, TimerStart] = {}
         """The timers that run, by number."""
-        timers.look(self.agent.state)
+        timers.update(self.agent.state)
 
     def running_at_end(self) -> list[TimerStart]:
         """Return the running timers."""
@@ -206,10 +206,10 @@ class _IncarnationRehearsal:
         both = zip(encoded, recorded, strict=False)
         return [our if their is None else base64.b64decode(their.text) for our, their in both]
 
-    def _follow_timers(self, played: PlayedInput, ended: Running | None) -> None:
+    def _follow_timers(self, played: PlayedInput, ended: RunningTimer | None) -> None:
         """Note the timers that the input started, and those that no longer run."""
         place, before = len(self._rehearsal.played), self._running_timers
-        self._timers.look(self.agent.state)
+        self._timers.update(self.agent.state)
         self._running_timers = {}
         for _, number, deadline in self._timers.running.values():
             duration_s = round(deadline - self.agent.state.now, 9)

@@ -16,7 +16,7 @@ from harness.field.reconstruct._other_records import OtherRecords
 from harness.field.reconstruct._rehearsal import Rehearsal
 from harness.field.reconstruct._timetable import Timetable, timetable
 from harness.field.reconstruct._timetable_script import scenario_document
-from harness.run.simulate import InMemory, Simulated, simulate_in_memory
+from harness.run.simulate import MemoryRecorder, Simulated, simulate_in_memory
 from harness.scenario.load import parse
 from harness.scenario.scenario_file import Document, to_yaml
 from ucp.clock import MICROSECONDS
@@ -153,7 +153,7 @@ def reconstruct(
         remarks.append(f"no export of {agents(lost)}: the vehicle counts as lost at the end of its trace")
     document = scenario_document(mission, table, rehearsals, lost, other_records.sealed)
     report_progress("playing the scenario")
-    simulated = simulate_in_memory(InMemory(tracing=True), parse(document), SEED)
+    simulated = simulate_in_memory(MemoryRecorder(tracing=True), parse(document), SEED)
     difference = first_difference(table, rehearsals, simulated)
     _compare_chains(flight, rehearsals, simulated, why)
     recorded_agents = sorted({*flight.traces, *flight.exports})

@@ -127,7 +127,7 @@ def _services(
     services: dict[str, Any] = {}
     initial_data = f"{scenario.name}, seed {seed}, by hand".encode()
     if keys is not None:
-        initial_data = keys.sealed_to_depot(initial_data)
+        initial_data = keys.add_depot_key(initial_data)
         write_json_atomically(folder / "agents" / PUBLIC_KEYS_FILE, keys.public.to_json())
     for number, vehicle in enumerate(scenario.roster):
         mission = f"{vehicle}.mission.json"

@@ -152,7 +152,7 @@ class AgentProcess:
         Raises AgentFailedError, AgentRefusedError or UnsupportedError, and ScenarioError if the program cannot be run.
         """
         incarnation = self._begin_incarnation()
-        bundle = keys.hand(self.agent_id, kept=incarnation.reboot)
+        bundle = keys.write_bundle(self.agent_id, kept=incarnation.reboot)
         mission = mission_file(
             self.agent_id,
             scenario,

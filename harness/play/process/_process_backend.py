@@ -56,7 +56,7 @@ class Processes(Backend):
         progress: Progress,
         interrupted: asyncio.Event,
         *,
-        told: bool = False,
+        interactive: bool = False,
         delivers_all: bool = False,
         pace: Pace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
@@ -76,5 +76,5 @@ class Processes(Backend):
             interrupted,
             agent_commands=self.agent_commands(scenario),
             open_lab=self.open_lab,
-            keeps_disks=told,
+            keeps_disks=interactive,
         ).opened()

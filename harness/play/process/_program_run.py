@@ -18,7 +18,7 @@ from harness.errors import HarnessError, InterruptedRunError, MachineError, Scen
 from harness.play._radio_range import TRACK_S, RadioRange
 from harness.play._vehicle_keys import KeyDirectories, key_directories
 from harness.play.agent_control import AgentRefusedError, Status
-from harness.play.mission import RunOutcome, Sought
+from harness.play.mission import RunOutcome, SoughtRun
 from harness.play.process._agent_process import AgentProcess, reboots_with_disk
 from harness.play.process._fleet import Fleet
 from harness.play.process._lag_meter import LagMeter
@@ -48,7 +48,7 @@ MIN_FOLLOW_S = 0.1
 
 
 class ProgramRun:
-    """One run. It implements `mission.Swarm` and `faults.AgentOperations`. Open it once."""
+    """One run, which implements `Swarm` and `AgentOperations`. Open it once."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class ProgramRun:
             self.rundir.keys = self._keys.directories
             if (keys := self._keys.keys) is not None:
                 self.rundir.write_public_keys(keys.public)
-                self.initial_data = keys.sealed_to_depot(self.initial_data)
+                self.initial_data = keys.add_depot_key(self.initial_data)
             async with self._in_lab():
                 yield self
 
@@ -210,7 +210,8 @@ class ProgramRun:
         await asyncio.gather(*(agent.ask("start", epoch_us=epoch_us) for agent in self.agents))
         if self._rogue is not None:
             captured = self.scenario.security.captured if self.scenario.security else None
-            await self._rogue.begin(epoch_us, None if captured is None else self._keys.hand(captured, kept=True))
+            bundle = None if captured is None else self._keys.write_bundle(captured, kept=True)
+            await self._rogue.begin(epoch_us, bundle)
         self.clock.start(epoch_us)
         self._udp_before_start = await self._lab.network.datagrams()
         namespaces = {agent_id: self._lab.network.networks[agent_id] for agent_id in self.scenario.roster}
@@ -218,7 +219,7 @@ class ProgramRun:
 
     async def apply(self, change: Change) -> None:
         if isinstance(change, NetworkChange):
-            await self._apply_conditions(self._reach.ask(change), asked=change.conditions)
+            await self._apply_conditions(self._reach.change_timeline(change), asked=change.conditions)
             return
         if isinstance(change, TimedInjection):
             if self._rogue is None:
@@ -349,7 +350,7 @@ class ProgramRun:
             await asyncio.sleep(self.clock.wall_s(left_s))
             self._waited_until_s = self.clock.now()
 
-    async def until_run(self, sought: Sought, mission_s: float) -> int | None:
+    async def until_run(self, sought: SoughtRun, mission_s: float) -> int | None:
         while True:
             over = self.clock.now() >= mission_s
             for agent in self.agents:

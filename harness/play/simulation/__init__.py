@@ -1,1 +1,1 @@
-"""The very same agents on a simulated air, in virtual time."""
+"""The simulation backend. The agents of the process backend run in virtual time, on a simulated network."""

@@ -1,8 +1,8 @@
-"""What vehicles would capture in virtual time: the air, with a tap at every vehicle's interface.
+"""Captures in virtual time: an air that writes a capture file for the interface of each vehicle.
 
-The same files as of real vehicles (`netem.capture`), of the frames that a kernel would make. Mission second 0 is the
-Unix epoch, at speedup 1. Whoever is paused or dead still has an interface, which frames reach; a copy that the air
-corrupts reaches nobody here.
+The files have the format of `netem.capture`, and contain the frames that a kernel would send. Mission second 0 is the
+Unix epoch, at speedup 1. Frames also reach the interface of a paused or dead agent. A copy that the network corrupts
+is in no file of a receiver, because the simulation does not deliver it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from harness.play.simulation.air import Happening, InFlight, StrayDatagram, VirtualAir
+from harness.play.simulation.air import MessageInFlight, ScheduledInput, StrayDatagram, VirtualAir
 from netem.capture import begin_file
 from netem.frames import udp_broadcast
 from netem.pcapng import PcapngFile
@@ -23,7 +23,7 @@ FRAMES_KEPT = 4096
 
 
 class VirtualCapture:
-    """The files of `roster`, in `folder`. What writes raises OSError."""
+    """The capture files of the vehicles in `folder`. The methods that write raise OSError."""
 
     def __init__(self, folder: Path, roster: Sequence[int]) -> None:
         self._roster = roster
@@ -35,15 +35,15 @@ class VirtualCapture:
             self._open = opened.pop_all()
 
     def air(self, *arguments: Any, deliver_all: bool) -> "CapturedAir":
-        """An air that is taken down."""
+        """Return an air that writes to these files."""
         return CapturedAir(self, *arguments, deliver_all=deliver_all)
 
-    def take_down(self, mission_s: float, number: int, frame: bytes, *, outbound: bool) -> None:
-        """The vehicle with this number sends the frame, or it reaches that vehicle."""
+    def record(self, mission_s: float, number: int, frame: bytes, *, outbound: bool) -> None:
+        """Record a frame that the vehicle with this number sends or receives."""
         self._files[number].packet(round(mission_s * NANOSECONDS), frame, outbound=outbound)
 
     def end(self, mission_s: float) -> dict[str, dict[str, int]]:
-        """Finish the files; what is in them, as in run.json."""
+        """Finish the files, and return their numbers of frames for run.json."""
         counted = {}
         with self._open:
             for vehicle, file in zip(self._roster, self._files, strict=True):
@@ -53,25 +53,25 @@ class VirtualCapture:
 
 
 class CapturedAir(VirtualAir):
-    """Delivers everything, also what cannot matter, and takes it down."""
+    """An air that delivers all messages and records them."""
 
     def __init__(self, capture: VirtualCapture, *arguments: Any, deliver_all: bool) -> None:
         super().__init__(*arguments, deliver_all=True)
         self._capture = capture
 
-    def until(self, mission_s: float) -> Iterator[Happening]:
-        for happening in super().until(mission_s):
-            at, _, number, what = happening
-            if isinstance(what, InFlight):
+    def inputs_until(self, mission_s: float) -> Iterator[ScheduledInput]:
+        for scheduled in super().inputs_until(mission_s):
+            at, _, number, what = scheduled
+            if isinstance(what, MessageInFlight):
                 frame = _frame(what.sender, what.sequence, what.message, what.sealed)
-                self._capture.take_down(at, number, frame, outbound=False)
+                self._capture.record(at, number, frame, outbound=False)
             elif isinstance(what, StrayDatagram):
                 frame = udp_broadcast(what.source, PORT, what.datagram)
-                self._capture.take_down(at, number, frame, outbound=False)
-            yield happening
+                self._capture.record(at, number, frame, outbound=False)
+            yield scheduled
 
     def broadcast_stray(self, now: float, number: int, datagram: bytes) -> None:
-        self._capture.take_down(now, number, udp_broadcast(self._roster[number], PORT, datagram), outbound=True)
+        self._capture.record(now, number, udp_broadcast(self._roster[number], PORT, datagram), outbound=True)
         super().broadcast_stray(now, number, datagram)
 
     def broadcast(
@@ -84,7 +84,7 @@ class CapturedAir(VirtualAir):
         datagram: Recorded | None = None,
         sealed: bytes | None = None,
     ) -> None:
-        self._capture.take_down(now, number, _frame(self._roster[number], sequence, message, sealed), outbound=True)
+        self._capture.record(now, number, _frame(self._roster[number], sequence, message, sealed), outbound=True)
         super().broadcast(now, number, sequence, message, data_bytes, datagram, sealed)
 
 

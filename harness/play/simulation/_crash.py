@@ -16,16 +16,16 @@ CORE, HARNESS = Path(ucp.__file__).parent, Path(harness.__file__).parent
 MAX_WORDS = 200
 
 
-def crash_of(life: Incarnation | None, error: Exception) -> AgentFailedError | None:
+def core_crash(incarnation: Incarnation | None, error: Exception) -> AgentFailedError | None:
     """Return the failure of the agent if the exception came out of its core, otherwise None."""
     frames = [(Path(frame.filename), frame.lineno) for frame in extract_tb(error.__traceback__)]
     ours = [(path, line) for path, line in frames if path.is_relative_to(CORE) or path.is_relative_to(HARNESS)]
-    if life is None or life.state is None or not ours or not ours[-1][0].is_relative_to(CORE):
+    if incarnation is None or incarnation.state is None or not ours or not ours[-1][0].is_relative_to(CORE):
         return None
     path, line = ours[-1]
-    handler = vars(life.state)["running"]
+    handler = vars(incarnation.state)["running"]
     detail = (
         f"crashed in Algorithm {handler.algorithm}, {handler.name}, at ucp/{path.relative_to(CORE)}:{line}: "
         f"{type(error).__name__}: {str(error)[:MAX_WORDS]}"
     )
-    return AgentFailedError(life.agent.agent_id, "crashed", detail)
+    return AgentFailedError(incarnation.agent.agent_id, "crashed", detail)

@@ -1,7 +1,6 @@
-"""The clockwork of virtual time: what happens to which agent, in the order in which it happens.
+"""The event loop of virtual time. It gives each agent its inputs in order of time, and sends the agents' messages.
 
-An agent is given messages, events and the ends of its timers, and what it says goes on the air. Nothing here knows of a
-mission; `simulation.py` does.
+Inputs are messages, events to log, and the ends of timers. `simulation.py` plays a mission with this loop.
 """
 
 import base64
@@ -14,16 +13,16 @@ from typing import TYPE_CHECKING, cast
 from harness.gc_pause import gc_paused
 from harness.play.backend import agent_seed
 from harness.play.core_version import edited_files
-from harness.play.mission import Sought
-from harness.play.simulation._crash import crash_of
+from harness.play.mission import SoughtRun
+from harness.play.simulation._crash import core_crash
 from harness.play.simulation._recurrence import Recurrence
 from harness.play.simulation._shared_channel import ChannelTraffic
-from harness.play.simulation._simulated_agent import OwnAgent, Stored, VirtualAgent
-from harness.play.simulation.air import Happening, InFlight, Logged, StrayDatagram, VirtualAir
+from harness.play.simulation._simulated_agent import DiskContents, OwnAgent, VirtualAgent
+from harness.play.simulation.air import DueEvent, MessageInFlight, ScheduledInput, StrayDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, LateTimers, NameOf
-from harness.play.simulation.incarnations import BlockNames, Incarnation, Secured
+from harness.play.simulation.incarnations import BlockNames, Incarnation, KeyedAgent
+from harness.play.simulation.recorded_seals import recorded_seals
 from harness.play.simulation.run_files import Recorder
-from harness.play.simulation.seals import seals_of
 from harness.play.variant import variant_in_use
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
@@ -36,28 +35,28 @@ from ucp.store import StoredState
 from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
-    from harness.play.simulation._secured_agents import Keys
+    from harness.play.simulation._secured_agents import SimulatedKeys
     from harness.play.simulation._simulated_rogue import VirtualRogue
-    from harness.play.simulation.foreign._foreigners import Foreigners
-    from harness.play.simulation.foreign._virtual_program import Programs
+    from harness.play.simulation.foreign._foreign_swarm import ForeignSwarm
+    from harness.play.simulation.foreign._virtual_program import ProgramPool
     from ucp.secure.bundle import PublicKeys
     from ucp.secure.crypto_suite import SignatureClaim
 
-ANY_LIFE = 0
-REMEMBERED = 10_000
-"""Messages that a rogue node knows of that comes later: as many as it keeps itself."""
+ANY_INCARNATION = 0
+KEPT_MESSAGES = 10_000
+"""Number of messages that a rogue node knows if it starts during a run. A rogue node keeps the same number."""
 
 
-class Clockwork:
-    """The agents of a scenario, on a virtual air. Agents are numbered in the roster's order.
+class EventLoop:
+    """The agents of a scenario on a virtual air. The number of an agent is its index in the roster.
 
     `deliver_all`: deliver also the messages that a released agent would ignore. This takes longer and changes only the
     traces. Every message is delivered if an agent has quirks, is not the harness's own, or has an edited core
     (`harness.play.core_version`), because such an agent might not ignore it. The same is true of a secured mission in
     which messages can be dropped: a second copy is a replay even if the first one had no effect.
 
-    `told`: a user may request injections during the run. `fate_script` makes the player of the scenario's fates, `air`
-    the carrier of messages. `programs` play agents of other makes.
+    `interactive`: a user may request injections during the run. `fate_script` creates the object that applies scripted
+    fates, and `air` the network. `programs` are the programs that play foreign agents.
     """
 
     def __init__(
@@ -68,10 +67,10 @@ class Clockwork:
         recorder: Recorder,
         *,
         deliver_all: bool,
-        told: bool,
+        interactive: bool,
         fate_script: Callable[[Sequence[Fate], Sequence[int], NameOf], FateScript],
         air: Callable[..., VirtualAir],
-        programs: "Programs | None",
+        programs: "ProgramPool | None",
     ) -> None:
         self.scenario = scenario
         self.roster = scenario.roster
@@ -79,71 +78,74 @@ class Clockwork:
         self._initial_data = initial_data
         self._recorder = recorder
         self._tracing = recorder.tracing
-        self._anybody_is_unknown = scenario.has_wrong_agents or bool(scenario.foreign)
-        """Whether anybody may do what no right agent of ours does."""
-        self._keys = self._keys_of_agents(told=told) if scenario.security else None
+        self._has_unknown_agents = scenario.has_wrong_agents or bool(scenario.foreign)
+        """True if an agent may deviate from the protocol, because it has quirks or is a foreign agent."""
+        self._keys = self._keys_of_agents(interactive=interactive) if scenario.security else None
         if self._keys is not None:
-            self._initial_data = self._keys.mission.sealed_to_depot(initial_data)
-        anything_counts = self._anybody_is_unknown or (self._keys is not None and not self._keys.nothing_is_dropped)
-        anything_counts = anything_counts or bool(edited_files()) or variant_in_use() is not None
-        self._deliver_all = deliver_all = deliver_all or anything_counts
+            self._initial_data = self._keys.mission.add_depot_key(initial_data)
+        all_messages_count = self._has_unknown_agents or (self._keys is not None and not self._keys.nothing_is_dropped)
+        all_messages_count = all_messages_count or bool(edited_files()) or variant_in_use() is not None
+        self._deliver_all = deliver_all = deliver_all or all_messages_count
         self._answers_wait = scenario.settings.answer_spread_s > 0
+        """True if an agent sends an answer some time after the query."""
         self._now = 0.0
         self._generating = True
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
-        self._lives: list[list[Incarnation]] = [[] for _ in self.roster]
+        self._incarnations: list[list[Incarnation]] = [[] for _ in self.roster]
         self._alive: list[Incarnation | None] = [None] * (len(self.roster) + 1)
-        """By number; the last is the rogue node's, which is no agent and has no life."""
-        self._foreigners = self._foreign_agents(programs) if scenario.foreign else None
+        """The living incarnation of each agent, or None. The last entry is that of the rogue node, and always None."""
+        self._foreign_swarm = self._foreign_agents(programs) if scenario.foreign else None
         self._late = {self._number[agent_id]: LateTimers(text) for agent_id, text in scenario.lateness.items()}
-        """By number, of the agents that have any."""
+        """Number of an agent with `lateness` -> its late timers."""
         self._channel = self._shared_channel()
         self._medium = Medium(self.roster, seed, AT_ONCE if self._channel else LATENCY)
-        self._script = fate_script(scenario.fates, self.roster, BlockNames(self.roster, self._lives).of)
+        self._script = fate_script(scenario.fates, self.roster, BlockNames(self.roster, self._incarnations).of)
         self._air = air(
             self.roster, scenario.settings, self._medium, self._script, self._channel, deliver_all=deliver_all
         )
         self._rogue = self._rogue_node() if scenario.rogue else None
-        self._on_the_air: deque[tuple[int, int, Message, float]] | None = deque(maxlen=REMEMBERED) if told else None
-        """What a rogue node would have heard, if there is none and may be one."""
-        self._sought: Sought | None = None
+        self._recent_messages: deque[tuple[int, int, Message, float]] | None = (
+            deque(maxlen=KEPT_MESSAGES) if interactive else None
+        )
+        """Messages for a rogue node that may start later. None if no rogue node can start later."""
+        self._sought: SoughtRun | None = None
         self._found: int | None = None
-        """The agent that has run what was sought."""
-        self._in_an_instant = False
-        """Whether it was found before all of its instant had been played."""
-        self._at_once: list[tuple[int, HandlerRun]] | None = None
-        """What agents have run at the last change; None once time has passed."""
+        """The agent that ran the sought handler."""
+        self._stopped_within_instant = False
+        """True if the sought run ended `run` while other inputs of the same instant may remain."""
+        self._recent_runs: list[tuple[int, HandlerRun]] | None = None
+        """Handler runs that the last change of the timeline caused. None after `run`."""
         self._recurrence: Recurrence | None = None
-        """Is told of timers that end, once the swarm has had its time to finish."""
+        """The search for a cycle, while the swarm settles."""
 
-    def _shared_channel(self) -> ChannelTraffic[InFlight | StrayDatagram] | None:
+    def _shared_channel(self) -> ChannelTraffic[MessageInFlight | StrayDatagram] | None:
         asked = self.scenario.network.channel
         if asked is None:
             return None
         journal = self._recorder.transmitted if self._tracing else None
         return ChannelTraffic(self.roster, asked.radio(), asked.processing_s, self.seed, journal)
 
-    def _foreign_agents(self, programs: "Programs | None") -> "Foreigners":
-        from harness.play.simulation.foreign._foreigners import Foreigners  # most scenarios have none
+    def _foreign_agents(self, programs: "ProgramPool | None") -> "ForeignSwarm":
+        from harness.play.simulation.foreign._foreign_swarm import ForeignSwarm  # most scenarios need no import
 
-        return Foreigners(
+        return ForeignSwarm(
             self.scenario, self.seed, self._initial_data, programs, tracing=self._tracing, keys=self._keys
         )
 
     @property
     def public_keys(self) -> "PublicKeys | None":
-        """Those of the vehicles; None of a mission that is not secured."""
+        """The public keys of the vehicles. None if the mission is not secured."""
         return self._keys.mission.public if self._keys else None
 
     @property
     def verified(self) -> "Callable[[SignatureClaim], bool] | None":
-        """Whether a signature that may have been made here is good; None of a mission that is not secured."""
+        """A function that verifies a signature, fast if it was made in this run. None if the mission is not secured."""
         return self._keys.crypto.verify if self._keys else None
 
-    def _keys_of_agents(self, *, told: bool) -> "Keys":
-        from harness.play.simulation._secured_agents import Keys  # needs the extra `secure`
+    def _keys_of_agents(self, *, interactive: bool) -> "SimulatedKeys":
+        from harness.play.simulation._secured_agents import SimulatedKeys  # needs the extra `secure`
 
-        return Keys(self.scenario, self.seed, told=told)
+        return SimulatedKeys(self.scenario, self.seed, interactive=interactive)
 
     def _rogue_node(self) -> "VirtualRogue":
         from harness.play.simulation._simulated_rogue import VirtualRogue  # scapy takes long to import
@@ -153,246 +155,256 @@ class Clockwork:
         return VirtualRogue(self.roster, self.seed, self._air, number, write, captured, self._initial_data)
 
     def _late_rogue(self) -> "VirtualRogue":
-        """One that has been on the air all along, and begins to send now."""
-        assert self._on_the_air is not None, "a scenario that injects has a rogue node from the beginning"
+        """Return a rogue node that has received the last messages of the run, as if it had always listened."""
+        assert self._recent_messages is not None, "a scenario that injects has a rogue node from the beginning"
         rogue = self._rogue_node()
-        for sender, sequence, message, sent_at in self._on_the_air:
-            rogue.hears(sender, sequence, message, sent_at)
+        for sender, sequence, message, sent_at in self._recent_messages:
+            rogue.receive_message(sender, sequence, message, sent_at)
         return rogue
 
-    # What happens
+    # Inputs
 
     def run(self, until: float) -> None:
-        """All that happens up to `until`."""
-        self._at_once = None
+        """Play all inputs up to `until`, or up to the sought handler run."""
+        self._recent_runs = None
         with gc_paused():
             self._play(until)
-        self._in_an_instant = self._found is not None
+        self._stopped_within_instant = self._found is not None
         if self._found is None:
             self._now = until
 
     def _play(self, until: float) -> None:
         alive = self._alive
-        life: Incarnation | None = None
+        incarnation: Incarnation | None = None
         try:
-            for happening in self._air.until(until):
-                self._now, _, number, what = happening
-                life = alive[number]
-                if life is None:
+            for scheduled in self._air.inputs_until(until):
+                self._now, _, number, what = scheduled
+                incarnation = alive[number]
+                if incarnation is None:
                     if self._rogue is not None and number == len(self.roster):
                         self._rogue.wake(self._now)
-                elif life.waiting is not None:
+                elif incarnation.waiting is not None:
                     if what is not None:
-                        life.waiting.append(happening)
-                elif isinstance(what, InFlight):
-                    self._arrive(number, life, what)
+                        incarnation.waiting.append(scheduled)
+                elif isinstance(what, MessageInFlight):
+                    self._handle_message(number, incarnation, what)
                 else:
-                    self._happen(number, life, what)
+                    self._handle_other_input(number, incarnation, what)
                 if self._found is not None:
                     return
         except Exception as error:
-            if (crash := crash_of(life, error)) is None:
+            if (crash := core_crash(incarnation, error)) is None:
                 raise
             raise crash from error
 
-    def _arrive(self, number: int, life: Incarnation, flight: InFlight) -> None:
-        """A message reaches the agent."""
+    def _handle_message(self, number: int, incarnation: Incarnation, flight: MessageInFlight) -> None:
+        """Give a message to the agent, if it matters to the agent."""
         sender, message = flight.sender, flight.message
-        if self._tracing or life.secured is not None or type(message) in ONLY_COUNTED:
-            self._hear(number, life)
-        if flight.sent_at < life.born_at:
+        if self._tracing or incarnation.secured is not None or type(message) in ONLY_COUNTED:
+            self._tally_answers(number, incarnation)
+        if flight.sent_at < incarnation.started_at:
             return
-        state = life.state
+        state = incarnation.state
         if self._deliver_all or state is None or flight.matters(state, sender, message):
-            now = self._now if life.clock is None else life.local_s(self._now)
-            self._give(life.agent, flight, now)
-            self._say(number, life)
+            now = self._now if incarnation.clock is None else incarnation.local_s(self._now)
+            self._give_message(incarnation.agent, flight, now)
+            self._send_and_trace(number, incarnation)
             if self._deliver_all or self._answers_wait or state is None or state.reconcile_in_progress:
-                self._wait(number, life)  # of the right handlers of messages only a reconcile's touch timers
+                self._schedule_timer(number, incarnation)  # no other correct handler of a message changes a timer
 
-    def _give(self, agent: VirtualAgent, flight: InFlight, now: float) -> None:
+    def _give_message(self, agent: VirtualAgent, flight: MessageInFlight, now: float) -> None:
         if flight.sealed is None:
             agent.receive_message(flight.sender, flight.sequence, flight.message, now, flight.datagram)
         else:
             agent.receive_datagram(flight.sealed, now)
 
-    def _happen(self, number: int, life: Incarnation, what: Logged | StrayDatagram | None) -> None:
-        """Anything else: the end of a timer, an event, or a datagram that is no message of an agent's."""
-        agent = life.agent
+    def _handle_other_input(self, number: int, incarnation: Incarnation, what: DueEvent | StrayDatagram | None) -> None:
+        """Give another input to the agent: the end of a timer, an event, or a stray datagram."""
+        agent = incarnation.agent
         if what is None:
-            self._timer_ends(number, life)
+            self._end_timer(number, incarnation)
         elif isinstance(what, StrayDatagram):
-            self._hear(number, life)
-            agent.receive_datagram(what.datagram, life.local_s(self._now))
-            self._after(number, life)
-        elif self._generating and life.logs and what[0] in (ANY_LIFE, len(self._lives[number])):
+            self._tally_answers(number, incarnation)
+            agent.receive_datagram(what.datagram, incarnation.local_s(self._now))
+            self._finish_input(number, incarnation)
+        elif self._generating and incarnation.logs and what[0] in (ANY_INCARNATION, len(self._incarnations[number])):
             if self._tracing:
-                self._hear(number, life)
+                self._tally_answers(number, incarnation)
             _, event_id, data, timestamp_us = what
             if timestamp_us is None:
-                timestamp_us = life.timestamp_us(self._now)
+                timestamp_us = incarnation.timestamp_us(self._now)
             self._recorder.logged(self._now, agent.agent_id, len(data))
-            agent.add_event(LoggableEvent(timestamp_us, event_id, data), life.local_s(self._now))
-            self._expect_event(number, life)
-            self._after(number, life)
+            agent.add_event(LoggableEvent(timestamp_us, event_id, data), incarnation.local_s(self._now))
+            self._schedule_event(number, incarnation)
+            self._finish_input(number, incarnation)
 
-    def _timer_ends(self, number: int, life: Incarnation) -> None:
-        if life.deadline is None or life.deadline > self._now or (soonest := life.agent.next_timer()) is None:
-            return  # it was stopped, or started anew, since it was expected to end now
-        life.deadline = None
-        self._hear(number, life)
+    def _end_timer(self, number: int, incarnation: Incarnation) -> None:
+        if (
+            incarnation.deadline is None
+            or incarnation.deadline > self._now
+            or (soonest := incarnation.agent.next_timer()) is None
+        ):
+            return  # the timer was stopped or restarted after this input was scheduled
+        incarnation.deadline = None
+        self._tally_answers(number, incarnation)
         if self._recurrence is not None:
-            self._recurrence.timers_end(self._now, max(soonest, life.local_s(self._now)), _own(life).state)
+            self._recurrence.record_timer_ends(
+                self._now, max(soonest, incarnation.local_s(self._now)), _own_agent(incarnation).state
+            )
         if number in self._late:
-            self._late_timer_ends(number, life)
+            self._end_late_timer(number, incarnation)
         else:
-            life.agent.handle_timer(max(soonest, life.local_s(self._now)))
-        if life.state is not None:
-            self._air.no_longer_asked(number, life.state)
-        self._after(number, life)
+            incarnation.agent.handle_timer(max(soonest, incarnation.local_s(self._now)))
+        if incarnation.state is not None:
+            self._air.close_ended_queries(number, incarnation.state)
+        self._finish_input(number, incarnation)
 
-    def _hear(self, number: int, life: Incarnation) -> None:
-        """Tell the agent of the answers that have come and that it only tallies.
+    def _tally_answers(self, number: int, incarnation: Incarnation) -> None:
+        """Give the agent the answers that have arrived and that it only tallies.
 
-        Before anybody looks at the tally; and in a trace everything stands in its order.
+        The loop calls this before the tally is read, and before other inputs if a trace is written, so that the lines
+        of the trace are in order.
         """
-        agent, state = life.agent, life.state
-        if state is None or life.waiting is not None or not self._air.asked_by[number]:
+        agent, state = incarnation.agent, incarnation.state
+        if state is None or incarnation.waiting is not None or not self._air.open_queries[number]:
             return
-        for at, _, answer in self._air.hear(number):
+        for at, _, answer in self._air.take_answers(number):
             if answer.matters(state, answer.sender, answer.message):
-                at = max(at, life.resumed_at)
-                local = max(state.now, life.local_s(at))
-                self._give(agent, answer, local)
+                at = max(at, incarnation.resumed_at)
+                local = max(state.now, incarnation.local_s(at))
+                self._give_message(agent, answer, local)
                 if self._tracing:
-                    self._take_down(life, at)
+                    self._write_trace(incarnation, at)
 
-    def _after(self, number: int, life: Incarnation) -> None:
-        """Do what the agent says after an input: send, trace, and wait for its next timer."""
-        self._say(number, life)
-        self._wait(number, life)
+    def _finish_input(self, number: int, incarnation: Incarnation) -> None:
+        """Complete an input: send the agent's messages, write its trace, and schedule its next timer."""
+        self._send_and_trace(number, incarnation)
+        self._schedule_timer(number, incarnation)
 
-    def _say(self, number: int, life: Incarnation) -> None:
-        """Send what the agent has to say, and take down what it has done."""
+    def _send_and_trace(self, number: int, incarnation: Incarnation) -> None:
+        """Send the agent's messages, and write its trace."""
         if self._tracing:
-            self._take_down(life, self._now)
-        if life.secured is not None:
-            self._say_sealed(number, life, life.secured)
+            self._write_trace(incarnation, self._now)
+        if incarnation.secured is not None:
+            self._send_sealed(number, incarnation, incarnation.secured)
             return
-        for sequence, message, datagram in life.agent.outgoing():
+        for sequence, message, datagram in incarnation.agent.outgoing():
             if message is None:
-                assert datagram is not None, "it is there, if it is no message"
-                self._send_stray(number, life, base64.b64decode(datagram.text))
+                assert datagram is not None, "an output is a message or a datagram"
+                self._send_stray(number, incarnation, base64.b64decode(datagram.text))
                 continue
             data_bytes = datagram_bytes(message)
-            life.bytes_sent += data_bytes
+            incarnation.bytes_sent += data_bytes
             self._air.broadcast(self._now, number, sequence, message, data_bytes, datagram)
             if self._rogue is not None:
-                self._rogue.hears(life.agent.agent_id, sequence, message, self._now)
-            elif self._on_the_air is not None:
-                self._on_the_air.append((life.agent.agent_id, sequence, message, self._now))
+                self._rogue.receive_message(incarnation.agent.agent_id, sequence, message, self._now)
+            elif self._recent_messages is not None:
+                self._recent_messages.append((incarnation.agent.agent_id, sequence, message, self._now))
 
-    def _say_sealed(self, number: int, life: Incarnation, agent: Secured) -> None:
-        """Send what the agent has to say, sealed. Who comes upon the mission late has heard nothing of it."""
+    def _send_sealed(self, number: int, incarnation: Incarnation, agent: KeyedAgent) -> None:
+        """Send the sealed messages of the agent. A rogue node that starts later does not know them."""
         for sealed, sequence, message, plain in agent.sealed_to_send():
             if message is None:
-                self._send_stray(number, life, sealed)
+                self._send_stray(number, incarnation, sealed)
                 continue
-            life.bytes_sent += len(sealed)
+            incarnation.bytes_sent += len(sealed)
             self._air.broadcast(self._now, number, sequence, message, len(sealed), plain, sealed)
             if self._rogue is not None:
-                self._rogue.hears_datagram(sealed, self._now)
+                self._rogue.receive_datagram(sealed, self._now)
 
-    def _send_stray(self, number: int, life: Incarnation, datagram: bytes) -> None:
-        """Send what is no message of the agent's own. A rogue node learns nothing from it."""
-        life.bytes_sent += len(datagram)
+    def _send_stray(self, number: int, incarnation: Incarnation, datagram: bytes) -> None:
+        """Send a datagram that is not a message of the agent. The rogue node does not receive it."""
+        incarnation.bytes_sent += len(datagram)
         self._air.broadcast_stray(self._now, number, datagram)
 
-    def _wait(self, number: int, life: Incarnation) -> None:
-        """Wait for the agent's next timer."""
-        agent = life.agent
+    def _schedule_timer(self, number: int, incarnation: Incarnation) -> None:
+        """Schedule the end of the agent's next timer."""
+        agent = incarnation.agent
         soonest = agent.next_timer()
-        deadline = None if soonest is None else max(self._now, self._ends_at(number, life, soonest))
-        if deadline != life.deadline:
-            life.deadline = deadline
+        deadline = None if soonest is None else max(self._now, self._timer_end(number, incarnation, soonest))
+        if deadline != incarnation.deadline:
+            incarnation.deadline = deadline
             if deadline is not None:
-                self._air.expect(deadline, number, None)
+                self._air.schedule(deadline, number, None)
         busy_until = agent.answers_nobody_until()
-        self._air.busy_until[number] = 0.0 if busy_until is None else life.mission_s(busy_until)
+        self._air.busy_until[number] = 0.0 if busy_until is None else incarnation.mission_s(busy_until)
 
-    def _ends_at(self, number: int, life: Incarnation, soonest: float) -> float:
-        """When a timer ends next, of which the first should by the agent's clock at `soonest`."""
+    def _timer_end(self, number: int, incarnation: Incarnation, soonest: float) -> float:
+        """Return the mission second of the next end of a timer. `soonest` is this time by the agent's clock."""
         if number not in self._late:
-            return life.mission_s(soonest)
+            return incarnation.mission_s(soonest)
         late = self._late[number]
-        late.look(_own(life).state)
-        ends = late.next(life.mission_s)
-        answer_s = _own(life).next_answer()
-        times_s = [*([] if ends is None else [ends[0]]), *([] if answer_s is None else [life.mission_s(answer_s)])]
+        late.update(_own_agent(incarnation).state)
+        ends = late.next(incarnation.mission_s)
+        answer_s = _own_agent(incarnation).next_answer()
+        times_s = [
+            *([] if ends is None else [ends[0]]),
+            *([] if answer_s is None else [incarnation.mission_s(answer_s)]),
+        ]
         return min(times_s)
 
-    def _late_timer_ends(self, number: int, life: Incarnation) -> None:
-        ends = self._late[number].next(life.mission_s)
+    def _end_late_timer(self, number: int, incarnation: Incarnation) -> None:
+        ends = self._late[number].next(incarnation.mission_s)
         if ends is None or ends[0] > self._now:
-            _own(life).release_answers(life.local_s(self._now))
+            _own_agent(incarnation).release_answers(incarnation.local_s(self._now))
             return
         name, _, deadline = ends[1]
-        agent = _own(life)
+        agent = _own_agent(incarnation)
         timer = next(timer for timer in agent.state.timers if timer.name == name)
-        agent.end_timer(timer, max(deadline, life.local_s(self._now)))
+        agent.end_timer(timer, max(deadline, incarnation.local_s(self._now)))
 
-    def _take_down(self, life: Incarnation, mission_s: float) -> None:
-        """Write what the agent has done into its trace."""
-        agent_id, entries = life.agent.agent_id, life.agent.trace()
-        somebody_looks = self._at_once is not None or self._sought is not None
+    def _write_trace(self, incarnation: Incarnation, mission_s: float) -> None:
+        """Write the agent's new handler runs into its trace."""
+        agent_id, entries = incarnation.agent.agent_id, incarnation.agent.trace()
+        searching = self._recent_runs is not None or self._sought is not None
         for entry in entries:
             entry.t = mission_s
             if isinstance(entry, HandlerRun):
-                life.handler_runs += 1
-                if somebody_looks:
-                    self._look(agent_id, entry)
+                incarnation.handler_runs += 1
+                if searching:
+                    self._check_sought(agent_id, entry)
         self._recorder.write(agent_id, entries)
 
-    def _look(self, agent_id: int, run: HandlerRun) -> None:
-        """Whether it is what somebody waits for, or will wait for in a moment."""
-        if self._at_once is not None:
-            self._at_once.append((agent_id, run))
+    def _check_sought(self, agent_id: int, run: HandlerRun) -> None:
+        """Check whether this is the sought run. After a change of the timeline, keep the run for a later search."""
+        if self._recent_runs is not None:
+            self._recent_runs.append((agent_id, run))
         elif self._sought is not None and self._found is None and self._sought.is_met_by(agent_id, run):
             self._found = agent_id
 
-    # An agent's life
+    # Incarnations
 
-    def _start(self, number: int, stored: Stored | None = None) -> None:
-        """Begin a life, or go on from what is `stored` of an earlier one."""
+    def _start(self, number: int, stored: DiskContents | None = None) -> None:
+        """Start an incarnation, with the contents of the agent's disk if `stored` is given."""
         agent_id = self.roster[number]
-        lives = self._lives[number]
+        incarnations = self._incarnations[number]
         clock = self.scenario.clocks.get(agent_id)
-        seed = agent_seed(self.seed, agent_id, len(lives) + 1)
+        seed = agent_seed(self.seed, agent_id, len(incarnations) + 1)
         source = RandomEvents(Random(seed), self.scenario.events.mean_s)
         local_s = self._now if clock is None else clock.shows(self._now)
         agent: VirtualAgent
-        if self._foreigners is not None and agent_id in self._foreigners:
-            agent = self._foreigners.begin(agent_id, len(lives) + 1, local_s, stored, born_at=self._now)
+        if self._foreign_swarm is not None and agent_id in self._foreign_swarm:
+            agent = self._foreign_swarm.begin(agent_id, len(incarnations) + 1, local_s, stored, started_at=self._now)
         else:
-            agent = self._own_agent(agent_id, seed, len(lives) + 1)
+            agent = self._new_own_agent(agent_id, seed, len(incarnations) + 1)
         state = agent.state if isinstance(agent, OwnAgent) else None
-        secured = cast(Secured, agent) if self._keys is not None else None
-        life = Incarnation(agent, source, clock, self._now, state, secured, stored is not None)
-        lives.append(life)
-        self._alive[number] = life
-        self._air.born_at[number] = self._now
-        self._recorder.begin(life)
+        secured = cast(KeyedAgent, agent) if self._keys is not None else None
+        incarnation = Incarnation(agent, source, clock, self._now, state, secured, stored is not None)
+        incarnations.append(incarnation)
+        self._alive[number] = incarnation
+        self._air.started_at[number] = self._now
+        self._recorder.begin(incarnation)
         if isinstance(stored, StoredState) and isinstance(agent, OwnAgent):
             agent.boot(stored, local_s)
-        self._after(number, life)
-        self._expect_event(number, life)
+        self._finish_input(number, incarnation)
+        self._schedule_event(number, incarnation)
 
-    def _own_agent(self, agent_id: int, seed: int, life: int) -> OwnAgent:
+    def _new_own_agent(self, agent_id: int, seed: int, incarnation: int) -> OwnAgent:
         quirks = self.scenario.quirks_of(agent_id)
         make: Callable[..., OwnAgent] = OwnAgent
         if self._keys is not None:
-            make = self._keys.agent(agent_id, life, self._now)
-        elif (seal := seals_of(self.scenario.events.script, agent_id)) is not None:
+            make = self._keys.agent(agent_id, incarnation, self._now)
+        elif (seal := recorded_seals(self.scenario.events.script, agent_id)) is not None:
             make = partial(OwnAgent, seal=seal)
         return make(
             agent_id,
@@ -403,37 +415,38 @@ class Clockwork:
             tracing=self._tracing,
         )
 
-    def _expect_event(self, number: int, life: Incarnation) -> None:
+    def _schedule_event(self, number: int, incarnation: Incarnation) -> None:
         if self.scenario.events.source != "scripted":
-            due, event_id, data = life.source.next()
-            this_life = len(self._lives[number])
-            self._air.expect(max(self._now, life.born_at + due), number, (this_life, event_id, data, None))
+            due, event_id, data = incarnation.source.next()
+            current = len(self._incarnations[number])
+            self._air.schedule(max(self._now, incarnation.started_at + due), number, (current, event_id, data, None))
 
-    def _resume(self, number: int, life: Incarnation, waiting: list[Happening]) -> None:
-        """What has waited is handled as a process does it: what the socket holds, then timers, then events.
+    def _resume(self, number: int, incarnation: Incarnation, waiting: list[ScheduledInput]) -> None:
+        """Handle the inputs that waited during a pause, in the order of a process: datagrams, timers, events.
 
-        What an agent asks while there is more in the socket may be answered by what came since.
+        Each datagram is handled at its position in the order of inputs. If the agent sends a query meanwhile, a later
+        datagram of the pause can be an answer to it.
         """
-        life.waiting, life.resumed_at = None, self._now
-        place = self._air.place
-        for happening in waiting:
-            what = happening[3]
-            if isinstance(what, InFlight | StrayDatagram):
-                self._air.place = happening
-                if isinstance(what, InFlight):
-                    self._arrive(number, life, what)
+        incarnation.waiting, incarnation.resumed_at = None, self._now
+        position = self._air.position
+        for scheduled in waiting:
+            what = scheduled[3]
+            if isinstance(what, MessageInFlight | StrayDatagram):
+                self._air.position = scheduled
+                if isinstance(what, MessageInFlight):
+                    self._handle_message(number, incarnation, what)
                 else:
-                    self._happen(number, life, what)
-        self._air.place = place
+                    self._handle_other_input(number, incarnation, what)
+        self._air.position = position
         del self._air.paused_at[number]
-        self._hear(number, life)
-        self._timer_ends(number, life)
-        for happening in waiting:
-            what = happening[3]
-            if not isinstance(what, InFlight | StrayDatagram):
-                self._happen(number, life, what)
+        self._tally_answers(number, incarnation)
+        self._end_timer(number, incarnation)
+        for scheduled in waiting:
+            what = scheduled[3]
+            if not isinstance(what, MessageInFlight | StrayDatagram):
+                self._handle_other_input(number, incarnation, what)
 
 
-def _own(life: Incarnation) -> OwnAgent:
-    assert isinstance(life.agent, OwnAgent), "of nobody else is so much known"
-    return life.agent
+def _own_agent(incarnation: Incarnation) -> OwnAgent:
+    assert isinstance(incarnation.agent, OwnAgent), "only agents of the harness show their state"
+    return incarnation.agent

@@ -1,18 +1,18 @@
-"""Whether a swarm in virtual time goes round in circles: its global state recurs, and nothing else is to come.
+"""Proof that a swarm in virtual time is in a cycle: its global state recurs, and no other input is to come.
 
-Looked at are the moments in which nothing is on its way, each as it is when the next timer is about to end: the
-protocol state of every agent, its timers relative to that moment, and their order. Only timers make the swarm go on
-from there. If such a state comes again it comes again for ever, unless lots decide otherwise. They do not where every
-message surely arrives, or never does, and besides
+The search compares the swarm at moments without messages in flight, just before the next timer ends. A state consists
+of the protocol state of every agent, its timers relative to this moment, and the order of the timers. From this moment
+on, only timers cause further steps. If the state recurs, it recurs forever, provided that the network draws do not
+matter. They do not matter if each message certainly arrives or certainly does not, and one of these conditions is met:
 
-- takes as long as any other; or
-- has arrived, and the answers to it, before the next timer of anybody ends, and has only been answered or tallied:
-  then nothing depends on when it came.
+- All messages take the same time.
+- Each message and its answers have arrived before the next timer ends, and were only answered or counted. Then their
+  delays have no effect.
 
-Only then the recurrence is a proof. Other cycles show in the traces (`harness.checker.recurring_cycles`).
+Otherwise the recurrence proves nothing. The traces show such cycles too (`harness.checker.recurring_cycles`).
 
-One state is kept and compared with all that follow, then a later one with twice as many (Brent's algorithm), so that a
-swarm that goes on for days takes no more memory than one that goes on for minutes.
+The search uses Brent's algorithm. It keeps one state and compares it with the following ones, then keeps a later state
+and compares it with twice as many. Its memory therefore does not grow with the length of the run.
 """
 
 from collections import defaultdict
@@ -24,77 +24,79 @@ from harness.archive.run_record import Cycle, CycleStep, CycleWait
 from ucp.agent import ON_TIMER
 from ucp.state import AgentState
 
-LOOK_AFTER_S = 120.0
-"""For so many mission seconds a swarm that has no more to log may take its time before anybody looks."""
+CHECK_AFTER_S = 120.0
+"""Mission seconds in which a swarm may settle before the search starts. The search costs time."""
 SAME_INSTANT_S = 1e-6
 MAX_STEPS = 1000
-"""More steps of a cycle than anyone reads are not named."""
+"""Maximum number of recorded steps of a cycle."""
 
 
 @dataclass(frozen=True, slots=True)
-class Waiting:
-    """An agent in whose way nothing is: `local_s` is what its clock shows when the next timer of anybody ends.
-
-    `wakes_s` is when its own next timer ends, in mission seconds; None if none runs.
-    """
+class AgentAtRest:
+    """An agent at a moment without messages in flight."""
 
     state: AgentState
     local_s: float
+    """Time of the agent's clock at the next end of a timer of any agent."""
     wakes_s: float | None
+    """Mission second at which the agent's own next timer ends. None if no timer runs."""
 
 
 class Recurrence:
-    """Is shown the swarm whenever nothing is on its way, and tells when it has seen all that will ever be.
+    """The search for a cycle. The simulation calls `check` whenever no message is in flight.
 
-    `delays`: how soon and how late any message surely arrives, in seconds.
+    `delays`: minimum and maximum delay of a message, in seconds.
     """
 
     def __init__(self, delays: tuple[float, float]) -> None:
         soonest, self._latest = delays
-        self._all_alike = soonest == self._latest
+        self._equal_delays = soonest == self._latest
         self._kept: object = None
         self._kept_at = 0.0
-        self._looks_left = 1
+        self._checks_left = 1
         self._keep_for = 1
         self._next_s = 0.0
-        self._as_timers_left_it: object = None
-        self._begin_anew()
+        self._state_after_timers: object = None
+        self._reset()
 
-    def _begin_anew(self) -> None:
+    def _reset(self) -> None:
         self._steps: list[CycleStep] = []
         self._answered_by: dict[int, set[int]] = defaultdict(set)
-        """Agent that asked, in a reconcile -> those who answered, since the state that is kept."""
-        self._told_apart = True
-        """Whether no two timers ended so close to each other that rounding decides which was first."""
+        """Agent in a reconcile -> agents that answered its queries since the kept state."""
+        self._order_is_certain = True
+        """False if two timers end so close to each other that rounding may decide their order."""
         self._delays_matter = False
 
-    def look(self, swarm: Sequence[Waiting], order: Sequence[object], fates: tuple[int, ...], fate_at: float) -> bool:
-        """Whether the swarm has been here before, and always comes back. Nothing is on its way, and some timer runs.
+    def check(
+        self, swarm: Sequence[AgentAtRest], order: Sequence[object], fates: tuple[int, ...], fate_at: float
+    ) -> bool:
+        """Return whether the swarm is in a cycle. No message may be in flight, and a timer must run.
 
-        `order` is that in which timers end, of one agent's, too, if it matters. `fates` is how far they have counted,
-        and `fate_at` when one last decided.
+        - `order`: order of the next ends of timers, for late timers also within an agent.
+        - `fates`: number of messages that each scripted fate has matched.
+        - `fate_at`: time at which a fate last changed the delivery of a message.
         """
         wakes = sorted(agent.wakes_s for agent in swarm if agent.wakes_s is not None)
-        if wakes[0] <= self._next_s + 2 * self._latest or self._as_timers_left_it != _what_messages_may_change(swarm):
+        if wakes[0] <= self._next_s + 2 * self._latest or self._state_after_timers != _changeable_by_messages(swarm):
             self._delays_matter = True
         if any(0 < later - sooner < SAME_INSTANT_S for sooner, later in pairwise(wakes)):
-            self._told_apart = False
+            self._order_is_certain = False
         self._next_s = wakes[0]
         state = (*map(_state, swarm), *order, fates)
-        delays_matter = not self._all_alike and (self._delays_matter or fate_at >= self._kept_at)
-        time_has_passed = self._next_s > self._kept_at  # who looks twice in the same wait sees the same
-        if state == self._kept and time_has_passed and self._told_apart and not delays_matter:
+        delays_matter = not self._equal_delays and (self._delays_matter or fate_at >= self._kept_at)
+        time_has_passed = self._next_s > self._kept_at  # two checks before the same end of a timer compare equal
+        if state == self._kept and time_has_passed and self._order_is_certain and not delays_matter:
             return True
-        self._looks_left -= 1
-        if not self._looks_left:
+        self._checks_left -= 1
+        if not self._checks_left:
             self._keep_for *= 2
-            self._looks_left = self._keep_for
+            self._checks_left = self._keep_for
             self._kept, self._kept_at = state, self._next_s
-            self._begin_anew()
+            self._reset()
         return False
 
-    def timers_end(self, now: float, local_s: float, state: AgentState) -> None:
-        """Timers of an agent are about to end, after all answers have been tallied."""
+    def record_timer_ends(self, now: float, local_s: float, state: AgentState) -> None:
+        """Record that timers of an agent are about to end. All answers have been counted."""
         if now != self._next_s:
             self._delays_matter = True
         for timer in state.timers:
@@ -106,19 +108,19 @@ class Recurrence:
         if state.phase_one_timer.active or state.phase_two_timer.active:
             self._answered_by[state.agent_id] |= state.reconcile_responders
 
-    def timers_have_ended(self, swarm: Sequence[Waiting]) -> None:
-        """All timers that end in this instant have; what they sent has not arrived yet."""
-        self._as_timers_left_it = _what_messages_may_change(swarm)
+    def record_state_after_timers(self, swarm: Sequence[AgentAtRest]) -> None:
+        """Record the state after all timers of an instant have ended, before their messages arrive."""
+        self._state_after_timers = _changeable_by_messages(swarm)
 
-    def cycle(self, swarm: Sequence[Waiting]) -> Cycle:
-        """Return the cycle that the last look has found."""
+    def cycle(self, swarm: Sequence[AgentAtRest]) -> Cycle:
+        """Return the cycle that the last `check` has found."""
         agents = {agent.state.agent_id for agent in swarm}
-        went_on = {step.agent_id for step in self._steps}
+        acted = {step.agent_id for step in self._steps}
         return Cycle(
             since_s=round(self._kept_at, 3),
             period_s=round(self._next_s - self._kept_at, 3),
             proven=True,
-            agents=sorted(went_on | {agent.state.agent_id for agent in swarm if not agent.state.idle}),
+            agents=sorted(acted | {agent.state.agent_id for agent in swarm if not agent.state.idle}),
             steps=self._steps,
             waits=[
                 CycleWait(agent_id=agent_id, for_agents=sorted(silent))
@@ -128,8 +130,8 @@ class Recurrence:
         )
 
 
-def _what_messages_may_change(swarm: Sequence[Waiting]) -> list[object]:
-    """Of what messages do to an agent all but what they are there to be tallied for."""
+def _changeable_by_messages(swarm: Sequence[AgentAtRest]) -> list[object]:
+    """Return the parts of the states that messages can change, without the tallies of answers."""
     return [
         (
             state.chain.top_chain_hash,
@@ -142,8 +144,8 @@ def _what_messages_may_change(swarm: Sequence[Waiting]) -> list[object]:
     ]
 
 
-def _state(agent: Waiting) -> tuple[object, ...]:
-    """All that the agent's next steps depend on; times are relative to its clock."""
+def _state(agent: AgentAtRest) -> tuple[object, ...]:
+    """Return the state on which the agent's next steps depend. Times are relative to its clock."""
     state = agent.state
     return (
         state.agent_id,

@@ -1,7 +1,7 @@
 """Secured agents in virtual time.
 
-All of it comes of the run's seed. Every datagram is sealed, and opened by whom it reaches; what many receivers work out
-of the same bytes is remembered (`_crypto_cache.py`).
+All keys are derived from the seed of the run, unless the scenario names a directory of keys. Agents seal and open every
+datagram as in a real mission. Results that several receivers need are cached (`_crypto_cache.py`).
 """
 
 import hashlib
@@ -12,7 +12,7 @@ from typing import Any
 
 from harness.play._vehicle_keys import mission_keys
 from harness.play.rogue._captured_bundle import CapturedKeys
-from harness.play.simulation._crypto_cache import remembered
+from harness.play.simulation._crypto_cache import cached_crypto
 from harness.play.simulation._simulated_agent import OwnAgent
 from harness.scenario import Scenario
 from netem.medium import LATENCY
@@ -26,7 +26,7 @@ from ucp.store import StoredState
 
 
 class SecuredOwnAgent(SecuredAgent, OwnAgent):
-    """The harness's own, with keys."""
+    """An agent of the harness with keys."""
 
     def export(self, now: float, exported_at_us: int) -> dict[str, Any]:
         return export_chain(self.state, exported_at_us, self.signatures)
@@ -37,50 +37,58 @@ class SecuredOwnAgent(SecuredAgent, OwnAgent):
         return stored
 
 
-class Keys:
-    """What the vehicles of a simulated mission have, and go on with when they come back.
+class SimulatedKeys:
+    """The keys of the vehicles of a simulated mission. A vehicle keeps its keys after a restart.
 
-    `told`: somebody may yet inject. Raises HarnessError.
+    `interactive`: a user may request injections during the run. Raises HarnessError.
     """
 
-    def __init__(self, scenario: Scenario, seed: int, *, told: bool) -> None:
-        self.nothing_is_dropped = not told and _drops_nothing(scenario)
-        """Whether agents handle all that reaches them, so that what cannot matter need not be delivered."""
+    def __init__(self, scenario: Scenario, seed: int, *, interactive: bool) -> None:
+        self.nothing_is_dropped = not interactive and _drops_nothing(scenario)
+        """True if agents drop no datagram. Then messages without effect need not be delivered."""
         self._seed = seed
-        keys = mission_keys(scenario, _of_seed(seed, "keys"))
+        keys = mission_keys(scenario, _derived_bytes(seed, "keys"))
         assert keys is not None, "the scenario is secured"
         self.mission = keys
         self._bundles: dict[int, Bundle] = dict(keys.bundles)
         captured = scenario.security.captured if scenario.security else None
         chance = Random(f"{seed}/captured")
         self.captured = None if captured is None else CapturedKeys(self._bundles[captured], lambda: chance.randbytes(8))
-        """What the rogue node has."""
-        self.crypto = remembered()
+        """The keys that the rogue node has captured."""
+        self.crypto = cached_crypto()
 
-    def agent(self, agent_id: int, life: int, now: float) -> Callable[..., SecuredOwnAgent]:
-        """What makes the agent of a life that begins `now`, in mission seconds; lives are counted from 1."""
+    def agent(self, agent_id: int, incarnation: int, now: float) -> Callable[..., SecuredOwnAgent]:
+        """Return a function that creates the agent of an incarnation that starts at mission second `now`.
+
+        Incarnations are numbered from 1.
+        """
 
         def keep(bundle: Bundle) -> None:
             self._bundles[agent_id] = bundle
 
-        boot = self._boot(agent_id, life, now)
+        boot = self._boot(agent_id, incarnation, now)
         bundle = self._bundles[agent_id]
         session = Session(bundle, boot, keep, self.crypto)
         return partial(SecuredOwnAgent, session, seal=make_seal(bundle) if self.mission.seals else None)
 
-    def handed(self, agent_id: int, life: int, now: float) -> dict[str, Any]:
-        """What an agent of another make is told of its keys when a life begins."""
-        return {"bundle": self.mission.bundles[agent_id].to_json(), "boot": self._boot(agent_id, life, now).hex()}
+    def key_fields(self, agent_id: int, incarnation: int, now: float) -> dict[str, Any]:
+        """Return the keys of a foreign agent for the first line of an incarnation."""
+        return {
+            "bundle": self.mission.bundles[agent_id].to_json(),
+            "boot": self._boot(agent_id, incarnation, now).hex(),
+        }
 
-    def _boot(self, agent_id: int, life: int, now: float) -> bytes:
-        return make_boot(round(now * MICROSECONDS) + life, _of_seed(self._seed, f"boot {agent_id} {life}")[:8])
+    def _boot(self, agent_id: int, incarnation: int, now: float) -> bytes:
+        return make_boot(
+            round(now * MICROSECONDS) + incarnation, _derived_bytes(self._seed, f"boot {agent_id} {incarnation}")[:8]
+        )
 
 
 def _drops_nothing(scenario: Scenario) -> bool:
-    """Whether secured agents handle all that reaches them, whatever the seed.
+    """Return whether secured agents certainly drop no datagram, with any seed.
 
-    So they do while nothing comes twice, or from anybody else, or of a former life, or so late that there is a newer
-    question: where the network does no more than lose and part, and agents no more than they should.
+    They drop copies, datagrams from other senders or earlier incarnations, and answers that arrive after a newer query.
+    None of these occurs if all agents are correct and the network only loses messages and has partitions.
     """
     timers = scenario.settings
     return not (
@@ -99,6 +107,6 @@ def _drops_nothing(scenario: Scenario) -> bool:
     )
 
 
-def _of_seed(seed: int, what: str) -> bytes:
-    """32 bytes that everybody who knows the seed can work out: keys of a simulated mission are no secrets."""
+def _derived_bytes(seed: int, what: str) -> bytes:
+    """Return 32 bytes that follow from the seed. SimulatedKeys of a simulated mission are not secret."""
     return hashlib.sha256(f"{what} of seed {seed}".encode()).digest()

@@ -1,7 +1,7 @@
 """The messages of agents on a radio channel that they share, in virtual time.
 
 A message waits for the processing time of its agent, then in the queue of its radio. It arrives, if at all, when its
-frame ends. `ChannelTraffic` connects the messages with their frames, and counts what became of them.
+frame ends. `ChannelTraffic` connects the messages with their frames, and counts their fates.
 """
 
 from collections import Counter
@@ -87,8 +87,8 @@ class ChannelTraffic(Generic[Message]):
         return ended
 
     def _line(self, at: float, sender: int, message: Message, data_bytes: int) -> dict[str, Any]:
-        whose = {"sender": self._roster[sender], "sequence": message.sequence, "bytes": data_bytes}
-        return {"at_s": round(at, 6), **whose}
+        identity = {"sender": self._roster[sender], "sequence": message.sequence, "bytes": data_bytes}
+        return {"at_s": round(at, 6), **identity}
 
     def _line_of(self, frame: Transmission, message: Message) -> dict[str, Any]:
         lost = {fate.value: [self._roster[number] for number in numbers(bits)] for fate, bits in frame.lost().items()}

@@ -1,4 +1,7 @@
-"""An agent as the simulation drives it: the harness's own, in this process, or one behind standard input and output."""
+"""The interface between the simulation and an agent, and its implementation by an agent of the harness.
+
+`foreign` implements it with a separate program.
+"""
 
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -12,17 +15,21 @@ from ucp.settings import Settings
 from ucp.store import StoredState
 from ucp.trace import Entry, Recorded
 
-Outgoing = tuple[int, Message | None, Recorded | None]
-"""What an agent broadcasts: sequence, message, and the datagram as it is on record, None if nobody has that.
+AgentOutput = tuple[int, Message | None, Recorded | None]
+"""(sequence, message, datagram): an output of an agent. The datagram is None if nothing has encoded it yet.
 
-Of a datagram that is no message of the agent's own there is only the last."""
+An output that is not a message of the agent has only the datagram, with sequence 0 and no message.
+"""
 
-Stored = StoredState | tuple[Any]
-"""What a brown-out leaves on an agent's disk; of an agent of another make (whatever it calls so,)."""
+DiskContents = StoredState | tuple[Any]
+"""The contents of an agent's disk after a brown-out. A foreign agent has a tuple with one value of its own."""
 
 
 class VirtualAgent(Protocol):
-    """`now` is what the agent's clock shows, in mission seconds; it never goes back. Everything raises HarnessError."""
+    """An agent in virtual time. `now` is the time of the agent's clock in mission seconds. It never decreases.
+
+    All methods and properties raise HarnessError if the agent fails.
+    """
 
     agent_id: int
     roster: frozenset[int]
@@ -32,7 +39,7 @@ class VirtualAgent(Protocol):
 
     @property
     def chain_changed_at(self) -> float | None:
-        """By its clock; 0 if it never did, None if nobody knows."""
+        """Time of the last change of the chain, by the agent's clock. 0: no change yet. None: unknown."""
 
     @property
     def initial_data(self) -> bytes: ...
@@ -56,32 +63,32 @@ class VirtualAgent(Protocol):
 
     def answers_nobody_until(self) -> float | None: ...
 
-    def outgoing(self) -> Sequence[Outgoing]:
-        """What it broadcasts since it was last asked, in order."""
+    def outgoing(self) -> Sequence[AgentOutput]:
+        """Return the outputs since the previous call, in order."""
 
     def trace(self) -> list[Entry]: ...
 
-    # What it says of itself
+    # Queries about the agent, which are not part of the mission
 
     def status(self) -> Status: ...
 
     def known_status(self) -> Status | None:
-        """None of an agent that failed: what it said before is no longer so."""
+        """Return the status, or None if the agent has failed."""
 
     def completed(self) -> list[bytes]:
-        """Hashes of the blocks that it completed, in order."""
+        """Return the hashes of the blocks that the agent completed, in order."""
 
     def export(self, now: float, exported_at_us: int) -> dict[str, Any]:
-        """Its chain export, as a document."""
+        """Return the chain export as JSON."""
 
-    def stored(self, now: float) -> Stored: ...
+    def stored(self, now: float) -> DiskContents: ...
 
-    def leave(self, now: float) -> None:
-        """Its life ends; what it said of itself by then it says for ever."""
+    def end(self, now: float) -> None:
+        """End the incarnation. Later queries return the state at this time."""
 
 
 class OwnAgent(Agent):
-    """The harness's own."""
+    """An agent of the harness, which runs in this process."""
 
     @property
     def initial_data(self) -> bytes:
@@ -99,7 +106,7 @@ class OwnAgent(Agent):
     def chain_changed_at(self) -> float:
         return self.state.chain_changed_at
 
-    def outgoing(self) -> Sequence[Outgoing]:
+    def outgoing(self) -> Sequence[AgentOutput]:
         return self._due_to_send()
 
     def status(self) -> Status:
@@ -129,5 +136,5 @@ class OwnAgent(Agent):
     def stored(self, now: float) -> StoredState:
         return StoredState.of(self.state)
 
-    def leave(self, now: float) -> None:
-        """It keeps its state."""
+    def end(self, now: float) -> None:
+        """Do nothing, because the object keeps its state."""

@@ -1,6 +1,7 @@
-"""The rogue node in virtual time: it hears every datagram when it is sent, and is heard a moment later.
+"""The rogue node in virtual time.
 
-What it sends reaches every living agent but the one that it imitates, which would take it for an echo of its own.
+The rogue node receives every datagram at the time of sending. Its own datagrams arrive after the mean latency at every
+living agent, except the agent that it imitates. That agent would drop them as an echo of its own messages.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +21,7 @@ MOMENT_S = LATENCY.mean_s
 
 
 class VirtualRogue:
-    """`number` is its own on the air, where agents are numbered in the roster's order."""
+    """The rogue node on a virtual air. `number` is its number there, after the numbers of the agents."""
 
     def __init__(
         self,
@@ -41,13 +42,13 @@ class VirtualRogue:
 
     @property
     def sent(self) -> dict[int, int]:
-        """How many datagrams each injection that has begun has made."""
+        """Number of an injection that has begun -> number of datagrams that it made."""
         return dict(self._rogue.sent)
 
-    def hears(self, sender: int, sequence: int, message: Message, now: float) -> None:
-        self.hears_datagram(encode(sender, sequence, message), now)
+    def receive_message(self, sender: int, sequence: int, message: Message, now: float) -> None:
+        self.receive_datagram(encode(sender, sequence, message), now)
 
-    def hears_datagram(self, datagram: bytes, now: float) -> None:
+    def receive_datagram(self, datagram: bytes, now: float) -> None:
         self._rogue.receive(datagram, now)
         self._send(now)
 
@@ -56,7 +57,7 @@ class VirtualRogue:
         self._send(now)
 
     def wake(self, now: float) -> None:
-        """Something that it waits for is due."""
+        """Handle the time that the rogue node waited for."""
         self._wakes_at = None
         self._rogue.handle_timer(now)
         self._send(now)
@@ -76,4 +77,4 @@ class VirtualRogue:
         soonest = self._rogue.next_timer()
         if soonest is not None and (self._wakes_at is None or soonest < self._wakes_at):
             self._wakes_at = soonest
-            self._air.expect(soonest, self._number, None)
+            self._air.schedule(soonest, self._number, None)

@@ -1,4 +1,4 @@
-"""The tracks of a run in virtual time, on a ground station: seen as vehicles are, and commanded by nobody."""
+"""Show the tracks of a run in virtual time on a ground station. The station sees vehicles, and cannot command them."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from sitl.track import Track
 from sitl.vehicle import VehicleError
 
 SHOW_S = 0.25
-"""Wall time between two looks at the tracks, at least: what that costs must not grow with the speedup."""
+"""Minimum wall time between two updates, so that their cost does not grow with the speedup."""
 SILENT_S = 1.0
-"""Of wall time: who stands still says that it is there, or a ground station takes it for lost."""
+"""Wall time after which a vehicle sends a heartbeat, even if time is paused. A station reports a silent one as lost."""
 READ_BYTES = 65_536
 
 
 @dataclass
-class _OnAir:
+class _Connection:
     vehicle: ShownVehicle
     channel: Channel
     sock: socket.socket
-    said_at: float = 0.0
+    sent_at: float = 0.0
 
 
-class TracksOnStation:
-    """Of one run; in one event loop. Close it."""
+class StationTracks:
+    """The connections of one run to its ground station, for use in one event loop. Close it after the run."""
 
     def __init__(self, station: GroundStation) -> None:
-        """Use `open`."""
+        """Create the object without connections. Use `open` instead."""
         self._station = station
-        self._on_air: dict[int, _OnAir] = {}
+        self._connections: dict[int, _Connection] = {}
         self._shown_at = 0.0
 
     @classmethod
     async def open(cls, scenario: Scenario, tracks: Mapping[int, Track], now: Callable[[], float]) -> Self:
-        """Raises ScenarioError if there is no way to the ground station."""
+        """Connect all vehicles. Raises ScenarioError if the ground station cannot be reached."""
         assert scenario.gcs is not None
         try:
             station = await GroundStation.open(Address.parse(scenario.gcs), now, lambda vehicles: None)
@@ -58,33 +58,35 @@ class TracksOnStation:
             vehicle = ShownVehicle(numbers[vehicle_id], home, epoch_us, vehicle_type, tracks[vehicle_id])
             ours, theirs = socket.socketpair()
             ours.setblocking(False)
-            shown._on_air[vehicle_id] = _OnAir(vehicle, Channel(vehicle), ours)
+            shown._connections[vehicle_id] = _Connection(vehicle, Channel(vehicle), ours)
             await station.attach(vehicle_id, vehicle.sysid, theirs)
         return shown
 
     def show(self, mission_s: float, lost: set[int]) -> None:
-        """Say where the vehicles are that are not `lost`, unless that was a moment ago."""
+        """Send the places of the vehicles that are not `lost`, unless the last update was less than `SHOW_S` ago."""
         if (at := time.monotonic()) - self._shown_at < SHOW_S:
             return
         self._shown_at = at
-        for vehicle_id, on_air in self._on_air.items():
+        for vehicle_id, connection in self._connections.items():
             if vehicle_id in lost:
                 continue
-            on_air.vehicle.show(mission_s)
+            connection.vehicle.show(mission_s)
             with contextlib.suppress(BlockingIOError, ConnectionError):
-                on_air.channel.receive(on_air.sock.recv(READ_BYTES))
-            on_air.channel.send_due()
-            if at - on_air.said_at >= SILENT_S:
-                on_air.channel.send(heartbeat(on_air.vehicle))
-            if data := on_air.channel.take():
-                on_air.said_at = at
-                with contextlib.suppress(BlockingIOError, ConnectionError):  # whoever reads too slowly misses something
-                    on_air.sock.send(data)
+                connection.channel.receive(connection.sock.recv(READ_BYTES))
+            connection.channel.send_due()
+            if at - connection.sent_at >= SILENT_S:
+                connection.channel.send(heartbeat(connection.vehicle))
+            if data := connection.channel.take():
+                connection.sent_at = at
+                with contextlib.suppress(
+                    BlockingIOError, ConnectionError
+                ):  # a station that reads too slowly misses messages
+                    connection.sock.send(data)
 
     def close(self) -> dict[str, Any]:
-        """End all connections; what passed over them, for the record."""
+        """End all connections, and return their record for run.json."""
         passed = self._station.to_json()
         self._station.close()
-        for on_air in self._on_air.values():
-            on_air.sock.close()
+        for connection in self._connections.values():
+            connection.sock.close()
         return passed

@@ -1,13 +1,16 @@
-"""What is on its way, in virtual time: messages, events, and the ends of timers, in the order in which they come.
+"""The queue of virtual time: messages in flight, events to log, and the ends of timers, in order of time.
 
-Everything is broadcast, so N agents hear N times what each says, and nearly all of it changes nothing (`ucp.interest`).
-Unless every handler run is to be traced, the air does not deliver what cannot matter: a question goes to all but those
-who will still reconcile when it arrives; an answer only to those who have asked, or will have when it arrives. What
-becomes of the agents is the same to the last bit either way: lots are drawn for a broadcast as a whole, and everything
-has its place in the order, (time, rank, receiver), whether or not anything else is delivered.
+Agents broadcast each message, so each message reaches nearly all agents. Most of these deliveries change no agent
+(`ucp.interest`). Unless the trace needs every handler run, the air omits deliveries without effect:
 
-Most answers are only tallied. They are not delivered one by one: the agent is told of those that have come, in order,
-before it looks at its tally (`hear`), and nobody works out when an answer reaches whom until then.
+- A query reaches all agents except those that will still be in a reconcile when it arrives.
+- An answer reaches only the agents that have sent the query, or will have sent it when the answer arrives.
+
+The omission changes no agent to the last bit, for two reasons. The network draws belong to the broadcast as a whole.
+The position of an input in the order, (time, rank, receiver), does not depend on other deliveries.
+
+Agents only count most answers. The air does not deliver these answers one by one. It gives them to the agent in order
+before the agent reads its count (`take_answers`), and only then computes when they arrived.
 
 If vehicles share a radio channel, every message occupies it, also one that matters to no agent. A message arrives when
 its frame ends. Only then is it known which agents receive it and which of them ask for it, so it is delivered to these
@@ -33,13 +36,13 @@ from ucp.state import AgentState
 from ucp.trace import Recorded
 
 NEVER = float("inf")
-SWEEP_EVERY = 1000
-"""Broadcasts between two looks for answers that have arrived everywhere."""
+DISCARD_EVERY = 1000
+"""Number of broadcasts after which obsolete answers are discarded."""
 
 
 @dataclass(slots=True, eq=False)
-class InFlight:
-    """One broadcast on its way."""
+class MessageInFlight:
+    """A broadcast message that is on its way to the receivers."""
 
     sender: int
     sequence: int
@@ -47,56 +50,61 @@ class InFlight:
     matters: Callable[[AgentState, int, Message], bool]
     sent_at: float
     rank: int
-    lots: RandomDraws
+    draws: RandomDraws
     datagram: Recorded | None
-    """None if no traces found to have it."""
+    """The datagram as traces record it. None if nothing has encoded it yet."""
     sealed: bytes | None = None
-    """As it is on the air in a secured mission."""
+    """The sealed datagram. None if the mission is not secured."""
 
     def __lt__(self, other: object) -> bool:
-        return False  # of two copies that arrive at one agent in one instant either is the first
+        return False  # two copies with equal time, rank and receiver are equal
 
 
-About = Literal["vote", "reconcile"]
-"""What an agent's question is about: it can have one of each."""
+QueryKind = Literal["vote", "reconcile"]
+"""The two kinds of queries. An agent has at most one open query of each kind."""
 
 
 @dataclass(slots=True, eq=False)
-class _Topic:
-    """What anybody says to one question, by sender in the order in which it was sent, and the numbers of who asks."""
+class _AnswerLog:
+    """The answers to one query, and the agents that sent it."""
 
-    answers: dict[int, list[InFlight]] = field(default_factory=dict)
+    answers: dict[int, list[MessageInFlight]] = field(default_factory=dict)
+    """Sender -> its answers, in the order of sending."""
     askers: set[int] = field(default_factory=set)
+    """Numbers of the agents whose query is open."""
     answer_count: int = 0
-    """How many answers there are."""
+    """Number of all answers."""
     quiet_at: float = 0.0
-    """None of the answers arrives later."""
+    """Time after which no answer arrives."""
 
 
 @dataclass(slots=True, eq=False)
-class _Asked:
-    """What an agent waits to hear, since when, and from whom it has heard it."""
+class _OpenQuery:
+    """An open query of an agent, since the position `since` in the order of inputs."""
 
     question: Question
-    topic: _Topic
-    since: "Happening"
+    log: _AnswerLog
+    since: "ScheduledInput"
     heard: set[int] = field(default_factory=set)
-    heard_of: int = 0
-    """How many answers there were when it was last told of them."""
+    """Senders whose answers the agent has received."""
+    answers_seen: int = 0
+    """Number of answers that existed at the last call of `take_answers`."""
     next_at: float = 0.0
-    """When the next of these comes."""
+    """Time at which the next of these answers arrives."""
     first: tuple[float, int] = (NEVER, 0)
-    """When the first answer of all arrives, and its rank, where no other is wanted."""
+    """Time and rank of the first answer, if the agent uses only one answer."""
 
 
-Logged = tuple[int, int, bytes, int | None]
-"""An event that an agent is about to log: in which of its lives (0: whichever it is), event ID, data, and its time in
-microseconds, None for that of the agent's clock."""
+DueEvent = tuple[int, int, bytes, int | None]
+"""(incarnation, event ID, data, microseconds): an event to log.
+
+Incarnation 0 stands for the current one. Without a time, the event has that of the agent's clock.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class StrayDatagram:
-    """A datagram that is no message of the agent at whose address, that of vehicle `source`, it is sent."""
+    """A datagram from the address of vehicle `source` that is not a message of the agent there."""
 
     source: int
     datagram: bytes
@@ -104,7 +112,7 @@ class StrayDatagram:
 
 
 class _Copies:
-    """The copies of a broadcast that arrive: (receiver, delay in seconds)."""
+    """The copies of a broadcast that arrive, as pairs of receiver and delay in seconds."""
 
     def __init__(self, copies: list[tuple[int, float]]) -> None:
         self._copies = copies
@@ -120,16 +128,19 @@ class _Copies:
 _UNKNOWN = _Copies([])
 """The copies of a message whose frame has not ended."""
 
-Happening = tuple[float, int, int, InFlight | Logged | StrayDatagram | None]
-"""(mission seconds, rank, number of the agent, what): a message, an event, or None for the end of a timer.
+ScheduledInput = tuple[float, int, int, MessageInFlight | DueEvent | StrayDatagram | None]
+"""(mission seconds, rank, agent number, input). The input is a message, an event, or None for the end of a timer.
 
-The number after the last agent's is the rogue node's.
-
-Of two in the same instant the one with the lower rank comes first."""
+The number after that of the last agent is the number of the rogue node. If two inputs have the same time, the one with
+the lower rank comes first.
+"""
 
 
 class VirtualAir:
-    """The air between `roster`, whose agents are numbered in its order. `deliver_all`: even what cannot matter."""
+    """The air between the agents of `roster`. The number of an agent is its index in the roster.
+
+    `deliver_all`: also deliver messages that cannot change their receiver.
+    """
 
     def __init__(
         self,
@@ -137,85 +148,86 @@ class VirtualAir:
         settings: Settings,
         medium: Medium,
         script: FateScript,
-        channel: ChannelTraffic[InFlight | StrayDatagram] | None,
+        channel: ChannelTraffic[MessageInFlight | StrayDatagram] | None,
         *,
         deliver_all: bool,
     ) -> None:
         self.busy_until = [0.0] * len(roster)
-        """Until when, at least, the agent with this number reconciles, and so answers nobody."""
-        self.born_at = [0.0] * len(roster)
-        """When the agent with this number was started; it does not hear what was sent before."""
+        """Agent number -> earliest end of its current reconcile. Until then it answers no query."""
+        self.started_at = [0.0] * len(roster)
+        """Agent number -> time of its start. The agent does not receive messages that were sent before."""
         self.paused_at: dict[int, float] = {}
-        """Since when the agents are paused that are; what has come since waits for them."""
-        self.asked_by: list[dict[About, _Asked]] = [{} for _ in roster]
-        """What the agent with this number waits to hear."""
+        """Number of a paused agent -> start of the pause. Inputs since then wait for the agent."""
+        self.open_queries: list[dict[QueryKind, _OpenQuery]] = [{} for _ in roster]
+        """Agent number -> its open queries."""
         self._quiet_at = 0.0
-        """When the last copy arrives that is not on the channel."""
-        self.place: Happening = (0.0, 0, 0, None)
-        """Where in the order the world stands."""
+        """Arrival of the last copy, except messages on a shared channel."""
+        self.position: ScheduledInput = (0.0, 0, 0, None)
+        """Current position in the order of inputs."""
         self._roster = roster
         self._settings = settings
         self._medium = medium
         self._script = script
         self._channel = channel
         self._deliver_all = deliver_all
-        self._coming: list[Happening] = []
+        self._queue: list[ScheduledInput] = []
         self._rank = 0
-        self._topics: dict[Question, _Topic] = defaultdict(_Topic)
-        self._swept_at = 0
-        self._waiting: dict[str, list[tuple[InFlight, int]]] = defaultdict(list)
-        self._named: dict[str, float] = {}
-        self._held: dict[int, list[tuple[InFlight, int, float]]] = defaultdict(list)
-        """What holds keep back, by their numbers: to whom, and when it would have arrived."""
+        self._answer_logs: dict[Question, _AnswerLog] = defaultdict(_AnswerLog)
+        self._discarded_at = 0
+        self._waiting: dict[str, list[tuple[MessageInFlight, int]]] = defaultdict(list)
+        self._arrived_at: dict[str, float] = {}
+        self._held: dict[int, list[tuple[MessageInFlight, int, float]]] = defaultdict(list)
+        """Number of a hold -> held messages, each with its receiver and its arrival without the hold."""
 
     def deliver_everything(self) -> None:
-        """From now on deliver even what cannot matter."""
+        """Also deliver messages that cannot change their receiver, from now on."""
         self._deliver_all = True
 
     @property
     def quiet_at(self) -> float:
-        """Nothing that was broadcast so far arrives later. On a channel, this is when its next event takes place."""
+        """Time after which no message arrives that is now in flight.
+
+        While a shared channel has messages, it is at least the time of the channel's next event.
+        """
         channel = self._channel
         return self._quiet_at if channel is None or channel.next_s == NEVER else max(self._quiet_at, channel.next_s)
 
-    def until(self, mission_s: float) -> Iterator[Happening]:
-        """What comes up to and at `mission_s`, in order, with whatever comes of it meanwhile."""
-        coming = self._coming
+    def inputs_until(self, mission_s: float) -> Iterator[ScheduledInput]:
+        """Yield the inputs up to and including `mission_s`, in order. The consumer may add inputs meanwhile."""
+        queue = self._queue
         while True:
             channel = self._channel
-            while (
-                channel is not None and channel.next_s <= mission_s and not (coming and coming[0][0] <= channel.next_s)
-            ):
+            while channel is not None and channel.next_s <= mission_s and not (queue and queue[0][0] <= channel.next_s):
                 at = channel.next_s
                 for transmission, message in channel.advance():
-                    self._end(at, transmission, message)
-            if not coming or coming[0][0] > mission_s:
+                    self._deliver_frame(at, transmission, message)
+            if not queue or queue[0][0] > mission_s:
                 break
-            happening = heappop(coming)
-            self.place = happening
+            happening = heappop(queue)
+            self.position = happening
             yield happening
         self._rank += 1
-        self.place = (mission_s, self._rank, 0, None)
+        self.position = (mission_s, self._rank, 0, None)
 
-    def expect(self, at: float, number: int, what: Logged | None) -> None:
-        """The agent's timer ends, or it logs an event, at `at`."""
+    def schedule(self, at: float, number: int, what: DueEvent | None) -> None:
+        """Schedule an event to log, or without `what` the end of a timer."""
         self._rank += 1
-        heappush(self._coming, (at, self._rank, number, what))
+        heappush(self._queue, (at, self._rank, number, what))
 
-    def order_of_timers(self, ends: Mapping[int, float]) -> list[int]:
-        """Numbers of the agents whose next timer ends when `ends` says, in the order in which that happens."""
-        coming = sorted(happening[:3] for happening in self._coming if happening[3] is None)
-        return list(dict.fromkeys(number for at, _, number in coming if ends.get(number) == at))
+    def timer_order(self, ends: Mapping[int, float]) -> list[int]:
+        """Sort agents by the ends of their next timers. `ends` maps numbers of agents to these ends."""
+        queue = sorted(happening[:3] for happening in self._queue if happening[3] is None)
+        return list(dict.fromkeys(number for at, _, number in queue if ends.get(number) == at))
 
     def inject(self, at: float, stray: StrayDatagram, numbers: Iterable[int]) -> None:
-        """`stray` reaches the agents with these numbers at `at`."""
+        """Schedule the arrival of a stray datagram at these agents."""
         self._rank += 1
         self._quiet_at = max(self._quiet_at, at)
         for number in numbers:
-            heappush(self._coming, (at, self._rank, number, stray))
+            heappush(self._queue, (at, self._rank, number, stray))
 
     def broadcast_stray(self, now: float, number: int, datagram: bytes) -> None:
-        """The agent with this number sends what is no message of its own. No fate is about it."""
+        """Send a datagram that is not a message of the agent. Scripted fates do not apply to it."""
         stray = StrayDatagram(self._roster[number], datagram)
         if self._channel is not None:
             self._channel.send(now, number, stray, len(datagram))
@@ -233,38 +245,38 @@ class VirtualAir:
         datagram: Recorded | None = None,
         sealed: bytes | None = None,
     ) -> None:
-        """The agent with this number sends `message`, in a datagram with so many bytes of data."""
+        """Send a message of the agent, in a datagram with `data_bytes` bytes of data."""
         self._rank += 1
         channel, kind = self._channel, type(message)
-        lots = self._medium.draw(number, now, data_bytes) if channel is None else _UNKNOWN
-        flight = InFlight(
-            self._roster[number], sequence, message, MATTERS[kind], now, self._rank, lots, datagram, sealed
+        draws = self._medium.draw(number, now, data_bytes) if channel is None else _UNKNOWN
+        flight = MessageInFlight(
+            self._roster[number], sequence, message, MATTERS[kind], now, self._rank, draws, datagram, sealed
         )
         answered = None if self._deliver_all else ANSWERED.get(kind)
-        if answered is None and kind in ASKED and (self._topics or not self._deliver_all):
-            self._ask(number, ASKED[kind](message, self._settings))
+        if answered is None and kind in ASKED and (self._answer_logs or not self._deliver_all):
+            self._open_query(number, ASKED[kind](message, self._settings))
         if channel is not None:
             channel.send(now, number, flight, data_bytes)
             return
-        if now + lots.latest > self._quiet_at:
-            self._quiet_at = now + lots.latest
-        if self._script.listens and self._scripted(now, number, flight):
+        if now + draws.latest > self._quiet_at:
+            self._quiet_at = now + draws.latest
+        if self._script.listens and self._apply_fates(now, number, flight):
             return
         if answered is None:
-            self._deliver(flight)
+            self._schedule_all(flight)
         else:
-            self._answer(answered(message), flight, number)
+            self._keep_answer(answered(message), flight, number)
 
-    def _deliver(self, flight: InFlight) -> None:
-        """Let it arrive at everybody but those who will certainly not answer."""
-        coming, busy_until, deliver_all = self._coming, self.busy_until, self._deliver_all
+    def _schedule_all(self, flight: MessageInFlight) -> None:
+        """Schedule the arrivals at all receivers, except at agents that will certainly ignore the message."""
+        queue, busy_until, deliver_all = self._queue, self.busy_until, self._deliver_all
         now, rank = flight.sent_at, flight.rank
-        for receiver, delay in flight.lots.to_all():
+        for receiver, delay in flight.draws.to_all():
             at = now + delay
             if deliver_all or at >= busy_until[receiver]:
-                heappush(coming, (at, rank, receiver, flight))
+                heappush(queue, (at, rank, receiver, flight))
 
-    # The channel, if there is one
+    # Shared channel
 
     def move(self, places: Mapping[int, Place], now: float) -> None:
         """Put the vehicles at these places."""
@@ -283,27 +295,27 @@ class VirtualAir:
                 now,
             )
 
-    def _end(self, at: float, transmission: Transmission, message: InFlight | StrayDatagram) -> None:
+    def _deliver_frame(self, at: float, transmission: Transmission, message: MessageInFlight | StrayDatagram) -> None:
         """Deliver a message whose frame ends. The conditions of the network apply to each copy that arrives."""
         sender, received = transmission.sender, transmission.received
-        lots = self._medium.draw(sender, at, transmission.data_bytes)
+        draws = self._medium.draw(sender, at, transmission.data_bytes)
         if isinstance(message, StrayDatagram):
             for receiver in numbers(received):
-                for delay in lots.copies_to(receiver):
+                for delay in draws.copies_to(receiver):
                     self.inject(at + delay, message, [receiver])
             return
         message.sent_at = transmission.began_at
         if self._script.listens:
-            message.lots = _Copies([copy for copy in lots.to_all() if received >> copy[0] & 1])
-            if self._scripted(at, sender, message):
+            message.draws = _Copies([copy for copy in draws.to_all() if received >> copy[0] & 1])
+            if self._apply_fates(at, sender, message):
                 return
-        if message.rank - self._swept_at > SWEEP_EVERY:
-            self._sweep(message)
-        for receiver in self._concerned(received, message, at):
-            for delay in lots.copies_to(receiver):
-                self._arrive(message, receiver, at + delay)
+        if message.rank - self._discarded_at > DISCARD_EVERY:
+            self._discard_answers(message)
+        for receiver in self._interested_receivers(received, message, at):
+            for delay in draws.copies_to(receiver):
+                self._schedule_arrival(message, receiver, at + delay)
 
-    def _concerned(self, received: int, flight: InFlight, at: float) -> Iterable[int]:
+    def _interested_receivers(self, received: int, flight: MessageInFlight, at: float) -> Iterable[int]:
         """Return the receivers to which the message can matter.
 
         An agent that reconciles ignores questions. An answer that arrives at once matters only to the agents that ask
@@ -315,158 +327,160 @@ class VirtualAir:
         if answered is None:
             busy_until = self.busy_until
             return [receiver for receiver in numbers(received) if at >= busy_until[receiver]]
-        topic = self._topics.get(answered(flight.message))
-        asking = topic.askers | self.paused_at.keys() if topic else self.paused_at.keys()
+        log = self._answer_logs.get(answered(flight.message))
+        asking = log.askers | self.paused_at.keys() if log else self.paused_at.keys()
         return [receiver for receiver in sorted(asking) if received >> receiver & 1]
 
-    # Answers, to whom they matter
+    # Answers
 
-    def hear(self, number: int) -> list[tuple[float, int, InFlight]]:
-        """(mission seconds, rank, answer) of the answers that the agent tallies and has not been told of, in order.
+    def take_answers(self, number: int) -> list[tuple[float, int, MessageInFlight]]:
+        """Return the new answers that the agent counts, as (mission seconds, rank, answer), in order.
 
-        Those that have come since it asked: of each agent the first.
+        They have arrived since the agent's query. Only the first answer of each sender counts.
         """
         heard = []
-        now, rank, _, _ = self.place
-        for asked in self.asked_by[number].values():
-            topic = asked.topic
-            if asked.question[0] not in ONLY_COUNTED or (topic.answer_count == asked.heard_of and now < asked.next_at):
+        now, rank, _, _ = self.position
+        for query in self.open_queries[number].values():
+            log = query.log
+            if query.question[0] not in ONLY_COUNTED or (
+                log.answer_count == query.answers_seen and now < query.next_at
+            ):
                 continue
-            asked.heard_of, asked.next_at = topic.answer_count, NEVER
-            for sender, flights in topic.answers.items():
-                if sender in asked.heard:
+            query.answers_seen, query.next_at = log.answer_count, NEVER
+            for sender, flights in log.answers.items():
+                if sender in query.heard:
                     continue
-                first = self._first(flights, number, asked.since)
+                first = self._earliest(flights, number, query.since)
                 if first is None:
                     continue
                 if first[0] < now or (first[0] == now and first[1] < rank):
-                    asked.heard.add(sender)
+                    query.heard.add(sender)
                     heard.append(first)
-                elif first[0] < asked.next_at:
-                    asked.next_at = first[0]
+                elif first[0] < query.next_at:
+                    query.next_at = first[0]
         heard.sort()
         return heard
 
-    def no_longer_asked(self, number: int, state: AgentState) -> None:
-        """A timer of the agent has ended, and with it a question."""
-        asked_by = self.asked_by[number]
-        for about, asked in list(asked_by.items()):
-            if not STILL_ASKED[asked.question[0]](state):
-                del asked_by[about]
-                asked.topic.askers.remove(number)
+    def close_ended_queries(self, number: int, state: AgentState) -> None:
+        """Close the queries of an agent that ended together with a timer."""
+        open_queries = self.open_queries[number]
+        for about, query in list(open_queries.items()):
+            if not STILL_ASKED[query.question[0]](state):
+                del open_queries[about]
+                query.log.askers.remove(number)
 
-    def is_gone(self, number: int) -> None:
-        """The agent has been killed."""
-        for asked in self.asked_by[number].values():
-            asked.topic.askers.remove(number)
-        self.asked_by[number].clear()
+    def remove_agent(self, number: int) -> None:
+        """Remove an agent that was killed."""
+        for query in self.open_queries[number].values():
+            query.log.askers.remove(number)
+        self.open_queries[number].clear()
         self.paused_at.pop(number, None)
         self.busy_until[number] = 0.0
 
-    def _ask(self, number: int, question: Question) -> None:
-        """From now on the agent waits for answers: also for those to others that have not arrived yet."""
-        asked_by = self.asked_by[number]
-        about: About = "vote" if question[0] is BlockAddResponse else "reconcile"
-        before = asked_by.get(about)
+    def _open_query(self, number: int, question: Question) -> None:
+        """Open a query of the agent. Answers to the same query of another agent also count if they arrive later."""
+        open_queries = self.open_queries[number]
+        about: QueryKind = "vote" if question[0] is BlockAddResponse else "reconcile"
+        before = open_queries.get(about)
         if before is not None:
-            before.topic.askers.remove(number)
-        topic = self._topics[question]
-        topic.askers.add(number)
-        asked = asked_by[about] = _Asked(question, topic, self.place)
+            before.log.askers.remove(number)
+        log = self._answer_logs[question]
+        log.askers.add(number)
+        query = open_queries[about] = _OpenQuery(question, log, self.position)
         if question[0] not in ONLY_COUNTED:
-            for flights in topic.answers.values():
-                self._arrive_first(flights, number, asked)
+            for flights in log.answers.values():
+                self._schedule_earliest(flights, number, query)
 
-    def _answer(self, question: Question, flight: InFlight, sender: int) -> None:
-        """Keep an answer for those who ask, or will before it arrives."""
-        topic = self._topics[question]
-        topic.answer_count += 1
-        topic.quiet_at = self._quiet_at
-        flights = topic.answers.get(sender)
+    def _keep_answer(self, question: Question, flight: MessageInFlight, sender: int) -> None:
+        """Keep an answer for the agents that have sent the query, or will send it before the answer arrives."""
+        log = self._answer_logs[question]
+        log.answer_count += 1
+        log.quiet_at = self._quiet_at
+        flights = log.answers.get(sender)
         if flights is None:
-            topic.answers[sender] = [flight]
+            log.answers[sender] = [flight]
         else:
             flights.append(flight)
         if question[0] not in ONLY_COUNTED:
-            for receiver in topic.askers:
-                self._arrive_first((flight,), receiver, self.asked_by[receiver]["reconcile"])
-        if flight.rank - self._swept_at > SWEEP_EVERY:
-            self._sweep(flight)
+            for receiver in log.askers:
+                self._schedule_earliest((flight,), receiver, self.open_queries[receiver]["reconcile"])
+        if flight.rank - self._discarded_at > DISCARD_EVERY:
+            self._discard_answers(flight)
 
-    def _arrive_first(self, flights: Iterable[InFlight], receiver: int, asked: _Asked) -> None:
-        """Let that answer arrive that comes first, unless another comes before it."""
-        first = self._first(flights, receiver, asked.since)
-        if first is not None and first[:2] < asked.first:
+    def _schedule_earliest(self, flights: Iterable[MessageInFlight], receiver: int, query: _OpenQuery) -> None:
+        """Schedule the earliest of these answers, unless an earlier one is already scheduled."""
+        first = self._earliest(flights, receiver, query.since)
+        if first is not None and first[:2] < query.first:
             at, rank, flight = first
-            asked.first = at, rank
-            heappush(self._coming, (at, rank, receiver, flight))
+            query.first = at, rank
+            heappush(self._queue, (at, rank, receiver, flight))
 
-    def _first(
-        self, flights: Iterable[InFlight], receiver: int, since: Happening
-    ) -> tuple[float, int, InFlight] | None:
-        """(mission seconds, rank, flight) of the flight that arrives first after `since`."""
+    def _earliest(
+        self, flights: Iterable[MessageInFlight], receiver: int, since: ScheduledInput
+    ) -> tuple[float, int, MessageInFlight] | None:
+        """Return (mission seconds, rank, message) of the message that arrives first after `since`."""
         since_s, since_rank, _, _ = since
-        born_at = self.born_at[receiver]
+        started_at = self.started_at[receiver]
         soonest, latest = self._medium.soonest, self._medium.latest
         first_at, first = NEVER, None
         for flight in flights:
             sent_at = flight.sent_at
             if sent_at + soonest >= first_at:
                 break
-            if sent_at + latest < since_s or sent_at < born_at:
+            if sent_at + latest < since_s or sent_at < started_at:
                 continue
-            for delay in flight.lots.copies_to(receiver):
+            for delay in flight.draws.copies_to(receiver):
                 at = sent_at + delay
                 if at < first_at and (at > since_s or (at == since_s and flight.rank > since_rank)):
                     first_at, first = at, flight
         return None if first is None else (first_at, first.rank, first)
 
-    def _sweep(self, latest: InFlight) -> None:
-        """Forget the answers that have arrived everywhere and that nobody waits for."""
-        self._swept_at = latest.rank
+    def _discard_answers(self, latest: MessageInFlight) -> None:
+        """Discard the answers that have arrived at all receivers, and whose query no agent has open."""
+        self._discarded_at = latest.rank
         heard_before = min([latest.sent_at, *self.paused_at.values()])
-        self._topics = defaultdict(
-            _Topic,
+        self._answer_logs = defaultdict(
+            _AnswerLog,
             {
-                question: topic
-                for question, topic in self._topics.items()
-                if topic.askers or topic.quiet_at >= heard_before
+                question: log
+                for question, log in self._answer_logs.items()
+                if log.askers or log.quiet_at >= heard_before
             },
         )
 
     # Scripted fates
 
-    def _scripted(self, now: float, number: int, flight: InFlight) -> bool:
-        """Send `flight` as the script says, to everybody; False if the script says nothing of it."""
+    def _apply_fates(self, now: float, number: int, flight: MessageInFlight) -> bool:
+        """Schedule the arrivals of a message as the scripted fates require. Return false if no fate matches."""
         decided = self._script.decide(
-            now, flight.sender, flight.message, flight.lots, lambda receiver: self._medium.hears(number, receiver)
+            now, flight.sender, flight.message, flight.draws, lambda receiver: self._medium.hears(number, receiver)
         )
         if decided is None:
             return False
         for receiver, at in decided.arrivals:
-            self._arrive(flight, receiver, at)
+            self._schedule_arrival(flight, receiver, at)
         for receiver, name in decided.waiting:
-            if name in self._named:
-                self._arrive(flight, receiver, max(now, self._named[name]) + RIGHT_AFTER_S)
+            if name in self._arrived_at:
+                self._schedule_arrival(flight, receiver, max(now, self._arrived_at[name]) + RIGHT_AFTER_S)
             else:
                 self._waiting[name].append((flight, receiver))
         for hold, receiver, at in decided.held:
             self._held[hold].append((flight, receiver, at))
         for name, at in decided.named:
-            self._named[name] = at
+            self._arrived_at[name] = at
             for waiting, receiver in self._waiting.pop(name, ()):
-                self._arrive(waiting, receiver, at + RIGHT_AFTER_S)
+                self._schedule_arrival(waiting, receiver, at + RIGHT_AFTER_S)
         return True
 
     def release(self, number: int, at: float) -> None:
-        """What the hold with this number has kept back arrives at `at`, or when it would have."""
+        """End a hold. Its messages arrive at `at`, or at their own time if that is later."""
         for flight, receiver, would_arrive in self._held.pop(number, ()):
-            self._arrive(flight, receiver, max(at, would_arrive))
+            self._schedule_arrival(flight, receiver, max(at, would_arrive))
 
-    def _arrive(self, flight: InFlight, receiver: int, at: float) -> None:
+    def _schedule_arrival(self, flight: MessageInFlight, receiver: int, at: float) -> None:
         self._quiet_at = max(self._quiet_at, at)
-        heappush(self._coming, (at, flight.rank, receiver, flight))
+        heappush(self._queue, (at, flight.rank, receiver, flight))
 
     def unmatched_fates(self) -> list[str]:
-        """A sentence for each scripted fate that came to nothing."""
+        """Return a sentence for each scripted fate that did not take effect."""
         return self._script.unmatched(self._waiting)

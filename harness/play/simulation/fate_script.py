@@ -18,19 +18,17 @@ NameOf = Callable[[bytes], str | None]
 
 
 @dataclass(slots=True, eq=False)
-class _Part:
-    """One fate and what it has come to: messages that fit it, and deliveries that it decided.
-
-    `arrivals` are the mission seconds at which the sender's datagrams arrive that have not been sent yet, by number.
-    While it `holds`, nobody knows yet until when.
-    """
+class _ScriptedFate:
+    """A scripted fate, with the numbers of messages that matched it and of deliveries that it decided."""
 
     index: int
     fate: Fate
-    fitting: int = 0
+    matches: int = 0
     decided: int = 0
     arrivals: dict[int, list[float]] = field(default_factory=dict)
+    """Number of a datagram that has not been sent yet -> mission seconds of its arrivals."""
     holds: bool = False
+    """True while the fate holds messages and the end of the hold is unknown."""
 
     def __post_init__(self) -> None:
         for number, at_s in parse_pairs(self.fate.arrivals or ""):
@@ -38,55 +36,59 @@ class _Part:
 
 
 @dataclass(slots=True)
-class Decided:
-    """When copies of a message arrive at whom, as far as that is known yet, in mission seconds."""
+class DecidedDelivery:
+    """The delivery of one message, as far as it is decided. Times are mission seconds, receivers are numbers."""
 
     arrivals: list[tuple[int, float]] = field(default_factory=list)
+    """(receiver, time): the copy arrives at this time."""
     waiting: list[tuple[int, str]] = field(default_factory=list)
-    """(receiver, name): to arrive after the message that the fate with this name is about."""
+    """(receiver, name): the copy arrives after the message that matches the fate with this name."""
     held: list[tuple[int, int, float]] = field(default_factory=list)
-    """(number, receiver, time): to arrive then, or when the hold with this number is over if that is later."""
+    """(number, receiver, time): the copy arrives at this time, or at the end of the hold with this number if later."""
     named: list[tuple[str, float]] = field(default_factory=list)
-    """(name, time): when the message arrives that the fate with this name is about."""
+    """(name, time): the message that matches the fate with this name arrives at this time."""
 
 
 class FateScript:
-    """Fates for `roster`; receivers are numbered in its order. `name_of` gives a block's name from its hash."""
+    """The scripted fates of a run. `name_of` returns a block's name from its hash.
+
+    The number of a receiver is its index in `roster`.
+    """
 
     def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf) -> None:
         self.listens = bool(fates)
-        """Whether `decide` is to be asked at all."""
+        """True if there are fates, so that `decide` must be called."""
         self.last_s: float | None = None
-        """When the last message was sent that did not go as chance would have it."""
-        self._parts = [_Part(index, fate) for index, fate in enumerate(fates)]
+        """Time at which the last message was sent whose delivery a fate changed."""
+        self._parts = [_ScriptedFate(index, fate) for index, fate in enumerate(fates)]
         self._number = {agent_id: number for number, agent_id in enumerate(roster)}
         self._name_of = name_of
-        self._about: dict[tuple[str | None, int | None], list[_Part]] = defaultdict(list)
+        self._about: dict[tuple[str | None, int | None], list[_ScriptedFate]] = defaultdict(list)
         for part in self._parts:
             self._about[part.fate.message, part.fate.sender].append(part)
 
     def hold(self, fate: Fate) -> int:
-        """From now on this fate is the last in the list, and holds back what fits it; its number."""
-        part = _Part(len(self._parts), fate.model_copy(update={"until_s": None}), holds=True)
+        """Append a fate that holds the matching messages from now on. Return its number."""
+        part = _ScriptedFate(len(self._parts), fate.model_copy(update={"until_s": None}), holds=True)
         self._parts.append(part)
         self._about[fate.message, fate.sender].append(part)
         self.listens = True
         return part.index
 
     def release(self, number: int, fate: Fate) -> None:
-        """The hold with this number lasts as long as `fate` says."""
+        """Set the end of the hold with this number to that of `fate`."""
         part = self._parts[number]
         part.fate, part.holds = fate, False
 
     def decide(
-        self, now: float, sender: int, message: Message, lots: RandomDraws, hears: Callable[[int], bool]
-    ) -> Decided | None:
-        """What becomes of a message that agent `sender` broadcasts; None if no fate is about it."""
-        parts = [part for part in self._fitting(now, sender, message) if self._picks(part)]
+        self, now: float, sender: int, message: Message, draws: RandomDraws, hears: Callable[[int], bool]
+    ) -> DecidedDelivery | None:
+        """Return the delivery of a message of agent `sender`. None if no fate matches it."""
+        parts = [part for part in self._matching(now, sender, message) if self._count_match(part)]
         if not parts:
             return None
-        decided = Decided()
-        by_chance = lots.to_all()
+        decided = DecidedDelivery()
+        by_chance = draws.to_all()
         for agent_id, receiver in self._number.items():
             if agent_id == sender:
                 continue
@@ -108,7 +110,7 @@ class FateScript:
                 decided.waiting.append((receiver, fate.after))
                 continue
             if fate.arrivals is not None:
-                arrivals = [max(now, at) for at in part.arrivals.pop(part.fitting - 1, ())]
+                arrivals = [max(now, at) for at in part.arrivals.pop(part.matches - 1, ())]
             elif fate.drop:
                 arrivals = []
             elif fate.delay_s is not None:
@@ -120,19 +122,22 @@ class FateScript:
                 decided.named.append((fate.name, arrivals[0]))
         return decided
 
-    def standing(self, now: float) -> tuple[int, ...] | None:
-        """How far each fate has counted, as far as that still matters; None while the time of one is to come."""
+    def settled_counts(self, now: float) -> tuple[int, ...] | None:
+        """Return the number of matches of each fate, up to the largest number that the fate names.
+
+        None if the result of a fate still depends on time.
+        """
         if any(part.arrivals or part.holds for part in self._parts):
             return None
         times = (time for part in self._parts for time in (part.fate.from_s, part.fate.until_s, part.fate.hold_until_s))
         if any(time is not None and time > now for time in times):
             return None
-        return tuple(min(part.fitting, max(part.fate.counts or (0,))) for part in self._parts)
+        return tuple(min(part.matches, max(part.fate.counts or (0,))) for part in self._parts)
 
     def unmatched(self, waiting: Collection[str]) -> list[str]:
-        """A sentence for each fate that came to nothing: whoever wrote it believes that it did something.
+        """Return a sentence for each fate that did not take effect, because its author expects an effect.
 
-        `waiting`: names of fates whose message others still wait for.
+        `waiting`: names of fates for whose message another message still waits.
         """
         sentences = []
         for part in self._parts:
@@ -146,7 +151,7 @@ class FateScript:
                 sentences.append(f"{fate}: the message that {part.fate.after!r} is about never arrived")
         return sentences
 
-    def _fitting(self, now: float, sender: int, message: Message) -> Iterator[_Part]:
+    def _matching(self, now: float, sender: int, message: Message) -> Iterator[_ScriptedFate]:
         keys = ((message.NAME, sender), (message.NAME, None), (None, sender), (None, None))
         parts = [part for key in keys for part in self._about.get(key, ())]
         if not parts:
@@ -160,48 +165,50 @@ class FateScript:
             if not early and not late and (fate.block is None or fate.block == block):
                 yield part
 
-    def _picks(self, part: _Part) -> bool:
-        """Count the message that fits; whether the fate is about this one."""
-        part.fitting += 1
+    def _count_match(self, part: _ScriptedFate) -> bool:
+        """Count a matching message. Return whether the fate applies to a message with this number."""
+        part.matches += 1
         counts = part.fate.counts
-        return counts is None or part.fitting in counts
+        return counts is None or part.matches in counts
 
 
-class Running(NamedTuple):
-    """A timer that runs: the `number`th, from 0, that the agent has started, and when it ends by the agent's clock."""
+class RunningTimer(NamedTuple):
+    """A running timer of an agent."""
 
     name: str
     number: int
+    """Number of timers that the agent started before this one."""
     deadline: float
+    """Time of its end by the agent's clock."""
 
 
 class LateTimers:
-    """Those of one agent, through all of its lives. `text` is as in a scenario."""
+    """The timers of one agent, through all of its incarnations. `text` is the agent's `lateness` in the scenario."""
 
     def __init__(self, text: str = "") -> None:
-        self.running: dict[str, Running] = {}
-        """By name."""
+        self.running: dict[str, RunningTimer] = {}
+        """Name of a timer -> the timer."""
         self._late_by_s = dict(parse_pairs(text))
         self._started = 0
 
-    def look(self, state: AgentState) -> None:
-        """See which timers run after an input; of several that it has started the one that `timers` names first."""
+    def update(self, state: AgentState) -> None:
+        """Update the running timers after an input. Several new timers are numbered in the order of `state.timers`."""
         for timer in state.timers:
             known, deadline = self.running.get(timer.name), timer.deadline
             if deadline is None:
                 self.running.pop(timer.name, None)
             elif known is None or known.deadline != deadline:
-                self.running[timer.name] = Running(timer.name, self._started, deadline)
+                self.running[timer.name] = RunningTimer(timer.name, self._started, deadline)
                 self._started += 1
 
     @property
-    def all_have_ended(self) -> bool:
-        """Whether none of those that are told to be late runs or is to come: from now on all end when they should."""
+    def late_ones_have_ended(self) -> bool:
+        """True if all late timers have ended. From now on, all timers end on time."""
         late = self._late_by_s.keys()
         running = {timer.number for timer in self.running.values()}
         return self._started > max(late, default=-1) and running.isdisjoint(late)
 
-    def next(self, at: Callable[[float], float]) -> tuple[float, Running] | None:
-        """When which ends next, in mission seconds; `at` is when the agent's clock shows something."""
+    def next(self, at: Callable[[float], float]) -> tuple[float, RunningTimer] | None:
+        """Return the mission second and the timer of the next end. `at` converts a time of the agent's clock."""
         ends = ((at(timer.deadline) + self._late_by_s.get(timer.number, 0.0), timer) for timer in self.running.values())
         return min(ends, default=None, key=lambda end: (end[0], end[1].deadline))

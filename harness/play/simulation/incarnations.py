@@ -1,11 +1,11 @@
-"""The lives of agents in virtual time, and what people call the blocks that they complete."""
+"""The incarnations of agents in virtual time, and the names of the blocks that they complete."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 from harness.play.simulation._simulated_agent import VirtualAgent
-from harness.play.simulation.air import Happening
+from harness.play.simulation.air import ScheduledInput
 from harness.scenario.scenario import Clock
 from ucp.clock import MICROSECONDS
 from ucp.events import RandomEvents
@@ -15,43 +15,43 @@ if TYPE_CHECKING:
     from ucp.secure.secured_agent import OutgoingDatagram
 
 
-class Secured(Protocol):
-    """An agent with keys, whoever made it."""
+class KeyedAgent(Protocol):
+    """An agent with keys. It is an agent of the harness or a foreign agent."""
 
     def sealed_to_send(self) -> "Iterable[OutgoingDatagram]":
-        """What it broadcasts since it was last asked, in order."""
+        """Return the datagrams that the agent sent since the previous call, in order."""
 
     def revoke(self, body: bytes, now: float) -> object:
-        """The authority says whose keys are revoked."""
+        """Handle a revocation by the authority of the keys."""
 
 
 @dataclass(slots=True)
 class Incarnation:
-    """An agent from its start, restart or reboot on."""
+    """An agent from its start, restart or reboot to its end."""
 
     agent: VirtualAgent
     source: RandomEvents
     clock: Clock | None
-    """None shows mission time."""
-    born_at: float
+    """None if the clock shows mission time."""
+    started_at: float
     state: AgentState | None = None
-    """What it holds, asks and counts; None of an agent into which nobody sees."""
-    secured: Secured | None = None
+    """The protocol state of the agent. None for a foreign agent, which does not show it."""
+    secured: KeyedAgent | None = None
     """The agent, if it has keys."""
     rebooted: bool = False
-    """It came back from a brown-out with what was on its disk."""
+    """True if the agent started with the data of its disk, after a brown-out."""
     deadline: float | None = None
-    """When its next timer ends, in mission seconds."""
-    waiting: list[Happening] | None = None
-    """What has reached the agent while it is paused; None if it is not."""
+    """Mission second at which the next timer ends."""
+    waiting: list[ScheduledInput] | None = None
+    """Inputs that have arrived during a pause. None if the agent is not paused."""
     resumed_at: float = 0.0
-    """Whatever came before is handled then."""
+    """Mission second of the end of the last pause. Answers that arrived earlier are handled at this time."""
     bytes_sent: int = 0
     handler_runs: int = 0
-    """Counted while tracing."""
+    """Number of handler runs. Only counted if a trace is written."""
     ended_at: float | None = None
     logs: bool = True
-    """Whether it still logs events."""
+    """True while the agent logs events."""
 
     @property
     def idle(self) -> bool:
@@ -62,44 +62,46 @@ class Incarnation:
         return self.agent.status().top_chain_hash if self.state is None else self.state.chain.top_chain_hash.hex()
 
     def local_s(self, mission_s: float) -> float:
-        """What the agent takes for mission time."""
+        """Return the time that the agent's clock shows at a mission second."""
         return mission_s if self.clock is None else self.clock.shows(mission_s)
 
     def timestamp_us(self, mission_s: float) -> int:
-        """What the agent's clock shows, or showed at its end, in microseconds; never less than 0."""
+        """Return the agent's clock in microseconds, at least 0. After the agent's end, the clock stands still."""
         return max(0, round(self._last_local_s(mission_s) * MICROSECONDS))
 
     def export(self, mission_s: float) -> dict[str, Any]:
-        """The agent's chain export, as a document."""
+        """Return the agent's chain export as JSON."""
         return self.agent.export(self._last_local_s(mission_s), self.timestamp_us(mission_s))
 
     def mission_s(self, local_s: float) -> float:
-        """When the agent's clock shows `local_s`."""
+        """Return the mission second at which the agent's clock shows `local_s`."""
         return local_s if self.clock is None else self.clock.mission_s(local_s)
 
     @property
     def chain_changed_at(self) -> float | None:
-        """In mission seconds; 0 if it never did, whatever the agent's clock then showed; None if nobody knows."""
+        """Mission second of the last change of the chain. 0 if there was no change, and None if it is unknown."""
         local_s = self.agent.chain_changed_at
         return self.mission_s(local_s) if local_s else local_s
 
     def _last_local_s(self, mission_s: float) -> float:
-        """What the agent takes for mission time, or did at its end."""
+        """Return the time that the agent's clock shows, or showed at the agent's end."""
         return self.local_s(mission_s if self.ended_at is None else self.ended_at)
 
 
 class BlockNames:
-    """What people call the blocks of `roster`, whose agents have had these `lives` up to now."""
+    """The names of blocks, such as 3.2 for the second block that agent 3 completed."""
 
-    def __init__(self, roster: Sequence[int], lives: Sequence[Sequence[Incarnation]]) -> None:
+    def __init__(self, roster: Sequence[int], incarnations: Sequence[Sequence[Incarnation]]) -> None:
         self._roster = roster
-        self._lives = lives
+        self._incarnations = incarnations
         self._names: dict[bytes, str] = {}
 
     def of(self, block_hash: bytes) -> str | None:
-        """`<agent>.<ordinal>` of a block that an agent has completed."""
+        """Return `<agent>.<ordinal>` of a block. None if no agent has completed it."""
         if block_hash not in self._names:
-            for agent_id, lives in zip(self._roster, self._lives, strict=True):
-                completed = dict.fromkeys(block for life in lives for block in life.agent.completed())
+            for agent_id, incarnations in zip(self._roster, self._incarnations, strict=True):
+                completed = dict.fromkeys(
+                    block for incarnation in incarnations for block in incarnation.agent.completed()
+                )
                 self._names.update((block, f"{agent_id}.{count}") for count, block in enumerate(completed, 1))
         return self._names.get(block_hash)

@@ -1,4 +1,4 @@
-"""The files of a simulated run, and the recorder of events that cannot be asked for at the end."""
+"""The files of a simulated run, and the interface of a recorder of events during a run."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
@@ -10,8 +10,8 @@ from ucp.agent_files import TraceFile, write_json_atomically
 from ucp.trace import Entry, header_line
 
 
-class OnDisk:
-    """The simulation's `Recorder` that writes them."""
+class DiskRecorder:
+    """A `Recorder` that writes the files of a run directory."""
 
     tracing = True
 
@@ -19,14 +19,14 @@ class OnDisk:
         self._rundir = rundir
         self._traces: dict[int, TraceFile] = {}
 
-    def begin(self, life: Incarnation) -> None:
-        agent_id = life.agent.agent_id
+    def begin(self, incarnation: Incarnation) -> None:
+        agent_id = incarnation.agent.agent_id
         if agent_id not in self._traces:
             self._traces[agent_id] = TraceFile(self._rundir.agents / f"{agent_id}.trace.jsonl")
-        self._traces[agent_id].write(header_line(**header(life)))
+        self._traces[agent_id].write(header_line(**header(incarnation)))
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
-        """The block that it becomes part of has it."""
+        """Do nothing, because the block with the event contains this information."""
 
     def write(self, agent_id: int, entries: list[Entry]) -> None:
         self._traces[agent_id].write("".join([entry.to_line() for entry in entries]))
@@ -43,18 +43,18 @@ class OnDisk:
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         self._rundir.append_tracks(at_s, places)
 
-    def keep_chains(self, at_s: float, lives: Iterable[Incarnation]) -> None:
-        self.export(at_s, lives)
+    def keep_chains(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
+        self.export(at_s, incarnations)
         self._rundir.keep_exports_before_final_reconcile()
 
-    def export(self, at_s: float, lives: Iterable[Incarnation]) -> None:
-        """Raises OSError."""
-        for life in lives:
-            path = self._rundir.agents / f"{life.agent.agent_id}.chain.json"
-            write_json_atomically(path, life.export(at_s))
+    def export(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
+        """Write the exports. Raises OSError."""
+        for incarnation in incarnations:
+            path = self._rundir.agents / f"{incarnation.agent.agent_id}.chain.json"
+            write_json_atomically(path, incarnation.export(at_s))
 
     def problems(self) -> dict[int, str]:
-        """Why the trace of which agent ends early."""
+        """Return agent ID -> reason for the early end of its trace."""
         return {agent_id: trace.problem for agent_id, trace in self._traces.items() if trace.problem}
 
     def close(self) -> None:
@@ -62,46 +62,48 @@ class OnDisk:
             trace.close()
 
 
-def header(life: Incarnation) -> dict[str, Any]:
-    """The first line of a trace, as keywords of `ucp.trace.header_line`."""
-    agent = life.agent
-    clock = {"epoch_us": 0, "speedup": 1, **(life.clock.model_dump() if life.clock else {})}
+def header(incarnation: Incarnation) -> dict[str, Any]:
+    """Return the first line of a trace as keyword arguments of `ucp.trace.header_line`."""
+    agent = incarnation.agent
+    clock = {"epoch_us": 0, "speedup": 1, **(incarnation.clock.model_dump() if incarnation.clock else {})}
     return {
         "agent_id": agent.agent_id,
         "roster": sorted(agent.roster),
         "initial_data": agent.initial_data,
         "settings": agent.settings.told(),
         "clock": clock,
-        "secured": life.secured is not None,
+        "secured": incarnation.secured is not None,
     }
 
 
 class Recorder(Protocol):
-    tracing: bool
-    """Whether handler runs are wanted; if not, `write` is not called."""
+    """An object that records the events of a run while they happen."""
 
-    def begin(self, life: Incarnation) -> None:
-        """An agent starts, or starts anew."""
+    tracing: bool
+    """True if handler runs are recorded. Otherwise `write` is not called."""
+
+    def begin(self, incarnation: Incarnation) -> None:
+        """Record the start of an incarnation."""
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
-        """An agent is about to log an event with so much data."""
+        """Record that an agent logs an event with `data_bytes` bytes of data."""
 
     def write(self, agent_id: int, entries: list[Entry]) -> None: ...
 
     def changed(self, record: dict[str, Any]) -> None:
-        """A change of the network, or a fault of agents, was made."""
+        """Record a change of the network, or a fault of agents."""
 
     def injected(self, record: dict[str, Any]) -> None:
-        """The rogue node has sent something; see `harness.play.rogue._journal`."""
+        """Record a datagram of the rogue node. See `harness.play.rogue._journal`."""
 
     def transmitted(self, record: dict[str, Any]) -> None:
         """Record a message that left the shared channel, or that a radio dropped. Called only while tracing."""
 
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
-        """Here are the vehicles now, if any fly."""
+        """Record the positions of the vehicles."""
 
-    def keep_chains(self, at_s: float, lives: Iterable[Incarnation]) -> None:
-        """A final reconcile is about to put the chains of these agents in order."""
+    def keep_chains(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
+        """Record the chains of these agents before a final reconcile."""
 
-    def export(self, at_s: float, lives: Iterable[Incarnation]) -> None:
-        """Somebody wants to see the chains of these agents as they are now. Raises OSError."""
+    def export(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
+        """Record the current chains of these agents. Raises OSError."""

@@ -1,8 +1,9 @@
-"""The simulation backend: a scenario played in virtual time, by the very agents that `ucp.node` runs.
+"""A swarm in virtual time. The agents are those that `ucp.node` runs.
 
-Nothing here waits, and nothing depends on the machine: the same scenario and seed give the same run, to the last bit.
-Each agent's events, the lots of each sender, and each agent's quirks have random streams of their own, so that adding
-one fault leaves the others as they are. Vehicles are tracks, without telemetry, so events are those of Algorithm 21.
+The simulation does not wait, and does not depend on the machine. The same scenario and seed give the same run to the
+last bit. The events of each agent, the network draws of each sender and the quirks of each agent have random streams of
+their own. A further fault in the scenario therefore changes no draw of the others. Vehicles are tracks without
+telemetry, so agents draw their events at random (Algorithm 21).
 """
 
 import base64
@@ -15,12 +16,12 @@ from harness.archive.run_record import Cycle
 from harness.errors import AgentFailedError, ScenarioError
 from harness.play._radio_range import TRACK_S, RadioRange, tracks_of
 from harness.play.agent_control import Status
-from harness.play.mission import RunOutcome, Sought
+from harness.play.mission import RunOutcome, SoughtRun
 from harness.play.rogue.rogue_line import OF_NO_INJECTION, line_of
-from harness.play.simulation._crash import crash_of
-from harness.play.simulation._event_loop import ANY_LIFE, Clockwork
-from harness.play.simulation._recurrence import LOOK_AFTER_S, Recurrence, Waiting
-from harness.play.simulation._simulated_agent import Stored
+from harness.play.simulation._crash import core_crash
+from harness.play.simulation._event_loop import ANY_INCARNATION, EventLoop
+from harness.play.simulation._recurrence import CHECK_AFTER_S, AgentAtRest, Recurrence
+from harness.play.simulation._simulated_agent import DiskContents
 from harness.play.simulation.air import NEVER, StrayDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, NameOf
 from harness.play.simulation.incarnations import Incarnation
@@ -37,15 +38,17 @@ from ucp.trace import HandlerRun
 if TYPE_CHECKING:
     from harness.play._pace import Pace
     from harness.play.simulation.foreign._answer import AgentLacksError
-    from harness.play.simulation.foreign._foreign_agent import LifeRecord
-    from harness.play.simulation.foreign._virtual_program import Programs
+    from harness.play.simulation.foreign._foreign_agent import IncarnationRecord
+    from harness.play.simulation.foreign._virtual_program import ProgramPool
 
 ENGINE = "virtual time"
-BREATH_S = 20.0
-"""Mission seconds between two looks at whoever watches."""
+PROGRESS_S = 20.0
+"""Mission seconds between two calls of `on_progress`."""
 
 
-class _AnyRun(Sought):
+class _AnyRun(SoughtRun):
+    """A description that every handler run meets."""
+
     def is_met_by(self, agent_id: int, run: HandlerRun) -> bool:
         return True
 
@@ -53,12 +56,8 @@ class _AnyRun(Sought):
 ANY_RUN = _AnyRun("any")
 
 
-class Simulation(Clockwork):
-    """A swarm in virtual time; see `harness.play.mission.Swarm`, and `Clockwork` for the options.
-
-    `told`: the timeline is told while it is played, and may yet inject. `breathe` is awaited every few mission seconds,
-    and time goes at this `pace`, if there is one.
-    """
+class Simulation(EventLoop):
+    """A swarm in virtual time, which implements `harness.play.mission.Swarm`."""
 
     def __init__(
         self,
@@ -67,20 +66,26 @@ class Simulation(Clockwork):
         recorder: Recorder,
         *,
         deliver_all: bool = False,
-        told: bool = False,
-        breathe: Callable[["Simulation"], Awaitable[None]] | None = None,
+        interactive: bool = False,
+        on_progress: Callable[["Simulation"], Awaitable[None]] | None = None,
         pace: "Pace | None" = None,
         fate_script: Callable[[Sequence[Fate], Sequence[int], NameOf], FateScript] = FateScript,
         air: Callable[..., VirtualAir] = VirtualAir,
-        programs: "Programs | None" = None,
+        programs: "ProgramPool | None" = None,
     ) -> None:
+        """
+        - `on_progress`: awaited every `PROGRESS_S` mission seconds.
+        - `pace`: limits the speed of virtual time.
+
+        `EventLoop` describes the other options.
+        """
         super().__init__(
             scenario,
             seed,
             _initial_data(scenario, seed),
             recorder,
             deliver_all=deliver_all,
-            told=told,
+            interactive=interactive,
             fate_script=fate_script,
             air=air,
             programs=programs,
@@ -88,10 +93,10 @@ class Simulation(Clockwork):
         self.played = RunOutcome(engine=ENGINE)
         self.stage = "mission"
         self.network = ""
-        self._breathe = breathe
+        self._breathe = on_progress
         self._pace = pace
-        self._disks: dict[int, Stored] = {}
-        """What is on the disk of the agents that reboot with it."""
+        self._disks: dict[int, DiskContents] = {}
+        """Agent number -> contents of its disk, for agents that are off and reboot with it."""
         self._switched_off: dict[int, Incarnation] = {}
         self._failures: dict[int, AgentFailedError | AgentLacksError] = {}
         self._reach = RadioRange(scenario)
@@ -103,16 +108,16 @@ class Simulation(Clockwork):
             self._all_rest_from_s = max(track.course.rests_from_s for track in self._tracks.values())
         self._moves_at = NEVER
         self.lost_vehicles: set[int] = set()
-        """Those that fly no more."""
+        """Vehicles that a ground station no longer sees, because they were shot down, fell, or were switched off."""
         self._injected: list[TimedInjection] = []
-        """What the rogue node was told."""
+        """The injections that the rogue node was ordered to make."""
 
     @property
     def tracks(self) -> Mapping[int, Track]:
-        """How the vehicles fly, if anybody asks."""
+        """The tracks of the vehicles. Empty if the scenario needs no positions."""
         return self._tracks
 
-    # The swarm, as harness.play.mission drives it
+    # The methods of harness.play.mission.Swarm
 
     def now(self) -> float:
         return self._now
@@ -122,15 +127,15 @@ class Simulation(Clockwork):
 
     async def begin(self, first: Change) -> None:
         await self.apply(first)
-        self._at_once = None
+        self._recent_runs = None
         self._move()
-        if self._foreigners is not None:
-            self._foreigners.start()
+        if self._foreign_swarm is not None:
+            self._foreign_swarm.start()
         for number in range(len(self.roster)):
             self._start(number)
         for event in self.scenario.events.script:
-            logged = ANY_LIFE, event.event_id, event.event_data, event.timestamp_us
-            self._air.expect(event.at_s, self._number[event.agent], logged)
+            logged = ANY_INCARNATION, event.event_id, event.event_data, event.timestamp_us
+            self._air.schedule(event.at_s, self._number[event.agent], logged)
         for scripted in self.scenario.datagrams:
             stray = StrayDatagram(scripted.source, base64.b64decode(scripted.datagram))
             for agent_id, at_s in scripted.reaches.items():
@@ -142,39 +147,39 @@ class Simulation(Clockwork):
         if self._breathe is None and not self._tracks:
             self.run(mission_s)
             return
-        while (self._now < mission_s or self._in_an_instant) and self._found is None:
-            breath_s = self._now + BREATH_S if self._breathe is not None else NEVER
+        while (self._now < mission_s or self._stopped_within_instant) and self._found is None:
+            breath_s = self._now + PROGRESS_S if self._breathe is not None else NEVER
             furthest = min(mission_s, breath_s, self._moves_at)
             if self._pace is None:
                 self.run(furthest)
             else:
                 await self._run_at(self._pace, furthest)
-            if self._now == self._moves_at and not self._in_an_instant:
+            if self._now == self._moves_at and not self._stopped_within_instant:
                 self._move()
             if self._breathe is not None:
                 await self._breathe(self)
 
     async def _run_at(self, pace: "Pace", furthest: float) -> None:
-        """As `run`, but no further than the pace allows."""
-        allowed_s = await pace.allows(self._now)
+        """Do the same as `run`, but stop at the time that the pace allows."""
+        allowed_s = await pace.allowed_until(self._now)
         if allowed_s is None:
             return
-        if not pace.wants_run:
+        if not pace.stops_at_next_run:
             self.run(min(furthest, allowed_s))
             return
         self._sought = ANY_RUN
         self.run(furthest)
         if self._found is not None:
-            pace.ran(self._now)
+            pace.record_run(self._now)
         self._sought = self._found = None
 
-    async def until_run(self, sought: Sought, mission_s: float) -> int | None:
-        self._deliver_all = True  # also what does nothing is a handler run
+    async def until_run(self, sought: SoughtRun, mission_s: float) -> int | None:
+        self._deliver_all = True  # a handler run without effect also counts
         self._air.deliver_everything()
-        at_once, self._at_once = self._at_once or [], None
-        for index, (agent_id, run) in enumerate(at_once):
+        recent_runs, self._recent_runs = self._recent_runs or [], None
+        for index, (agent_id, run) in enumerate(recent_runs):
             if sought.is_met_by(agent_id, run):
-                self._at_once = at_once[index + 1 :]
+                self._recent_runs = recent_runs[index + 1 :]
                 return agent_id
         self._sought, self._found = sought, None
         await self.until(mission_s)
@@ -185,14 +190,14 @@ class Simulation(Clockwork):
         return self._script.hold(fate)
 
     async def release(self, number: int, fate: Fate) -> None:
-        assert fate.hold_until_s is not None, "by now it is known"
+        assert fate.hold_until_s is not None, "a release sets the end of the hold"
         self._script.release(number, fate)
         self._air.release(number, fate.hold_until_s)
 
     async def apply(self, change: Change) -> None:
-        self._at_once = []
+        self._recent_runs = []
         if isinstance(change, NetworkChange):
-            self._put_into_force(self._reach.ask(change), asked=change.conditions.to_json())
+            self._apply_conditions(self._reach.change_timeline(change), asked=change.conditions.to_json())
             return
         if isinstance(change, VehicleFault):
             raise ScenarioError(no_vehicles([change.what]))
@@ -208,7 +213,7 @@ class Simulation(Clockwork):
             await change.apply(self, agent_id)
         self._recorder.changed(record)
 
-    def _put_into_force(self, change: NetworkChange, **more: Any) -> None:
+    def _apply_conditions(self, change: NetworkChange, **more: Any) -> None:
         self._air.apply(change.conditions, self._now, clears_all=change.clears_all)
         self.network = change.detail
         record = change.to_json(round(self._now, 3))
@@ -216,79 +221,89 @@ class Simulation(Clockwork):
         self._recorder.changed({**record, **more})
 
     def _move(self) -> None:
-        """The vehicles are somewhere else by now."""
+        """Move the vehicles to their places at this time, and adapt the network."""
         if not self._tracks:
             return
         places = {vehicle: Place(*track.in_field(self._now)) for vehicle, track in self._tracks.items()}
         self._recorder.moved(self._now, places)
         self._air.move(places, self._now)
         if change := self._reach.move(self._now, places):
-            self._put_into_force(change)
+            self._apply_conditions(change)
         self._moves_at = self._now + self._move_every_s if self._now < self._all_rest_from_s else NEVER
 
     async def stop_events(self) -> None:
         self._generating = False
 
     async def until_idle(self, limit_s: float) -> bool:
-        limit, look_at = self._now + limit_s, self._now + LOOK_AFTER_S
-        recurrence, self._recurrence, self.played.cycle = self._looks_for_recurrence(), None, None
+        limit, look_at = self._now + limit_s, self._now + CHECK_AFTER_S
+        recurrence, self._recurrence, self.played.cycle = self._new_recurrence(), None, None
         while self._now < limit:
-            awake = (life for life in self.living() if life.waiting is None)
-            last = max([self._air.quiet_at, *(life.deadline or 0.0 for life in awake)])
+            awake = (incarnation for incarnation in self.living() if incarnation.waiting is None)
+            last = max([self._air.quiet_at, *(incarnation.deadline or 0.0 for incarnation in awake)])
             if last <= self._now:
-                return self._stands_still()
+                return self._is_settled()
             if recurrence is None or self._now < look_at:
                 await self.until(min(limit, last))
-            elif await self._recurs_until(min(limit, last), recurrence):
+            elif await self._run_until_recurrence(min(limit, last), recurrence):
                 return False
         return False
 
-    def _stands_still(self) -> bool:
-        """Whether all agents are idle, now that nothing is on its way and no timer runs; those that are not hang."""
-        hanging = [life.agent for life in self.living() if life.waiting is None and not life.idle]
+    def _is_settled(self) -> bool:
+        """Return whether all agents are idle. No message is in flight and no timer runs, so other agents hang."""
+        hanging = [
+            incarnation.agent for incarnation in self.living() if incarnation.waiting is None and not incarnation.idle
+        ]
         if hanging and not self._generating:
             agents = [agent.agent_id for agent in hanging]
             self.played.cycle = Cycle(since_s=round(self._now, 3), proven=True, agents=agents)
-        return not hanging and all(life.waiting is None for life in self.living())
+        return not hanging and all(incarnation.waiting is None for incarnation in self.living())
 
-    def _looks_for_recurrence(self) -> Recurrence | None:
-        """None while there is more to come than agents themselves do, or lots decide what becomes of them."""
+    def _new_recurrence(self) -> Recurrence | None:
+        """Return a search for a cycle, or None if the future depends on draws or on other inputs than the agents."""
         moving = bool(self._tracks) and self.scenario.network.radio and self.played.final_reconcile is None
         delays = self._medium.certain_delays()
-        unknown = self._anybody_is_unknown or self._rogue is not None
-        spread = self.scenario.settings.answer_spread_s > 0  # answers wait differently each time
+        unknown = self._has_unknown_agents or self._rogue is not None
+        spread = self.scenario.settings.answer_spread_s > 0  # the waiting times of answers differ in each cycle
         if self._generating or moving or unknown or delays is None or self._channel is not None or spread:
             return None
         return Recurrence(delays)
 
-    async def _recurs_until(self, mission_s: float, recurrence: Recurrence) -> bool:
-        """As `until`, but no further than until the swarm is seen to go round in circles; whether it was."""
+    async def _run_until_recurrence(self, mission_s: float, recurrence: Recurrence) -> bool:
+        """Run until `mission_s`, or until the swarm is in a cycle. Return whether it is in a cycle."""
         self._recurrence = recurrence
         while self._now < mission_s:
             if self._air.quiet_at > self._now:
                 await self.until(min(mission_s, self._air.quiet_at))
                 continue
-            lives = {number: life for number, life in enumerate(self._alive) if life and life.waiting is None}
-            for number, life in lives.items():
-                self._hear(number, life)
-            wakes_s = {number: life.deadline for number, life in lives.items() if life.deadline is not None}
+            incarnations = {
+                number: incarnation
+                for number, incarnation in enumerate(self._alive)
+                if incarnation and incarnation.waiting is None
+            }
+            for number, incarnation in incarnations.items():
+                self._tally_answers(number, incarnation)
+            wakes_s = {
+                number: incarnation.deadline
+                for number, incarnation in incarnations.items()
+                if incarnation.deadline is not None
+            }
             next_s = min(wakes_s.values())
             swarm = [
-                Waiting(life.state, life.local_s(next_s), life.deadline)
-                for life in lives.values()
-                if life.state is not None
+                AgentAtRest(incarnation.state, incarnation.local_s(next_s), incarnation.deadline)
+                for incarnation in incarnations.values()
+                if incarnation.state is not None
             ]
-            fates = self._script.standing(self._now)
+            fates = self._script.settled_counts(self._now)
             order = [
-                *self._air.order_of_timers(wakes_s),
+                *self._air.timer_order(wakes_s),
                 *(name for late in self._late.values() for name in late.running),
             ]
-            all_on_time = all(late.all_have_ended for late in self._late.values())
-            if all_on_time and fates is not None and recurrence.look(swarm, order, fates, self._script.last_s or 0.0):
+            all_on_time = all(late.late_ones_have_ended for late in self._late.values())
+            if all_on_time and fates is not None and recurrence.check(swarm, order, fates, self._script.last_s or 0.0):
                 self.played.cycle = recurrence.cycle(swarm)
                 return True
             await self.until(min(mission_s, next_s))
-            recurrence.timers_have_ended(swarm)
+            recurrence.record_state_after_timers(swarm)
         return False
 
     async def keep_chains(self) -> None:
@@ -296,54 +311,58 @@ class Simulation(Clockwork):
 
     async def reconcile(self, agent_id: int) -> None:
         number = self._number[agent_id]
-        life = self._alive[number]
-        if life is not None and life.waiting is None:
-            self._hear(number, life)
+        incarnation = self._alive[number]
+        if incarnation is not None and incarnation.waiting is None:
+            self._tally_answers(number, incarnation)
             try:
-                life.agent.begin_reconcile(life.local_s(self._now))
+                incarnation.agent.begin_reconcile(incarnation.local_s(self._now))
             except Exception as error:
-                if (crash := crash_of(life, error)) is None:
+                if (crash := core_crash(incarnation, error)) is None:
                     raise
                 raise crash from error
-            self._after(number, life)
+            self._finish_input(number, incarnation)
 
     async def top_chain_hashes(self) -> dict[int, str]:
-        return {life.agent.agent_id: life.top_chain_hash for life in self.living()}
+        return {incarnation.agent.agent_id: incarnation.top_chain_hash for incarnation in self.living()}
 
     async def completed(self) -> dict[int, int]:
-        return {life.agent.agent_id: len(life.agent.completed()) for life in self.living() if life.waiting is None}
+        return {
+            incarnation.agent.agent_id: len(incarnation.agent.completed())
+            for incarnation in self.living()
+            if incarnation.waiting is None
+        }
 
     async def snapshot(self) -> RunOutcome:
-        played = self._played_by_now()
+        played = self._outcome_so_far()
         self._recorder.export(self._now, self.exporting())
         return played
 
     def fail(self, error: "AgentFailedError | AgentLacksError") -> None:
-        """The mission is over: an agent crashed or hung, or cannot do it."""
+        """Record that an agent crashed, hung, or does not support the mission. This ends the mission."""
         number = self._number[error.agent_id]
-        if (life := self._alive[number]) is not None:
-            life.ended_at = self._now
+        if (incarnation := self._alive[number]) is not None:
+            incarnation.ended_at = self._now
         self._alive[number] = None
-        self._air.is_gone(number)
+        self._air.remove_agent(number)
         self._failures[number] = error
         if self.played.outcome == "completed":
             self.played.end_early("failed", error)
 
     def close(self) -> None:
-        """Nobody is asked anything any more."""
-        if self._foreigners is not None:
-            self._foreigners.close()
+        """Release the programs of foreign agents."""
+        if self._foreign_swarm is not None:
+            self._foreign_swarm.close()
 
     def end(self) -> None:
-        """Take down what there is at the end."""
+        """Record the outcome at the end of the mission."""
         if self._rogue is not None:
             self._rogue.close()
-        self.played = self._played_by_now()
+        self.played = self._outcome_so_far()
 
-    def _played_by_now(self) -> RunOutcome:
-        for number, life in enumerate(self._alive):
-            if life is not None:
-                self._hear(number, life)
+    def _outcome_so_far(self) -> RunOutcome:
+        for number, incarnation in enumerate(self._alive):
+            if incarnation is not None:
+                self._tally_answers(number, incarnation)
         last_s, network = self._script.last_s, self.played.network
         return dataclasses.replace(
             self.played,
@@ -363,86 +382,88 @@ class Simulation(Clockwork):
     def _injected_nothing(self) -> list[str]:
         return silent_injections(self._injected, self._rogue.sent) if self._rogue is not None else []
 
-    # What is there
+    # State of the agents
 
     def living(self) -> Iterator[Incarnation]:
-        return (life for life in self._alive if life is not None)
+        return (incarnation for incarnation in self._alive if incarnation is not None)
 
     def exporting(self) -> Iterator[Incarnation]:
-        """Those who leave an export, in the roster's order: who lives, and who was switched off."""
-        for number, life in enumerate(self._alive):
-            if (leaves := self._switched_off.get(number, life)) is not None:
+        """Yield the agents that leave an export, in the order of the roster. They are alive or were switched off."""
+        for number, incarnation in enumerate(self._alive):
+            if (leaves := self._switched_off.get(number, incarnation)) is not None:
                 yield leaves
 
-    def records(self) -> list["LifeRecord"]:
-        """What agents of another make were given and answered, by life."""
-        return [] if self._foreigners is None else self._foreigners.records
+    def records(self) -> list["IncarnationRecord"]:
+        """Return the inputs and answers of each incarnation of a foreign agent."""
+        return [] if self._foreign_swarm is None else self._foreign_swarm.records
 
     def _agent_to_json(self, number: int) -> dict[str, Any]:
-        lives = self._lives[number]
+        incarnations = self._incarnations[number]
         off, failure = self._switched_off.get(number), self._failures.get(number)
-        life = off or self._alive[number]
-        completed = dict.fromkeys(block.hex() for life in lives for block in life.agent.completed())
-        for block in life.agent.completed() if life else ():
+        incarnation = off or self._alive[number]
+        completed = dict.fromkeys(
+            block.hex() for incarnation in incarnations for block in incarnation.agent.completed()
+        )
+        for block in incarnation.agent.completed() if incarnation else ():
             del completed[block.hex()]
-        reboots = sum(life.rebooted for life in lives)
-        known = [life.agent.known_status() for life in lives]
+        reboots = sum(incarnation.rebooted for incarnation in incarnations)
+        known = [incarnation.agent.known_status() for incarnation in incarnations]
         dropped = sum((Counter(status.dropped) for status in known if status), Counter[str]())
-        gone = "rebooting" if number in self._disks else "killed" if lives else "not started"
+        gone = "rebooting" if number in self._disks else "killed" if incarnations else "not started"
         ended = failure.outcome if failure else gone
         detail = failure.detail if failure else f"switched off at {off.ended_at:g} s" if off else None
         return {
-            "outcome": "exported" if life else ended,
+            "outcome": "exported" if incarnation else ended,
             **({"detail": detail} if detail else {}),
-            **self._whose(number, known),
-            "restarts": max(0, len(lives) - 1 - reboots),
+            **self._program_to_json(number, known),
+            "restarts": max(0, len(incarnations) - 1 - reboots),
             "reboots": reboots,
             "completed_before": list(completed),
-            "idle": life.idle if life else None,
-            "bytes_sent": sum(life.bytes_sent for life in lives),
+            "idle": incarnation.idle if incarnation else None,
+            "bytes_sent": sum(incarnation.bytes_sent for incarnation in incarnations),
             **({"dropped": dict(dropped)} if self._rogue is not None or self._keys is not None else {}),
-            "messages_sent": sum(life.agent.messages_sent for life in lives),
+            "messages_sent": sum(incarnation.agent.messages_sent for incarnation in incarnations),
             "reconciles": sum(status.reconciles for status in known if status) if all(known) else None,
-            "chain_changed_at_s": _rounded(life.chain_changed_at) if life else None,
+            "chain_changed_at_s": _rounded(incarnation.chain_changed_at) if incarnation else None,
             **(
-                {"handler_runs": [self._handler_runs(*each) for each in zip(lives, known, strict=True)]}
+                {"handler_runs": [self._handler_runs(*each) for each in zip(incarnations, known, strict=True)]}
                 if self._tracing
                 else {}
             ),
         }
 
-    def _whose(self, number: int, known: Sequence[Status | None]) -> dict[str, Any]:
-        """Whose make the agent is, if it is not ours."""
+    def _program_to_json(self, number: int, known: Sequence[Status | None]) -> dict[str, Any]:
+        """Return command and version of a foreign agent. Empty for an agent of the harness."""
         agent_id = self.roster[number]
-        if self._foreigners is None or agent_id not in self._foreigners:
+        if self._foreign_swarm is None or agent_id not in self._foreign_swarm:
             return {}
         version = next((status.version for status in reversed(known) if status), None)
-        return {"command": self._foreigners.command_of(agent_id), "version": version}
+        return {"command": self._foreign_swarm.command_of(agent_id), "version": version}
 
-    def _handler_runs(self, life: Incarnation, status: Status | None) -> dict[str, int | float] | None:
-        """How many it has counted; if nobody sees into it, as it says itself."""
+    def _handler_runs(self, incarnation: Incarnation, status: Status | None) -> dict[str, int | float] | None:
+        """Return the number of handler runs. A foreign agent reports this number itself."""
         if status is None:
             return None
-        at_s = self._now if life.ended_at is None else life.ended_at
-        counted = status.handled if life.state is None else life.handler_runs
+        at_s = self._now if incarnation.ended_at is None else incarnation.ended_at
+        counted = status.handled if incarnation.state is None else incarnation.handler_runs
         return {"counted": counted, "from_s": round(at_s, 3), "until_s": round(at_s, 3)}
 
-    # What faults do to it: harness.scenario.faults.AgentOperations
+    # The methods of harness.scenario.faults.AgentOperations
 
     async def end_incarnation(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
         number = self._number[agent_id]
         if with_vehicle:
             self.lost_vehicles.add(agent_id)
-        if (life := self._alive[number]) is not None:
-            self._hear(number, life)
-            life.ended_at = self._now
+        if (incarnation := self._alive[number]) is not None:
+            self._tally_answers(number, incarnation)
+            incarnation.ended_at = self._now
             if disk_kept:
-                self._disks[number] = life.agent.stored(life.local_s(self._now))
-            life.agent.leave(life.local_s(self._now))
-            if self._foreigners is not None:
-                self._foreigners.ended(life.agent)
+                self._disks[number] = incarnation.agent.stored(incarnation.local_s(self._now))
+            incarnation.agent.end(incarnation.local_s(self._now))
+            if self._foreign_swarm is not None:
+                self._foreign_swarm.ended(incarnation.agent)
         self._alive[number] = None
-        self._air.is_gone(number)
+        self._air.remove_agent(number)
 
     async def begin_incarnation(self, agent_id: int, *, new_vehicle: bool = False) -> None:
         number = self._number[agent_id]
@@ -450,49 +471,49 @@ class Simulation(Clockwork):
         self._start(number, self._disks.pop(number, None))
 
     async def fall(self, agent_id: int) -> None:
-        """A track knows nothing of that."""
+        """Remove the vehicle from the ground station. Its track does not change."""
         self.lost_vehicles.add(agent_id)
 
     async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
-        assert self._keys is not None, "was refused"
+        assert self._keys is not None, "a revocation without keys is refused"
         revocation = self._keys.mission.revoke(agent_id)
         for number in map(self._number.__getitem__, heard_by):
-            life = self._alive[number]
-            if life is not None and life.waiting is None and life.secured is not None:
-                self._hear(number, life)
-                life.secured.revoke(revocation, life.local_s(self._now))
-                self._after(number, life)
+            incarnation = self._alive[number]
+            if incarnation is not None and incarnation.waiting is None and incarnation.secured is not None:
+                self._tally_answers(number, incarnation)
+                incarnation.secured.revoke(revocation, incarnation.local_s(self._now))
+                self._finish_input(number, incarnation)
 
     async def set_circumstance(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
-        raise AssertionError("was refused")
+        raise AssertionError("faults of vehicles are refused")
 
     async def pause(self, agent_id: int) -> None:
         number = self._number[agent_id]
-        if (life := self._alive[number]) is not None:
-            self._hear(number, life)
-            life.waiting = []
+        if (incarnation := self._alive[number]) is not None:
+            self._tally_answers(number, incarnation)
+            incarnation.waiting = []
             self._air.paused_at[number] = self._now
 
     async def resume(self, agent_id: int) -> None:
         number = self._number[agent_id]
-        life = self._alive[number]
-        if life is not None and life.waiting is not None:
-            self._resume(number, life, life.waiting)
+        incarnation = self._alive[number]
+        if incarnation is not None and incarnation.waiting is not None:
+            self._resume(number, incarnation, incarnation.waiting)
 
     async def stop_logging(self, agent_id: int) -> None:
-        if (life := self._alive[self._number[agent_id]]) is not None:
-            life.logs = False
+        if (incarnation := self._alive[self._number[agent_id]]) is not None:
+            incarnation.logs = False
 
     async def switch_off(self, agent_id: int) -> None:
         number = self._number[agent_id]
-        life = self._alive[number]
+        incarnation = self._alive[number]
         await self.end_incarnation(agent_id, with_vehicle=True)
-        if life is not None:
-            self._switched_off[number] = life
+        if incarnation is not None:
+            self._switched_off[number] = incarnation
 
 
 def no_vehicles(keys: Sequence[str]) -> str:
-    """Why these keys cannot be played here, and the way out."""
+    """Return the error that these keys need flying vehicles."""
     named = ", ".join(f"`{key}`" for key in keys)
     return (
         f"{named} need{'s' if len(keys) == 1 else ''} flying vehicles, but virtual time computes the tracks: use "

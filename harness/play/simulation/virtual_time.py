@@ -1,4 +1,4 @@
-"""The backend of virtual time: the very same agents on a simulated air, into a run directory as any other run."""
+"""The simulation backend. It plays a swarm in virtual time, and writes a run directory like the other backends."""
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -13,15 +13,15 @@ from harness.play.backend import Backend
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
 from harness.play.simulation.foreign._answer import AgentLacksError
-from harness.play.simulation.run_files import OnDisk
+from harness.play.simulation.run_files import DiskRecorder
 from harness.play.simulation.simulation import Simulation, no_vehicles
 from harness.scenario import Scenario
 from harness.scenario.faults import VehicleFault
 
 if TYPE_CHECKING:
     from harness.play.simulation._captured_air import VirtualCapture
-    from harness.play.simulation._station_tracks import TracksOnStation
-    from harness.play.simulation.foreign._virtual_program import Programs
+    from harness.play.simulation._station_tracks import StationTracks
+    from harness.play.simulation.foreign._virtual_program import ProgramPool
 
 
 class VirtualTime(Backend):
@@ -61,32 +61,32 @@ class VirtualTime(Backend):
         progress: Progress,
         interrupted: asyncio.Event,
         *,
-        told: bool = False,
+        interactive: bool = False,
         delivers_all: bool = False,
         pace: Pace | None = None,
     ) -> AsyncIterator[Simulation]:
-        station: TracksOnStation | None = None
+        station: StationTracks | None = None
 
-        async def breathe(simulation: Simulation) -> None:
+        async def on_progress(simulation: Simulation) -> None:
             progress.show(_snapshot(simulation))
             if station is not None:
                 station.show(simulation.now(), simulation.lost_vehicles)
-            await asyncio.sleep(0)  # lets the loop hear of Ctrl-C
+            await asyncio.sleep(0)  # the loop handles Ctrl-C now
             if interrupted.is_set():
                 raise InterruptedRunError(f"the run was interrupted at mission second {simulation.now():.0f}")
 
-        with closing(OnDisk(rundir)) as files, _programs(scenario, rundir) as programs:
+        with closing(DiskRecorder(rundir)) as files, _programs(scenario, rundir) as programs:
             capture = _captures(rundir, scenario) if scenario.capture else None
             air = capture.air if capture else VirtualAir
             if scenario.gcs and pace is None:
-                pace = Pace(scenario.speedup)  # nobody could follow it otherwise
+                pace = Pace(scenario.speedup)  # an operator could not follow unlimited time
             simulation = Simulation(
                 scenario,
                 seed,
                 files,
                 deliver_all=delivers_all,
-                told=told,
-                breathe=breathe,
+                interactive=interactive,
+                on_progress=on_progress,
                 pace=pace,
                 air=air,
                 programs=programs,
@@ -112,7 +112,7 @@ class VirtualTime(Backend):
             except OSError as error:
                 simulation.played.end_early("failed", _failure(error, rundir))
             if simulation.records() and simulation.played.outcome == "completed":
-                await _compare_again(simulation, breathe)
+                await _compare_again(simulation, on_progress)
             for agent_id, problem in files.problems().items():
                 simulation.played.agents[str(agent_id)]["trace_problem"] = problem
             for agent_id, names in programs.close().items() if programs else ():
@@ -120,20 +120,20 @@ class VirtualTime(Backend):
 
 
 def _of_real_vehicles(scenario: Scenario) -> list[str]:
-    """The keys of what only a program that flies can have."""
+    """Return the keys of the scenario that only a vehicle program supports."""
     asked = (scenario.vehicles, *scenario.vehicles.each.values())
     keys = ("frame", "parameters", "wind", "arguments", "debugger")
     return [key for key in keys if any(getattr(vehicles, key) for vehicles in asked)]
 
 
-async def _open_station(simulation: Simulation) -> "TracksOnStation":
-    from harness.play.simulation._station_tracks import TracksOnStation  # draws in MAVLink
+async def _open_station(simulation: Simulation) -> "StationTracks":
+    from harness.play.simulation._station_tracks import StationTracks  # imports MAVLink, which is slow
 
-    return await TracksOnStation.open(simulation.scenario, simulation.tracks, simulation.now)
+    return await StationTracks.open(simulation.scenario, simulation.tracks, simulation.now)
 
 
-def _export(simulation: Simulation, files: OnDisk) -> None:
-    """Take down what there is at the end, of whoever still answers. Raises OSError."""
+def _export(simulation: Simulation, files: DiskRecorder) -> None:
+    """Record the end of the run, and export the chains of all agents that still answer. Raises OSError."""
     while True:
         try:
             simulation.end()
@@ -143,36 +143,36 @@ def _export(simulation: Simulation, files: OnDisk) -> None:
             simulation.fail(error)
 
 
-async def _compare_again(simulation: Simulation, breathe: Callable[[Simulation], Awaitable[None]]) -> None:
-    """Play the lives of agents that are not ours again, to see whether they are the same twice."""
-    from harness.play.simulation.foreign.determinism import Again, NotTheSameError
+async def _compare_again(simulation: Simulation, on_progress: Callable[[Simulation], Awaitable[None]]) -> None:
+    """Check that foreign agents are deterministic: give them their inputs again, and compare the answers."""
+    from harness.play.simulation.foreign.determinism import DeterminismCheck, NondeterminismError
 
     simulation.enter("the same again")
-    with closing(Again(patient=True)) as again:
+    with closing(DeterminismCheck(patient=True)) as again:
         try:
             for record in simulation.records():
-                await breathe(simulation)
+                await on_progress(simulation)
                 again.compare(record)
-        except NotTheSameError as error:
+        except NondeterminismError as error:
             simulation.played.end_early("failed", error)
         except InterruptedRunError as error:
             simulation.played.end_early("interrupted", error)
 
 
 @contextmanager
-def _programs(scenario: Scenario, rundir: RunDirectory) -> Iterator["Programs | None"]:
-    """Those that play agents of another make, of whom each leaves its log in the run's directory."""
+def _programs(scenario: Scenario, rundir: RunDirectory) -> Iterator["ProgramPool | None"]:
+    """Open a pool of programs for the foreign agents, with logs in the run directory. None without foreign agents."""
     if not scenario.foreign:
         yield None
         return
-    from harness.play.simulation.foreign._virtual_program import Programs
+    from harness.play.simulation.foreign._virtual_program import ProgramPool
 
-    with closing(Programs(rundir.agents)) as programs:
+    with closing(ProgramPool(rundir.agents)) as programs:
         yield programs
 
 
 def _refuse_what_foreign_agents_cannot(scenario: Scenario) -> None:
-    from harness.play.simulation.foreign._foreigners import commands_of
+    from harness.play.simulation.foreign._foreign_swarm import commands_of
 
     commands_of(scenario)
     late = sorted(agent_id for agent_id in scenario.lateness if agent_id in scenario.foreign)
@@ -188,7 +188,7 @@ def _failure(error: OSError, rundir: RunDirectory) -> MachineError:
 
 
 def _captures(rundir: RunDirectory, scenario: Scenario) -> "VirtualCapture":
-    from harness.play.simulation._captured_air import VirtualCapture  # draws in what builds networks
+    from harness.play.simulation._captured_air import VirtualCapture  # imports the network modules, which is slow
 
     try:
         return VirtualCapture(rundir.capture(), scenario.roster)
@@ -197,5 +197,5 @@ def _captures(rundir: RunDirectory, scenario: Scenario) -> "VirtualCapture":
 
 
 def _snapshot(simulation: Simulation) -> Snapshot:
-    statuses = {life.agent.agent_id: life.agent.status() for life in simulation.living()}
+    statuses = {incarnation.agent.agent_id: incarnation.agent.status() for incarnation in simulation.living()}
     return Snapshot(simulation.stage, simulation.now(), simulation.scenario.duration_s, simulation.network, statuses)

@@ -14,7 +14,7 @@ from harness.checker.reference.state import State
 from harness.checker.steps import check
 from harness.play.simulation.simulation import Simulation
 from harness.proof.model._shape import Held, Shape, shape_of
-from harness.run.simulate import InMemory, Simulated, simulate_in_memory
+from harness.run.simulate import MemoryRecorder, Simulated, simulate_in_memory
 from harness.scenario import Scenario
 from ucp.agent import HANDLERS
 from ucp.trace import HandlerRun
@@ -133,7 +133,7 @@ def simulate_watched(scenario: Scenario, seed: int, watch: Watch, **options: Any
     return simulate_in_memory(_Watched(watch), scenario, seed, deliver_all=True, **options)
 
 
-class _Watched(InMemory):
+class _Watched(MemoryRecorder):
     def __init__(self, watch: Watch) -> None:
         super().__init__(tracing=True)
         self._watch = watch

@@ -209,7 +209,7 @@ def _perform(interventions: Interventions, request: dict[str, Any]) -> Future[fl
         case "pause":
             return interventions.pause()
         case "go on":
-            return interventions.go_on()
+            return interventions.resume()
         case "step":
             return interventions.step(float(request["seconds"]))
         case "next run":

@@ -14,8 +14,8 @@ from typing import Any
 
 from harness.checker import Result
 from harness.errors import AgentFailedError
-from harness.play.simulation.fate_script import Decided, FateScript, NameOf
-from harness.run.simulate import InMemory, ended_by, simulate_in_memory
+from harness.play.simulation.fate_script import DecidedDelivery, FateScript, NameOf
+from harness.run.simulate import MemoryRecorder, ended_by, simulate_in_memory
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
 from netem.medium import RandomDraws
@@ -69,7 +69,7 @@ def record(scenario: Scenario, seed: int) -> Recording:
     return Recording(result, tape.events, sorted(tape.lost, key=lambda lost: lost.at_s))
 
 
-class _Recorder(InMemory):
+class _Recorder(MemoryRecorder):
     def __init__(self) -> None:
         super().__init__(tracing=True)
         self.events: list[Logged] = []
@@ -115,10 +115,12 @@ class _RecordingScript(FateScript):
         self._tape = tape
         self._sent: Counter[tuple[str, int]] = Counter()
 
-    def decide(self, now: float, sender: int, message: Message, lots: RandomDraws, hears: Any) -> Decided | None:
-        decided = super().decide(now, sender, message, lots, hears)
+    def decide(
+        self, now: float, sender: int, message: Message, draws: RandomDraws, hears: Any
+    ) -> DecidedDelivery | None:
+        decided = super().decide(now, sender, message, draws, hears)
         self._sent[message.NAME, sender] += 1
-        arrivals = lots.to_all() if decided is None else [*decided.arrivals, *decided.waiting]
+        arrivals = draws.to_all() if decided is None else [*decided.arrivals, *decided.waiting]
         reached = {number for number, _ in arrivals}
         block_hash = block_named(message)
         for number, receiver in enumerate(self._roster):

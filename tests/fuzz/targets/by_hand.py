@@ -14,9 +14,9 @@ from typing import Any
 from harness.errors import ScenarioError
 from harness.play.agent_control import connect
 from harness.play.interventions import Interventions
-from harness.play.request_socket import SOCKET, ask_run, listening
+from harness.play.request_socket import SOCKET, ask_run, serve_requests
 from harness.play.simulation.simulation import Simulation
-from harness.run.simulate import InMemory, simulate
+from harness.run.simulate import MemoryRecorder, simulate
 from harness.scenario import Scenario
 from harness.scenario.injection import INJECTIONS
 from tests.fuzz.finding import require, sound
@@ -31,8 +31,8 @@ def run(data: bytes) -> None:
     short = [line for line in data.split(b"\n")[:MOST_LINES] if len(line) < LONGEST_LINE]
     lines = [line for line in short if not any(name.encode() in line for name in INJECTIONS)]
     hand = Interventions(ASKED, virtual_time=True, paused=True)
-    memory = InMemory(tracing=True)
-    simulation = Simulation(ASKED, 1, memory, told=True, breathe=_breathe, pace=hand.pace)
+    memory = MemoryRecorder(tracing=True)
+    simulation = Simulation(ASKED, 1, memory, interactive=True, on_progress=_yield, pace=hand.pace)
     with TemporaryDirectory() as folder:
         asyncio.run(_converse(hand, simulation, Path(folder), lines))
         require(not (Path(folder) / SOCKET).exists(), "the socket is left behind")
@@ -42,13 +42,13 @@ def run(data: bytes) -> None:
     require({agent_id: export.top_chain_hash for agent_id, export in again.items()} == chains, "it is played otherwise")
 
 
-async def _breathe(simulation: Simulation) -> None:
+async def _yield(simulation: Simulation) -> None:
     await asyncio.sleep(0)
 
 
 async def _converse(hand: Interventions, simulation: Simulation, folder: Path, lines: list[bytes]) -> None:
     async def played() -> None:
-        async with listening(hand, folder):
+        async with serve_requests(hand, folder):
             await hand.story(simulation, ASKED)
 
     playing = asyncio.create_task(played())

@@ -12,15 +12,15 @@ from unittest.mock import patch
 
 from harness import checker
 from harness.errors import HarnessError
-from harness.play.simulation.foreign import _foreigners, _virtual_program, determinism
-from harness.play.simulation.foreign._virtual_program import Program
+from harness.play.simulation.foreign import _foreign_swarm, _virtual_program, determinism
+from harness.play.simulation.foreign._virtual_program import LineProgram
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from tests.fuzz.finding import require, sound
 from tests.harness.virtual import scenario
 from ucp.virtual import VirtualAgent
 
-assert determinism.Program is Program, "it is imported here, so that it never takes the replacement for its own"
+assert determinism.LineProgram is LineProgram, "it is imported here, so that it never takes the replacement for its own"
 _REPLACED = re.compile(rb'\{"n":(\d{1,3}),"answer":(.*)\}')
 SCENARIO: Scenario = scenario(
     agents=3,
@@ -34,7 +34,7 @@ SCENARIO: Scenario = scenario(
 )
 
 
-class _Ours(Program):
+class _Ours(LineProgram):
     """Our agent, which says something else now and then; it needs no process."""
 
     _agent: VirtualAgent
@@ -88,8 +88,8 @@ def _play(replaced: dict[int, bytes]) -> list[bytes]:
     """The good answers."""
     ours = type("Replaced", (_Ours,), {"answers": [], "replaced": replaced})
     with (
-        patch.object(_virtual_program, "Program", ours),
-        patch.object(_foreigners, "SHARED", _virtual_program.Programs()),
+        patch.object(_virtual_program, "LineProgram", ours),
+        patch.object(_foreign_swarm, "SHARED", _virtual_program.ProgramPool()),
     ):
         try:
             played = simulate(SCENARIO, 1, tracing=True)

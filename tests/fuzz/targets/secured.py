@@ -13,7 +13,7 @@ from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from harness.play.simulation._crypto_cache import remembered
+from harness.play.simulation._crypto_cache import cached_crypto
 from tests.fuzz.finding import require
 from ucp.block import Block
 from ucp.events import LoggableEvent
@@ -255,7 +255,9 @@ def _driven(data: bytes, crypto: CryptoFunctions) -> tuple[object, ...]:
 
 
 def run(data: bytes) -> None:
-    require(_driven(data, CRYPTO_FUNCTIONS) == _driven(data, remembered()), "cached cryptography gives another result")
+    require(
+        _driven(data, CRYPTO_FUNCTIONS) == _driven(data, cached_crypto()), "cached cryptography gives another result"
+    )
     with suppress(MalformedDatagramError):
         Opener(KEYS.bundle(1)).open(data)
 

@@ -1,4 +1,4 @@
-"""Backends by name, and one that only this file knows: the tests' own air, in which nothing gets lost."""
+"""The table of backends, and a backend of this file with a network that loses nothing."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -23,7 +23,9 @@ from tests.harness.virtual import scenario
 from tests.ucp.air import Air
 
 
-class OnPerfectAir(Swarm):
+class PerfectSwarm(Swarm):
+    """A swarm on a network without loss."""
+
     def __init__(self, roster: list[int], seed: int, rundir: RunDirectory) -> None:
         self.played = RunOutcome(engine="perfect air")
         self.air = Air(roster)
@@ -72,7 +74,7 @@ class OnPerfectAir(Swarm):
 
 
 class PerfectAir(Backend):
-    """Under a name that scenarios and records may have."""
+    """A backend with the name of another one, because scenarios and records accept only known names."""
 
     name = "docker"
 
@@ -89,10 +91,10 @@ class PerfectAir(Backend):
         progress: Progress,
         interrupted: asyncio.Event,
         *,
-        told: bool = False,
+        interactive: bool = False,
         delivers_all: bool = False,
-    ) -> AsyncIterator[OnPerfectAir]:
-        swarm = OnPerfectAir(list(scenario.roster), seed, rundir)
+    ) -> AsyncIterator[PerfectSwarm]:
+        swarm = PerfectSwarm(list(scenario.roster), seed, rundir)
         yield swarm
         swarm.played.mission_s = swarm.now()
         await swarm.snapshot()
@@ -103,16 +105,16 @@ def perfect_air(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(BACKENDS, PerfectAir.name, PerfectAir())
 
 
-def test_every_name_stands_for_the_backend_that_says_it() -> None:
+def test_table_maps_each_name_to_its_backend() -> None:
     assert {name: backend.name for name, backend in BACKENDS.items()} == {name: name for name in BACKEND_NAMES}
 
 
-def test_a_record_tells_whether_its_run_was_in_virtual_time() -> None:
+def test_name_shows_whether_a_run_was_in_virtual_time() -> None:
     assert [name for name in (*BACKEND_NAMES, "of another version", None, []) if in_virtual_time(name)] == ["sim"]
 
 
 @pytest.mark.usefixtures("perfect_air")
-def test_a_backend_plays_as_soon_as_it_is_in_the_table(tmp_path: Path) -> None:
+def test_backend_in_the_table_plays_a_scenario(tmp_path: Path) -> None:
     finished = run(scenario(agents=3, duration_s=600, final_reconcile=True), 1, tmp_path / "run", Silent(), "docker")
     assert (finished.exit_status, finished.played.engine) == (0, "perfect air")
     assert {number: one.verdict for number, one in finished.result.characteristics.items()} == dict.fromkeys(
@@ -123,14 +125,14 @@ def test_a_backend_plays_as_soon_as_it_is_in_the_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("perfect_air")
-def test_what_a_backend_refuses_leaves_no_run_directory(tmp_path: Path) -> None:
+def test_refused_scenario_leaves_no_run_directory(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="needs an air that is not perfect"):
         run(scenario(network={"loss": 0.1}), 1, tmp_path / "run", Silent(), "docker")
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.usefixtures("perfect_air")
-def test_a_matrix_plays_it_in_run_directories_and_refuses_before_any_run(tmp_path: Path) -> None:
+def test_matrix_plays_the_backend_and_refuses_before_any_run(tmp_path: Path) -> None:
     asked = matrix(agents=[3], scenario={"duration_s": 60}, loss=(0.0,), seeds=2, backend="docker", keep="all")
     (cell,) = played(asked, 1, judge, tmp_path / "out").record.cells
     assert (cell.backend, cell.runs, cell.failed) == ("docker", 2, 0)

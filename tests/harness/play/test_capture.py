@@ -1,4 +1,4 @@
-"""Captures of runs: the same files of real vehicles and of virtual time, and what they say is what happened."""
+"""Captures of runs with processes and in virtual time contain the frames that were sent and received."""
 
 import json
 import os
@@ -50,12 +50,12 @@ def record(out: Path) -> dict[str, Any]:
 
 
 def files(out: Path) -> dict[str, bytes]:
-    """What must not depend on whether somebody captures."""
+    """Return the files that a capture must not change."""
     kept = ("agents/*", "before-final-reconcile/*", "network.jsonl")
     return {str(path.relative_to(out)): path.read_bytes() for pattern in kept for path in out.glob(pattern)}
 
 
-def test_in_virtual_time_a_capture_changes_nothing_else(tmp_path: Path) -> None:
+def test_capture_in_virtual_time_changes_nothing_else(tmp_path: Path) -> None:
     for name, capture in (("without", False), ("with", True)):
         finished = run(scenario(**RUN, capture=capture), 5, tmp_path / name, Silent(), "sim")
         assert finished.played.outcome == "completed", finished.played.outcome_detail
@@ -67,18 +67,18 @@ def test_in_virtual_time_a_capture_changes_nothing_else(tmp_path: Path) -> None:
         assert without[key] == with_capture[key]
 
 
-def test_in_virtual_time_the_files_hold_what_was_sent_and_what_reached_each_interface(tmp_path: Path) -> None:
+def test_virtual_captures_have_sent_and_received_frames(tmp_path: Path) -> None:
     run(scenario(**RUN, capture=True), 5, tmp_path / "run", Silent(), "sim")
     found = captured(tmp_path / "run")
-    said = record(tmp_path / "run")
+    recorded = record(tmp_path / "run")
     assert sorted(found) == [1, 2, 3]
     sent = {vehicle: [frame for frame in seen if frame.outbound] for vehicle, seen in found.items()}
-    came = {vehicle: [frame for frame in seen if not frame.outbound] for vehicle, seen in found.items()}
-    assert sum(map(len, sent.values())) == said["figures"]["messages"]
+    received = {vehicle: [frame for frame in seen if not frame.outbound] for vehicle, seen in found.items()}
+    assert sum(map(len, sent.values())) == recorded["figures"]["messages"]
     for vehicle, seen in found.items():
         path = tmp_path / "run" / "capture" / f"{vehicle}.pcapng"
         assert comment(path) == {"ucp_harness": 1, "vehicle": vehicle, "epoch_us": 0, "speedup": 1.0}
-        assert statistics(path) == {"received": len(seen), "dropped": 0} == said["capture"][str(vehicle)]
+        assert statistics(path) == {"received": len(seen), "dropped": 0} == recorded["capture"][str(vehicle)]
         assert seen == sorted(seen, key=lambda frame: frame.at_ns)
         for frame in seen:
             sender, _, _ = decode(frame.payload)
@@ -86,17 +86,17 @@ def test_in_virtual_time_the_files_hold_what_was_sent_and_what_reached_each_inte
             assert frame.outbound == (sender == vehicle)
             before = [one.at_ns for one in sent[sender] if one.data == frame.data]
             assert frame.outbound or any(2e6 <= frame.at_ns - at_ns <= 50e6 for at_ns in before)
-    # A paused or dead agent says nothing, and its interface hears what it would have.
+    # A paused or dead agent sends nothing. Its interface still receives frames.
     for vehicle, (silent_from, silent_until) in {2: (200, 350), 1: (300, 400)}.items():
         span = range(silent_from * 10**9, silent_until * 10**9)
         assert not [frame for frame in sent[vehicle] if frame.at_ns in span]
-        assert [frame for frame in came[vehicle] if frame.at_ns in span]
+        assert [frame for frame in received[vehicle] if frame.at_ns in span]
     apart = range(int(50.05 * 10**9), 150 * 10**9)
-    assert {decode(frame.payload)[0] for frame in came[3] if frame.at_ns in apart} == set()
-    assert {decode(frame.payload)[0] for frame in came[2] if frame.at_ns in apart} == {1}
+    assert {decode(frame.payload)[0] for frame in received[3] if frame.at_ns in apart} == set()
+    assert {decode(frame.payload)[0] for frame in received[2] if frame.at_ns in apart} == {1}
 
 
-def test_in_virtual_time_a_message_whose_fate_is_to_be_lost_is_in_its_senders_file_alone(tmp_path: Path) -> None:
+def test_scripted_loss_is_only_in_the_virtual_capture_of_the_sender(tmp_path: Path) -> None:
     fates = [{"message": "Commit Block", "receiver": 2, "drop": True}]
     run(scenario(**{**RUN, "timeline": []}, fates=fates, capture=True), 5, tmp_path / "run", Silent(), "sim")
     commits = {
@@ -108,39 +108,39 @@ def test_in_virtual_time_a_message_whose_fate_is_to_be_lost_is_in_its_senders_fi
 
 
 @pytest.mark.lab
-def test_a_run_captures_what_the_kernel_counted_on_the_agents_own_clock(tmp_path: Path) -> None:
+def test_capture_agrees_with_the_counters_of_the_kernel(tmp_path: Path) -> None:
     path = write_scenario(tmp_path, **{**RUN, "timeline": [{"at_s": 100, "kill": [3]}], "duration_s": 300})
     done = harness("run", path, "--capture", "--seed", 1, "--out", tmp_path / "run")
     assert done.returncode == 0, done.stdout + done.stderr
-    said, found = record(tmp_path / "run"), captured(tmp_path / "run")
-    assert said["scenario"]["capture"]
+    recorded, found = record(tmp_path / "run"), captured(tmp_path / "run")
+    assert recorded["scenario"]["capture"]
     assert sorted(found) == [1, 2, 3]
     trace = (tmp_path / "run" / "agents" / "1.trace.jsonl").read_text().splitlines()
     clock = json.loads(trace[0])["clock"]
     for vehicle, seen in found.items():
         path = tmp_path / "run" / "capture" / f"{vehicle}.pcapng"
         counts = {outbound: sum(frame.outbound == outbound for frame in seen) for outbound in (True, False)}
-        assert counts[False] == said["counters"]["receivers"][str(vehicle)]["passed"]
-        assert statistics(path) == {"received": len(seen), "dropped": 0} == said["capture"][str(vehicle)]
+        assert counts[False] == recorded["counters"]["receivers"][str(vehicle)]["passed"]
+        assert statistics(path) == {"received": len(seen), "dropped": 0} == recorded["capture"][str(vehicle)]
         assert comment(path) == {"ucp_harness": 1, "vehicle": vehicle, **clock}
         for frame in seen:
             sender, _, _ = decode(frame.payload)
             assert frame.outbound == (sender == vehicle)
-            assert 0 <= (frame.at_ns - clock["epoch_us"] * 1000) / 1e9 * clock["speedup"] <= said["mission_s"] + 60
-    assert sum(frame.outbound for seen in found.values() for frame in seen) >= said["figures"]["messages"]
+            assert 0 <= (frame.at_ns - clock["epoch_us"] * 1000) / 1e9 * clock["speedup"] <= recorded["mission_s"] + 60
+    assert sum(frame.outbound for seen in found.values() for frame in seen) >= recorded["figures"]["messages"]
     first = next(frame for frame in found[1] if frame.outbound)
     assert isinstance(decode(first.payload)[2], BlockAddRequest)
     assert first.data[SOURCE] == udp_broadcast(1, PORT, b"")[SOURCE]
-    # Vehicle 3 is dead, and still in the air.
+    # Agent 3 is dead, and the interface of its vehicle still receives frames.
     killed_ns = (clock["epoch_us"] + 100 / clock["speedup"] * 10**6) * 1000 + 50e6
     assert [frame for frame in found[3] if frame.at_ns > killed_ns]
     assert not [frame for frame in found[3] if frame.at_ns > killed_ns and frame.outbound]
 
 
 @pytest.mark.lab
-def test_of_a_run_that_is_killed_the_captures_are_read(tmp_path: Path) -> None:
-    going_on = {**RUN, "timeline": [], "duration_s": 100_000}
-    running = Running(write_scenario(tmp_path, **going_on), tmp_path / "run", "--capture")
+def test_captures_of_a_killed_run_are_readable(tmp_path: Path) -> None:
+    long_run = {**RUN, "timeline": [], "duration_s": 100_000}
+    running = Running(write_scenario(tmp_path, **long_run), tmp_path / "run", "--capture")
     running.wait_for_mission(1, 2, 3)
     running.wait_for(lambda: all(len(seen) > 20 for seen in captured(tmp_path / "run").values()), "captured frames")
     running.process.kill()
@@ -152,9 +152,9 @@ def test_of_a_run_that_is_killed_the_captures_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_a_capture_that_crashes_ends_the_run_with_one_sentence_and_status_3(tmp_path: Path) -> None:
-    going_on = {**RUN, "timeline": [], "duration_s": 100_000}
-    running = Running(write_scenario(tmp_path, **going_on), tmp_path / "run", "--capture")
+def test_crashed_capture_ends_the_run_with_one_sentence_and_status_3(tmp_path: Path) -> None:
+    long_run = {**RUN, "timeline": [], "duration_s": 100_000}
+    running = Running(write_scenario(tmp_path, **long_run), tmp_path / "run", "--capture")
     running.wait_for_mission(1, 2, 3)
     (pid,) = [pid for pid, command in processes(tmp_path / "run").items() if "netem.tap" in command]
     os.kill(pid, signal.SIGKILL)
@@ -163,14 +163,14 @@ def test_a_capture_that_crashes_ends_the_run_with_one_sentence_and_status_3(tmp_
     assert sentences(err) == [
         "The capture of packets failed: SIGKILL; the chains and traces written before that are exported and checked",
     ]
-    said = running.record()
-    assert said["outcome"] == "failed"
-    assert said["capture"] is None
-    assert {agent["outcome"] for agent in said["agents"].values()} == {"exported"}
+    recorded = running.record()
+    assert recorded["outcome"] == "failed"
+    assert recorded["capture"] is None
+    assert {agent["outcome"] for agent in recorded["agents"].values()} == {"exported"}
     assert not processes(tmp_path / "run")
 
 
-def test_a_run_whose_captures_have_gaps_says_so(tmp_path: Path) -> None:
+def test_report_shows_gaps_of_captures(tmp_path: Path) -> None:
     counts = {"1": {"received": 10, "dropped": 0}, "7": {"received": 20, "dropped": 4}}
     frames = {vehicle: CapturedFrames.model_validate(counted) for vehicle, counted in counts.items()}
     assert gaps(frames) == ("the capture lacks 4 of 30 frames, of vehicle 7, because this machine was too slow")

@@ -1,4 +1,4 @@
-"""A run whose vehicles are seen, and one of them commanded, at a ground station."""
+"""Runs with a ground station that sees all vehicles and commands one of them."""
 
 import asyncio
 import json
@@ -21,7 +21,7 @@ DEADLINE_S = 60.0
 
 
 class GroundStation(threading.Thread):
-    """Sees who is there, and sends vehicle 2 home once it flies; on a free port."""
+    """A ground station on a free port. It records the vehicles, and sends vehicle 2 home when it flies."""
 
     def __init__(self, deadline_s: float = DEADLINE_S) -> None:
         super().__init__(daemon=True)
@@ -37,7 +37,7 @@ class GroundStation(threading.Thread):
             message = self._link.recv_match(type=["HEARTBEAT", "GLOBAL_POSITION_INT"], blocking=True, timeout=0.2)
             if message is None:
                 continue
-            if message.get_srcSystem() not in self.seen:  # an ArduPilot says where it is to who asks
+            if message.get_srcSystem() not in self.seen:  # ArduPilot sends positions only on request
                 self.seen.add(message.get_srcSystem())
                 self._link.mav.request_data_stream_send(message.get_srcSystem(), 1, mavlink.MAV_DATA_STREAM_ALL, 4, 1)
             flies = message.get_type() == "GLOBAL_POSITION_INT" and message.relative_alt > 19_000
@@ -49,7 +49,7 @@ class GroundStation(threading.Thread):
 
 
 @pytest.mark.lab
-def test_an_operator_sees_all_vehicles_and_flies_the_one_that_is_commanded(tmp_path: Path) -> None:
+def test_operator_sees_all_vehicles_and_commands_one(tmp_path: Path) -> None:
     ground = GroundStation()
     ground.start()
     scenario = write_scenario(tmp_path, vehicles={"kind": "embedded"}, duration_s=200, speedup=50)
@@ -76,8 +76,8 @@ def test_an_operator_sees_all_vehicles_and_flies_the_one_that_is_commanded(tmp_p
         pytest.param(("docker", "--image-from-host"), marks=pytest.mark.docker),
     ],
 )
-def test_an_operator_flies_a_real_copter_under_a_debugger(backend: tuple[str, ...], tmp_path: Path) -> None:
-    """Two minutes, of which a copter needs 46 s to get ready."""
+def test_operator_flies_a_real_copter_under_a_debugger(backend: tuple[str, ...], tmp_path: Path) -> None:
+    """The test takes two minutes, because a copter needs 46 s until it can be armed."""
     if "ARDUPILOT_SITL" not in os.environ:
         pytest.skip("no ArduPilot: set ARDUPILOT_SITL to the directory that holds an arducopter")
     ground = GroundStation(deadline_s=200)
@@ -99,7 +99,7 @@ def test_an_operator_flies_a_real_copter_under_a_debugger(backend: tuple[str, ..
 
 
 @pytest.mark.any_user
-def test_tracks_in_virtual_time_are_seen_and_refuse_commands(tmp_path: Path) -> None:
+def test_tracks_in_virtual_time_are_visible_and_refuse_commands(tmp_path: Path) -> None:
     ground = GroundStation()
     ground.start()
     timeline = [{"at_s": 60, "kill": [3]}]
@@ -116,21 +116,21 @@ def test_tracks_in_virtual_time_are_seen_and_refuse_commands(tmp_path: Path) -> 
     assert "Its commands were refused, because virtual time computes the tracks" in (out / "report.html").read_text()
 
 
-def test_vehicles_whose_time_stands_still_are_heard_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vehicles_send_heartbeats_while_time_is_paused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_station_tracks, "SHOW_S", 0.0)
     monkeypatch.setattr(_station_tracks, "SILENT_S", 0.0)
     link = mavutil.mavlink_connection("udpin:127.0.0.1:0", dialect="ardupilotmega")
     asked = Scenario.model_validate({"name": "held", "agents": 2, "gcs": f"127.0.0.1:{link.port.getsockname()[1]}"})
 
-    async def stand_still() -> None:
-        standing = {vehicle: track("copter", None) for vehicle in (1, 2)}
-        shown = await _station_tracks.TracksOnStation.open(asked, standing, lambda: 0.0)
+    async def show_paused_time() -> None:
+        tracks = {vehicle: track("copter", None) for vehicle in (1, 2)}
+        shown = await _station_tracks.StationTracks.open(asked, tracks, lambda: 0.0)
         for _ in range(5):
             shown.show(0.0, lost=set())
             await asyncio.sleep(0.01)
         shown.close()
 
-    asyncio.run(stand_still())
+    asyncio.run(show_paused_time())
     heard = [link.recv_match(type="HEARTBEAT", blocking=True, timeout=DEADLINE_S) for _ in range(6)]
     assert {message.get_srcSystem() for message in heard} == {1, 2}
     link.close()
@@ -145,7 +145,7 @@ def test_vehicles_whose_time_stands_still_are_heard_all_the_same(monkeypatch: py
         (["--gcs", "255.255.255.255:14550"], "255.255.255.255:14550 cannot be sent (Permission denied)"),
     ],
 )
-def test_a_ground_station_that_cannot_be_is_one_sentence(arguments: list[str], sentence: str, tmp_path: Path) -> None:
+def test_invalid_ground_station_is_one_sentence(arguments: list[str], sentence: str, tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path, vehicles={"kind": "embedded"})
     done = harness("run", scenario, "--out", tmp_path / "run", *arguments)
     assert done.returncode == 2
@@ -154,7 +154,7 @@ def test_a_ground_station_that_cannot_be_is_one_sentence(arguments: list[str], s
 
 
 @pytest.mark.any_user
-def test_a_ground_station_to_which_there_is_no_way_is_one_sentence(tmp_path: Path) -> None:
+def test_unreachable_ground_station_is_one_sentence(tmp_path: Path) -> None:
     options = ["--out", tmp_path / "run", "--backend", "sim", "--gcs", "255.255.255.255:1"]
     done = harness("run", write_scenario(tmp_path), *options)
     assert done.returncode == 2

@@ -1,4 +1,4 @@
-"""Somebody has things happen to a run that goes on."""
+"""Requests of a user to an active run."""
 
 import asyncio
 import json
@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from harness.errors import HarnessError, ScenarioError
+from harness.errors import ScenarioError
 from harness.play.interventions import Interventions
 from harness.play.progress import Silent
 from harness.play.request_socket import SOCKET
@@ -26,22 +26,22 @@ pytestmark = pytest.mark.any_user
 
 
 def played(asked: Scenario, out: Path, do: Callable[[Interventions], None]) -> Run:
-    """A run in virtual time that stands at second 0 until `do` has it go on."""
-    hand = Interventions(asked, virtual_time=True, paused=True)
+    """Play a run in virtual time that is paused at second 0. `do` sends requests, and time resumes after it."""
+    interventions = Interventions(asked, virtual_time=True, paused=True)
     over = threading.Event()
 
     def click() -> None:
-        while hand.closed and not over.is_set():
+        while interventions.closed and not over.is_set():
             over.wait(0.005)
         try:
-            do(hand)
+            do(interventions)
         finally:
-            hand.go_on()
+            interventions.resume()
 
     with ThreadPoolExecutor(1) as thread:
         clicked = thread.submit(click)
         try:
-            finished = run(asked, 7, out, Silent(), "sim", interventions=hand)
+            finished = run(asked, 7, out, Silent(), "sim", interventions=interventions)
         finally:
             over.set()
         clicked.result(TIMEOUT_S)
@@ -49,29 +49,29 @@ def played(asked: Scenario, out: Path, do: Callable[[Interventions], None]) -> R
 
 
 def files_of(run: Path) -> dict[str, bytes]:
-    """What the agents have left."""
+    """Return the files of the agents."""
     return {str(path.relative_to(run)): path.read_bytes() for path in sorted((run / "agents").rglob("*.json*"))}
 
 
-def test_what_was_clicked_can_be_played_again_to_the_last_byte(tmp_path: Path) -> None:
+def test_replay_of_requests_gives_the_same_files(tmp_path: Path) -> None:
     asked = scenario(duration_s=600, network={"loss": 0.1}, timeline=[{"at_s": 40, "loss": 0.2}], final_reconcile=True)
     at_s: list[float] = []
 
-    def click(hand: Interventions) -> None:
+    def click(interventions: Interventions) -> None:
         def ask(**entry: Any) -> None:
-            at_s.append(hand.ask(entry).result(TIMEOUT_S))
+            at_s.append(interventions.ask(entry).result(TIMEOUT_S))
 
         ask(partition=[[1, 2], [3, 4]])
-        assert hand.step(30).result(TIMEOUT_S) == pytest.approx(30.001)
-        hand.step_to_next_run().result(TIMEOUT_S)
+        assert interventions.step(30).result(TIMEOUT_S) == pytest.approx(30.001)
+        interventions.step_to_next_run().result(TIMEOUT_S)
         ask(kill=[2])
         ask(reboot=[3], down_s=30, disk="kept")
-        hand.step_to_next_run().result(TIMEOUT_S)
+        interventions.step_to_next_run().result(TIMEOUT_S)
         ask(reboot=[4], down_s=20.5, disk="lost")
-        hand.step(100).result(TIMEOUT_S)
+        interventions.step(100).result(TIMEOUT_S)
         ask(heal=True)
         ask(network={"links": [{"from": 1, "to": 3, "loss": 0.9}]})
-        hand.step(100).result(TIMEOUT_S)
+        interventions.step(100).result(TIMEOUT_S)
         ask(loss=0.0)
 
     finished = played(asked, tmp_path / "run", click)
@@ -87,9 +87,9 @@ def test_what_was_clicked_can_be_played_again_to_the_last_byte(tmp_path: Path) -
     assert not any(fault.by_hand for fault in again.record.faults)
 
 
-def test_a_run_without_a_click_is_as_ever(tmp_path: Path) -> None:
+def test_run_without_requests_equals_a_normal_run(tmp_path: Path) -> None:
     asked = scenario(duration_s=300, network={"loss": 0.1})
-    played(asked, tmp_path / "watched", lambda hand: None)
+    played(asked, tmp_path / "watched", lambda interventions: None)
     run(asked, 7, tmp_path / "alone", Silent(), "sim")
     assert files_of(tmp_path / "watched") == files_of(tmp_path / "alone")
     assert not (tmp_path / "watched/replay.yaml").exists()
@@ -110,60 +110,60 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-def test_what_cannot_be_is_a_sentence_and_changes_nothing(tmp_path: Path) -> None:
+def test_impossible_request_is_one_sentence_and_changes_nothing(tmp_path: Path) -> None:
     strained = {"at_s": 90, "network": {"loss": 0.3, "delay": 0.1}, "for_s": 60}
     asked = scenario(duration_s=300, timeline=[strained, {"at_s": 200, "kill": [3]}])
     wrong: list[str] = []
 
-    def click(hand: Interventions) -> None:
-        hand.step(100).result(TIMEOUT_S)
-        hand.ask({"kill": [2]}).result(TIMEOUT_S)
-        before = hand.scenario
+    def click(interventions: Interventions) -> None:
+        interventions.step(100).result(TIMEOUT_S)
+        interventions.ask({"kill": [2]}).result(TIMEOUT_S)
+        before = interventions.scenario
         for entry, sentence in REFUSED:
             with pytest.raises(ScenarioError) as refusal:
-                hand.ask(entry).result(TIMEOUT_S)
+                interventions.ask(entry).result(TIMEOUT_S)
             if sentence not in str(refusal.value):
                 wrong.append(str(refusal.value))
-        assert hand.scenario is before
+        assert interventions.scenario is before
         for seconds in (0, -1, float("nan"), float("inf")):
             with pytest.raises(ScenarioError, match="is not a step"):
-                hand.step(seconds).result(TIMEOUT_S)
+                interventions.step(seconds).result(TIMEOUT_S)
         with pytest.raises(ScenarioError, match="is not a speed: use a number above 0"):
-            hand.set_factor(0).result(TIMEOUT_S)
+            interventions.set_factor(0).result(TIMEOUT_S)
 
     played(asked, tmp_path / "run", click)
     assert wrong == []
 
 
-def test_what_is_for_a_while_ends_where_somebody_asks_for_other(tmp_path: Path) -> None:
+def test_lasting_request_ends_a_temporary_change(tmp_path: Path) -> None:
     timeline = [{"at_s": 50, "partition": [[1, 2]], "for_s": 500}, {"at_s": 60, "loss": 0.5, "for_s": 400}]
     asked = scenario(duration_s=600, timeline=timeline)
 
-    def click(hand: Interventions) -> None:
-        hand.step(100).result(TIMEOUT_S)
-        hand.ask({"heal": True}).result(TIMEOUT_S)
-        hand.ask({"loss": 0.1}).result(TIMEOUT_S)
+    def click(interventions: Interventions) -> None:
+        interventions.step(100).result(TIMEOUT_S)
+        interventions.ask({"heal": True}).result(TIMEOUT_S)
+        interventions.ask({"loss": 0.1}).result(TIMEOUT_S)
 
     finished = played(asked, tmp_path / "run", click)
-    told = [(fault.at_s, fault.what, fault.detail) for fault in finished.record.faults]
-    assert told[2:] == [(100.0, "heal, undone", "loss 50 %"), (100.001, "loss, undone", "loss 10 %")]
+    faults = [(fault.at_s, fault.what, fault.detail) for fault in finished.record.faults]
+    assert faults[2:] == [(100.0, "heal, undone", "loss 50 %"), (100.001, "loss, undone", "loss 10 %")]
     run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
     assert files_of(tmp_path / "again") == files_of(tmp_path / "run")
 
 
-def test_where_vehicles_fly_it_is_played_again_just_so(tmp_path: Path) -> None:
+def test_replay_with_flying_vehicles_gives_the_same_files(tmp_path: Path) -> None:
     radio = {"hard_range": {"range_m": 100}, "update_s": 1}
     flight = [{"vehicles": [1], "plan": [{"take_off": 20}, {"go_to": [300, 0]}, {"go_to": [0, 0]}]}]
     schedule = [{"nemesis": "halves", "every_s": 50, "for_s": 20}]
     network, events = {"radio": radio}, {"mean_s": 2}
     asked = scenario(duration_s=300, agents=3, network=network, flight=flight, schedule=schedule, events=events)
 
-    def click(hand: Interventions) -> None:
+    def click(interventions: Interventions) -> None:
         for number in range(40):
-            hand.step_to_next_run().result(TIMEOUT_S)
+            interventions.step_to_next_run().result(TIMEOUT_S)
             if number % 10 == 9:
-                hand.step(0.5).result(TIMEOUT_S)
-                hand.ask({"loss": number / 100}).result(TIMEOUT_S)
+                interventions.step(0.5).result(TIMEOUT_S)
+                interventions.ask({"loss": number / 100}).result(TIMEOUT_S)
 
     played(asked, tmp_path / "run", click)
     run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
@@ -171,62 +171,70 @@ def test_where_vehicles_fly_it_is_played_again_just_so(tmp_path: Path) -> None:
     assert (tmp_path / "again/tracks.jsonl").read_bytes() == (tmp_path / "run/tracks.jsonl").read_bytes()
 
 
-def test_agents_of_another_make_are_asked_for_nothing_that_their_scenario_does_not(tmp_path: Path) -> None:
+def test_foreign_agents_get_only_requests_that_they_support(tmp_path: Path) -> None:
     node = [sys.executable, "-m", "ucp.node"]
     rebooted = [{"at_s": 80, "reboot": [1], "down_s": 5, "disk": "kept"}]
     asked = scenario(duration_s=100, agents=2, agent_command={2: node}, timeline=rebooted)
 
-    def click(hand: Interventions) -> None:
-        hand.step(20).result(TIMEOUT_S)
+    def click(interventions: Interventions) -> None:
+        interventions.step(20).result(TIMEOUT_S)
         with pytest.raises(ScenarioError, match="agent 2 has no disk"):
-            hand.ask({"reboot": [1, 2], "down_s": 5, "disk": "kept"}).result(TIMEOUT_S)
+            interventions.ask({"reboot": [1, 2], "down_s": 5, "disk": "kept"}).result(TIMEOUT_S)
         with pytest.raises(ScenarioError, match="`flood` needs a rogue node"):
-            hand.ask({"flood": {"per_s": 10, "for_s": 1}}).result(TIMEOUT_S)
-        hand.ask({"reboot": [1], "down_s": 5, "disk": "kept"}).result(TIMEOUT_S)
-        hand.ask({"reboot": [2], "down_s": 5, "disk": "lost"}).result(TIMEOUT_S)
+            interventions.ask({"flood": {"per_s": 10, "for_s": 1}}).result(TIMEOUT_S)
+        interventions.ask({"reboot": [1], "down_s": 5, "disk": "kept"}).result(TIMEOUT_S)
+        interventions.ask({"reboot": [2], "down_s": 5, "disk": "lost"}).result(TIMEOUT_S)
 
     assert played(asked, tmp_path / "run", click).played.outcome == "completed"
 
 
-def test_who_is_refused_at_once_and_asks_again_is_answered(tmp_path: Path) -> None:
-    def click(hand: Interventions) -> None:
-        hand.step(20).result(TIMEOUT_S)
-        refused = hand.ask({"kill": [99]})
-        refused.add_done_callback(lambda _: again.append(hand.ask({"kill": [98]})))  # in the run's own thread
+def test_second_request_after_a_refusal_is_answered(tmp_path: Path) -> None:
+    def click(interventions: Interventions) -> None:
+        interventions.step(20).result(TIMEOUT_S)
+        refused = interventions.ask({"kill": [99]})
+        refused.add_done_callback(lambda _: again.append(interventions.ask({"kill": [98]})))  # in the thread of the run
         for answer in (refused, *again):
             with pytest.raises(ScenarioError):
                 answer.result(TIMEOUT_S)
-        threading.Event().wait(0.2)  # the run has gone to sleep again
-        hand.ask({"kill": [2]}).result(TIMEOUT_S)
+        threading.Event().wait(0.2)  # the run waits again
+        interventions.ask({"kill": [2]}).result(TIMEOUT_S)
 
     again: list[Future[float]] = []
     assert played(scenario(duration_s=40), tmp_path / "run", click).played.outcome == "completed"
 
 
-def test_after_the_end_nothing_happens_and_every_answer_comes(tmp_path: Path) -> None:
+def test_requests_before_and_after_the_run_are_refused(tmp_path: Path) -> None:
     asked = scenario(duration_s=100)
-    hand = Interventions(asked, virtual_time=True)
+    interventions = Interventions(asked, virtual_time=True)
     with pytest.raises(ScenarioError, match="the mission has not started"):
-        hand.ask({"loss": 0.5}).result(0)
-    run(asked, 7, tmp_path / "run", Silent(), "sim", interventions=hand)
+        interventions.ask({"loss": 0.5}).result(0)
+    run(asked, 7, tmp_path / "run", Silent(), "sim", interventions=interventions)
     with pytest.raises(ScenarioError, match="the run has ended"):
-        hand.ask({"loss": 0.5}).result(0)
+        interventions.ask({"loss": 0.5}).result(0)
     with pytest.raises(ScenarioError, match="has ended"):
-        hand.pause().result(0)
+        interventions.pause().result(0)
 
 
-def test_no_more_waits_than_there_is_room_for(tmp_path: Path) -> None:
-    hand = Interventions(scenario(), virtual_time=False)
+def test_request_beyond_the_maximum_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def click(interventions: Interventions) -> None:
+        monkeypatch.setattr("harness.play.interventions.MAX_WAITING", 0)
+        with pytest.raises(ScenarioError, match="0 commands are waiting: repeat this command later"):
+            interventions.ask({"loss": 0.5}).result(TIMEOUT_S)
+
+    assert played(scenario(duration_s=20), tmp_path / "run", click).record.faults == []
+
+
+def test_pause_is_refused_in_real_time() -> None:
+    interventions = Interventions(scenario(), virtual_time=False)
     with pytest.raises(ScenarioError, match="the time of real processes cannot be paused"):
-        hand.pause().result(0)
-    assert issubclass(ScenarioError, HarnessError)
+        interventions.pause().result(0)
 
 
-def test_another_process_asks_by_the_socket_in_the_runs_directory(tmp_path: Path) -> None:
+def test_other_process_sends_requests_to_the_socket(tmp_path: Path) -> None:
     out = tmp_path / ("a directory that lies deep " * 4) / "run"
     answers: dict[str, Any] = {}
 
-    def click(hand: Interventions) -> None:
+    def click(interventions: Interventions) -> None:
         async def ask() -> None:
             directory = os.open(out, os.O_PATH)
             reader, writer = await asyncio.open_unix_connection(f"/proc/self/fd/{directory}/{SOCKET}")

@@ -1,4 +1,4 @@
-"""The orchestrator is killed with SIGKILL at any moment, and the kernel leaves nothing of the run but its directory."""
+"""If SIGKILL ends the harness at any moment, only the run directory remains of the run."""
 
 import contextlib
 import json
@@ -20,13 +20,13 @@ pytestmark = pytest.mark.lab
 
 MOMENTS = 20
 LAST_MOMENT_S = 3.5
-"""The run below is over after about four seconds: start, two seconds of mission, settling, export, check, report."""
+"""The run below takes about four seconds: start, two seconds of mission, settling, export, check, report."""
 GONE_WITHIN_S = 10.0
 MARK = "UCP_TEST_MARK"
 
 
 def marked(mark: str) -> dict[int, str]:
-    """PID -> network namespace of every process that inherited the mark of this test's run."""
+    """Return PID -> network namespace of each process that inherited the mark of this run."""
     wanted = f"{MARK}={mark}".encode()
     found = {}
     for entry in Path("/proc").iterdir():
@@ -38,7 +38,7 @@ def marked(mark: str) -> dict[int, str]:
 
 
 def network_namespaces() -> set[str]:
-    """All that a process lives in, holds open, or has mounted."""
+    """Return all network namespaces in which a process runs, or that a process has open or mounted."""
     found = set()
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -52,7 +52,7 @@ def network_namespaces() -> set[str]:
 
 
 def rules() -> str:
-    """The firewall rules of this network, if we may see them."""
+    """Return the firewall rules of this network. Empty if this user cannot read them."""
     nft = shutil.which("nft", path="/usr/sbin:/sbin:/usr/bin")
     if nft is None or os.geteuid() != 0:
         return ""
@@ -60,7 +60,7 @@ def rules() -> str:
 
 
 @pytest.mark.parametrize("moment", range(MOMENTS))
-def test_nothing_is_left_of_a_killed_run(moment: int, tmp_path: Path) -> None:
+def test_killed_run_leaves_nothing(moment: int, tmp_path: Path) -> None:
     after_s = Random(moment).uniform(moment, moment + 1) / MOMENTS * LAST_MOMENT_S
     interfaces, firewall = set(Path("/sys/class/net").iterdir()), rules()
     temporary = tmp_path / "tmp"
@@ -79,7 +79,7 @@ def test_nothing_is_left_of_a_killed_run(moment: int, tmp_path: Path) -> None:
     namespaces = set()
     killed_at = time.monotonic() + after_s
     while (left_s := killed_at - time.monotonic()) > 0:
-        time.sleep(min(left_s, 0.2))  # to look at every process takes long enough to be felt beside other tests
+        time.sleep(min(left_s, 0.2))  # reading /proc more often would slow other tests down
         namespaces |= set(marked(mark).values())
     run.send_signal(signal.SIGKILL)
     run.wait()
@@ -87,8 +87,8 @@ def test_nothing_is_left_of_a_killed_run(moment: int, tmp_path: Path) -> None:
     while left := marked(mark):
         assert time.monotonic() < deadline, f"still there: {left}"
         time.sleep(0.02)
-    of_the_lab = namespaces - {str(Path("/proc/self/ns/net").readlink())}
-    while still := of_the_lab & network_namespaces():
+    lab_namespaces = namespaces - {str(Path("/proc/self/ns/net").readlink())}
+    while still := lab_namespaces & network_namespaces():
         assert time.monotonic() < deadline, f"still there: {still}"
         time.sleep(0.02)
     assert set(Path("/sys/class/net").iterdir()) == interfaces
@@ -96,4 +96,4 @@ def test_nothing_is_left_of_a_killed_run(moment: int, tmp_path: Path) -> None:
     assert not list(temporary.iterdir())
     assert not list(work.iterdir())
     for export in (tmp_path / "run").glob("agents/*.chain.json"):
-        json.loads(export.read_text())  # whole, or not there
+        json.loads(export.read_text())  # an export is complete, or absent

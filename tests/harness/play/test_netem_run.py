@@ -1,4 +1,4 @@
-"""A whole run of agents over real netem, judged: on this machine if its kernel has netem, else in User Mode Linux."""
+"""A whole run of agents over real netem. `make test-netem` plays it in User Mode Linux."""
 
 import json
 from pathlib import Path
@@ -40,6 +40,6 @@ def test_agents_agree_over_delays_and_bursts_of_loss(tmp_path: Path) -> None:
     start, *_, end = map(json.loads, (tmp_path / "run" / "network.jsonl").read_text().splitlines())
     for receiver in start["applied"]["receivers"].values():
         assert receiver["loss"] == LOSS | {"loss_good": 0.0, "loss_bad": 1.0}
-        # Delays are of mission seconds: on the wire they are as much shorter as the clock is faster.
+        # Delays are in mission seconds. The speedup of 10 divides the delay in the kernel by 10.
         assert receiver["delay"] == {"mean_s": 0.01, "jitter_s": 0.002, "distribution": "normal"}
     assert all(receiver["passed"] > 0 for receiver in end["counters"]["receivers"].values())

@@ -1,4 +1,4 @@
-"""Flight makes the network: what the radio loses where the vehicles are, over what the timeline asks."""
+"""The network follows the flight: radio losses apply in addition to the conditions of the timeline."""
 
 from pathlib import Path
 
@@ -25,47 +25,47 @@ def at(*north_m: float) -> dict[int, Place]:
     return {vehicle: Place(metres, 0.0, 0.0) for vehicle, metres in enumerate(north_m, 1)}
 
 
-def asking(conditions: NetworkConditions) -> NetworkChange:
+def change_to(conditions: NetworkConditions) -> NetworkChange:
     return NetworkChange(5.0, "loss", "", conditions)
 
 
-def test_who_flies_out_of_range_is_cut_off_and_back_again() -> None:
+def test_vehicle_out_of_range_is_cut_off_and_reconnected() -> None:
     reach = RadioRange(scenario())
-    assert reach.move(1.0, at(0, 50, 90)) is None, "all hear all, as before"
+    assert reach.move(1.0, at(0, 50, 90)) is None, "all vehicles are still in range"
     apart = reach.move(2.0, at(0, 50, 200))
     assert apart is not None and (apart.at_s, apart.what, apart.detail) == (2.0, RANGE, "1 2 | 3")
     assert apart.losses == {"1-3": 1.0, "2-3": 1.0}
     assert apart.conditions.link(3, 1) == LinkConditions(1.0) and apart.conditions.link(1, 2) == LinkConditions()
-    assert reach.move(3.0, at(0, 50, 300)) is None, "no farther than lost"
+    assert reach.move(3.0, at(0, 50, 300)) is None, "a lost link stays lost at a larger distance"
     relayed = reach.move(4.0, at(0, 50, 140))
     assert relayed is not None and relayed.detail == "1 2 3" and relayed.losses == {"2-3": 0.0}
     together = reach.move(5.0, at(0, 50, 90))
     assert together is not None and together.conditions == NetworkConditions() and together.losses == {"1-3": 0.0}
 
 
-def test_what_the_timeline_asks_and_where_the_vehicles_are_hold_together() -> None:
+def test_timeline_and_radio_range_apply_together() -> None:
     reach = RadioRange(scenario())
     reach.move(1.0, at(0, 50, 200))
-    asked = reach.ask(asking(NetworkConditions(LinkConditions(0.2), partition=(frozenset({1}),))))
+    asked = reach.change_timeline(change_to(NetworkConditions(LinkConditions(0.2), partition=(frozenset({1}),))))
     assert asked.conditions.link(1, 2) == LinkConditions(0.2) and asked.conditions.link(1, 3).loss == 1.0
     assert asked.conditions.is_cut(1, 2) and asked.detail == ""
     moved = reach.move(2.0, at(0, 50, 90))
     assert moved is not None and moved.detail == "2 3 | 1", "the partition still stands"
 
 
-def test_a_final_reconcile_hears_over_any_distance() -> None:
+def test_final_reconcile_ignores_distances() -> None:
     reach = RadioRange(scenario())
     reach.move(1.0, at(0, 50, 200))
-    cleared = reach.ask(final_reconcile(9.0))
+    cleared = reach.change_timeline(final_reconcile(9.0))
     assert cleared.conditions == NetworkConditions() and cleared.losses == {"1-3": 0.0, "2-3": 0.0}
     assert reach.move(10.0, at(0, 500, 2000)) is None
 
 
-def test_without_a_radio_distance_does_not_matter() -> None:
+def test_distance_has_no_effect_without_a_radio() -> None:
     assert RadioRange(scenario(network={})).move(1.0, at(0, 1e6, 2e6)) is None
 
 
-def test_on_record_is_who_is_connected_and_not_each_step_of_it() -> None:
+def test_record_has_changes_of_connected_groups_only() -> None:
     played = RunOutcome()
     change = {"at_s": 1.0, "what": RANGE, "detail": "1 2 | 3", "fully_connected": False}
     for record in (
@@ -78,7 +78,7 @@ def test_on_record_is_who_is_connected_and_not_each_step_of_it() -> None:
     assert [record["at_s"] for record in played.network] == [1.0, 3.0, 4.0]
 
 
-def test_vehicles_fly_in_virtual_time_where_somebody_asks_where_they_are() -> None:
+def test_virtual_time_has_tracks_only_if_positions_are_needed() -> None:
     assert tracks_of(scenario(network={})) == {}
     standing = tracks_of(scenario(vehicles={"type": "rover", "spacing_m": 30}))
     assert standing[2].in_field(600.0) == pytest.approx(standing[2].in_field(0.0))
@@ -88,7 +88,7 @@ def test_vehicles_fly_in_virtual_time_where_somebody_asks_where_they_are() -> No
     assert (north_m, up_m) == pytest.approx((400.0, 20.0), abs=1.0)
 
 
-def test_subswarms_that_fly_apart_split_the_network_and_reconcile_when_they_rejoin() -> None:
+def test_subswarms_split_the_network_and_reconcile_after_the_rejoin() -> None:
     split_rejoin = load_scenario(SCENARIOS / "split_rejoin.yaml")
     simulated = simulate(split_rejoin, 1)
     connected = [(state["at_s"], state["detail"]) for state in simulated.played.network if state["what"] == RANGE]
@@ -111,15 +111,13 @@ def test_subswarms_that_fly_apart_split_the_network_and_reconcile_when_they_rejo
         ({"hard_range": {}, "update_s": 0}, r"network\.radio\.update_s"),
     ],
 )
-def test_a_radio_that_means_nothing_is_answered_in_one_sentence(
-    radio: dict[str, object], word: str, tmp_path: Path
-) -> None:
+def test_invalid_radio_is_one_sentence(radio: dict[str, object], word: str, tmp_path: Path) -> None:
     path = tmp_path / "scenario.yaml"
     path.write_text(f"name: Range\nnetwork: {{radio: {radio}}}\n")
     with pytest.raises(ScenarioError, match=word):
         load_scenario(path)
 
 
-def test_a_radio_needs_vehicles() -> None:
+def test_radio_needs_vehicles() -> None:
     with pytest.raises(ValueError, match=r"`network.radio` needs vehicles, but `vehicles.kind` is none"):
         scenario(vehicles={"kind": "none"})

@@ -1,4 +1,4 @@
-"""A swarm in virtual time that goes round in circles is seen to, and the run stops there."""
+"""A run in virtual time stops when its swarm is in a cycle."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ VOTE_ENDS = "vote_timer_expiration"
 
 
 def in_step(agents: int = 5, blocks: int = 2, **keys: Any) -> Scenario:
-    """Every agent completes so many blocks in the same instants."""
+    """Return a scenario in which all agents complete their blocks at the same times."""
     events = [
         {"at_s": 1.0 + block, "agent": agent, "bytes": 256}
         for block in range(blocks)
@@ -25,7 +25,7 @@ def in_step(agents: int = 5, blocks: int = 2, **keys: Any) -> Scenario:
     return scenario(agents=agents, duration_s=60, events={"source": "scripted", "script": events}, **keys)
 
 
-def the_cycle(simulated: Simulated) -> Cycle:
+def cycle_of(simulated: Simulated) -> Cycle:
     cycle = simulated.played.cycle
     assert cycle is not None
     return cycle
@@ -35,11 +35,11 @@ NETWORKS: list[dict[str, Any]] = [{}, {"delay": 0.01}, {"delay": {"mean_s": 0.5,
 
 
 @pytest.mark.parametrize("network", NETWORKS)
-def test_agents_that_reconcile_in_step_do_so_for_ever_and_the_run_stops(network: dict[str, Any]) -> None:
+def test_run_stops_when_agents_reconcile_in_step_forever(network: dict[str, Any]) -> None:
     run = simulate(in_step(network=network), seed=1)
-    cycle = the_cycle(run)
+    cycle = cycle_of(run)
     assert not run.played.settled
-    assert run.played.mission_s < 300, "it does not play the half hour that agents may take to finish"
+    assert run.played.mission_s < 300, "the run stops before the settling limit of half an hour"
     assert (cycle.period_s, cycle.proven, cycle.agents) == (15.0, True, [1, 2, 3, 4, 5])
     assert {(step.agent_id, step.handler) for step in cycle.steps} == {
         (agent, handler) for agent in range(1, 6) for handler in (PHASE_1_ENDS, VOTE_ENDS)
@@ -49,17 +49,17 @@ def test_agents_that_reconcile_in_step_do_so_for_ever_and_the_run_stops(network:
     }
 
 
-def test_what_was_seen_is_the_same_traced_or_not_and_whatever_is_delivered() -> None:
+def test_tracing_and_deliveries_do_not_change_the_cycle() -> None:
     plain, traced, everything = (
-        the_cycle(simulate(in_step(), seed=3, tracing=tracing, deliver_all=deliver_all))
+        cycle_of(simulate(in_step(), seed=3, tracing=tracing, deliver_all=deliver_all))
         for tracing, deliver_all in ((False, False), (True, False), (True, True))
     )
     assert plain == traced == everything
 
 
-def test_a_cycle_goes_on_for_ever_indeed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cycle_continues_until_the_limit_without_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     stopped = simulate(in_step(), seed=1)
-    monkeypatch.setattr(Simulation, "_looks_for_recurrence", lambda simulation: None)
+    monkeypatch.setattr(Simulation, "_new_recurrence", lambda simulation: None)
     played_out = simulate(in_step(), seed=1)
     assert played_out.played.mission_s == 60 + 1800
     assert played_out.result.figures["reconciles"] > 9 * stopped.result.figures["reconciles"]
@@ -70,11 +70,11 @@ def test_a_cycle_goes_on_for_ever_indeed(monkeypatch: pytest.MonkeyPatch) -> Non
     assert first == last
 
 
-def test_a_final_reconcile_that_goes_round_stops_as_well() -> None:
+def test_cycle_in_a_final_reconcile_ends_the_run() -> None:
     run = simulate(in_step(final_reconcile=True), seed=1)
     assert run.played.final_reconcile is not None
     assert not run.played.final_reconcile.complete
-    assert the_cycle(run).since_s > run.played.final_reconcile.at_s
+    assert cycle_of(run).since_s > run.played.final_reconcile.at_s
 
 
 @pytest.mark.parametrize(
@@ -86,19 +86,19 @@ def test_a_final_reconcile_that_goes_round_stops_as_well() -> None:
         {"timeline": [{"at_s": 2, "flood": {"for_s": 1, "per_s": 1}}]},
     ],
 )
-def test_nothing_is_proven_where_lots_decide(chance: dict[str, Any]) -> None:
+def test_random_draws_prevent_the_proof_of_a_cycle(chance: dict[str, Any]) -> None:
     for seed in range(5):
         assert simulate(in_step(**chance), seed).played.cycle is None
 
 
-def test_a_swarm_that_becomes_idle_goes_round_in_no_circle() -> None:
+def test_idle_swarm_is_in_no_cycle() -> None:
     for seed in range(20):
         run = simulate(scenario(agents=5, duration_s=600, network={"loss": 0.15}, final_reconcile=True), seed)
         assert run.played.cycle is None
 
 
-def test_an_agent_that_hangs_is_a_standstill() -> None:
-    """With one of the field test's faults a tie leaves a reconcile that no timer ends."""
+def test_hanging_agent_is_reported_without_a_period() -> None:
+    """The quirk `crash_on_tie` lets a tie leave an agent in a reconcile that no timer ends."""
     hanging = [
         run
         for seed in range(20)
@@ -110,14 +110,14 @@ def test_an_agent_that_hangs_is_a_standstill() -> None:
     ]
     assert hanging
     for run in hanging:
-        cycle = the_cycle(run)
+        cycle = cycle_of(run)
         assert "period_s" not in cycle
         busy = [agent_id for agent_id, export in run.evidence.exports.items() if not export.idle]
         assert cycle.agents == busy
 
 
-def test_who_is_looked_at_twice_in_the_same_wait_has_not_come_again() -> None:
-    """A hunt found that: it was said to go round every 0 s, and was done 15 s later."""
+def test_two_checks_at_the_same_time_are_no_cycle() -> None:
+    """A hunt found this run: the search reported a period of 0 s, but the swarm was idle 15 s later."""
     script = [(1, 1), (1, 3), (7, 2), (11, 3), (12, 1), (27, 2), (32, 3)]
     run = simulate(
         scenario(
@@ -142,7 +142,7 @@ def test_who_is_looked_at_twice_in_the_same_wait_has_not_come_again() -> None:
 
 
 @pytest.mark.parametrize(("late", "proven"), [("2+0.001", True), ("2+0.001 9000+1", False)])
-def test_timers_that_were_told_to_be_late_prove_nothing_only_until_they_have_ended(late: str, proven: bool) -> None:
+def test_late_timers_prevent_a_proof_until_they_have_ended(late: str, proven: bool) -> None:
     run = simulate(in_step(lateness={1: late}, network={"delay": 0.01}), seed=1)
     assert not run.played.settled
     assert (run.played.cycle is not None) == proven

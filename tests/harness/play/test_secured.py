@@ -1,4 +1,4 @@
-"""A secured mission in virtual time is the plain one, and nobody without keys gets in."""
+"""A secured mission in virtual time gives the same verdicts as a plain one, and drops forged messages."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios"
 
 
 def dropped(run: Simulated) -> set[str]:
-    """Why agents dropped what they did."""
+    """Return the reasons for which agents dropped datagrams."""
     return {reason for agent in run.played.agents.values() for reason in agent.get("dropped", {})}
 
 
@@ -22,34 +22,34 @@ def secured(plain: Scenario) -> Scenario:
     return plain.model_copy(update={"security": Security()})
 
 
-def test_a_sweep_that_delivers_what_matters_is_the_run_that_delivers_all() -> None:
+def test_omitted_deliveries_change_no_secured_agent() -> None:
     request = secured(scenario(network={"loss": 0.2}, timeline=[{"at_s": 300, "partition": [[1, 2]]}], duration_s=600))
     sweep, whole = simulate(request, 3), simulate(request, 3, deliver_all=True)
     assert sweep.result.chains == whole.result.chains
     assert sweep.played.agents == whole.played.agents
 
 
-def test_a_secured_mission_is_judged_as_a_plain_one() -> None:
+def test_secured_mission_is_judged_like_a_plain_one() -> None:
     judged = simulate(secured(scenario(network={"loss": 0.1}, duration_s=300)), 2, tracing=True)
     assert judged.result.characteristics["1"].kind == "good"
     assert not judged.result.bad
     assert not dropped(judged)
 
 
-def test_what_comes_twice_is_a_replay_and_on_record() -> None:
+def test_duplicate_datagram_is_recorded_as_a_replay() -> None:
     judged = simulate(secured(scenario(network={"duplicate": 0.5}, duration_s=300)), 2, tracing=True)
     assert not judged.result.bad
     assert dropped(judged) == {"replayed"}
 
 
-def test_who_has_no_keys_forges_nothing() -> None:
+def test_rogue_node_without_keys_has_no_effect() -> None:
     rogue = load_scenario(SCENARIOS / "rogue.yaml")
     assert simulate(rogue, 1, tracing=True).result.bad
     judged = simulate(secured(rogue), 1, tracing=True)
     assert not judged.result.bad
 
 
-def test_a_capture_shows_who_said_what_kind_of_thing_and_agrees_with_the_traces(tmp_path: Path) -> None:
+def test_capture_shows_senders_and_types_of_sealed_messages(tmp_path: Path) -> None:
     request = secured(scenario(duration_s=200, capture=True, events={"mean_s": 5}))
     finished = run(request, 1, tmp_path / "run", Silent(), "sim")
     assert not finished.result.bad

@@ -1,4 +1,4 @@
-"""The library plays secured as it does plain, and where it does not, that is told."""
+"""The library scenarios give the same chains with and without keys, and the program reports any difference."""
 
 import sys
 from pathlib import Path
@@ -16,25 +16,25 @@ def test_scenarios_of_every_kind_have_the_same_chains_with_keys() -> None:
         all_of(["attrition", "late_joiner", "loss_30", "revoked_in_partition", "rolling_partitions", "secure"])
     )
     assert compare(asked, range(1, 2), 1) == {}
-    told = {name: without for name, _, without in asked if without}
-    assert told == {
+    exceptions = {name: without for name, _, without in asked if without}
+    assert exceptions == {
         "revoked_in_partition": (secured_library.REVOCATIONS,),
         "secure": (secured_library.INJECTIONS,),
     }
 
 
-def test_a_matrix_is_compared_at_each_of_its_rates() -> None:
+def test_matrix_is_compared_at_each_of_its_rates() -> None:
     names = [name for name, _, _ in all_of(["thesis_matrix"])]
     assert len(names) == 8
     assert names[-1] == "thesis_matrix, loss 1"
 
 
-def test_sealing_is_left_out_as_it_is_in_the_hashes() -> None:
+def test_sealing_is_left_out_because_it_changes_hashes() -> None:
     sealing = scenario(security={"seal": True})
     assert in_both("mine", sealing).without == (secured_library.SEALING,)
 
 
-def test_where_chains_differ_the_scenario_is_named_and_the_status_is_1(
+def test_different_chains_give_the_scenario_and_status_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mine = tmp_path / "mine.yaml"
@@ -43,12 +43,12 @@ def test_where_chains_differ_the_scenario_is_named_and_the_status_is_1(
     monkeypatch.setattr(Scenario, "secured", lambda it: secured(it.model_copy(update={"duration_s": 60})))
     monkeypatch.setattr(sys, "argv", ["secured_library", "--seeds", "2", "--jobs", "1", str(mine)])
     assert main() == 1
-    said = capsys.readouterr().out
-    assert f"{mine} different\n    seed 1: agent 1 has other blocks from block" in said
-    assert "1 scenarios with 2 seeds, 1 different" in said
+    output = capsys.readouterr().out
+    assert f"{mine} different\n    seed 1: agent 1 has other blocks from block" in output
+    assert "1 scenarios with 2 seeds, 1 different" in output
 
 
-def test_a_file_that_is_no_scenario_is_one_sentence(
+def test_invalid_scenario_file_is_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["secured_library", str(tmp_path / "nothing.yaml")])

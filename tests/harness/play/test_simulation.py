@@ -1,4 +1,4 @@
-"""The simulation: the same seed gives the same run, on any machine, whatever is delivered or traced."""
+"""The simulation is deterministic. Tracing and omitted deliveries do not change a run."""
 
 import hashlib
 import json
@@ -28,7 +28,7 @@ from ucp.trace import HandlerRun
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 
-NOTHING_CAME_OF_IT = {
+WITHOUT_EFFECT = {
     "reconcile in progress",
     "no vote running",
     "another block",
@@ -42,11 +42,11 @@ NOTHING_CAME_OF_IT = {
     "another chain",
     "not held",
 }
-"""Branches that a message takes when it changes nothing."""
+"""Branches of messages that change no agent."""
 
 
-def left_behind(simulated: Simulated) -> dict[str, Any]:
-    """Exports and figures: all that a run gives but its traces, and how many handler runs are in them."""
+def results_of(simulated: Simulated) -> dict[str, Any]:
+    """Return the results of a run except its traces and their numbers of handler runs."""
     exports = {agent_id: export.model_dump() for agent_id, export in simulated.evidence.exports.items()}
     agents = {
         agent_id: {name: value for name, value in agent.items() if name != "handler_runs"}
@@ -59,7 +59,7 @@ def left_behind(simulated: Simulated) -> dict[str, Any]:
 def effective_runs(simulated: Simulated) -> dict[int, list[str]]:
     return {
         agent_id: [
-            run.to_line() for run in trace.runs if run.trigger.kind != "message" or run.branch not in NOTHING_CAME_OF_IT
+            run.to_line() for run in trace.runs if run.trigger.kind != "message" or run.branch not in WITHOUT_EFFECT
         ]
         for agent_id, trace in simulated.evidence.traces.items()
     }
@@ -122,7 +122,7 @@ def playable(timeline: list[dict[str, Any]]) -> bool:
     final_reconcile=st.booleans(),
     seed=st.integers(0, 1000),
 )
-def test_what_is_not_delivered_would_have_changed_nothing(
+def test_omitted_deliveries_change_no_agent(
     network: dict[str, Any],
     timeline: list[dict[str, Any]],
     schedule: list[dict[str, Any]],
@@ -144,43 +144,43 @@ def test_what_is_not_delivered_would_have_changed_nothing(
         settle={"limit_s": 300},
         final_reconcile=final_reconcile,
     )
-    needed, all_ = simulate(one, seed, tracing=True), simulate(one, seed, tracing=True, deliver_all=True)
-    assert left_behind(needed) == left_behind(all_)
-    assert effective_runs(needed) == effective_runs(all_)
-    assert left_behind(simulate(one, seed)) == left_behind(needed)
+    fast, all_ = simulate(one, seed, tracing=True), simulate(one, seed, tracing=True, deliver_all=True)
+    assert results_of(fast) == results_of(all_)
+    assert effective_runs(fast) == effective_runs(all_)
+    assert results_of(simulate(one, seed)) == results_of(fast)
 
 
 @pytest.mark.parametrize("quirk", ["vote_while_reconciling", "count_phase1_of_others"])
-def test_a_wrong_agent_hears_what_cannot_matter_to_a_right_one(quirk: str) -> None:
-    """One that answers while it reconciles, and one that counts answers to the questions of others."""
+def test_wrong_agents_receive_all_messages(quirk: str) -> None:
+    """One agent answers during a reconcile. The other counts answers to queries of other agents."""
     right = scenario(network={"loss": 0.2})
     wrong = scenario(network={"loss": 0.2}, quirks={quirk: True})
-    unasked = left_behind(simulate(wrong, 1))
-    assert unasked == left_behind(simulate(wrong, 1, deliver_all=True))
-    assert unasked != left_behind(simulate(right, 1))
+    default = results_of(simulate(wrong, 1))
+    assert default == results_of(simulate(wrong, 1, deliver_all=True))
+    assert default != results_of(simulate(right, 1))
     off = scenario(network={"loss": 0.2}, quirks={quirk: False})
     assert digest(simulate(off, 1, tracing=True)) == digest(simulate(right, 1, tracing=True))
 
 
-def test_a_quirk_of_some_agents_is_theirs_alone() -> None:
-    """Who is not named is right, and so is everybody where nobody is left who is wrong."""
+def test_quirk_affects_only_the_named_agents() -> None:
+    """Agents without the quirk are correct. A quirk with the value false has no effect."""
     some = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": {"agents": [2, 3]}})
     assert some.quirks_of(2) == {"vote_while_reconciling": True} and some.quirks_of(1) == {}
     steps = simulate(some, 1, tracing=True).result.beside["steps"]
     assert steps.verdict == "deviates" and {finding.agent_id for finding in steps.evidence} <= {2, 3}
-    everybody = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": {"agents": [1, 2, 3, 4, 5]}})
+    all_named = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": {"agents": [1, 2, 3, 4, 5]}})
     alike = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": True})
-    assert digest(simulate(everybody, 1, tracing=True)) == digest(simulate(alike, 1, tracing=True))
-    nobody = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": {"agents": [2], "value": False}})
+    assert digest(simulate(all_named, 1, tracing=True)) == digest(simulate(alike, 1, tracing=True))
+    switched_off = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": {"agents": [2], "value": False}})
     right = scenario(network={"loss": 0.2})
-    assert digest(simulate(nobody, 1, tracing=True)) == digest(simulate(right, 1, tracing=True))
+    assert digest(simulate(switched_off, 1, tracing=True)) == digest(simulate(right, 1, tracing=True))
 
 
-def test_nor_where_flight_makes_the_network() -> None:
+def test_omitted_deliveries_change_no_agent_during_flight() -> None:
     one = load_scenario(SCENARIOS / "split_rejoin.yaml")
-    needed, all_ = simulate(one, 1, tracing=True), simulate(one, 1, tracing=True, deliver_all=True)
-    assert left_behind(needed) == left_behind(all_)
-    assert effective_runs(needed) == effective_runs(all_)
+    fast, all_ = simulate(one, 1, tracing=True), simulate(one, 1, tracing=True, deliver_all=True)
+    assert results_of(fast) == results_of(all_)
+    assert effective_runs(fast) == effective_runs(all_)
 
 
 def version_1(run: HandlerRun) -> str:
@@ -193,8 +193,8 @@ def version_1(run: HandlerRun) -> str:
 
 
 def digest(simulated: Simulated) -> str:
-    """Of exports, traces and figures; of traces what version 1 had, with which the digests were taken."""
-    document = left_behind(simulated)
+    """Return a digest of exports, figures and traces. It covers the keys of version 1 of the trace format."""
+    document = results_of(simulated)
     del document["played"]
     traces = [version_1(run) for _, trace in sorted(simulated.evidence.traces.items()) for run in trace.runs]
     return hashlib.sha256(json.dumps([document, traces], sort_keys=True).encode()).hexdigest()[:16]
@@ -221,13 +221,13 @@ BURSTS = {
         ("bursts", 1, "c096a7b164a7bf65"),
     ],
 )
-def test_a_seed_means_the_same_run_on_every_machine(name: str, seed: int, expected: str) -> None:
-    """A digest that changes says that old seeds no longer reproduce old runs: change it knowingly."""
+def test_seed_gives_the_same_run_on_every_machine(name: str, seed: int, expected: str) -> None:
+    """A changed digest means that old seeds no longer reproduce old runs. The commit must explain it."""
     one = scenario(network=BURSTS, duration_s=600) if name == "bursts" else load_scenario(SCENARIOS / name)
     assert digest(simulate(one, seed, tracing=True)) == expected
 
 
-def test_under_a_rate_a_message_takes_as_long_as_its_frame() -> None:
+def test_message_on_a_link_with_a_rate_takes_the_time_of_its_frame() -> None:
     traces = simulate(scenario(network={"rate": 9600}, duration_s=300), 1, tracing=True).evidence.traces
     sent_at = {(agent, sent.seq): run.t for agent, trace in traces.items() for run in trace.runs for sent in run.sent}
     triggers = [(run.t, run.trigger.to_json()) for trace in traces.values() for run in trace.runs]
@@ -239,18 +239,18 @@ def test_under_a_rate_a_message_takes_as_long_as_its_frame() -> None:
         assert at - sent_at[int(sent_by), int(sequence)] == pytest.approx(frame_bytes * 8 / 9600, abs=1e-9)
 
 
-def test_chains_that_differ_never_became_one() -> None:
+def test_uniform_time_is_none_if_chains_differ() -> None:
     assert simulate(scenario(network={"loss": 1.0}), 1).result.figures["uniform_at_s"] is None
     assert simulate(scenario(), 1).result.figures["uniform_at_s"]
 
 
-def test_another_seed_is_another_run() -> None:
+def test_other_seed_gives_another_run() -> None:
     one = scenario(duration_s=300)
     assert digest(simulate(one, 1)) == digest(simulate(one, 1)) != digest(simulate(one, 2))
 
 
-def test_adding_loss_leaves_the_events_as_they_are() -> None:
-    """One random stream per concern."""
+def test_added_loss_does_not_change_the_events() -> None:
+    """Events and losses have separate random streams."""
 
     def completed(**network: Any) -> list[list[str]]:
         exports = simulate(scenario(network=network), 5).evidence.exports.values()
@@ -259,7 +259,7 @@ def test_adding_loss_leaves_the_events_as_they_are() -> None:
     assert completed() == completed(loss=0.3) == completed(loss=0.3, duplicate=0.2)
 
 
-def test_a_run_directory_says_what_a_simulation_in_memory_says(tmp_path: Path) -> None:
+def test_run_directory_equals_the_simulation_in_memory(tmp_path: Path) -> None:
     one = load_scenario(SCENARIOS / "loss_15.yaml")
     finished = run(one, 3, tmp_path / "run", Silent(), "sim")
     in_memory = simulate(one, 3, tracing=True)
@@ -276,7 +276,7 @@ def test_a_run_directory_says_what_a_simulation_in_memory_says(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*[!x].yaml")), ids=lambda path: path.stem)
-def test_every_scenario_that_runs_as_processes_runs_in_virtual_time(path: Path) -> None:
+def test_every_scenario_runs_in_virtual_time(path: Path) -> None:
     simulated = simulate(load_scenario(path), 1, tracing=True)
     assert simulated.played.settled == (path.stem not in LIVELOCKS)
     found = (*LIVELOCKS, "rogue", "captured", "missed_commit", "field_test_2020")
@@ -295,7 +295,7 @@ def test_every_scenario_that_runs_as_processes_runs_in_virtual_time(path: Path) 
         ),
     ],
 )
-def test_what_virtual_time_cannot_give_is_refused_by_its_keys(keys: dict[str, Any], sentence: str) -> None:
+def test_keys_that_need_processes_are_refused_in_virtual_time(keys: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ScenarioError, match=sentence):
         simulate(scenario(**keys), 1)
 
@@ -313,7 +313,7 @@ def test_what_virtual_time_cannot_give_is_refused_by_its_keys(keys: dict[str, An
         ),
     ],
 )
-def test_what_processes_cannot_be_given_yet_is_refused_by_its_keys(
+def test_keys_that_need_virtual_time_are_refused_for_processes(
     tmp_path: Path, keys: dict[str, Any], named: str
 ) -> None:
     with pytest.raises(ScenarioError, match=f"{named} virtual time: use --backend sim"):
@@ -322,7 +322,7 @@ def test_what_processes_cannot_be_given_yet_is_refused_by_its_keys(
 
 
 @pytest.mark.lab
-def test_what_this_machine_cannot_do_to_packets_is_refused_with_the_way_out(tmp_path: Path) -> None:
+def test_conditions_without_an_engine_are_refused_with_a_solution(tmp_path: Path) -> None:
     require(None)
     if unavailable("netem") is None:
         pytest.skip("this kernel has netem")
@@ -333,12 +333,12 @@ def test_what_this_machine_cannot_do_to_packets_is_refused_with_the_way_out(tmp_
     assert not (tmp_path / "run").exists()
 
 
-def test_conditions_that_mean_nothing_at_the_speedup_are_refused(tmp_path: Path) -> None:
+def test_conditions_impossible_at_the_speedup_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match=r"`network` at `speedup` 0\.5: delay\.mean_s: 100\.0 is out of range"):
         run(scenario(network={"delay": 50}, speedup=0.5), 1, tmp_path / "run", Silent(), "process")
 
 
-def test_ctrl_c_ends_a_long_simulation_with_everything_kept(tmp_path: Path) -> None:
+def test_ctrl_c_ends_a_simulation_and_keeps_its_results(tmp_path: Path) -> None:
     keys = {"agents": 40, "network": {"loss": 0.3}, "events": {"source": "random"}}
     running = Running(write_scenario(tmp_path, duration_s=50_000, **keys), tmp_path / "run", "--backend", "sim")
     running.wait_for_mission(1)

@@ -42,7 +42,7 @@ def write_flight(run_dir: Path, scenario: Scenario, ways: Mapping[int, Way], sec
         while changes and changes[0].at_s <= at_s:
             change = changes.pop(0)
             if isinstance(change, NetworkChange):
-                asked = reach.ask(change)
+                asked = reach.change_timeline(change)
                 lines.append({**asked.to_json(change.at_s), "asked": change.conditions.to_json()})
             else:
                 lines.append(change.to_json(change.at_s))

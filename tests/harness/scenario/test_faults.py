@@ -74,13 +74,13 @@ def test_restarted_agent_receives_no_message_sent_before_its_start() -> None:
     heard = [run.t for run in simulated.evidence.traces[2].runs if run.trigger.kind == "message"]
     assert not [t for t in heard if 300 < t < 311]
     assert [t for t in heard if t < 300 or t > 311]
-    assert agent_seed(4, 2) != agent_seed(4, 2, life=2)
+    assert agent_seed(4, 2) != agent_seed(4, 2, incarnation=2)
 
 
 def test_restarted_agent_logs_no_event_of_its_first_incarnation() -> None:
     """The events that its first incarnation had yet to log are lost."""
     simulated = played([{"at_s": 300, "kill": [2]}, {"at_s": 300.5, "restart": [2]}])
-    source = RandomEvents(Random(agent_seed(4, 2, life=2)), mean_s=10)
+    source = RandomEvents(Random(agent_seed(4, 2, incarnation=2)), mean_s=10)
     expected = [t for t in (300.5 + source.next()[0] for _ in range(100)) if t <= 600]
     assert [
         run.t for run in simulated.evidence.traces[2].runs if run.t > 300 and run.trigger.kind == "event"

@@ -2,6 +2,6 @@
 
 `_virtual_program` starts a program and exchanges lines with it, within a limit of wall time. `_answer` parses an
 answer. `_foreign_agent` lets the simulation drive one incarnation as it drives its own agents, and `_foreign_secured`
-does so with keys. `_foreigners` chooses the program of each agent. `determinism` gives every incarnation its inputs
+does so with keys. `_foreign_swarm` chooses the program of each agent. `determinism` gives every incarnation its inputs
 again in another process, and compares the answers.
 """

@@ -1,4 +1,4 @@
-"""An answer of an agent in virtual time, and how such an agent fails."""
+"""The parser of an answer of a foreign agent, and the errors of such an agent."""
 
 import base64
 import math
@@ -15,36 +15,39 @@ from ucp.messages import Datagram, MalformedDatagramError, decode
 from ucp.trace import Entry, HandlerRun, Recorded
 
 MAX_SENT = 1000
-"""No input makes an agent broadcast more."""
+"""Maximum number of datagrams in one answer."""
 MAX_UDP_BYTES = 65507
 LATEST_S = 1e12
 SHOWN = 60
 
 
 class AnswerError(Exception):
-    """A line that is no answer: why, in words that follow "agent 3 answered"."""
+    """A line that is not a valid answer. The message completes a sentence that starts with "agent 3 answered"."""
 
 
 class LacksError(Exception):
-    """The agent says that it lacks what it was asked for: its sentence."""
+    """The agent does not support the input. The message is the agent's sentence."""
 
 
 class RefusedError(Exception):
-    """The agent says that it cannot take the line: its sentence."""
+    """The agent refuses the input. The message is the agent's sentence."""
 
 
 @dataclass(slots=True)
 class Answer:
-    """`sent` are datagrams as they are, and with what they say if they are messages."""
+    """A valid answer of an agent."""
 
     sent: list[tuple[bytes, Recorded]]
+    """Datagrams, each with its record, which contains the message if the datagram is one."""
     timer: float | None
+    """Time of the next end of a timer, by the agent's clock."""
     trace: list[Entry] = field(default_factory=list)
-    told: Any = None
+    command_answer: Any = None
+    """The answer to a command. The parser does not check it."""
 
 
 def read_answer(line: bytes, *, tracing: bool) -> Answer:
-    """Raises AnswerError, LacksError or RefusedError."""
+    """Parse a line. Raises AnswerError, LacksError or RefusedError."""
     try:
         said = from_json(line, allow_inf_nan=False)
     except ValueError as error:
@@ -63,7 +66,7 @@ def read_answer(line: bytes, *, tracing: bool) -> Answer:
     if timer is not None and (type(timer) not in (int, float) or not -LATEST_S <= timer <= LATEST_S):
         what = f"with the timer {shown(timer)}, not" if "timer" in said else "without"
         raise AnswerError(f"{what} a number of mission seconds, or null, as `timer`")
-    answer = Answer([_datagram(text) for text in sent], timer, told=said.get("answer"))
+    answer = Answer([_datagram(text) for text in sent], timer, command_answer=said.get("answer"))
     if tracing:
         trace = said.get("trace")
         if not isinstance(trace, list):
@@ -88,7 +91,7 @@ def _datagram(text: Any) -> tuple[bytes, Recorded]:
 
 
 def _entries(trace: list[Any]) -> Iterable[Entry]:
-    """The lines of a trace but for its header, which is known."""
+    """Yield the lines of a trace without its header, which the harness knows."""
     for number, line in enumerate(trace):
         if isinstance(line, dict) and "schema" in line:
             continue
@@ -106,7 +109,7 @@ def _entries(trace: list[Any]) -> Iterable[Entry]:
 
 
 def shown(value: Any) -> str:
-    """As much of something that an agent said as a sentence can hold."""
+    """Return the start of a value from an agent, for an error message."""
     text = value.decode(errors="replace").strip() if isinstance(value, bytes) else str(value)
     return repr(text[:SHOWN] + ("..." if len(text) > SHOWN else ""))
 
@@ -115,7 +118,7 @@ Outcome = Literal["crashed", "hung", "not supported"]
 
 
 class AgentLacksError(UnsupportedError):
-    """An agent says that it lacks what this mission needs, or cannot be driven in virtual time."""
+    """An agent does not support the mission or virtual time."""
 
     outcome: Outcome = "not supported"
 

@@ -1,8 +1,8 @@
-"""One life of an agent that is not ours, in virtual time: the same face as `OwnAgent`, and a program behind it.
+"""One incarnation of a foreign agent in virtual time. It has the interface of `OwnAgent`, and a program behind it.
 
-Every input is a line to the program, and its answer tells all that one may know: what it sends, when its next timer
-ends, what its trace says. What it holds it is asked for, by the commands of the control socket; these are the harness's
-own questions, and no part of the mission: what the agent's trace says of them is left out.
+The harness writes each input to the program as a line. The answer contains the datagrams that the agent sends, the end
+of its next timer, and the lines of its trace. The harness asks for the agent's state with the commands of the control
+socket. These commands are not part of the mission, so their lines of the trace are discarded.
 """
 
 import json
@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from harness.archive.exports import Export
 from harness.errors import AgentFailedError
 from harness.play.agent_control import Status, is_shell_error, last_line
-from harness.play.simulation._simulated_agent import Outgoing, Stored
+from harness.play.simulation._simulated_agent import AgentOutput, DiskContents
 from harness.play.simulation.foreign._answer import (
     AgentLacksError,
     Answer,
@@ -25,43 +25,43 @@ from harness.play.simulation.foreign._answer import (
     RefusedError,
     read_answer,
 )
-from harness.play.simulation.foreign._virtual_program import Program, ProgramFailedError
+from harness.play.simulation.foreign._virtual_program import LineProgram, ProgramFailedError
 from ucp.events import LoggableEvent
 from ucp.messages import Datagram, Message
 from ucp.settings import Settings
 from ucp.trace import Entry, HandlerRun, Recorded, in_base64
 
 MAX_TIMERS_PER_S = 10_000
-"""An agent whose timers end more often in a mission second, or in one instant, hangs."""
+"""Maximum number of ends of timers in a mission second. An agent with more of them counts as hung."""
 MAX_SENT_PER_S = 5000
-"""Datagrams in a mission second: more are a storm, which feeds itself where others answer."""
+"""Maximum number of datagrams in a mission second. More datagrams, and the answers to them, would grow without end."""
 ROUNDED_S = 2e-6
-"""The times of a trace have six digits after the point."""
+"""Tolerance for times of a trace, which have six decimal places."""
 NO_VIRTUAL_TIME = (2, 127)
-"""Exit statuses of agents that take `--virtual` for a mission file that is wrong, or say that they lack it."""
+"""Exit statuses of agents without virtual time. They take `--virtual` for a mission file (2), or refuse it (127)."""
 
 
-class _PerSecond:
-    """How many of something there were in this mission second."""
+class _CounterPerSecond:
+    """A counter for the current mission second."""
 
     def __init__(self) -> None:
         self._second = self._count = 0
 
     def add(self, count: int, now: float) -> int:
-        """How many there are by now, with these."""
+        """Add `count`, and return the count of the mission second `now`."""
         self._count = count + (self._count if self._second == int(now) else 0)
         self._second = int(now)
         return self._count
 
 
 @dataclass
-class LifeRecord:
-    """What an agent was given in one life, and what it answered, in lines: the first `limit` bytes of it."""
+class IncarnationRecord:
+    """The inputs and answers of one incarnation as lines. After `limit` bytes, no further lines are recorded."""
 
     agent_id: int
     command: tuple[str, ...]
     after_another: bool
-    """Its process had played another life before."""
+    """True if the process had played another incarnation before."""
     limit: int
     exchanges: list[tuple[bytes, bytes]] = field(default_factory=list)
     length: int = 0
@@ -73,9 +73,9 @@ class LifeRecord:
 
 
 class ForeignAgent:
-    """The agent of a `mission` (`ucp-mission/1`), played by `program`. Raises AgentFailedError, AgentLacksError.
+    """One incarnation of a foreign agent, which implements `VirtualAgent`.
 
-    With a `store` it boots from that: (what an earlier life answered,). `handed` is what it is told of its keys.
+    The methods raise AgentFailedError or AgentLacksError. After a failure, each input raises the same error again.
     """
 
     def __init__(
@@ -83,43 +83,52 @@ class ForeignAgent:
         mission: dict[str, Any],
         initial_data: bytes,
         settings: Settings,
-        program: Program,
+        program: LineProgram,
         now: float,
         *,
         tracing: bool,
-        store: Stored | None = None,
-        handed: Mapping[str, Any] | None = None,
+        store: DiskContents | None = None,
+        key_fields: Mapping[str, Any] | None = None,
         record_bytes: int,
     ) -> None:
+        """Start the incarnation.
+
+        - `mission`: mission file (`ucp-mission/1`).
+        - `store`: contents of the disk with which the agent boots.
+        - `key_fields`: keys of the agent in a secured mission.
+        - `record_bytes`: maximum size of `record`.
+        """
         self.agent_id: int = mission["agent_id"]
         self.roster: frozenset[int] = frozenset(mission["roster"])
         self.initial_data = initial_data
         self.settings = settings
         self.messages_sent = 0
         self.chain_changed_at: float | None = 0.0 if tracing else None
-        self.record = LifeRecord(self.agent_id, program.command, after_another=not program.is_new, limit=record_bytes)
+        self.record = IncarnationRecord(
+            self.agent_id, program.command, after_another=not program.is_new, limit=record_bytes
+        )
         self.failed: AgentFailedError | AgentLacksError | None = None
         self._program = program
         self._tracing = tracing
         self._now = now
         self._timer: float | None = None
-        self._timers_ended, self._datagrams_sent = _PerSecond(), _PerSecond()
+        self._timers_ended, self._datagrams_sent = _CounterPerSecond(), _CounterPerSecond()
         self._sent: list[tuple[bytes, Recorded]] = []
         self._trace: list[Entry] = []
         self._completed: list[bytes] | None = [] if tracing else None
-        """None if it has to be asked for."""
+        """Hashes of the completed blocks from the trace. None without a trace."""
         self._status: Status | None = None
-        """None if it may be another by now."""
+        """The current status. None if it is unknown, because an input may have changed it."""
         self._export: dict[str, Any] | None = None
-        """What it left."""
+        """The export at the end of the incarnation."""
         first = {
             "t": float(now),
             "mission": mission,
             "trace": tracing,
             **({"store": store[0]} if isinstance(store, tuple) else {}),
-            **(handed or {}),
+            **(key_fields or {}),
         }
-        self._give(json.dumps(first, separators=(",", ":")), "its mission", now)
+        self._give_input(json.dumps(first, separators=(",", ":")), "its mission", now)
 
     # Inputs
 
@@ -132,33 +141,35 @@ class ForeignAgent:
         self._receive(in_base64(data), now)
 
     def _receive(self, text: str, now: float) -> None:
-        self._give(f'{{"t":{self._at(now)},"datagram":"{text}"}}', "a datagram", now)
+        self._give_input(f'{{"t":{self._time_text(now)},"datagram":"{text}"}}', "a datagram", now)
 
     def add_event(self, event: LoggableEvent, now: float) -> None:
         event_of = f'"event_id":{event.event_id},"data":"{in_base64(event.data)}","timestamp_us":{event.timestamp_us}'
-        self._give(f'{{"t":{self._at(now)},{event_of}}}', "an event", now)
+        self._give_input(f'{{"t":{self._time_text(now)},{event_of}}}', "an event", now)
 
     def handle_timer(self, now: float) -> None:
         if self._timers_ended.add(1, now) > MAX_TIMERS_PER_S:
             raise self._failure("hung", f"has a timer that expires again and again at {now:g} s")
-        self._give(f'{{"t":{self._at(now)},"timer":true}}', "the expiry of its timer", now)
+        self._give_input(f'{{"t":{self._time_text(now)},"timer":true}}', "the expiry of its timer", now)
 
     def begin_reconcile(self, now: float) -> None:
-        told = self._give(f'{{"t":{self._at(now)},"command":"reconcile"}}', "the command reconcile", now).told
-        self._accepted("reconcile", told)
+        command_answer = self._give_input(
+            f'{{"t":{self._time_text(now)},"command":"reconcile"}}', "the command reconcile", now
+        ).command_answer
+        self._checked_answer("reconcile", command_answer)
 
-    # What comes of them
+    # Outputs
 
     def next_timer(self) -> float | None:
         return self._timer
 
     def answers_nobody_until(self) -> float | None:
-        """Nobody knows."""
+        """Return None, because the state of a foreign agent is unknown."""
         return None
 
-    def outgoing(self) -> Sequence[Outgoing]:
+    def outgoing(self) -> Sequence[AgentOutput]:
         sent, self._sent = self._sent, []
-        outgoing: list[Outgoing] = []
+        outgoing: list[AgentOutput] = []
         for _, datagram in sent:
             said = datagram.content
             if isinstance(said, Datagram) and said.sender == self.agent_id:
@@ -171,13 +182,13 @@ class ForeignAgent:
         trace, self._trace = self._trace, []
         return trace
 
-    # What it says of itself
+    # Queries about the agent
 
     def status(self) -> Status:
         if self._status is None:
-            told = self._ask("status", self._now)
+            command_answer = self._ask("status", self._now)
             try:
-                self._status = Status.model_validate(told)
+                self._status = Status.model_validate(command_answer)
             except ValidationError as error:
                 raise self._failure(
                     "crashed", f"answered to the command status without a proper {_where(error)}"
@@ -199,7 +210,7 @@ class ForeignAgent:
         return self._export if self._export is not None else self._ask_for_export(now)
 
     def _ask_for_export(self, now: float) -> dict[str, Any]:
-        """Its export, which is one."""
+        """Request the export, and check that it is one of this agent and mission."""
         export = self._ask("export", now)
         try:
             read = Export.model_validate(export)
@@ -211,43 +222,43 @@ class ForeignAgent:
             raise self._failure("crashed", "answered to the command export with the chain of another mission")
         return export
 
-    def stored(self, now: float) -> Stored:
-        told = self._ask("store", now)
-        if "store" not in told:
+    def stored(self, now: float) -> DiskContents:
+        command_answer = self._ask("store", now)
+        if "store" not in command_answer:
             raise self._failure("crashed", "answered to the command store without `store`")
-        return (told["store"],)
+        return (command_answer["store"],)
 
-    def leave(self, now: float) -> None:
+    def end(self, now: float) -> None:
         if self._export is None and self.failed is None:
             self.status()
             self._export = self._ask_for_export(now)
 
     # Lines
 
-    def _at(self, now: float) -> str:
-        """The time of an input: rounding may make the next one a hair earlier than the last."""
+    def _time_text(self, now: float) -> str:
+        """Return the time of an input as text. Rounding must not make it earlier than that of the previous input."""
         return repr(float(max(now, self._now)))
 
     def _ask(self, command: str, now: float) -> dict[str, Any]:
-        """Something about itself, which changes nothing. Raises HarnessError."""
+        """Send a command that must not change the agent, and return its answer."""
         timer = self._timer
-        answer = self._exchange(f'{{"t":{self._at(now)},"command":"{command}"}}', f"the command {command}", now)
+        answer = self._exchange(f'{{"t":{self._time_text(now)},"command":"{command}"}}', f"the command {command}", now)
         if answer.sent or answer.timer != timer or any(isinstance(entry, HandlerRun) for entry in answer.trace):
             raise self._failure("crashed", f"did not only answer the command {command}")
-        return self._accepted(command, answer.told)
+        return self._checked_answer(command, answer.command_answer)
 
-    def _accepted(self, command: str, told: Any) -> dict[str, Any]:
-        if not isinstance(told, dict):
+    def _checked_answer(self, command: str, command_answer: Any) -> dict[str, Any]:
+        if not isinstance(command_answer, dict):
             raise self._failure("crashed", f"gave no `answer` to the command {command}")
-        if told.get("ok") is False:
-            error = str(told.get("error", "no reason given"))
-            if told.get("unsupported") is True:
-                raise self._lacks(f"refused the command {command}: {last_line(error)}")
+        if command_answer.get("ok") is False:
+            error = str(command_answer.get("error", "no reason given"))
+            if command_answer.get("unsupported") is True:
+                raise self._lacks_error(f"refused the command {command}: {last_line(error)}")
             raise self._failure("crashed", f"refused to {command}: {last_line(error)}")
-        return told
+        return command_answer
 
-    def _give(self, line: str, what: str, now: float) -> Answer:
-        """An input, of which may come whatever it likes; nothing does of one over which it fails."""
+    def _give_input(self, line: str, what: str, now: float) -> Answer:
+        """Give an input to the agent, and take over all outputs. An input on which the agent fails has no outputs."""
         answer = self._exchange(line, what, now)
         if self._datagrams_sent.add(len(answer.sent), now) > MAX_SENT_PER_S:
             raise self._failure("crashed", f"sent more than {MAX_SENT_PER_S} datagrams within mission second {now:.0f}")
@@ -274,12 +285,12 @@ class ForeignAgent:
             answer = read_answer(said, tracing=self._tracing)
         except ProgramFailedError as error:
             if error.status in NO_VIRTUAL_TIME and not self.record.exchanges:
-                raise self._has_no_virtual_time(error.status) from None
+                raise self._start_error(error.status) from None
             raise self._failure(error.outcome, f"{error} when it was given {what} at {now:g} s") from None
         except AnswerError as error:
             raise self._failure("crashed", f"answered {what} at {now:g} s {error}") from None
         except LacksError as error:
-            raise self._lacks(last_line(str(error))) from None
+            raise self._lacks_error(last_line(str(error))) from None
         except RefusedError as error:
             raise self._failure("crashed", f"refused {what} at {now:g} s: {last_line(str(error))}") from None
         self.record.add(given, said)
@@ -287,7 +298,7 @@ class ForeignAgent:
         return answer
 
     def _check(self, entries: list[Entry]) -> list[bytes]:
-        """Hashes of the blocks that were completed, as the trace says it. Raises AgentFailedError."""
+        """Check the times of the trace, and return the hashes of the blocks that it reports as completed."""
         for entry in entries:
             if not abs(entry.t - self._now) <= ROUNDED_S:
                 raise self._failure("crashed", f"wrote t={entry.t!r} into its trace of an input at {self._now:g} s")
@@ -297,31 +308,31 @@ class ForeignAgent:
             raise self._failure("crashed", "completed a block whose hash in its trace is none") from None
 
     def _failure(self, outcome: Outcome, detail: str) -> AgentFailedError:
-        self.failed = AgentFailedError(self.agent_id, outcome, f"{detail}{self._program.where_it_logs()}")
-        self._program.owes_an_answer = True  # nobody knows what it will say next
+        self.failed = AgentFailedError(self.agent_id, outcome, f"{detail}{self._program.log_phrase()}")
+        self._program.owes_an_answer = True  # the next lines of the program are unpredictable
         return self.failed
 
-    def _lacks(self, words: str) -> AgentLacksError:
+    def _lacks_error(self, words: str) -> AgentLacksError:
         self.failed = AgentLacksError(self.agent_id, self._program.command, words)
         self._program.owes_an_answer = True
         return self.failed
 
-    def _has_no_virtual_time(self, status: int) -> AgentFailedError | AgentLacksError:
-        """It ended before it said anything."""
+    def _start_error(self, status: int) -> AgentFailedError | AgentLacksError:
+        """Return the error for a program that ended before its first answer."""
         words = self._program.last_line()
         if is_shell_error(words):
             return self._failure("crashed", f"ended by itself with status {status} ({words})")
-        return self._lacks(
+        return self._lacks_error(
             f"with --virtual it ends with status {status}{words and ', and says: '}{words}; use --backend process, or "
             "see docs/how-to/simulate-in-virtual-time.md"
         )
 
 
 def _changes(entries: list[Entry]) -> Iterator[tuple[str, str]]:
-    """Operation and block hash."""
+    """Yield operation and block hash of each change in these lines."""
     return (change for entry in entries if isinstance(entry, HandlerRun) for change in entry.changes)
 
 
 def _where(error: ValidationError) -> str:
-    """The first key that is wrong."""
+    """Return the first invalid key."""
     return f"`{'.'.join(str(part) for part in error.errors()[0]['loc'])}`"

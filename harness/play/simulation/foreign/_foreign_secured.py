@@ -1,4 +1,4 @@
-"""An agent of another make with keys: what it sends is opened for the records, and reaches others as it is."""
+"""A foreign agent with keys. The harness opens its datagrams for the records, and delivers them unchanged."""
 
 import re
 from collections.abc import Iterator
@@ -19,7 +19,10 @@ _DIGITS = re.compile("[0-9a-fA-F]{8,}")
 
 
 class SecuredForeignAgent(ForeignAgent):
-    """One that was handed this `bundle`; all other arguments are ForeignAgent's. Its secrets are in no sentence."""
+    """A foreign agent with the keys of `bundle`. The other arguments are those of `ForeignAgent`.
+
+    Error messages do not contain its secrets.
+    """
 
     def __init__(self, bundle: Bundle, *arguments: Any, **options: Any) -> None:
         self._opener = Opener(bundle)
@@ -27,11 +30,13 @@ class SecuredForeignAgent(ForeignAgent):
         super().__init__(*arguments, **options)
 
     def sealed_to_send(self) -> Iterator[OutgoingDatagram]:
-        """What it broadcasts since it was last asked, in order; what nobody can open is no message of its own."""
+        """Yield the datagrams since the previous call, in order. A datagram that cannot be opened has no message."""
         sent, self._sent = self._sent, []
         for data, _ in sent:
             try:
-                self.messages_sent -= read_clear_header(data).type == REVOCATION  # which is none of its messages
+                self.messages_sent -= (
+                    read_clear_header(data).type == REVOCATION
+                )  # a revocation is not a message of the agent
                 opened = self._opener.open(data)
             except MalformedDatagramError:
                 yield OutgoingDatagram(data)
@@ -41,18 +46,18 @@ class SecuredForeignAgent(ForeignAgent):
             yield OutgoingDatagram(data, said.sequence, said.message if is_its_own else None, opened.recorded)
 
     def revoke(self, body: bytes, now: float) -> None:
-        """The authority says whose keys are revoked."""
-        given = f'{{"t":{self._at(now)},"command":"revoke","revocation":"{in_base64(body)}"}}'
-        self._accepted("revoke", self._give(given, "the command revoke", now).told)
+        """Give the agent a revocation by the authority of the keys."""
+        given = f'{{"t":{self._time_text(now)},"command":"revoke","revocation":"{in_base64(body)}"}}'
+        self._checked_answer("revoke", self._give_input(given, "the command revoke", now).command_answer)
 
     def _failure(self, outcome: Outcome, detail: str) -> AgentFailedError:
         return super()._failure(outcome, self._hidden(detail))
 
-    def _lacks(self, words: str) -> AgentLacksError:
-        return super()._lacks(self._hidden(words))
+    def _lacks_error(self, words: str) -> AgentLacksError:
+        return super()._lacks_error(self._hidden(words))
 
     def _hidden(self, words: str) -> str:
-        """Also if a secret is cut off."""
+        """Return the text without secrets and without parts of secrets."""
 
         def shown(digits: re.Match[str]) -> str:
             text = digits[0].lower()

@@ -23,16 +23,16 @@ from threading import Lock
 from typing import IO
 
 from harness.archive.exports import MAX_EXPORT_BYTES
-from harness.play.agent_control import LOOKED_AT_BYTES, last_line, last_line_in
+from harness.play.agent_control import TAIL_BYTES, last_line, last_line_in
 from harness.play.child_processes import ChildProcesses
 from harness.play.simulation.foreign._answer import Outcome
 
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
-"""Wall time after which a program that does not answer counts as hung; the first answer comes after its start."""
+"""Wall time after which a program that does not answer counts as hung. The first answer may take `START_LIMIT_S`."""
 MAX_ANSWER_BYTES = MAX_EXPORT_BYTES
 CHUNK_BYTES = 64 * 1024
-MOMENT_S = 1.0
+END_LIMIT_S = 1.0
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = CDLL(None)
@@ -45,13 +45,14 @@ class ProgramFailedError(Exception):
         super().__init__(what)
         self.outcome: Outcome = outcome
         self.status = status
-        """Its exit status, if it ended by itself."""
+        """Exit status of the program, if it ended by itself."""
 
 
-class Program:
-    """`command` with `--virtual`, started. What it says on standard error goes to `log`, or is kept for a while.
+class LineProgram:
+    """A running program, which was started with `command` and the argument `--virtual`.
 
-    Raises OSError if it cannot be started.
+    Its standard error goes to `log`. Without `log`, it goes to a temporary file that each mission clears. Raises
+    OSError if the program cannot be started.
     """
 
     def __init__(self, command: Sequence[str], log: Path | None = None) -> None:
@@ -59,11 +60,11 @@ class Program:
         self.log = log
         self.owes_an_answer = False
         self._answered = False
-        self._said = b""
+        self._received = b""
         self._processes = ChildProcesses()
         self.left_behind: list[str] = []
-        """Names of the processes that ran on after its end."""
-        self._errors: IO[bytes] = log.open("ab") if log is not None else _passing_file()
+        """Names of the child processes that remained after the program's end."""
+        self._errors: IO[bytes] = log.open("ab") if log is not None else _temporary_file()
         try:
             self._process = subprocess.Popen(
                 [*command, "--virtual"],
@@ -87,7 +88,7 @@ class Program:
 
     @property
     def is_new(self) -> bool:
-        """Whether it has answered nothing yet."""
+        """True if the program has not answered yet."""
         return not self._answered
 
     @property
@@ -96,53 +97,53 @@ class Program:
 
     def tell(self, line: bytes) -> None:
         """Write a line. Raises ProgramFailedError."""
-        if self._said:
-            raise ProgramFailedError("crashed", f"wrote an unexpected line: {_shown(self._said)}")
+        if self._received:
+            raise ProgramFailedError("crashed", f"wrote an unexpected line: {_shown(self._received)}")
         self.owes_an_answer = True
         try:
             written = os.write(self._in, line)
         except BlockingIOError:
             written = 0
         except BrokenPipeError:
-            raise self._ended() from None
+            raise self._end_error() from None
         if written < len(line):
             self._write(memoryview(line)[written:])
 
     def answer(self) -> bytes:
-        """The next line that it says, with its end. Raises ProgramFailedError."""
+        """Read the next line, with its line end. Raises ProgramFailedError."""
         limit_s = ANSWER_LIMIT_S if self._answered else START_LIMIT_S
-        if not self._said:
+        if not self._received:
             if not self._readable.poll(limit_s * 1000):
-                raise _hung(limit_s)
-            self._said = os.read(self._out, CHUNK_BYTES)
-            if not self._said:
-                raise self._ended()
-        end = self._said.find(b"\n") + 1
-        line = self._said[:end] if end else self._long_line(limit_s)
-        self._said = self._said[len(line) :]
+                raise _hung_error(limit_s)
+            self._received = os.read(self._out, CHUNK_BYTES)
+            if not self._received:
+                raise self._end_error()
+        end = self._received.find(b"\n") + 1
+        line = self._received[:end] if end else self._long_line(limit_s)
+        self._received = self._received[len(line) :]
         self._answered, self.owes_an_answer = True, False
         return line
 
     def _long_line(self, limit_s: float) -> bytes:
-        """A line that comes in pieces."""
+        """Read the rest of a line that arrives in pieces, and return the line."""
         deadline = time.monotonic() + limit_s
-        pieces = [self._said]
-        length = len(self._said)
+        pieces = [self._received]
+        length = len(self._received)
         while b"\n" not in pieces[-1]:
             if length > MAX_ANSWER_BYTES:
                 raise ProgramFailedError("crashed", f"answers with a line of more than {MAX_ANSWER_BYTES >> 20} MiB")
             left_s = deadline - time.monotonic()
             if left_s <= 0 or not self._readable.poll(left_s * 1000):
-                raise _hung(limit_s)
+                raise _hung_error(limit_s)
             pieces.append(os.read(self._out, CHUNK_BYTES))
             length += len(pieces[-1])
             if not pieces[-1]:
-                raise self._ended()
-        self._said = b"".join(pieces)
-        return self._said[: self._said.find(b"\n") + 1]
+                raise self._end_error()
+        self._received = b"".join(pieces)
+        return self._received[: self._received.find(b"\n") + 1]
 
     def _write(self, left: memoryview) -> None:
-        """Write what does not fit into the pipe, and hear what it says meanwhile."""
+        """Write the rest of a line when the pipe is full. Read output meanwhile, so that the program can go on."""
         deadline = time.monotonic() + ANSWER_LIMIT_S
         ready = select.poll()
         ready.register(self._in, select.POLLOUT)
@@ -154,84 +155,84 @@ class Program:
                 raise ProgramFailedError("hung", f"did not read its input within {ANSWER_LIMIT_S:g} s")
             if self._out in events:
                 heard = os.read(self._out, CHUNK_BYTES)
-                self._said += heard
-                if not heard or len(self._said) > MAX_ANSWER_BYTES:
-                    raise self._ended() if not heard else ProgramFailedError("crashed", "writes without end")
+                self._received += heard
+                if not heard or len(self._received) > MAX_ANSWER_BYTES:
+                    raise self._end_error() if not heard else ProgramFailedError("crashed", "writes without end")
             if self._in in events:
                 with suppress(BlockingIOError):
                     try:
                         left = left[os.write(self._in, left) :]
                     except BrokenPipeError:
-                        raise self._ended() from None
+                        raise self._end_error() from None
 
-    def _ended(self) -> ProgramFailedError:
+    def _end_error(self) -> ProgramFailedError:
         try:
-            status = self._process.wait(MOMENT_S)
+            status = self._process.wait(END_LIMIT_S)
         except subprocess.TimeoutExpired:
             return ProgramFailedError("crashed", "closed its standard input or output and did not end")
         if status < 0:
             return ProgramFailedError("crashed", f"was ended by {signal.Signals(-status).name}")
         return ProgramFailedError("crashed", f"ended by itself with status {status}", status)
 
-    def where_it_logs(self) -> str:
-        """Where its log is, or what it said last, as the end of a sentence."""
+    def log_phrase(self) -> str:
+        """Return the end of an error message: the path of the log, or the last line of the output."""
         if self.log is not None:
             return f"; its log is {self.log}"
         words = self.last_line()
         return f"; its last output: {words}" if words else ""
 
     def last_line(self) -> str:
-        """What it said last on standard error; empty if nothing."""
+        """Return the last line of standard error. Empty if there is none."""
         if self.log is not None:
             return last_line_in(self.log)
         size = self._errors.seek(0, os.SEEK_END)
-        self._errors.seek(max(0, size - LOOKED_AT_BYTES))
+        self._errors.seek(max(0, size - TAIL_BYTES))
         return last_line(self._errors.read().decode("utf-8", "replace"))
 
-    def forget_words(self) -> None:
-        """What it said on standard error in a mission that is over, if nobody keeps it."""
+    def clear_output(self) -> None:
+        """Discard the standard error of a finished mission, unless it goes to a log."""
         if self.log is None:
             self._errors.seek(0)
             self._errors.truncate()
 
     def close_input(self) -> None:
-        """Tell it to end."""
+        """Close the standard input of the program, on which it ends."""
         with suppress(OSError):
             assert self._process.stdin is not None
             self._process.stdin.close()
 
     def end(self, within_s: float = 0.0) -> None:
-        """Have it ended, in whatever state it is; after `within_s` by SIGKILL."""
+        """End the program and its children, after `within_s` seconds with SIGKILL."""
         self.close_input()
         try:
             self._process.wait(within_s)
         except subprocess.TimeoutExpired:
             with suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)  # a script, and what it has started
+                os.killpg(self._process.pid, signal.SIGKILL)  # the process group includes the children of a script
             self._process.wait()
             self._processes.end_left_behind()
         else:
             self.left_behind = self._processes.end_left_behind()
-        self.let_go()
+        self.release()
 
     def close(self) -> None:
-        """Have it ended, now."""
+        """End the program at once."""
         self.end()
 
-    def let_go(self) -> None:
-        """Close what belongs to it here. It goes on."""
+    def release(self) -> None:
+        """Close the files of this process that belong to the program. Do not end the program."""
         self.close_input()
         assert self._process.stdout is not None
         self._process.stdout.close()
         self._errors.close()
 
 
-def _hung(limit_s: float) -> ProgramFailedError:
+def _hung_error(limit_s: float) -> ProgramFailedError:
     return ProgramFailedError("hung", f"did not answer within {limit_s:g} s (with a whole line, flushed)")
 
 
-def _passing_file() -> IO[bytes]:
-    return tempfile.TemporaryFile()  # whoever asks for it closes it
+def _temporary_file() -> IO[bytes]:
+    return tempfile.TemporaryFile()  # the caller closes it
 
 
 def _die_with_parent() -> None:
@@ -244,46 +245,50 @@ def _shown(said: bytes) -> str:
 
 
 MAX_IDLE = 128
-"""So many wait; who has waited longest is ended."""
+"""Maximum number of idle programs. A further one ends the program that has been idle for the longest time."""
 GRACE_S = 1.0
 
 
-class Programs:
-    """`logs` is where their standard error goes, to a file by agent; None keeps it only to say why one failed."""
+class ProgramPool:
+    """A pool of programs.
+
+    Standard error of a program goes to a file for each agent in the directory `logs`. With None, only error messages
+    use it.
+    """
 
     def __init__(self, logs: Path | None = None) -> None:
         self._logs = logs
-        self._idle: list[Program] = []
-        """Who came last has waited least."""
-        self._taken: set[Program] = set()
+        self._idle: list[LineProgram] = []
+        """Idle programs, the longest idle one first."""
+        self._taken: set[LineProgram] = set()
         self._lock = Lock()
 
-    def take(self, command: Sequence[str], agent_id: int) -> Program:
-        """One that plays nothing, to be given back. Raises OSError if it cannot be started."""
+    def take(self, command: Sequence[str], agent_id: int) -> LineProgram:
+        """Return an idle or new program. The caller gives it back later. Raises OSError if it cannot be started."""
         log = self._logs / f"{agent_id}.log" if self._logs is not None else None
         with self._lock:
-            program = self._waiting(tuple(command), log) or Program(command, log)
+            program = self._idle_program(tuple(command), log) or LineProgram(command, log)
             self._taken.add(program)
         return program
 
-    def _waiting(self, command: tuple[str, ...], log: Path | None) -> Program | None:
+    def _idle_program(self, command: tuple[str, ...], log: Path | None) -> LineProgram | None:
         for program in reversed(self._idle):
             if (program.command, program.log) == (command, log):
                 self._idle.remove(program)
                 if program.runs:
                     return program
                 program.close()
-                return self._waiting(command, log)
+                return self._idle_program(command, log)
         return None
 
-    def give_back(self, program: Program) -> None:
-        """Nobody asks it any more, for now."""
+    def give_back(self, program: LineProgram) -> None:
+        """Make the program available again. End it if it still has to write an answer."""
         with self._lock:
             self._taken.discard(program)
             if program.owes_an_answer:
                 program.close()
                 return
-            program.forget_words()
+            program.clear_output()
             self._idle.append(program)
             if len(self._idle) > MAX_IDLE:
                 self._idle.pop(0).close()
@@ -300,17 +305,17 @@ class Programs:
             program.end(max(0.0, deadline - time.monotonic()))
         return {int(each.log.stem): each.left_behind for each in programs if each.log is not None and each.left_behind}
 
-    def forget(self) -> None:
-        """They are another process's."""
+    def release_all(self) -> None:
+        """Empty the pool without ending the programs, because they belong to the parent process."""
         for program in [*self._taken, *self._idle]:
-            program.let_go()
+            program.release()
         self._taken.clear()
         self._idle.clear()
         self._lock = Lock()
 
 
-SHARED = Programs()
-"""Those of missions in memory, of which a sweep plays thousands."""
+SHARED = ProgramPool()
+"""The pool for missions in memory. A sweep plays thousands of them."""
 
 atexit.register(SHARED.close)
-os.register_at_fork(after_in_child=SHARED.forget)
+os.register_at_fork(after_in_child=SHARED.release_all)

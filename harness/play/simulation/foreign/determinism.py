@@ -1,7 +1,8 @@
-"""Whether agents are the same twice: each life is given its inputs once more, in another process and at another time.
+"""Check that foreign agents are deterministic.
 
-An agent that reads a clock, draws random numbers of its own, or keeps something from an earlier life answers otherwise.
-Then no seed would mean anything, so it is found out, and named.
+The check gives each incarnation its inputs again, in another process and at another time, and compares the answers. An
+agent that reads a clock, draws random numbers of its own, or keeps data of an earlier incarnation answers differently.
+A seed could then not reproduce its runs, so the check reports the agent.
 """
 
 import json
@@ -13,15 +14,15 @@ from typing import Any
 
 from harness.errors import VIOLATED, HarnessError
 from harness.play.simulation.foreign._answer import shown
-from harness.play.simulation.foreign._foreign_agent import LifeRecord
-from harness.play.simulation.foreign._virtual_program import Program, ProgramFailedError
+from harness.play.simulation.foreign._foreign_agent import IncarnationRecord
+from harness.play.simulation.foreign._virtual_program import LineProgram, ProgramFailedError
 
 OF_ITSELF = "it may read a clock, draw random numbers, or depend on the order of a hash table"
 OF_BEFORE = "it may keep state of an earlier incarnation in the same process"
 
 
-class NotTheSameError(HarnessError):
-    """An agent answers the same inputs otherwise when it is given them again."""
+class NondeterminismError(HarnessError):
+    """An agent gives different answers to the same inputs."""
 
     exit_status = VIOLATED
 
@@ -30,50 +31,54 @@ class NotTheSameError(HarnessError):
         self.agent_id = agent_id
 
 
-class Again:
-    """Gives lives their inputs again, one after another in one process of each make. Close it.
+class DeterminismCheck:
+    """A check of any number of incarnations, with one process for each command. Close it after use.
 
-    If `patient`, not within the second in which they were played: clocks may be looked at in whole seconds.
+    `patient`: wait for the next second of the clock first, because an agent may read a clock in whole seconds.
     """
 
     def __init__(self, *, patient: bool) -> None:
-        self._programs: dict[tuple[str, ...], Program] = {}
+        self._programs: dict[tuple[str, ...], LineProgram] = {}
         if patient:
             time.sleep(1 - time.time() % 1)
 
-    def compare(self, record: LifeRecord) -> None:
-        """The first life of each make is given its inputs twice, so that a process plays more than one.
+    def compare(self, record: IncarnationRecord) -> None:
+        """Give an incarnation its inputs again. Raises NondeterminismError if an answer differs.
 
-        Raises NotTheSameError.
+        The first incarnation of each command gets its inputs twice, so that each process plays more than one
+        incarnation.
         """
         used = record.command in self._programs
         if not used:
-            self._programs[record.command] = Program(record.command)
+            self._programs[record.command] = LineProgram(record.command)
         for after_another in (used,) if used else (False, True):
-            difference = _given_to(self._programs[record.command], record)
+            difference = _first_difference(self._programs[record.command], record)
             if difference is not None:
-                raise NotTheSameError(record.agent_id, _explained(record, difference, used=after_another))
+                raise NondeterminismError(record.agent_id, _error_message(record, difference, used=after_another))
 
     def close(self) -> None:
         for program in self._programs.values():
             program.close()
 
 
-def _explained(record: LifeRecord, difference: str, *, used: bool) -> str:
-    """Whether what came before in a process makes the difference: two that are new say so."""
+def _error_message(record: IncarnationRecord, difference: str, *, used: bool) -> str:
+    """Return the error message, with the probable cause.
+
+    Two new processes show whether an earlier incarnation in the same process causes the difference.
+    """
     sentence = f"is not deterministic: {difference}"
     if not used and not record.after_another:
         return f"{sentence}; {OF_ITSELF}"
     differences = []
     for _ in range(2):
-        with closing(Program(record.command)) as program:
-            differences.append(_given_to(program, record))
+        with closing(LineProgram(record.command)) as program:
+            differences.append(_first_difference(program, record))
     of_before = differences[0] is None or (record.after_another and differences[0] == differences[1])
     return f"{sentence}; {OF_BEFORE if of_before else OF_ITSELF}"
 
 
-def _given_to(program: Program, record: LifeRecord) -> str | None:
-    """What it answers otherwise than is on record, first; None if nothing."""
+def _first_difference(program: LineProgram, record: IncarnationRecord) -> str | None:
+    """Give the recorded inputs to a program. Return a description of the first different answer, or None."""
     for line, answer in record.exchanges:
         try:
             program.tell(line)
@@ -98,24 +103,24 @@ def _input(line: bytes) -> str:
 
 
 def _difference(before: bytes, now: bytes) -> str:
-    """Where two answers differ first."""
+    """Describe the first difference of two answers."""
     try:
-        parted = next(_parted(json.loads(before), json.loads(now), ()), None)
+        different = next(_differences(json.loads(before), json.loads(now), ()), None)
     except (ValueError, RecursionError):
-        parted = ((), before, now)
-    if parted is None:
+        different = ((), before, now)
+    if different is None:
         return "the same in another order or notation; each byte must be equal"
-    path, was, is_now = parted
+    path, was, is_now = different
     where = f"`{'.'.join(path)}` " if path else ""
     return f"with {where}{shown(is_now)}, and {shown(was)} before"
 
 
-def _parted(was: Any, is_now: Any, path: Sequence[str]) -> Iterator[tuple[Sequence[str], Any, Any]]:
+def _differences(was: Any, is_now: Any, path: Sequence[str]) -> Iterator[tuple[Sequence[str], Any, Any]]:
     if isinstance(was, dict) and isinstance(is_now, dict):
         for key in dict.fromkeys((*was, *is_now)):
-            yield from _parted(was.get(key), is_now.get(key), (*path, key))
+            yield from _differences(was.get(key), is_now.get(key), (*path, key))
     elif isinstance(was, list) and isinstance(is_now, list):
         for index, (one, other) in enumerate(zip_longest(was, is_now)):
-            yield from _parted(one, other, (*path, str(index)))
+            yield from _differences(one, other, (*path, str(index)))
     elif was != is_now or type(was) is not type(is_now):
         yield path, was, is_now

@@ -1,4 +1,4 @@
-"""Agents of other makes for virtual time: ours behind standard input and output, and small ones that go wrong."""
+"""Foreign agents for virtual time: the harness's own agent as a program, and small programs with errors."""
 
 import os
 import sys
@@ -23,7 +23,7 @@ for number, line in enumerate(sys.stdin):
     CODE
     print(json.dumps(said), flush=True)
 """
-"""An agent that does nothing but answer; CODE may have it go wrong."""
+"""An agent that only answers. CODE can make it fail."""
 
 EXPORT = """
 if 'mission' in given:
@@ -35,11 +35,11 @@ if given.get('command') == 'export':
         'chain': [], 'blocks_to_be_committed': [], 'reconcile_stack': [], 'current_block': {'event_data': ''},
         'completed': [], 'reconcile_in_progress': False, 'idle': True}
 """
-"""Code with which it has an export, of nothing."""
+"""Code that adds an empty export to the small agent."""
 
 
 def small(directory: Path, code: str = "pass") -> list[str]:
-    """The command of an agent that does nothing, but for `code`, which runs before each answer is written."""
+    """Return the command of a small agent. It runs `code` before it writes each answer."""
     path = directory / "agent.py"
     path.write_text(SMALL.replace("CODE", code.replace("\n", "\n    ")))
     return [sys.executable, "-S", "-E", str(path)]
@@ -50,7 +50,7 @@ def played_by(command: list[str] | dict[int, list[str]], **keys: Any) -> Scenari
 
 
 def living(word: Path) -> list[int]:
-    """Processes that have to do with these files."""
+    """Return the processes whose command contains this path."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():

@@ -1,4 +1,4 @@
-"""What an agent in virtual time can do wrong: one sentence that names it, and what became of it on record."""
+"""Errors of a foreign agent in virtual time. The run record has one sentence that names the agent, and its outcome."""
 
 import json
 import sys
@@ -27,7 +27,7 @@ def narrow_limits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
-    """Agent 2 goes wrong, agent 1 is ours."""
+    """Play a run in which agent 2 is a small agent with `code`, and agent 1 an agent of the harness."""
     one = played_by({2: small(tmp_path, code)}, **{**SHORT, **keys})
     return run(one, 1, tmp_path / "run", Silent(), "sim")
 
@@ -93,7 +93,7 @@ def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
         (EVENT + "said = {'error': 'no such event', 'unsupported': True}", "not supported", "no such event"),
     ],
 )
-def test_what_goes_wrong_is_one_sentence_and_on_record(
+def test_error_of_an_agent_is_one_sentence_in_the_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, outcome: str, sentence: str
 ) -> None:
     if "sleep" in code:
@@ -118,7 +118,7 @@ virtual.main()
 """
 
 
-def test_of_a_run_that_an_agent_ended_nobody_is_accused(tmp_path: Path) -> None:
+def test_crash_of_an_agent_violates_no_characteristic(tmp_path: Path) -> None:
     (tmp_path / "dying.py").write_text(ENDS_IN_PHASE_TWO)
     dying = [sys.executable, str(tmp_path / "dying.py")]
     finished = run(played_by({2: dying}, network={"loss": 0.3}), 1, tmp_path / "run", Silent(), "sim")
@@ -126,8 +126,8 @@ def test_of_a_run_that_an_agent_ended_nobody_is_accused(tmp_path: Path) -> None:
     assert finished.exit_status == 1 and not finished.result.bad
 
 
-def test_a_storm_that_feeds_itself_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two agents that answer each datagram with two."""
+def test_growing_number_of_datagrams_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of two agents answers each datagram with two datagrams."""
     monkeypatch.setattr(_foreign_agent, "MAX_SENT_PER_S", 200)
     code = EVENT + "said['sent'] = ['AA==']\nif 'datagram' in given:\n    said['sent'] = ['AA==', 'AA==']"
     one = played_by(small(tmp_path, code), **SHORT)
@@ -135,8 +135,8 @@ def test_a_storm_that_feeds_itself_ends(tmp_path: Path, monkeypatch: pytest.Monk
         simulate(one, 1, tracing=True)
 
 
-def test_what_is_no_message_of_its_own_reaches_the_others_and_is_dropped(tmp_path: Path) -> None:
-    """Half a header, and what another agent would send."""
+def test_stray_datagram_reaches_other_agents(tmp_path: Path) -> None:
+    """The agent sends half a header, and a message in another agent's name."""
     forged = in_base64(encode(1, 0, BlockAddRequest(bytes(32), bytes(32))))
     code = EVENT + f"said['sent'] = ['VUMB', '{forged}']"
     run_with(tmp_path, code, agents=3, duration_s=20)
@@ -145,7 +145,7 @@ def test_what_is_no_message_of_its_own_reaches_the_others_and_is_dropped(tmp_pat
     assert [line["trigger"]["from"] for line in lines if "trigger" in line] == [1]
 
 
-def test_an_agent_that_does_not_end_by_itself_is_ended(tmp_path: Path) -> None:
+def test_agent_that_does_not_end_is_killed(tmp_path: Path) -> None:
     run_with(tmp_path, "import atexit, time\nif number == 0:\n    atexit.register(time.sleep, 99)")
     assert not living(tmp_path)
 
@@ -161,13 +161,13 @@ def test_an_agent_that_does_not_end_by_itself_is_ended(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_an_agent_that_is_not_the_same_twice_is_named(tmp_path: Path, code: str, why: str) -> None:
+def test_nondeterministic_agent_is_named(tmp_path: Path, code: str, why: str) -> None:
     finished = run_with(tmp_path, EXPORT + code)
     detail = str(finished.played.outcome_detail)
     assert finished.exit_status == 1
     assert "agent 2 is not deterministic: given" in detail and why in detail, detail
 
 
-def test_what_virtual_time_lacks_is_not_supported(tmp_path: Path) -> None:
+def test_agent_without_virtual_time_is_not_supported(tmp_path: Path) -> None:
     with pytest.raises(UnsupportedError, match=r"not supported by agent 2 .*with --virtual it ends with status 2"):
         simulate(played_by({2: ["/bin/sh", "-c", "exit 2"]}, **SHORT), 1)

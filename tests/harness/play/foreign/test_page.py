@@ -1,4 +1,4 @@
-"""The agent that docs/how-to/simulate-in-virtual-time.md shows, with ours as its core, is one."""
+"""The agent in docs/how-to/simulate-in-virtual-time.md works, with the harness's own agent as its core."""
 
 import re
 import sys
@@ -37,7 +37,7 @@ class MyAgent:
 """
 
 
-def test_what_the_page_shows_drives_an_agent(tmp_path: Path) -> None:
+def test_program_on_the_page_drives_an_agent(tmp_path: Path) -> None:
     shown = re.search(r'```python title="virtual_agent.py"\n(.*?)```', PAGE.read_text(encoding="utf-8"), re.DOTALL)
     assert shown is not None and shown[1].count("\n") <= 36
     (tmp_path / "virtual_agent.py").write_text(shown[1])

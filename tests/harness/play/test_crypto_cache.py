@@ -1,4 +1,4 @@
-"""What agents of a simulated mission work out once for all of them hides no mistake of any of them."""
+"""The cache of cryptographic results hides no error of an agent."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from harness.play.simulation import _crypto_cache as memory
-from harness.play.simulation._crypto_cache import Signatures, remembered
+from harness.play.simulation import _crypto_cache as cache
+from harness.play.simulation._crypto_cache import RecordedSignatures, cached_crypto
 from harness.run.simulate import Simulated, simulate
 from tests.harness.virtual import scenario
 from ucp.block import Block
@@ -34,7 +34,7 @@ def sealed(bundle: Bundle, crypto: CryptoFunctions, sequence: int = 0) -> bytes:
     return session(bundle, crypto).seal(sequence, QUESTION, None, None, 0)
 
 
-def what_comes_of(datagram: bytes, receiver: Session) -> str:
+def result_of(datagram: bytes, receiver: Session) -> str:
     try:
         return type(receiver.open(datagram, receiver.crypto.read(datagram)).datagram.message).__name__
     except MalformedDatagramError as dropped:
@@ -53,37 +53,37 @@ def what_comes_of(datagram: bytes, receiver: Session) -> str:
     ],
     ids=["another secret", "another mission", "another public key"],
 )
-def test_who_has_other_keys_opens_nothing_though_all_others_have(wrong: Bundle, reason: str) -> None:
-    crypto = remembered()
+def test_agent_with_wrong_keys_opens_no_cached_datagram(wrong: Bundle, reason: str) -> None:
+    crypto = cached_crypto()
     datagram = sealed(KEYS.bundle(1), crypto)
     right, again, other = (session(bundle, crypto) for bundle in (KEYS.bundle(3), KEYS.bundle(4), wrong))
-    came_of = [what_comes_of(datagram, receiver) for receiver in (right, other, again)]
-    assert came_of == ["BlockAddRequest", reason, "BlockAddRequest"]
+    results = [result_of(datagram, receiver) for receiver in (right, other, again)]
+    assert results == ["BlockAddRequest", reason, "BlockAddRequest"]
 
 
-def test_other_bytes_are_opened_anew() -> None:
-    crypto = remembered()
+def test_changed_bytes_do_not_use_the_cache() -> None:
+    crypto = cached_crypto()
     datagram = sealed(KEYS.bundle(1), crypto)
-    assert what_comes_of(datagram, session(KEYS.bundle(2), crypto)) == "BlockAddRequest"
+    assert result_of(datagram, session(KEYS.bundle(2), crypto)) == "BlockAddRequest"
     for place in range(len(datagram)):
-        bent = bytearray(datagram)
-        bent[place] ^= 1
+        changed = bytearray(datagram)
+        changed[place] ^= 1
         receiver = session(KEYS.bundle(3), crypto)
         receiver.public_keys = dict.fromkeys(range(2**16), KEYS.public.vehicles[1])
-        assert what_comes_of(bytes(bent), receiver) != "BlockAddRequest"
+        assert result_of(bytes(changed), receiver) != "BlockAddRequest"
 
 
-def test_what_was_heard_is_each_receivers_own_knowledge() -> None:
-    crypto = remembered()
+def test_each_receiver_has_its_own_replay_window() -> None:
+    crypto = cached_crypto()
     datagram = sealed(KEYS.bundle(1), crypto)
     for agent_id in (2, 3):
         receiver = session(KEYS.bundle(agent_id), crypto)
-        assert what_comes_of(datagram, receiver) == "BlockAddRequest"
-        assert what_comes_of(datagram, receiver) == "replayed"
+        assert result_of(datagram, receiver) == "BlockAddRequest"
+        assert result_of(datagram, receiver) == "replayed"
 
 
-def test_a_claim_is_good_if_it_verifies_and_not_else() -> None:
-    signatures = Signatures()
+def test_cached_verification_equals_the_library() -> None:
+    signatures = RecordedSignatures()
     makers = {agent_id: signatures.signer(KEYS.vehicles[agent_id]) for agent_id in (1, 2)}
     made = [
         SignatureClaim(KEYS.public.vehicles[each], makers[each].sign(data), data)
@@ -97,35 +97,35 @@ def test_a_claim_is_good_if_it_verifies_and_not_else() -> None:
                 assert signatures.verified(claim) == verify(claim) == (claim in made)
 
 
-def test_a_signature_that_was_not_made_here_is_verified() -> None:
-    maker, here = Signatures().signer(KEYS.vehicles[1]), Signatures()
+def test_signature_of_another_process_is_verified() -> None:
+    maker, here = RecordedSignatures().signer(KEYS.vehicles[1]), RecordedSignatures()
     claim = SignatureClaim(KEYS.public.vehicles[1], maker.sign(b"a"), b"a")
     assert here.verified(claim)
     assert not here.verified(claim._replace(signed=b"b"))
 
 
-def test_a_library_whose_signatures_do_not_verify_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "verify", lambda claim: False)
-    signatures = Signatures()
+def test_library_with_wrong_signatures_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "verify", lambda claim: False)
+    signatures = RecordedSignatures()
     maker = signatures.signer(KEYS.vehicles[1])
     claims = [SignatureClaim(KEYS.public.vehicles[1], maker.sign(data), data) for data in map(bytes, range(1, 300))]
     assert not all(map(signatures.verified, claims))
 
 
-def test_a_memory_that_is_full_forgets_and_is_as_right(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "SIGNATURES_REMEMBERED", 2)
-    signatures = Signatures()
+def test_full_cache_drops_entries_and_stays_correct(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "SIGNATURES_CACHED", 2)
+    signatures = RecordedSignatures()
     maker = signatures.signer(KEYS.vehicles[1])
     claims = [SignatureClaim(KEYS.public.vehicles[1], maker.sign(data), data) for data in (b"a", b"b", b"c", b"d")]
     assert all(map(signatures.verified, claims))
     assert len(signatures._made) == 2
 
 
-# In a whole mission one vehicle of five is wrong
+# Missions in which one of five vehicles is wrong
 
 
 def played(monkeypatch: pytest.MonkeyPatch, agent_id: int, spoil: Callable[[SecuredAgent], None]) -> Simulated:
-    """A mission in which `spoil` has been at this agent."""
+    """Play a mission in which `spoil` has changed this agent."""
     init = SecuredAgent.__init__
 
     def spoiled(agent: SecuredAgent, *arguments: Any, **options: Any) -> None:
@@ -141,33 +141,33 @@ def dropped(run: Simulated) -> dict[str, set[str]]:
     return {agent_id: set(agent["dropped"]) for agent_id, agent in run.played.agents.items()}
 
 
-def of_one(agent_id: int, *reasons: str) -> dict[str, set[str]]:
+def only_at(agent_id: int, *reasons: str) -> dict[str, set[str]]:
     return {str(each): set(reasons) if each == agent_id else set() for each in range(1, 6)}
 
 
-def of_all_but(agent_id: int, *reasons: str) -> dict[str, set[str]]:
+def except_at(agent_id: int, *reasons: str) -> dict[str, set[str]]:
     return {str(each): set() if each == agent_id else set(reasons) for each in range(1, 6)}
 
 
-def test_a_mission_without_a_mistake_drops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert dropped(played(monkeypatch, 3, lambda agent: None)) == of_one(3)
+def test_correct_mission_drops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert dropped(played(monkeypatch, 3, lambda agent: None)) == only_at(3)
 
 
-def test_who_has_a_wrong_key_of_another_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_public_key_causes_drops(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoil(agent: SecuredAgent) -> None:
         agent.session.public_keys = {**agent.session.public_keys, 1: agent.session.public_keys[2]}
 
     assert dropped(played(monkeypatch, 3, spoil))["3"] >= {"not signed by its sender"}
 
 
-def test_who_verifies_wrongly_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_verification_causes_drops(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoil(agent: SecuredAgent) -> None:
         agent.session.crypto = replace(agent.session.crypto, verify=lambda claim: False)
 
-    assert dropped(played(monkeypatch, 3, spoil)) == of_one(3, "not signed by its sender")
+    assert dropped(played(monkeypatch, 3, spoil)) == only_at(3, "not signed by its sender")
 
 
-def test_whose_window_is_wrong_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_replay_window_causes_drops(monkeypatch: pytest.MonkeyPatch) -> None:
     class Narrow(ReplayWindow):
         __slots__ = ()
 
@@ -188,7 +188,7 @@ def test_whose_window_is_wrong_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     assert dropped(played(monkeypatch, 3, spoil))["3"] >= {"replayed"}
 
 
-def test_who_signs_other_bytes_than_it_sends_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signature_of_other_bytes_causes_drops(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoil(agent: SecuredAgent) -> None:
         sign = agent.session.private_key.sign
         monkeypatch.setattr(agent.session.private_key, "sign", lambda data: sign(data + b"!"))
@@ -196,24 +196,24 @@ def test_who_signs_other_bytes_than_it_sends_is_seen(monkeypatch: pytest.MonkeyP
     assert dropped(played(monkeypatch, 3, spoil))["1"] == {"not signed by its sender"}
 
 
-def test_who_signs_with_anothers_key_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signature_with_another_key_causes_drops(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoil(agent: SecuredAgent) -> None:
         agent.session.private_key = agent.session.crypto.signer(bytes(32))
 
     assert dropped(played(monkeypatch, 3, spoil))["1"] == {"not signed by its sender"}
 
 
-def test_who_seals_for_another_epoch_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seal_for_another_epoch_causes_drops(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoil(agent: SecuredAgent) -> None:
         epochs = agent.session.epochs
         epochs._bundle = epochs._bundle.at_epoch(0, bytes(32))
 
     run = played(monkeypatch, 3, spoil)
-    assert dropped(run) == {**of_all_but(3, "not authentic"), "3": {"not authentic"}}
+    assert dropped(run) == {**except_at(3, "not authentic"), "3": {"not authentic"}}
 
 
-def test_a_block_in_anothers_name_is_seen_though_its_signature_was_made_here() -> None:
-    crypto = remembered()
+def test_block_in_another_agents_name_is_dropped_despite_the_cache() -> None:
+    crypto = cached_crypto()
     maker, receiver = (
         SecuredAgent(session(KEYS.bundle(agent_id), crypto), agent_id, ROSTER, b"test") for agent_id in (1, 2)
     )

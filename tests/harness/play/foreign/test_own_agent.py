@@ -1,4 +1,4 @@
-"""Our own agent, driven by lines as any other, does to the byte what it does in the simulation itself."""
+"""The harness's own agent gives the same run as a foreign agent and in the simulation, to the byte."""
 
 import json
 from operator import itemgetter
@@ -33,7 +33,7 @@ EVENTFUL: dict[str, Any] = {
 }
 
 
-def left_behind(simulated: Simulated) -> dict[str, Any]:
+def results_of(simulated: Simulated) -> dict[str, Any]:
     agents = [
         {key: value for key, value in agent.items() if key not in ("command", "version")}
         for agent in simulated.played.agents.values()
@@ -50,20 +50,20 @@ def left_behind(simulated: Simulated) -> dict[str, Any]:
 
 def both(one: Scenario, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
     foreign = one.model_copy(update={"agent_command": OURS})
-    in_it = simulate(one, seed, tracing=True, deliver_all=True)
-    return left_behind(in_it), left_behind(simulate(foreign, seed, tracing=True))
+    own = simulate(one, seed, tracing=True, deliver_all=True)
+    return results_of(own), results_of(simulate(foreign, seed, tracing=True))
 
 
-def test_behind_lines_it_does_what_it_does_in_the_simulation() -> None:
-    """With all that can happen to it; one process plays a second mission as if it were the first."""
+def test_own_agent_behaves_the_same_behind_lines() -> None:
+    """The scenario has all kinds of faults. The second mission reuses the process of the first."""
     for seed in (1, 2):
         within, outside = both(scenario(**EVENTFUL), seed)
         assert within == outside
         assert within["agents"][0]["restarts"] == within["agents"][2]["reboots"] == 1
 
 
-def test_so_it_does_with_keys() -> None:
-    """It seals and opens, boots with what it heard of revocations, and drops what the simulation's own drops."""
+def test_own_agent_with_keys_behaves_the_same_behind_lines() -> None:
+    """It seals and opens datagrams, keeps revocations over a reboot, and drops the same datagrams."""
     revoked = {"at_s": 200, "revoke": [1], "heard_by": [2]}
     forged = {"at_s": 120, "forge": {"message": "Commit Block", "sender": 2}}
     keys = {
@@ -78,7 +78,7 @@ def test_so_it_does_with_keys() -> None:
         assert dropped >= {"replayed", "revoked sender"}
 
 
-def test_a_run_directory_has_what_a_run_in_memory_has(tmp_path: Path) -> None:
+def test_run_directory_with_foreign_agents_equals_memory(tmp_path: Path) -> None:
     one = played_by({2: OURS}, agents=3, duration_s=200, network={"loss": 0.1})
     finished = run(one, 1, tmp_path / "run", Silent(), "sim")
     assert finished.exit_status == 0

@@ -1,4 +1,4 @@
-"""What agents sealed, as it is on record: whoever has not a vehicle's keys cannot seal it again."""
+"""Sealed event data from records of a mission. A replay reuses it, because it lacks the vehicles' keys."""
 
 import base64
 from collections.abc import Iterable, Mapping
@@ -10,10 +10,11 @@ from ucp.sealed import SEAL_BYTES
 
 
 @dataclass(frozen=True)
-class SealsOnRecord:
-    """By the event that filled the block, encoded; a block of which nothing is on record stays as it is."""
+class RecordedSeals:
+    """A seal that returns recorded data. Event data without a record stays unsealed."""
 
     sealed: Mapping[bytes, bytes]
+    """Encoded last event of a block -> sealed event data of the block."""
 
     def __call__(self, event_data: bytes, timestamp_us: int) -> bytes:
         try:
@@ -24,11 +25,11 @@ class SealsOnRecord:
         return sealed if len(sealed) == len(event_data) + SEAL_BYTES else event_data
 
 
-def seals_of(script: Iterable[ScriptedEvent], agent_id: int) -> SealsOnRecord | None:
-    """What the script says that this agent sealed; None if nothing."""
+def recorded_seals(script: Iterable[ScriptedEvent], agent_id: int) -> RecordedSeals | None:
+    """Return the sealed data of this agent in the script of events. None if the script has no sealed data of it."""
     sealed = {
         event.logged.encode(): base64.b64decode(event.sealed)
         for event in script
         if event.agent == agent_id and event.sealed is not None
     }
-    return SealsOnRecord(sealed) if sealed else None
+    return RecordedSeals(sealed) if sealed else None
