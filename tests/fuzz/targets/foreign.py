@@ -34,8 +34,8 @@ SCENARIO: Scenario = scenario(
 )
 
 
-class _Ours(LineProgram):
-    """Our agent, which says something else now and then; it needs no process."""
+class _OwnAgentProgram(LineProgram):
+    """The harness's own agent without a process. Some of its answers are replaced."""
 
     _agent: VirtualAgent
     answers: list[bytes]
@@ -43,7 +43,7 @@ class _Ours(LineProgram):
 
     def __init__(self, command: tuple[str, ...], log: Path | None = None) -> None:
         self.command, self.log, self.owes_an_answer = tuple(command), None, False
-        self._said = b""
+        self._received = b""
 
     @property
     def is_new(self) -> bool:
@@ -53,30 +53,30 @@ class _Ours(LineProgram):
     def runs(self) -> bool:
         return True
 
-    def tell(self, line: bytes) -> None:
+    def write(self, line: bytes) -> None:
         given = json.loads(line)
         if "mission" in given:
             self._agent = VirtualAgent(given)
         else:
             self._agent.give(given)
 
-    def answer(self) -> bytes:
+    def read(self) -> bytes:
         good = self._agent.answer().encode() + b"\n"
         answer = self.replaced.get(len(self.answers), good)
         self.answers.append(good)
         return answer
 
-    def where_it_logs(self) -> str:
+    def log_phrase(self) -> str:
         return ""
 
-    def last_words(self) -> str:
+    def last_line(self) -> str:
         return ""
 
-    def forget_words(self) -> None:
-        """It has none."""
+    def clear_output(self) -> None:
+        """Do nothing, because there is no output."""
 
     def end(self, within_s: float = 0.0) -> None:
-        """It is no process."""
+        """Do nothing, because there is no process."""
 
 
 def run(data: bytes) -> None:
@@ -85,8 +85,8 @@ def run(data: bytes) -> None:
 
 
 def _play(replaced: dict[int, bytes]) -> list[bytes]:
-    """The good answers."""
-    ours = type("Replaced", (_Ours,), {"answers": [], "replaced": replaced})
+    """Play the scenario, and return the answers without replacements."""
+    ours = type("Replaced", (_OwnAgentProgram,), {"answers": [], "replaced": replaced})
     with (
         patch.object(_virtual_program, "LineProgram", ours),
         patch.object(_foreign_swarm, "SHARED", _virtual_program.ProgramPool()),

@@ -280,8 +280,8 @@ class ForeignAgent:
         given = f"{line}\n".encode("ascii")
         program = self._program
         try:
-            program.tell(given)
-            said = program.answer()
+            program.write(given)
+            said = program.read()
             answer = read_answer(said, tracing=self._tracing)
         except ProgramFailedError as error:
             if error.status in NO_VIRTUAL_TIME and not self.record.exchanges:

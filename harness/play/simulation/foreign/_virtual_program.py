@@ -95,7 +95,7 @@ class LineProgram:
     def runs(self) -> bool:
         return self._process.poll() is None
 
-    def tell(self, line: bytes) -> None:
+    def write(self, line: bytes) -> None:
         """Write a line. Raises ProgramFailedError."""
         if self._received:
             raise ProgramFailedError("crashed", f"wrote an unexpected line: {_shown(self._received)}")
@@ -107,9 +107,9 @@ class LineProgram:
         except BrokenPipeError:
             raise self._end_error() from None
         if written < len(line):
-            self._write(memoryview(line)[written:])
+            self._write_rest(memoryview(line)[written:])
 
-    def answer(self) -> bytes:
+    def read(self) -> bytes:
         """Read the next line, with its line end. Raises ProgramFailedError."""
         limit_s = ANSWER_LIMIT_S if self._answered else START_LIMIT_S
         if not self._received:
@@ -119,12 +119,12 @@ class LineProgram:
             if not self._received:
                 raise self._end_error()
         end = self._received.find(b"\n") + 1
-        line = self._received[:end] if end else self._long_line(limit_s)
+        line = self._received[:end] if end else self._read_rest(limit_s)
         self._received = self._received[len(line) :]
         self._answered, self.owes_an_answer = True, False
         return line
 
-    def _long_line(self, limit_s: float) -> bytes:
+    def _read_rest(self, limit_s: float) -> bytes:
         """Read the rest of a line that arrives in pieces, and return the line."""
         deadline = time.monotonic() + limit_s
         pieces = [self._received]
@@ -142,7 +142,7 @@ class LineProgram:
         self._received = b"".join(pieces)
         return self._received[: self._received.find(b"\n") + 1]
 
-    def _write(self, left: memoryview) -> None:
+    def _write_rest(self, left: memoryview) -> None:
         """Write the rest of a line when the pipe is full. Read output meanwhile, so that the program can go on."""
         deadline = time.monotonic() + ANSWER_LIMIT_S
         ready = select.poll()

@@ -81,8 +81,8 @@ def _first_difference(program: LineProgram, record: IncarnationRecord) -> str | 
     """Give the recorded inputs to a program. Return a description of the first different answer, or None."""
     for line, answer in record.exchanges:
         try:
-            program.tell(line)
-            again = program.answer()
+            program.write(line)
+            again = program.read()
         except ProgramFailedError as error:
             return f"given {_input(line)} again, it {error}"
         if again != answer:
