@@ -8,9 +8,11 @@ A receiver begins to receive a frame if it does not send and receives no other f
 `sensitivity_dbm`, and if the frame is `preamble_db` stronger than noise and all other frames together. The last
 condition must hold during `capture_window_s`. Within this time the receiver changes to a stronger frame, which is the
 capture effect. It receives the frame if the ratio of the power to noise and all other frames never falls below
-`sinr_db`, and if it does not begin to send. Two stations that
-do not hear each other do not wait for each other: they are hidden from each other, and their frames collide at a
-receiver between them.
+`sinr_db`, and if it does not begin to send.
+
+Two stations that do not hear each other do not wait for each other: they are hidden from each other, and their frames
+collide at a receiver between them. A station that receives no frame senses the sum of all powers, and waits until this
+sum falls below `energy_dbm`.
 
 The model neglects the propagation time, which is 1 us for 300 m and part of the slot time, and draws no bit errors: a
 ratio of signal to interference decides. In a frame of 100 bytes, the step from no errors to certain errors takes about
@@ -19,6 +21,7 @@ ratio of signal to interference decides. In a frame of 100 bytes, the step from 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from itertools import count
@@ -54,6 +57,7 @@ class Channel:
         self._airtimes: dict[int, int | None] = {}
         """Data bytes -> nanoseconds; None if the radio cannot send a message of this length."""
         self._silence = [linear(round(100 * radio.noise_dbm))] * len(vehicles)
+        self._energy = self._silence[0] + linear(round(100 * energy_dbm)) if isinstance(radio, Contention) else math.inf
         self._begins = 1 + linear(round(-100 * radio.preamble_db)) / linear(0)
         self._suffices = 1 + linear(round(-100 * radio.sinr_db)) / linear(0)
         self._capture_window = nanoseconds(radio.capture_window_s)
@@ -131,17 +135,18 @@ class Channel:
             if frame.ends_ns < self._next_end:
                 self._next_end = frame.ends_ns
             frames.append(frame)
+        sensed = frames
         if len(frames) == 1 and not self._active:
             frames[0].receiving = frames[0].reach.heard
         else:
-            self._overlap(frames, now)
+            sensed = frames + self._overlap(frames, now)
         self._active += frames
-        self._access.begun(frames, now)
+        self._access.begun(sensed, now)
 
-    def _overlap(self, frames: list[Frame], now: int) -> None:
+    def _overlap(self, frames: list[Frame], now: int) -> list[Frame]:
         """Decide which receivers begin to receive these frames, and which frames on the air are disturbed.
 
-        A power p suffices if p >= ratio (total - p), which is p (1 + 1 / ratio) >= total.
+        Return the earlier frames that further stations sense from now on. A power p suffices if p >= ratio (total - p), which is p (1 + 1 / ratio) >= total.
         """
         for frame in self._active:
             frame.deaf |= frame.reach.heard & self._sending
@@ -162,6 +167,31 @@ class Channel:
         for frame in air:
             if frame.receiving:
                 frame.disturbed |= frame.receiving & ~_sufficient(frame, totals, suffices)
+        return self._sum_energy(air, totals)
+
+    def _sum_energy(self, air: list[Frame], totals: Sequence[float]) -> list[Frame]:
+        """Let stations sense the sum of the powers of all frames, until it falls below the level of energy detection.
+
+        Return the frames that further stations sense from now on.
+        """
+        level = self._energy
+        by_end = sorted(air, key=lambda frame: frame.ends_ns, reverse=True)
+        sensed = by_end[0].sensed
+        changed = []
+        for station, total in enumerate(totals):
+            bit = 1 << station
+            if total < level or sensed & bit:
+                continue
+            power = self._silence[station]
+            for frame in by_end:
+                if frame.sensed & bit:
+                    break
+                power += frame.reach.powers[station]
+                if power >= level:
+                    frame.summed |= bit
+                    changed.append(frame)
+                    break
+        return changed
 
     def _end(self, frame: Frame, now: int) -> None:
         self._active.remove(frame)

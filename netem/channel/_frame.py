@@ -49,11 +49,13 @@ class Frame:
     """Receivers at which other frames were too strong."""
     deaf: int = 0
     """Receivers in range that sent a frame themselves."""
+    summed: int = 0
+    """Receivers that sense the sum of overlapping frames until this frame ends."""
 
     @property
     def sensed(self) -> int:
         """Stations for which this frame makes the channel busy."""
-        return self.receiving | self.disturbed | self.reach.energetic
+        return self.receiving | self.disturbed | self.reach.energetic | self.summed
 
     @property
     def received(self) -> int:

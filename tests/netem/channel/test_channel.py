@@ -105,6 +105,28 @@ def test_hidden_stations_collide_although_each_senses_an_idle_channel() -> None:
     assert first.fate(2) is Fate.RANGE
 
 
+def starts_between_two_frames(energy_dbm: float, seed: int) -> float:
+    """Return when station 2 begins a frame that it queues at 1.0005 s.
+
+    Stations 0 and 1 are hidden from each other. Both begin a frame at 1 s, and that of station 0 is much longer. At
+    station 2, each frame has -80.1 dBm and their sum -77.1 dBm, and the station can receive neither.
+    """
+    made = channel(replace(QUIET, energy_dbm=energy_dbm), 0, 800, 400, seed=seed)
+    made.send(0, 1.0, 10 * ANSWER)
+    made.send(1, 1.0, ANSWER)
+    made.send(2, 1.0005, ANSWER)
+    return next(frame.began_at for frame in made.advance(LONG_AFTER) if frame.sender == 2)
+
+
+def test_station_senses_the_sum_of_frames_until_one_of_them_ends() -> None:
+    starts = {round(starts_between_two_frames(-79.0, seed), 9) for seed in range(300)}
+    assert starts == {round(1.0 + AIRTIME_S + DIFS_S + slots * 20e-6, 9) for slots in range(32)}
+
+
+def test_station_sends_if_the_sum_of_frames_is_below_energy_detection() -> None:
+    assert starts_between_two_frames(-76.0, 1) == pytest.approx(1.0005)
+
+
 def test_stronger_frame_in_the_same_slot_is_captured() -> None:
     near, far = sent(QUIET, [0, 20, 400], (0, 1.0), (2, 1.0))
     assert near.fate(1) is Fate.RECEIVED
