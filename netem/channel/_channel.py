@@ -146,7 +146,9 @@ class Channel:
     def _overlap(self, frames: list[Frame], now: int) -> list[Frame]:
         """Decide which receivers begin to receive these frames, and which frames on the air are disturbed.
 
-        Return the earlier frames that further stations sense from now on. A power p suffices if p >= ratio (total - p), which is p (1 + 1 / ratio) >= total.
+        Return the frames that further stations sense from now on.
+
+        A power p suffices if p >= ratio (total - p), which is p (1 + 1 / ratio) >= total.
         """
         for frame in self._active:
             frame.deaf |= frame.reach.heard & self._sending
