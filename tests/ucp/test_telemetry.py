@@ -44,12 +44,12 @@ def heartbeat(mode: int = STABILIZE, armed: bool = False) -> Any:
     return mavlink.MAVLink_heartbeat_message(2, 3, 128 if armed else 0, mode, 4, 3)
 
 
-def place(ms: int = 60_000, lat: int = -353632620, lon: int = 1491652370) -> Any:
+def position_msg(ms: int = 60_000, lat: int = -353632620, lon: int = 1491652370) -> Any:
     return mavlink.MAVLink_global_position_int_message(ms, lat, lon, 604_000, 20_000, 300, -400, -250, 27_000)
 
 
 def good_estimate() -> Any:
-    """Without it a position does not count."""
+    """Return a SYS_STATUS with a good estimate. Without it, positions are no events."""
     bit = mavlink.MAV_SYS_STATUS_AHRS
     return mavlink.MAVLink_sys_status_message(bit, bit, bit, 0, 0xFFFF, -1, -1, 0, 0, 0, 0, 0, 0)
 
@@ -62,12 +62,12 @@ def source(position_interval_s: float = 10.0, seed: int = 1) -> TelemetryEvents:
     return TelemetryEvents(position_interval_s, random.Random(seed))
 
 
-def test_a_mode_change_is_an_event_and_a_mode_kept_is_none() -> None:
+def test_mode_change_is_an_event_and_an_unchanged_mode_is_not() -> None:
     events = source()
     ((first, data),) = events.receive(frames(heartbeat(STABILIZE)), 0.0)
     assert (first, describe(first, data)) == (MODE_CHANGE, "[0.0 s] mode STABILIZE")
     assert events.receive(frames(heartbeat(STABILIZE)), 1.0) == []
-    events.receive(frames(place(5_000)), 1.5)
+    events.receive(frames(position_msg(5_000)), 1.5)
     ((second, data),) = events.receive(frames(heartbeat(GUIDED)), 2.0)
     assert (second, data) == (MODE_CHANGE, struct.pack(">IBII", 5_000, 2, STABILIZE, GUIDED))
     assert describe(second, data) == "[5.0 s] mode GUIDED (was STABILIZE)"
@@ -89,7 +89,7 @@ def test_a_status_text_is_an_event() -> None:
     assert describe(event_id, data) == "[0.0 s] critical: PreArm: Need Position Estimate"
 
 
-def test_a_status_text_in_chunks_is_one_event() -> None:
+def test_status_text_in_chunks_is_one_event() -> None:
     words = "x" * 50 + "y" * 50 + "z"
     events = source()
     chunks = (text(words[at * 50 : at * 50 + 50], 7, at) for at in range(3))
@@ -97,14 +97,14 @@ def test_a_status_text_in_chunks_is_one_event() -> None:
     assert (event_id, data[5:].decode()) == (STATUS_TEXT, words)
 
 
-def test_a_status_text_that_lost_its_end_is_kept() -> None:
+def test_status_text_without_its_last_chunk_is_an_event() -> None:
     events = source()
     assert events.receive(frames(text("x" * 50, 7, 0)), 0.0) == []
-    said = [data[5:].decode() for _, data in events.receive(frames(text("next")), 1.0)]
-    assert said == ["x" * 50, "next"]
+    event_texts = [data[5:].decode() for _, data in events.receive(frames(text("next")), 1.0)]
+    assert event_texts == ["x" * 50, "next"]
 
 
-def test_data_never_exceeds_its_limit() -> None:
+def test_event_data_never_exceeds_its_limit() -> None:
     events = source()
     events.receive(frames(*(text("é" * 25, 7, chunk) for chunk in range(255))), 0.0)
     ((_, data),) = events.receive(frames(text("", 7, 255)), 1.0)
@@ -112,12 +112,12 @@ def test_data_never_exceeds_its_limit() -> None:
 
 
 def positions(events: TelemetryEvents, seconds: int) -> list[float]:
-    """Feed a position every tenth of a second; return when position events came."""
-    data = frames(good_estimate(), place())
+    """Feed a position every tenth of a second, and return the times of the position events."""
+    data = frames(good_estimate(), position_msg())
     return [now / 10 for now in range(10 * seconds) if events.receive(data, now / 10)]
 
 
-def test_positions_come_at_random_intervals_around_the_mean() -> None:
+def test_intervals_of_positions_are_random_around_the_mean() -> None:
     times = positions(source(10.0), 2000)
     gaps = [after - before for before, after in itertools.pairwise(times)]
     assert min(gaps) >= 5.0
@@ -126,7 +126,7 @@ def test_positions_come_at_random_intervals_around_the_mean() -> None:
     assert max(gaps) - min(gaps) > 5.0
 
 
-def test_a_seed_fixes_the_intervals_and_another_changes_them() -> None:
+def test_equal_seeds_give_equal_intervals_of_positions() -> None:
     assert positions(source(seed=1), 100) == positions(source(seed=1), 100)
     assert positions(source(seed=1), 100) != positions(source(seed=2), 100)
 
@@ -134,10 +134,10 @@ def test_a_seed_fixes_the_intervals_and_another_changes_them() -> None:
 def test_a_position_holds_attitude_battery_and_mode() -> None:
     events = source()
     status = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 15_900, 1_000, 77, 0, 0, 0, 0, 0, 0)
-    events.receive(frames(heartbeat(GUIDED, armed=True), status, place()), 0.0)
+    events.receive(frames(heartbeat(GUIDED, armed=True), status, position_msg()), 0.0)
     events.receive(frames(mavlink.MAVLink_attitude_message(59_000, 0.1, -0.2, 3.0, 0.01, 0, float("inf"))), 1.0)
     events.receive(frames(mavlink.MAVLink_system_time_message(1_700_000_000_000_000, 59_500)), 1.0)
-    ((event_id, data),) = events.receive(frames(place()), 100.0)
+    ((event_id, data),) = events.receive(frames(position_msg()), 100.0)
     assert event_id == POSITION
     assert len(data) == 64
     fields = telemetry.Position.unpack(data)
@@ -163,18 +163,18 @@ def test_a_position_holds_attitude_battery_and_mode() -> None:
 
 def test_a_position_before_the_first_fix_is_no_event() -> None:
     events = source()
-    nowhere = frames(good_estimate(), place(lat=0, lon=0))
+    nowhere = frames(good_estimate(), position_msg(lat=0, lon=0))
     assert not any(events.receive(nowhere, float(now)) for now in range(100))
 
 
-def test_a_ground_station_or_gimbal_on_the_same_link_makes_no_events() -> None:
+def test_other_components_on_the_link_cause_no_events() -> None:
     events = source()
     assert events.receive(frames(heartbeat(GUIDED), text("hello"), component=154), 0.0) == []
     ground = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
     assert events.receive(frames(ground), 0.0) == []
 
 
-def test_messages_may_come_in_crumbs_and_between_garbage() -> None:
+def test_translator_reads_split_messages_between_garbage() -> None:
     events = source()
     stream = b"noise" + frames(heartbeat(GUIDED)) + b"\x00\xfd\xff" + bytes(300) + frames(text("still here"))
     made = [event for byte in stream for event in events.receive(bytes([byte]), 0.0)]
@@ -182,7 +182,7 @@ def test_messages_may_come_in_crumbs_and_between_garbage() -> None:
     assert events.garbage >= 2
 
 
-def test_what_is_kept_between_reads_is_bounded() -> None:
+def test_buffer_between_reads_is_limited() -> None:
     events = source()
     frame = frames(heartbeat())
     events.receive(frame[:10], 0.0)
@@ -192,7 +192,7 @@ def test_what_is_kept_between_reads_is_bounded() -> None:
 
 
 @given(st.lists(st.binary(max_size=600), max_size=10))
-def test_random_bytes_raise_nothing(reads: list[bytes]) -> None:
+def test_random_bytes_raise_no_exception(reads: list[bytes]) -> None:
     events = source()
     for now, data in enumerate(reads):
         events.receive(data, float(now))
@@ -226,7 +226,7 @@ _KINDS = (
 
 
 @given(st.data(), st.lists(st.sampled_from(_KINDS), min_size=1, max_size=12))
-def test_well_formed_messages_with_any_values_make_readable_events(data: st.DataObject, kinds: list[Any]) -> None:
+def test_messages_with_random_values_give_readable_events(data: st.DataObject, kinds: list[Any]) -> None:
     events = TelemetryEvents(10.0, random.Random(1), EVENT_KINDS)
     for at, kind in enumerate(kinds):
         message = any_message(kind, lambda name: data.draw(_FIELDS[name]))
@@ -238,7 +238,7 @@ def test_well_formed_messages_with_any_values_make_readable_events(data: st.Data
 
 
 @given(st.integers(-5, 300), st.binary(max_size=300))
-def test_anything_can_be_described(event_id: int, data: bytes) -> None:
+def test_random_events_have_a_printable_text(event_id: int, data: bytes) -> None:
     described = describe(event_id, data)
     assert described.isprintable()
     position = position_of(event_id, data)
@@ -246,12 +246,12 @@ def test_anything_can_be_described(event_id: int, data: bytes) -> None:
 
 
 @pytest.mark.parametrize("event_id", [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 254])
-def test_what_is_no_event_of_ours_is_unreadable(event_id: int) -> None:
+def test_other_event_data_is_unreadable(event_id: int) -> None:
     assert describe(event_id, b"\x00") == "unreadable"
 
 
 class FakeVehicle:
-    """Counts what it is sent, says one thing to each client, and hangs up when told."""
+    """A vehicle that records the requested messages, greets each client, and can close the connection."""
 
     def __init__(self, loop: Loop) -> None:
         self.requested: set[int] = set()
@@ -290,17 +290,17 @@ class FakeVehicle:
         self._listener.close()
 
 
-def test_the_connection_waits_for_the_vehicle_asks_and_comes_back_after_a_restart() -> None:
-    loop, heard = Loop(), bytearray()
+def test_connection_waits_requests_messages_and_reconnects() -> None:
+    loop, received = Loop(), bytearray()
     vehicle = FakeVehicle(loop)
     port = vehicle.serve()
     vehicle.close()
-    connection = VehicleConnection(loop, "127.0.0.1", port, heard.extend)
-    run_until(loop, lambda: True, after_s=0.02)  # the first attempt finds nobody
+    connection = VehicleConnection(loop, "127.0.0.1", port, received.extend)
+    run_until(loop, lambda: True, after_s=0.02)  # the first attempt finds no listener
     vehicle.serve(port)
     run_until(loop, lambda: vehicle.requested == {1, 2, 30, 33, 42})
     vehicle.hang_up()
-    run_until(loop, lambda: b"hello 2" in heard)
-    assert bytes(heard) == b"hello 1hello 2"
+    run_until(loop, lambda: b"hello 2" in received)
+    assert bytes(received) == b"hello 1hello 2"
     connection.close()
     vehicle.close()

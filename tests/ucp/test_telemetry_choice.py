@@ -1,4 +1,4 @@
-"""What to log is chosen in a scenario, stands in the mission file, and reaches the chain."""
+"""The kinds of events to log are selected in a scenario, written to the mission file, and logged by the agent."""
 
 import base64
 import json
@@ -21,23 +21,23 @@ from ucp.mission import MissionError, parse_mission
 from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, MODE_CHANGE, STATUS_TEXT
 
 
-def parsed(**events: Any) -> tuple[str, ...]:
+def parse_log(**events: Any) -> tuple[str, ...]:
     return parse_mission(mission(events={"source": "mavlink", **events})).events.log
 
 
-def test_a_mission_file_that_chooses_nothing_logs_as_ever() -> None:
-    assert parsed() == DEFAULT_LOG == ("mode", "arming", "text", "position")
+def test_mission_file_without_a_selection_logs_the_default_kinds() -> None:
+    assert parse_log() == DEFAULT_LOG == ("mode", "arming", "text", "position")
 
 
-def test_a_mission_file_can_choose_every_kind() -> None:
-    assert parsed(log=list(EVENT_KINDS)) == tuple(EVENT_KINDS)
-    assert parsed(log=[]) == ()
+def test_mission_file_can_select_every_kind() -> None:
+    assert parse_log(log=list(EVENT_KINDS)) == tuple(EVENT_KINDS)
+    assert parse_log(log=[]) == ()
 
 
 @pytest.mark.parametrize("log", ["mode", None, [1], [["mode"]], [{}], ["mode", "weather"], {"mode": True}])
-def test_a_mission_file_with_a_wrong_choice_is_refused_in_a_sentence(log: Any) -> None:
+def test_mission_file_with_a_wrong_selection_is_rejected(log: Any) -> None:
     with pytest.raises(MissionError, match=r"`events\.log` must list kinds of events \(mode, arming, text, waypoint"):
-        parsed(log=log)
+        parse_log(log=log)
 
 
 def load(tmp_path: Path, **events: Any) -> Events:
@@ -46,7 +46,7 @@ def load(tmp_path: Path, **events: Any) -> Events:
     return load_scenario(path).events
 
 
-def test_a_scenario_chooses_what_to_log(tmp_path: Path) -> None:
+def test_scenario_selects_the_kinds_to_log(tmp_path: Path) -> None:
     assert load(tmp_path).log == list(DEFAULT_LOG)
     assert load(tmp_path, log=["waypoint", "failsafe"]).log == ["waypoint", "failsafe"]
 
@@ -59,29 +59,29 @@ def test_a_scenario_chooses_what_to_log(tmp_path: Path) -> None:
         ("mode", r"`events\.log` is 'mode': it should be a valid list"),
     ],
 )
-def test_a_scenario_with_a_wrong_choice_is_refused_in_a_sentence(tmp_path: Path, log: Any, sentence: str) -> None:
+def test_scenario_with_a_wrong_selection_is_rejected(tmp_path: Path, log: Any, sentence: str) -> None:
     with pytest.raises(ScenarioError, match=sentence):
         load(tmp_path, log=log)
 
 
 @pytest.fixture
 def vehicle_port() -> Iterator[int]:
-    """A vehicle that says its mode and a text to whoever connects."""
+    """The port of a vehicle that sends its mode and a text to its first client."""
     with socket.create_server(("127.0.0.1", 0)) as server:
 
-        def speak() -> None:
+        def serve() -> None:
             client, _ = server.accept()
             with client:
                 client.sendall(frames(heartbeat(4, armed=True), text("the text")))
                 while client.recv(4096):
                     pass
 
-        threading.Thread(target=speak, daemon=True).start()
+        threading.Thread(target=serve, daemon=True).start()
         yield server.getsockname()[1]
 
 
 @pytest.mark.parametrize(("log", "ids"), [(["text"], [STATUS_TEXT]), (["mode", "text"], [MODE_CHANGE, STATUS_TEXT])])
-def test_an_agent_logs_what_its_mission_chose(
+def test_agent_logs_the_kinds_that_its_mission_selects(
     tmp_path: Path, vehicle_port: int, log: list[str], ids: list[int]
 ) -> None:
     agent = AgentUnderTest(

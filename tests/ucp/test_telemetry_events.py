@@ -1,4 +1,4 @@
-"""Waypoints, failsafes and battery levels: what of a vehicle's stream becomes an event, and how it reads."""
+"""Waypoints, failsafes and battery levels: the events in a vehicle's stream, and their text."""
 
 import random
 import struct
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
-from tests.ucp.test_telemetry import frames, place
+from tests.ucp.test_telemetry import frames, position_msg
 from ucp.telemetry import (
     ARMED,
     BATTERY,
@@ -46,66 +46,71 @@ def status(unhealthy: int = 0, left: int = -1, millivolt: int = 0xFFFF, enabled:
     )
 
 
-def said(events: TelemetryEvents, *messages: Any) -> list[str]:
+def event_texts(events: TelemetryEvents, *messages: Any) -> list[str]:
     return [describe(event_id, data) for event_id, data in events.receive(frames(*messages), 0.0)]
 
 
-def test_a_mission_item_reached_is_an_event() -> None:
+def test_reached_mission_item_is_an_event() -> None:
     events = source("waypoint")
-    ((event_id, data),) = events.receive(frames(place(7_500), mavlink.MAVLink_mission_item_reached_message(300)), 0.0)
+    ((event_id, data),) = events.receive(
+        frames(position_msg(7_500), mavlink.MAVLink_mission_item_reached_message(300)), 0.0
+    )
     assert (event_id, data) == (WAYPOINT, struct.pack(">IH", 7_500, 300))
     assert describe(event_id, data) == "[7.5 s] reached mission item 300"
 
 
-def test_an_item_reached_again_is_an_event_again() -> None:
+def test_mission_item_reached_again_is_a_second_event() -> None:
     """A mission may jump back."""
     reached = mavlink.MAVLink_mission_item_reached_message(2)
-    assert len(said(source("waypoint"), reached, reached)) == 2
+    assert len(event_texts(source("waypoint"), reached, reached)) == 2
 
 
-def test_a_failsafe_is_an_event_when_it_begins_gets_worse_and_ends() -> None:
+def test_start_escalation_and_end_of_a_failsafe_are_events() -> None:
     events = source("failsafe")
-    assert said(events, heartbeat(STANDBY, armed=False), heartbeat(ACTIVE)) == []
-    assert said(events, heartbeat(CRITICAL)) == ["[0.0 s] failsafe, critical"]
-    assert said(events, heartbeat(CRITICAL)) == []
-    assert said(events, heartbeat(EMERGENCY)) == ["[0.0 s] failsafe, emergency"]
-    assert said(events, heartbeat(ACTIVE)) == ["[0.0 s] failsafe over, active"]
-    assert said(events, heartbeat(STANDBY)) == []
+    assert event_texts(events, heartbeat(STANDBY, armed=False), heartbeat(ACTIVE)) == []
+    assert event_texts(events, heartbeat(CRITICAL)) == ["[0.0 s] failsafe, critical"]
+    assert event_texts(events, heartbeat(CRITICAL)) == []
+    assert event_texts(events, heartbeat(EMERGENCY)) == ["[0.0 s] failsafe, emergency"]
+    assert event_texts(events, heartbeat(ACTIVE)) == ["[0.0 s] failsafe over, active"]
+    assert event_texts(events, heartbeat(STANDBY)) == []
 
 
-def test_what_failed_is_named_and_its_data_is_as_documented() -> None:
+def test_failsafe_event_names_the_failed_sensors() -> None:
     events = source("failsafe")
-    events.receive(frames(place(9_000), heartbeat(ACTIVE), status()), 0.0)
+    events.receive(frames(position_msg(9_000), heartbeat(ACTIVE), status()), 0.0)
     ((event_id, data),) = events.receive(frames(status(RADIO)), 0.0)
     assert (event_id, data) == (FAILSAFE, struct.pack(">IBI", 9_000, ACTIVE, RADIO))
     assert describe(event_id, data) == "[9.0 s] failsafe, active: RC receiver"
-    assert said(events, heartbeat(CRITICAL)) == ["[9.0 s] failsafe, critical: RC receiver"]
-    assert said(events, status(ALL)) == ["[9.0 s] failsafe, critical: RC receiver, geofence, AHRS, battery"]
-    assert said(events, status(), heartbeat(ACTIVE)) == ["[9.0 s] failsafe, critical", "[9.0 s] failsafe over, active"]
+    assert event_texts(events, heartbeat(CRITICAL)) == ["[9.0 s] failsafe, critical: RC receiver"]
+    assert event_texts(events, status(ALL)) == ["[9.0 s] failsafe, critical: RC receiver, geofence, AHRS, battery"]
+    assert event_texts(events, status(), heartbeat(ACTIVE)) == [
+        "[9.0 s] failsafe, critical",
+        "[9.0 s] failsafe over, active",
+    ]
 
 
-def test_a_breached_fence_is_a_failsafe_although_it_is_not_critical() -> None:
-    assert said(source("failsafe"), heartbeat(ACTIVE), status(FENCE)) == ["[0.0 s] failsafe, active: geofence"]
+def test_breached_fence_is_a_failsafe_although_it_is_not_critical() -> None:
+    assert event_texts(source("failsafe"), heartbeat(ACTIVE), status(FENCE)) == ["[0.0 s] failsafe, active: geofence"]
 
 
 @pytest.mark.parametrize(
     ("bit", "name"), [(mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG, "compass"), (mavlink.MAV_SYS_STATUS_SENSOR_GPS, "GPS")]
 )
-def test_a_sensor_that_is_lost_in_flight_is_named_though_nothing_is_critical(bit: int, name: str) -> None:
+def test_sensor_lost_in_flight_is_a_failsafe_although_not_critical(bit: int, name: str) -> None:
     """ArduPilot 4.7 says nothing else of a lost compass, nor a plane of a lost GPS."""
     lost = mavlink.MAVLink_sys_status_message(ALL | bit, ALL | bit, ALL, 0, 0xFFFF, -1, -1, 0, 0, 0, 0, 0, 0)
-    assert said(source("failsafe"), heartbeat(ACTIVE), lost) == [f"[0.0 s] failsafe, active: {name}"]
+    assert event_texts(source("failsafe"), heartbeat(ACTIVE), lost) == [f"[0.0 s] failsafe, active: {name}"]
 
 
-def test_what_is_unhealthy_on_the_ground_or_not_enabled_has_not_failed() -> None:
+def test_sensor_unhealthy_on_the_ground_or_disabled_is_no_failsafe() -> None:
     events = source("failsafe")
-    assert said(events, heartbeat(STANDBY, armed=False), status(ALL)) == []
-    assert said(source("failsafe"), heartbeat(ACTIVE), status(ALL, enabled=0)) == []
+    assert event_texts(events, heartbeat(STANDBY, armed=False), status(ALL)) == []
+    assert event_texts(source("failsafe"), heartbeat(ACTIVE), status(ALL, enabled=0)) == []
 
 
-def test_a_sensor_that_is_no_failsafe_is_none() -> None:
+def test_other_unhealthy_sensors_are_no_failsafe() -> None:
     gyro = mavlink.MAVLink_sys_status_message(ALL | 1, ALL | 1, ALL, 0, 0xFFFF, -1, -1, 0, 0, 0, 0, 0, 0)
-    assert said(source("failsafe"), heartbeat(ACTIVE), gyro) == []
+    assert event_texts(source("failsafe"), heartbeat(ACTIVE), gyro) == []
 
 
 def levels(percentages: Iterable[int]) -> list[int]:
@@ -114,23 +119,23 @@ def levels(percentages: Iterable[int]) -> list[int]:
     return [left for left in percentages if events.receive(frames(status(left=left)), 0.0)]
 
 
-def test_the_battery_is_logged_every_10_percent_and_every_5_when_low() -> None:
+def test_battery_event_occurs_every_10_percent_and_every_5_when_low() -> None:
     assert levels(range(100, -1, -1)) == [100, 90, 80, 70, 60, 50, 40, 30, 20, 15, 10, 5, 0]
 
 
-def test_a_level_that_was_jumped_over_is_logged_once_and_noise_around_it_not_again() -> None:
+def test_skipped_battery_levels_and_noise_give_one_event() -> None:
     assert levels([77, 76, 41, 40, 41, 40, 42, 39, 12, 13, 12]) == [77, 41, 40, 12]
 
 
-def test_a_battery_that_was_changed_is_logged() -> None:
+def test_changed_battery_is_an_event() -> None:
     assert levels([30, 29, 39, 40, 41, 100, 100, 90]) == [30, 40, 100, 90]
 
 
-def test_a_battery_that_does_not_know_its_percentage_is_not_logged() -> None:
+def test_battery_without_a_percentage_is_no_event() -> None:
     assert levels([-1, -1, 50, -1, 50]) == [50]
 
 
-def test_a_battery_event_reads_as_documented() -> None:
+def test_battery_event_has_the_documented_text() -> None:
     ((event_id, data),) = source("battery").receive(frames(status(left=15, millivolt=14_320)), 0.0)
     assert (event_id, data) == (BATTERY, struct.pack(">IHhb", 0, 14_320, 1_000, 15))
     assert describe(event_id, data) == "[0.0 s] battery 15 %, 14.3 V, 10.0 A"
@@ -143,27 +148,34 @@ def test_a_battery_event_reads_as_documented() -> None:
 )
 def test_modes_have_the_names_of_their_vehicle(vehicle_type: int, mode: int, name: str) -> None:
     message = mavlink.MAVLink_heartbeat_message(vehicle_type, 3, 0, mode, ACTIVE, 3)
-    assert said(source("mode"), message) == [f"[0.0 s] mode {name}"]
+    assert event_texts(source("mode"), message) == [f"[0.0 s] mode {name}"]
 
 
-def test_the_default_is_what_was_always_logged() -> None:
+def test_default_kinds_are_mode_arming_text_and_position() -> None:
     events = TelemetryEvents(10.0, random.Random(1))
     reached = mavlink.MAVLink_mission_item_reached_message(2)
     made = [event_id for event_id, _ in events.receive(frames(heartbeat(CRITICAL), status(RADIO, 50), reached), 0.0)]
     assert made == [1, ARMED]
     text = mavlink.MAVLink_statustext_message(6, b"hello")
     made += [
-        event_id for event_id, _ in events.receive(frames(place()), 0.0) + events.receive(frames(place(), text), 99.0)
+        event_id
+        for event_id, _ in events.receive(frames(position_msg()), 0.0)
+        + events.receive(frames(position_msg(), text), 99.0)
     ]
     assert made == [1, ARMED, POSITION, STATUS_TEXT]
 
 
 @pytest.mark.parametrize("kind", EVENT_KINDS)
-def test_a_kind_that_was_not_chosen_is_not_logged(kind: EventKind) -> None:
-    """And choosing it alone gives the same events as choosing all, without the others."""
+def test_events_of_kinds_that_are_not_selected_are_not_logged(kind: EventKind) -> None:
+    """If only this kind is selected, its events are the same as if all kinds are selected."""
     stream = [
-        frames(heartbeat(CRITICAL), status(RADIO, 50), mavlink.MAVLink_mission_item_reached_message(2), place()),
-        frames(heartbeat(ACTIVE, armed=False), status(), mavlink.MAVLink_statustext_message(6, b"hello"), place()),
+        frames(heartbeat(CRITICAL), status(RADIO, 50), mavlink.MAVLink_mission_item_reached_message(2), position_msg()),
+        frames(
+            heartbeat(ACTIVE, armed=False),
+            status(),
+            mavlink.MAVLink_statustext_message(6, b"hello"),
+            position_msg(),
+        ),
     ]
 
     def logged(log: Iterable[EventKind]) -> list[tuple[int, bytes]]:
@@ -192,7 +204,7 @@ FIELDS = st.tuples(
 
 
 @given(FIELDS)
-def test_a_position_record_comes_back_as_it_was(fields: tuple[Any, ...]) -> None:
+def test_packed_position_record_unpacks_to_the_same_position(fields: tuple[Any, ...]) -> None:
     position = Position(*fields)
     assert len(position.pack()) == 64
     assert Position.unpack(position.pack()) == position

@@ -1,11 +1,11 @@
-"""The `mavlink` event source: what a vehicle says about itself becomes loggable events.
+"""The `mavlink` event source: it turns the telemetry of a vehicle into loggable events.
 
-`TelemetryEvents` is the translator: bytes from the vehicle in, (event ID, data) out, with time as an argument.
-`VehicleConnection` is the thin connection that feeds it. `describe` turns an event's data back into words,
-`position_of` into a position. `mode_name` returns the name of a flight mode. A mission chooses what is logged, by kind
-(`EVENT_KINDS`).
+`TelemetryEvents` translates the bytes of a vehicle into pairs of event ID and data. Time is an argument, and it does no
+I/O. `VehicleConnection` connects to the vehicle and passes its bytes to the translator. `describe` returns the data of
+an event as text, `position_of` returns it as a position, and `mode_name` returns the name of a flight mode. A mission
+selects the events to log by kind (`EVENT_KINDS`).
 
-    ID  kind      event             data, big-endian (MAVLink messages it comes from)
+    ID  kind      event             data, big-endian (source: MAVLink messages)
     1   mode      mode change       `>IBII`   vehicle time ms, MAV_TYPE, mode before (0xFFFFFFFF: unknown), mode
                                               (HEARTBEAT)
     2   arming    armed             `>II`     vehicle time ms, mode (HEARTBEAT)
@@ -14,30 +14,31 @@
     5   position  position          64 bytes, see `Position` (GLOBAL_POSITION_INT, ATTITUDE, SYS_STATUS, SYSTEM_TIME)
     6   waypoint  waypoint reached  `>IH`     vehicle time ms, number of the mission item (MISSION_ITEM_REACHED,
                                               MISSION_CURRENT)
-    7   failsafe  failsafe or over  `>IBI`    vehicle time ms, MAV_STATE, what failed (HEARTBEAT, SYS_STATUS)
+    7   failsafe  failsafe or over  `>IBI`    vehicle time ms, MAV_STATE, failed sensors (HEARTBEAT, SYS_STATUS)
     8   battery   battery level     `>IHhb`   vehicle time ms, mV (65535: unknown), 0.01 A (-1: unknown), % left
                                               (SYS_STATUS)
 
-Vehicle time is milliseconds since the vehicle's boot, in its own (perhaps simulated) time. A mode is ArduPilot's
-custom_mode. A position record is large enough that positions alone, one in 10 s, fill about nine blocks of 1024 bytes
-in the thesis's 20 minutes.
+Vehicle time is the number of milliseconds since the vehicle's boot, by the vehicle's own clock. In a simulation this is
+simulated time. A mode is ArduPilot's custom_mode. One position in 10 s fills about nine blocks of 1024 bytes in the 20
+minutes of the thesis's mission.
 
-A position counts while the vehicle says that its estimate is good: MAV_SYS_STATUS_AHRS of SYS_STATUS. Before, and if it
-is lost in flight, there are no positions: an ArduPlane that has booted says for some seconds that it is near 0 N, 0 E.
+A position is an event only while the vehicle reports a good estimate (MAV_SYS_STATUS_AHRS of SYS_STATUS). For some
+seconds after its boot, ArduPlane reports a position near 0 N, 0 E with a bad estimate.
 
-What ArduPilot says every 30 s while it cannot be armed (`PreArm: ...`) is an event once, until its mode or its arming
-changes.
+While ArduPilot cannot be armed, it repeats the reasons every 30 s as texts `PreArm: ...`. Each such text is an event
+once, until the mode or the arming changes.
 
-Failsafes are read from what is meant for machines. While one acts (radio, battery, ground station, EKF, terrain, dead
-reckoning), ArduPilot's HEARTBEAT says MAV_STATE_CRITICAL; a plane that has crashed says MAV_STATE_EMERGENCY. Which one
-it is, SYS_STATUS tells of some, by a bit of MAV_SYS_STATUS_SENSOR that is enabled and unhealthy: RC receiver, battery,
-compass, GPS, geofence (neither a breach nor a lost compass is critical) and AHRS, the estimate of
-attitude and position. These bits are "what failed". They count while the vehicle is armed or critical: before a flight
-the estimate is not healthy yet. Every change is an event, and so is the end. A ground station failsafe has no bit: log
-`text` too, where ArduPilot says which it is and what it does about it.
+Failsafes are read from fields, not from texts. While a failsafe acts (radio, battery, ground station, EKF, terrain,
+dead reckoning), ArduPilot's HEARTBEAT has the state MAV_STATE_CRITICAL. A crashed plane has MAV_STATE_EMERGENCY. Bits
+of MAV_SYS_STATUS_SENSOR in SYS_STATUS that are enabled and unhealthy name the failed sensors: RC receiver, battery,
+compass, GPS, geofence, and AHRS, the estimate of attitude and position. A breached geofence or a lost compass does not
+make the state critical. The bits count only while the vehicle is armed or its state is critical, because the estimate
+is not healthy before a flight. Each change of state or sensors is an event, and so is the end of the failsafe. A
+failsafe of the ground station has no bit. To see its name, log `text` too.
 
-Battery levels are every 10 %, and every 5 % from 20 % down. A level reached is an event, and so is a battery that was
-charged or changed. A vehicle that does not know its percentage has no levels; its battery failsafe is event 7.
+Battery levels are multiples of 10 %, and below 20 % also multiples of 5 %. The event occurs at the first known charge,
+if the charge falls to a level, and if the battery was charged or changed. A vehicle that does not report its percentage
+has no battery levels. Its battery failsafe is event 7.
 """
 
 from ucp.events import DEFAULT_LOG, EventKind

@@ -1,4 +1,4 @@
-"""The connection to a vehicle: what it sends goes to the translator, and it is asked for what the translator wants."""
+"""The connection to a vehicle. It requests MAVLink messages and passes the received bytes on."""
 
 import contextlib
 import socket
@@ -10,8 +10,11 @@ from ucp.loop import Loop, Timer
 MAX_READ_BYTES = 65536
 
 _REQUESTED = {33: 1.0, 30: 1.0, 1: 2.0, 2: 2.0, 42: 1.0}
-"""Message ID: interval in simulated seconds. HEARTBEAT, STATUSTEXT and MISSION_ITEM_REACHED come unasked; at an
-interval ArduPilot would repeat which mission item it reached last."""
+"""Message ID -> requested interval in simulated seconds.
+
+ArduPilot sends HEARTBEAT, STATUSTEXT and MISSION_ITEM_REACHED without a request. With an interval, it would repeat the
+last MISSION_ITEM_REACHED.
+"""
 _SET_MESSAGE_INTERVAL = 511  # MAV_CMD_SET_MESSAGE_INTERVAL
 
 _COMPANION_SYSTEM, _COMPANION_COMPONENT = 255, 191  # MAV_COMP_ID_ONBOARD_COMPUTER
@@ -21,10 +24,10 @@ _FIRST_REQUEST_S, _LAST_REQUEST_S = 1.0, 30.0
 
 
 class VehicleConnection:
-    """Hands everything that the vehicle at `host`:`port` sends to `sink`, until `close`.
+    """Passes all bytes of the vehicle at `host`:`port` to `sink`, until `close`.
 
-    Waits for the vehicle to listen, asks it for the messages that `TelemetryEvents` wants, and connects again when it
-    restarts.
+    It tries to connect until the vehicle accepts, requests the messages that `TelemetryEvents` needs, and connects
+    again after a restart of the vehicle.
     """
 
     def __init__(self, loop: Loop, host: str, port: int, sink: Callable[[bytes], object]) -> None:
@@ -33,14 +36,14 @@ class VehicleConnection:
         self._sink = sink
         self._retry_s = _FIRST_RETRY_S
         self._socket: socket.socket | None = None
-        self._next: Timer | None = None
-        """When it tries to connect again, or asks again."""
+        self._retry_timer: Timer | None = None
+        """The timer of the next attempt to connect, or of the next request."""
         self._connect()
 
     def close(self) -> None:
-        """Nothing comes to the sink any more."""
-        if self._next is not None:
-            self._next.cancel()
+        """Close the connection and stop trying to connect. `sink` is not called any more."""
+        if self._retry_timer is not None:
+            self._retry_timer.cancel()
         if self._socket is not None:
             self._loop.watch(self._socket)
             self._socket.close()
@@ -54,25 +57,25 @@ class VehicleConnection:
         except BlockingIOError:
             self._loop.watch(self._socket, writable=self._connected)
         except OSError:
-            self._try_again()
+            self._retry()
         else:
             self._connected()
 
-    def _try_again(self) -> None:
+    def _retry(self) -> None:
         self.close()
-        self._next = self._loop.call_later(self._retry_s, self._connect)
+        self._retry_timer = self._loop.call_later(self._retry_s, self._connect)
         self._retry_s = min(2 * self._retry_s, _LAST_RETRY_S)
 
     def _connected(self) -> None:
-        assert self._socket is not None, "it was to be connected"
+        assert self._socket is not None, "_connect opened it"
         if self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-            self._try_again()
+            self._retry()
             return
         self._loop.watch(self._socket, readable=self._read)
-        from pymavlink.dialects.v20 import common  # which takes its time
+        from pymavlink.dialects.v20 import common  # the import is slow
 
         self._mav = common.MAVLink(None, srcSystem=_COMPANION_SYSTEM, srcComponent=_COMPANION_COMPONENT)
-        self._ask(_FIRST_REQUEST_S)
+        self._request_messages(_FIRST_REQUEST_S)
 
     def _read(self) -> None:
         assert self._socket is not None, "it is watched"
@@ -80,23 +83,29 @@ class VehicleConnection:
             data = self._socket.recv(MAX_READ_BYTES)
         except BlockingIOError:
             return
-        except OSError:  # a vehicle that is killed resets its connections
+        except OSError:  # a killed vehicle resets its connections
             data = b""
         if data:
             self._retry_s = _FIRST_RETRY_S
             self._sink(data)
         else:
-            self._try_again()  # not at once: a port that accepts and closes is not hammered
+            self._retry()  # after a pause, because a port may accept each connection and close it at once
 
-    def _ask(self, pause_s: float) -> None:
-        """Ask for the messages, and again ever more seldom: a vehicle that is booting acknowledges and forgets."""
+    def _request_messages(self, pause_s: float) -> None:
+        """Request the messages, and repeat the requests with growing pauses.
+
+        A vehicle that is booting acknowledges a request and may forget it.
+        """
         assert self._socket is not None, "it is connected"
         for message_id, interval_s in _REQUESTED.items():
-            # target 0: every system on this link, which is one
+            # target 0 means each system on this link. There is one.
             request = self._mav.command_long_encode(
                 0, 0, _SET_MESSAGE_INTERVAL, 0, message_id, interval_s * 1e6, 0, 0, 0, 0, 0
             )
-            with contextlib.suppress(OSError):  # it is told by what is read, or does not read: it is asked again
+            # _read notices a lost connection, and the repeated request makes up for a full buffer
+            with contextlib.suppress(OSError):
                 self._socket.send(request.pack(self._mav))
             self._mav.seq = (self._mav.seq + 1) % 256
-        self._next = self._loop.call_later(pause_s, partial(self._ask, min(2 * pause_s, _LAST_REQUEST_S)))
+        self._retry_timer = self._loop.call_later(
+            pause_s, partial(self._request_messages, min(2 * pause_s, _LAST_REQUEST_S))
+        )

@@ -1,4 +1,4 @@
-"""What an event of the `mavlink` source holds, in words."""
+"""The data of `mavlink` events as text."""
 
 import math
 import struct
@@ -15,62 +15,62 @@ _STATES = (  # MAV_STATE
 
 
 def describe(event_id: int, data: bytes) -> str:
-    """Say in words what an event of this source holds; 'unreadable' when it is none. Raises nothing."""
+    """Return the data of an event of the `mavlink` source as text. Other data gives "unreadable"."""
     try:
         match event_id:
             case _records.MODE_CHANGE:
                 ms, kind, before, mode = _records.MODE_CHANGE_DATA.unpack(data)
                 change = "" if before == _records.UNKNOWN_MODE else f" (was {mode_name(before, kind)})"
-                return f"{_seconds(ms)} mode {mode_name(mode, kind)}{change}"
+                return f"{_time_prefix(ms)} mode {mode_name(mode, kind)}{change}"
             case _records.ARMED | _records.DISARMED:
                 ms, mode = _records.ARMING_DATA.unpack(data)
-                return f"{_seconds(ms)} {'armed' if event_id == _records.ARMED else 'disarmed'} in mode {mode}"
+                return f"{_time_prefix(ms)} {'armed' if event_id == _records.ARMED else 'disarmed'} in mode {mode}"
             case _records.STATUS_TEXT:
                 ms, severity = _records.STATUS_TEXT_DATA.unpack_from(data)
                 text = data[_records.STATUS_TEXT_DATA.size :].decode(errors="replace")
                 printable = "".join(char if char.isprintable() else "?" for char in text)
-                return f"{_seconds(ms)} {_SEVERITIES[severity]}: {printable}"
+                return f"{_time_prefix(ms)} {_SEVERITIES[severity]}: {printable}"
             case _records.POSITION:
                 return _position(Position.unpack(data))
             case _records.WAYPOINT:
                 ms, item = _records.WAYPOINT_DATA.unpack(data)
-                return f"{_seconds(ms)} reached mission item {item}"
+                return f"{_time_prefix(ms)} reached mission item {item}"
             case _records.FAILSAFE:
                 return _failsafe(*_records.FAILSAFE_DATA.unpack(data))
             case _records.BATTERY:
                 ms, millivolt, centiampere, left = _records.BATTERY_DATA.unpack(data)
                 volts = "" if millivolt == _records.UNKNOWN_VOLTAGE else f", {millivolt / 1e3:.1f} V"
                 amperes = "" if centiampere == -1 else f", {centiampere / 100:.1f} A"
-                return f"{_seconds(ms)} battery {left} %{volts}{amperes}"
+                return f"{_time_prefix(ms)} battery {left} %{volts}{amperes}"
     except (struct.error, IndexError):
         pass
     return "unreadable"
 
 
 def _position(position: Position) -> str:
-    words = [
-        f"{_seconds(position.vehicle_ms)} at {position.lat_e7 / 1e7:.7f} {position.lon_e7 / 1e7:.7f}",
+    parts = [
+        f"{_time_prefix(position.vehicle_ms)} at {position.lat_e7 / 1e7:.7f} {position.lon_e7 / 1e7:.7f}",
         f"{position.alt_mm / 1e3:.1f} m",
         f"{position.relative_alt_mm / 1e3:.1f} m above home",
         f"{math.hypot(position.north_cms, position.east_cms) / 100:.1f} m/s",
         f"climb {-position.down_cms / 100:.1f} m/s",
     ]
     if position.heading_cdeg != _records.UNKNOWN_HEADING:
-        words.append(f"heading {position.heading_cdeg / 100:.0f}")
+        parts.append(f"heading {position.heading_cdeg / 100:.0f}")
     if position.battery_mv != _records.UNKNOWN_VOLTAGE:
         left = f" {position.battery_percent} %" if position.battery_percent >= 0 else ""
-        words.append(f"battery {position.battery_mv / 1e3:.1f} V{left}")
-    words.append(f"mode {position.mode}" + (" armed" if position.armed else ""))
-    return ", ".join(words)
+        parts.append(f"battery {position.battery_mv / 1e3:.1f} V{left}")
+    parts.append(f"mode {position.mode}" + (" armed" if position.armed else ""))
+    return ", ".join(parts)
 
 
 def _failsafe(ms: int, state: int, failed: int) -> str:
     name = _STATES[state]
     if state not in _records.CRITICAL_STATES and not failed:
-        return f"{_seconds(ms)} failsafe over, {name}"
+        return f"{_time_prefix(ms)} failsafe over, {name}"
     sensors = [word for bit, word in _records.SENSORS.items() if failed & bit]
-    return f"{_seconds(ms)} failsafe, {name}" + (f": {', '.join(sensors)}" if sensors else "")
+    return f"{_time_prefix(ms)} failsafe, {name}" + (f": {', '.join(sensors)}" if sensors else "")
 
 
-def _seconds(vehicle_ms: int) -> str:
+def _time_prefix(vehicle_ms: int) -> str:
     return f"[{vehicle_ms / 1e3:.1f} s]"

@@ -1,5 +1,7 @@
-"""Names of ArduPilot's flight modes (custom_mode) by MAV_TYPE: ArduPilot's documentation of the parameters FLTMODE1
-(Copter, Plane) and MODE1 (Rover)."""
+"""Names of ArduPilot's flight modes (custom_mode) by MAV_TYPE.
+
+Source: ArduPilot's documentation of the parameters FLTMODE1 (Copter, Plane) and MODE1 (Rover).
+"""
 
 _COPTER = {
     0: "STABILIZE",
@@ -81,5 +83,5 @@ _BY_TYPE = {
 
 
 def mode_name(mode: int, vehicle_type: int) -> str:
-    """The mode's name; its number where it has none."""
+    """Return the name of a mode, or its number if it has no name."""
     return _BY_TYPE.get(vehicle_type, {}).get(mode, str(mode))

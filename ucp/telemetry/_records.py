@@ -1,4 +1,4 @@
-"""Event IDs of the `mavlink` source and the layout of their data; the package's docstring has them as a table."""
+"""Event IDs of the `mavlink` source and the layout of their data. The package's docstring has a table of them."""
 
 import struct
 from typing import NamedTuple
@@ -18,7 +18,8 @@ EVENT_KINDS: dict[EventKind, tuple[int, ...]] = {
 }
 """The event IDs of each kind."""
 
-MAX_DATA_BYTES = 256  # longer data is cut
+MAX_DATA_BYTES = 256
+"""Maximum length of event data. Longer data is truncated."""
 
 UNKNOWN_MODE = 0xFFFFFFFF
 UNKNOWN_HEADING = UNKNOWN_VOLTAGE = 0xFFFF
@@ -30,7 +31,7 @@ SENSORS = {
     **{1 << 2: "compass", 1 << 5: "GPS"},
     **{1 << 16: "RC receiver", 1 << 20: "geofence", 1 << 21: "AHRS", 1 << 25: "battery"},
 }
-"""The bits of MAV_SYS_STATUS_SENSOR that a failsafe event can hold, and what they are called."""
+"""Bit of MAV_SYS_STATUS_SENSOR -> name of the sensor in a failsafe event."""
 
 MODE_CHANGE_DATA = struct.Struct(">IBII")
 ARMING_DATA = struct.Struct(">II")
@@ -43,7 +44,7 @@ _POSITION_DATA = struct.Struct(">IQiiiihhhHfffhhhHhbIB")
 
 
 class Position(NamedTuple):
-    """A position record, in the order and the units of its data: `>IQiiiihhhHfffhhhHhbIB`, 64 bytes."""
+    """A position record, with the order and the units of its data: `>IQiiiihhhHfffhhhHhbIB`, 64 bytes."""
 
     vehicle_ms: int
     clock_us: int  # the vehicle's clock, microseconds since the Unix epoch; 0: unknown
@@ -63,21 +64,21 @@ class Position(NamedTuple):
     yaw_mrads: int
     battery_mv: int  # 65535: unknown
     battery_ca: int  # 0.01 A; -1: unknown
-    battery_percent: int  # left; -1: unknown
+    battery_percent: int  # remaining charge; -1: unknown
     mode: int
-    armed: int  # 1 when armed
+    armed: int  # 1 if armed
 
     def pack(self) -> bytes:
         return _POSITION_DATA.pack(*self)
 
     @classmethod
     def unpack(cls, data: bytes) -> "Position":
-        """Raises struct.error for anything but 64 bytes."""
+        """Parse a position record. Raises struct.error unless `data` has 64 bytes."""
         return cls._make(_POSITION_DATA.unpack(data))
 
 
 def position_of(event_id: int, data: bytes) -> Position | None:
-    """The position that an event holds; None if it is another event, unreadable, or nowhere on Earth."""
+    """Return the position in an event. None if it is another event, is unreadable, or is out of range."""
     if event_id != POSITION:
         return None
     try:
