@@ -36,7 +36,7 @@ from sitl.plan import PlanError
 from sitl.vehicle import VehicleError
 from ucp.block import MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
 from ucp.events import EVENT_HEADER_BYTES
-from ucp.quirks import Quirks, in_force
+from ucp.quirks import Quirks, active_quirks
 from ucp.sealed import SEAL_BYTES
 from ucp.settings import Settings
 from ucp.short_value import shown
@@ -191,7 +191,7 @@ class Scenario(Model):
     @property
     def has_wrong_agents(self) -> bool:
         """True if any agent makes mistakes on purpose."""
-        return any(in_force(self.quirks_of(agent_id)) for agent_id in self.roster)
+        return any(active_quirks(self.quirks_of(agent_id)) for agent_id in self.roster)
 
     def flight_of(self, vehicle: int) -> Flight | None:
         """Return the flight of this vehicle. None if no flight names it."""

@@ -267,7 +267,7 @@ def test_a_quirk_makes_the_agent_wrong_until_it_is_taken_away(agent: AgentUnderT
         ("reconcile", {}, "has not started"),
         ("log", {"event_id": 1, "data": "AQ=="}, "has not started"),
         ("quirk", {"name": "ignore_commit", "value": 7}, "probability"),
-        ("quirk", {"name": "never_reconcile", "value": 1}, "never_reconcile is true or false"),
+        ("quirk", {"name": "never_reconcile", "value": 1}, "never_reconcile must be true or false"),
         ("quirk", {"name": "never_reconciles" * 1000, "value": True}, "the nearest are never_reconcile"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Wrong agents make the mistakes that they are asked to make, and nothing else about them is other than it was."""
+"""Wrong agents make the requested mistakes and are otherwise correct."""
 
 from functools import cache
 from random import Random
@@ -13,12 +13,18 @@ from ucp.agent import HANDLERS, Agent
 from ucp.core import Core
 from ucp.events import LoggableEvent
 from ucp.messages import BlockAddResponse
-from ucp.quirks import CRASHED, QUIRKS, check_quirk, in_force, wrong_handlers
+from ucp.quirks import CRASHED, QUIRKS, active_quirks, check_quirk, wrong_handlers
 
 CRASHING = {"break_off_commit", "break_off_broadcast", "crash_on_tie"}
 """Quirks whose mistake is an exception."""
-MADE_TO_CRASH = {"keep_committed_block", "commit_others_twice", "skip_phase2", "ask_for_what_is_held", "take_any_block"}
-"""Quirks whose mistake makes a good handler end by one, for what it finds should not be."""
+INDIRECTLY_CRASHING = {
+    "keep_committed_block",
+    "commit_others_twice",
+    "skip_phase2",
+    "ask_for_what_is_held",
+    "take_any_block",
+}
+"""Quirks whose mistake leads to a state in which a good handler raises an exception."""
 
 
 def value(quirk: str) -> float | bool:
@@ -27,8 +33,8 @@ def value(quirk: str) -> float | bool:
 
 @cache
 def traces(seed: int, quirk: str | None) -> dict[int, Trace]:
-    """Of a swarm to which everything happens: loss, copies, parted chains, deques of many blocks."""
-    hard = scenario(
+    """Return the traces of a swarm with loss, duplicated messages, diverged chains and deques of many blocks."""
+    difficult = scenario(
         duration_s=450,
         network={"loss": 0.25, "duplicate": 0.2},
         events={"source": "random", "mean_s": 15},
@@ -36,7 +42,7 @@ def traces(seed: int, quirk: str | None) -> dict[int, Trace]:
         settle={"limit_s": 100},
         quirks={quirk: value(quirk)} if quirk else {},
     )
-    return simulate(hard, seed, tracing=True, deliver_all=True).evidence.traces
+    return simulate(difficult, seed, tracing=True, deliver_all=True).evidence.traces
 
 
 def lines(traces: dict[int, Trace]) -> list[str]:
@@ -44,7 +50,7 @@ def lines(traces: dict[int, Trace]) -> list[str]:
 
 
 @pytest.mark.parametrize("quirk", QUIRKS)
-def test_an_agent_with_a_quirk_is_another_that_plays_to_the_end_and_does_what_it_declares(quirk: str) -> None:
+def test_agent_with_a_quirk_differs_and_follows_its_declarations(quirk: str) -> None:
     handlers = {handler.name: handler for handler in wrong_handlers({quirk: value(quirk)}, Random(0))}
     right, wrong = traces(1, None), traces(1, quirk)
     for trace in wrong.values():
@@ -52,28 +58,28 @@ def test_an_agent_with_a_quirk_is_another_that_plays_to_the_end_and_does_what_it
     assert lines(wrong) != lines(right)
     crashed = any(run.branch == CRASHED for trace in wrong.values() for run in trace.runs)
     assert crashed >= (quirk in CRASHING)
-    assert crashed <= (quirk in CRASHING | MADE_TO_CRASH), "no handler ends by an exception that nobody meant"
+    assert crashed <= (quirk in CRASHING | INDIRECTLY_CRASHING), "a handler raised an unexpected exception"
 
 
-def test_there_are_quirks_of_every_algorithm_and_each_says_what_it_does_wrong() -> None:
+def test_each_algorithm_has_a_quirk_and_each_quirk_a_sentence() -> None:
     assert {algorithm for quirk in QUIRKS.values() for algorithm in quirk.algorithms} == set(range(1, 21))
     assert len({quirk.sentence for quirk in QUIRKS.values()}) == len(QUIRKS)
     assert all(quirk.sentence.endswith(".") for quirk in QUIRKS.values())
 
 
-def test_quirks_that_are_off_are_none() -> None:
+def test_quirks_that_are_off_change_no_handler() -> None:
     off = {"crash_on_tie": False, "ignore_commit": 0.0}
-    assert in_force(off) == {}
+    assert active_quirks(off) == {}
     assert wrong_handlers(off, Random(0)) == []
 
 
-def test_an_unknown_quirk_is_told_which_names_are_like_it() -> None:
+def test_error_for_an_unknown_quirk_lists_similar_names() -> None:
     with pytest.raises(ValueError, match=r"unknown quirk 'crash_on_ties': .* the nearest are crash_on_tie, "):
         check_quirk("crash_on_ties", True)
 
 
-def voted_down() -> Agent:
-    """An agent that has proposed its block, and has one vote against its own."""
+def agent_with_a_tied_vote() -> Agent:
+    """Return an agent that has proposed a block and received one disapproval, next to its own approval."""
     agent = Agent(1, [1, 2], b"")
     while agent.state.candidate_block is None:
         agent.add_event(LoggableEvent(1, 1, bytes(256)), 0.0)
@@ -94,23 +100,23 @@ def voted_down() -> Agent:
         (["tie_is_majority", "say_everything_twice"], 1, ["Commit Block", "Commit Block"]),
     ],
 )
-def test_quirks_of_one_algorithm_add_up_in_any_order(quirks: list[str], chain: int, sent: list[str]) -> None:
-    agent = voted_down()
+def test_quirks_of_one_algorithm_combine_in_any_order(quirks: list[str], chain: int, sent: list[str]) -> None:
+    agent = agent_with_a_tied_vote()
     agent.replace_handlers(wrong_handlers(dict.fromkeys(quirks, True), Random(0)))
     agent.handle_timer(10.0)
     assert len(agent.state.chain) == chain
     assert [message.NAME for _, message in agent.messages_to_send()] == sent
 
 
-def test_what_is_wrong_about_the_core_is_so_only_while_its_algorithm_runs() -> None:
-    agent = voted_down()
+def test_wrong_core_method_applies_only_while_its_algorithm_runs() -> None:
+    agent = agent_with_a_tied_vote()
     agent.replace_handlers(wrong_handlers({"break_off_commit": True, "commit_whatever_the_vote": True}, Random(0)))
     agent.handle_timer(10.0)
     assert type(agent.state) is Core
     assert agent.state.completed and not agent.state.blocks_to_be_committed and not len(agent.state.chain)
 
 
-def test_the_good_handlers_are_none_the_wiser() -> None:
+def test_quirks_do_not_change_the_good_handlers() -> None:
     before = [dict(vars(handler)) for handler in HANDLERS.values()]
     wrong = wrong_handlers({name: value(name) for name in QUIRKS}, Random(0))
     assert [vars(handler) for handler in HANDLERS.values()] == before

@@ -1,4 +1,4 @@
-"""Wrong agents: mistakes that an agent makes on request, so that tests show what finds them.
+"""Wrong agents: mistakes that an agent makes on request. They show which checks find which mistakes.
 
 A quirk replaces a handler, or a helper that handlers use. An agent has quirks only if its mission, its scenario or the
 command `quirk` names them. The thesis's own mistakes are among them: `ignore_commit` (Section 4.2), and `crash_on_tie`,
@@ -13,12 +13,21 @@ from typing import Any
 from ucp.agent import HANDLERS
 from ucp.handler import EventHandler
 from ucp.quirks import _commit_quirks, _core_quirks, _reconcile_quirks
-from ucp.quirks._quirk import CRASHED, Quirk, ending_by_exceptions
+from ucp.quirks._quirk import CRASHED, Quirk, catch_exceptions
 
-__all__ = ["CRASHED", "QUIRKS", "Quirk", "Quirks", "UnknownQuirkError", "check_quirk", "in_force", "wrong_handlers"]
+__all__ = [
+    "CRASHED",
+    "QUIRKS",
+    "Quirk",
+    "Quirks",
+    "UnknownQuirkError",
+    "active_quirks",
+    "check_quirk",
+    "wrong_handlers",
+]
 
 Quirks = dict[str, bool | float]
-"""Quirk -> true, or its probability. False, 0 and a quirk that is left out are the same."""
+"""Name of a quirk -> true or its probability. False, 0 and a missing quirk mean the same."""
 
 QUIRKS: dict[str, Quirk] = {
     quirk.name: quirk
@@ -29,7 +38,7 @@ QUIRKS: dict[str, Quirk] = {
 """All quirks by name, in the order of their Algorithms."""
 
 MAX_NAME = 40
-"""More of a wrong name is not shown."""
+"""Maximum number of characters of an unknown name in an error message."""
 
 
 class UnknownQuirkError(ValueError):
@@ -37,7 +46,7 @@ class UnknownQuirkError(ValueError):
 
 
 def check_quirk(name: str, value: object) -> None:
-    """Raises ValueError for a value that is not allowed, and UnknownQuirkError for an unknown name."""
+    """Raise UnknownQuirkError if the name is unknown, and ValueError if the quirk cannot have this value."""
     if name not in QUIRKS:
         name = name[:MAX_NAME]
         near = ", ".join(get_close_matches(name, QUIRKS, cutoff=0.0))
@@ -45,21 +54,21 @@ def check_quirk(name: str, value: object) -> None:
     QUIRKS[name].check(value)
 
 
-def in_force(quirks: Mapping[str, bool | float]) -> dict[str, float]:
-    """The quirks that are neither false nor 0; with none the agent is a right one."""
+def active_quirks(quirks: Mapping[str, bool | float]) -> dict[str, float]:
+    """Return the quirks that are neither false nor 0. An agent with no active quirk is correct."""
     return {name: float(quirks[name]) for name in QUIRKS if quirks.get(name)} if quirks else {}
 
 
-def wrong_handlers(quirks: Mapping[str, bool | float], lots: Random) -> list[EventHandler[Any]]:
-    """The handlers of an agent with these quirks; none if no quirk is in force.
+def wrong_handlers(quirks: Mapping[str, bool | float], rng: Random) -> list[EventHandler[Any]]:
+    """Return all handlers of an agent with these quirks. The list is empty if no quirk is active.
 
-    They draw random numbers from `lots`.
+    The handlers draw random numbers from `rng`.
     """
-    wrong = in_force(quirks)
+    wrong = active_quirks(quirks)
     if not wrong:
         return []
     handlers = {handler.algorithm: handler for handler in HANDLERS.values()}
     for name, value in wrong.items():
         for algorithm in QUIRKS[name].algorithms:
-            handlers[algorithm] = QUIRKS[name].in_place_of(handlers[algorithm], value, lots)
-    return [ending_by_exceptions(handler) for handler in handlers.values()]
+            handlers[algorithm] = QUIRKS[name].wrong_handler(handlers[algorithm], value, rng)
+    return [catch_exceptions(handler) for handler in handlers.values()]

@@ -1,4 +1,4 @@
-"""Mistakes in building and committing blocks: Algorithms 1-6."""
+"""Mistakes in building and committing blocks (Algorithms 1 to 6)."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -43,7 +43,7 @@ def propose_during_vote(good: Handler, core: Core) -> str:
 @quirk(2)
 def propose_while_reconciling(good: Handler, core: Core) -> str:
     """The agent proposes while it reconciles."""
-    return as_if_not_reconciling(good, core)
+    return run_as_if_not_reconciling(good, core)
 
 
 @quirk(2)
@@ -102,7 +102,7 @@ def disapprove_everything(good: Helper, core: Core, message: BlockAddResponse) -
 @quirk(3)
 def vote_while_reconciling(good: Handler, core: Core, sender: int, message: BlockAddRequest) -> str:
     """The agent votes while it reconciles."""
-    return as_if_not_reconciling(good, core, sender, message)
+    return run_as_if_not_reconciling(good, core, sender, message)
 
 
 @quirk(4)
@@ -206,9 +206,9 @@ def break_off_broadcast(good: Helper, core: Core, message: CommitBlock) -> None:
 
 
 @quirk(6, branches=("ignored by quirk",), chance=True)
-def ignore_commit(good: Handler, core: Core, sender: int, message: CommitBlock, strikes: Callable[[], bool]) -> str:
+def ignore_commit(good: Handler, core: Core, sender: int, message: CommitBlock, occurs: Callable[[], bool]) -> str:
     """The agent ignores each Commit Block with the probability that is the quirk's value."""
-    if not core.reconcile_in_progress and strikes():
+    if not core.reconcile_in_progress and occurs():
         return "ignored by quirk"
     return good(core, sender, message)
 
@@ -223,7 +223,7 @@ def commit_without_succession(good: Handler, core: Core, sender: int, message: C
 @quirk(6)
 def commit_while_reconciling(good: Handler, core: Core, sender: int, message: CommitBlock) -> str:
     """The agent commits blocks of other agents while it reconciles."""
-    return as_if_not_reconciling(good, core, sender, message)
+    return run_as_if_not_reconciling(good, core, sender, message)
 
 
 @quirk(6, helper=Core.commit)
@@ -232,8 +232,8 @@ def commit_others_twice(good: Helper, core: Core, block: Block) -> None:
     commit_twice(good, core, block)
 
 
-def as_if_not_reconciling(good: Handler, core: Core, *inputs: int | Message) -> str:
-    """Run `good` with the flag down."""
+def run_as_if_not_reconciling(good: Handler, core: Core, *inputs: int | Message) -> str:
+    """Run `good` with `reconcile_in_progress` set to False, and restore the flag afterwards."""
     reconciling, core.reconcile_in_progress = core.reconcile_in_progress, False
     try:
         return good(core, *inputs)
@@ -242,13 +242,14 @@ def as_if_not_reconciling(good: Handler, core: Core, *inputs: int | Message) -> 
 
 
 def commit_twice(commit: Helper, core: Core, block: Block) -> None:
+    """Commit a block twice, without the chain's guard against duplicates."""
     core.chain.__class__ = UnguardedChain
     commit(core, block)
     commit(core, block)
 
 
 class UnguardedChain(Chain):
-    """A chain that takes a block twice."""
+    """A chain that accepts a block twice."""
 
     def append(self, block: Block) -> None:
         self._block_of_hash.pop(block.block_hash, None)

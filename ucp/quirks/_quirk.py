@@ -10,9 +10,9 @@
     def hide_commits(good: Helper, core: Core, message: CommitBlock) -> None:
         '''The agent commits its approved block and sends no Commit Block.'''
 
-The first replaces the handler of Algorithm 4. `good` is the replaced handler. The second replaces `Core.send`, and only
-for Algorithm 5. `good` may itself be wrong, so quirks of one Algorithm add up. The good handlers and the core do not
-know of quirks.
+The first quirk replaces the handler of Algorithm 4. `good` is the replaced handler. The second quirk replaces
+`Core.send`, but only while the handler of Algorithm 5 runs. `good` may already be wrong, so several quirks of one
+Algorithm can be combined. The good handlers and the core contain no code for quirks.
 """
 
 from collections.abc import Callable
@@ -36,15 +36,16 @@ CRASHED = "crashed by quirk"
 
 @dataclass(frozen=True, eq=False)
 class Quirk:
-    """`wrong` replaces the handlers of `algorithms`, or the core's method `helper` for these handlers.
+    """One mistake. `wrong` replaces the handlers of `algorithms`, or the core's method `helper` for these handlers.
 
-    In addition to those of the good handlers, it may take `branches`, send, start and trigger. With `chance` its value
-    is a probability 0..1, and it receives a function that draws whether the mistake occurs. Otherwise it is on or off.
+    `branches`, `sends`, `starts` and `triggers` list the branches, messages, timers and events of the wrong handlers
+    that the good handlers lack. If `chance` is true, the value of the quirk is a probability 0..1, and `wrong` receives
+    a function that draws whether the mistake occurs. Otherwise the value is true or false.
     """
 
     name: str
     sentence: str
-    """The mistake of the agent."""
+    """A description of the mistake."""
     algorithms: tuple[int, ...]
     wrong: Callable[..., Any]
     helper: str | None
@@ -55,28 +56,28 @@ class Quirk:
     chance: bool
 
     def check(self, value: object) -> None:
-        """Raises ValueError, in a sentence, if the quirk cannot have this value."""
+        """Raise ValueError if the quirk cannot have this value. The message is one sentence."""
         if not self.chance:
             if not isinstance(value, bool):
-                raise ValueError(f"{self.name} is true or false, not {shown(value)}")
+                raise ValueError(f"{self.name} must be true or false, not {shown(value)}")
         elif isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
-            raise ValueError(f"{self.name} is a probability 0..1, not {shown(value)}")
+            raise ValueError(f"{self.name} must be a probability 0..1, not {shown(value)}")
 
-    def in_place_of(self, good: EventHandler[Any], value: float, lots: Random) -> EventHandler[Any]:
-        """Return the wrong handler. It draws random numbers from `lots`."""
+    def wrong_handler(self, good: EventHandler[Any], value: float, rng: Random) -> EventHandler[Any]:
+        """Return the wrong handler that replaces `good`. It draws random numbers from `rng`."""
         return replace(
             good,
-            run=self._run(good.run, value, lots),
+            run=self._run(good.run, value, rng),
             branches=good.branches + self.branches,
             sends=good.sends + self.sends,
             starts=good.starts + self.starts,
             triggers=good.triggers + self.triggers,
         )
 
-    def _run(self, good: Handler, value: float, lots: Random) -> Handler:
+    def _run(self, good: Handler, value: float, rng: Random) -> Handler:
         if self.helper is not None:
             return self._run_with_wrong_helper(good, self.helper)
-        chance = {"strikes": lambda: lots.random() < value} if self.chance else {}
+        chance = {"occurs": lambda: rng.random() < value} if self.chance else {}
 
         def run(core: Core, *inputs: object) -> str:
             branch: str = self.wrong(good, core, *inputs, **chance)
@@ -87,21 +88,21 @@ class Quirk:
     def _run_with_wrong_helper(self, good: Handler, helper: str) -> Handler:
         wrong_cores: dict[type[Core], type[Core]] = {}
 
-        def wrong_core(right: type[Core]) -> type[Core]:
+        def wrong_core(right_core: type[Core]) -> type[Core]:
             def method(core: Core, *arguments: object) -> object:
-                return self.wrong(getattr(right, helper), core, *arguments)
+                return self.wrong(getattr(right_core, helper), core, *arguments)
 
-            return type(right.__name__, (right,), {"__slots__": (), helper: method})
+            return type(right_core.__name__, (right_core,), {"__slots__": (), helper: method})
 
         def run(core: Core, *inputs: object) -> str:
-            right = type(core)
-            if right not in wrong_cores:
-                wrong_cores[right] = wrong_core(right)
-            core.__class__ = wrong_cores[right]
+            right_core = type(core)
+            if right_core not in wrong_cores:
+                wrong_cores[right_core] = wrong_core(right_core)
+            core.__class__ = wrong_cores[right_core]
             try:
                 return good(core, *inputs)
             finally:
-                core.__class__ = right
+                core.__class__ = right_core
 
         return run
 
@@ -115,19 +116,22 @@ def quirk(
     triggers: tuple[LocalEvent, ...] = (),
     chance: bool = False,
 ) -> Callable[[Callable[..., Any]], Quirk]:
-    """Make a function a quirk of these Algorithms. The quirk takes its name and docstring."""
+    """Turn a function into a quirk of these Algorithms. Its name and docstring become those of the quirk."""
 
     def declare(wrong: Callable[..., Any]) -> Quirk:
         sentence = " ".join((wrong.__doc__ or "").split())
-        assert sentence, f"{wrong.__name__} says what it does wrong"
+        assert sentence, f"the docstring of {wrong.__name__} describes its mistake"
         name = helper.__name__ if helper is not None else None
         return Quirk(wrong.__name__, sentence, algorithms, wrong, name, branches, sends, starts, triggers, chance)
 
     return declare
 
 
-def ending_by_exceptions(handler: EventHandler[Any]) -> EventHandler[Any]:
-    """The handler, which may raise: it then ends where it is, and the agent goes on, as in the thesis's field tests."""
+def catch_exceptions(handler: EventHandler[Any]) -> EventHandler[Any]:
+    """Return the handler with a branch for exceptions.
+
+    An exception ends the handler run, and the agent continues, as in the field tests of the thesis.
+    """
 
     def run(core: Core, *inputs: object) -> str:
         try:

@@ -1,4 +1,4 @@
-"""Mistakes in reconciling: Algorithms 7-20."""
+"""Mistakes in reconciling (Algorithms 7 to 20)."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from ucp.messages import (
     NextInSequenceResponse,
     RequestForBlock,
 )
-from ucp.quirks._commit_quirks import as_if_not_reconciling
+from ucp.quirks._commit_quirks import run_as_if_not_reconciling
 from ucp.quirks._quirk import Handler, Helper, quirk
 from ucp.reconcile import most_named
 from ucp.timers import Timer
@@ -59,7 +59,7 @@ def contain_everything(good: Helper, core: Core, message: ChainContainResponse) 
 @quirk(9)
 def answer_phase1_while_reconciling(good: Handler, core: Core, sender: int, message: ChainContainQuery) -> str:
     """The agent answers Chain Contain Queries while it reconciles."""
-    return as_if_not_reconciling(good, core, sender, message)
+    return run_as_if_not_reconciling(good, core, sender, message)
 
 
 @quirk(10)
@@ -128,7 +128,7 @@ def keep_old_candidates(good: Handler, core: Core) -> str:
 @quirk(13)
 def name_successor_while_reconciling(good: Handler, core: Core, sender: int, message: ChainHashSuccessorQuery) -> str:
     """The agent answers Chain Hash Successor Queries while it reconciles."""
-    return as_if_not_reconciling(good, core, sender, message)
+    return run_as_if_not_reconciling(good, core, sender, message)
 
 
 @quirk(13, helper=Core.send)
@@ -214,7 +214,7 @@ def stop_after_stack(good: Helper, core: Core, event: LocalEvent) -> None:
 @quirk(17)
 def send_blocks_while_reconciling(good: Handler, core: Core, sender: int, message: RequestForBlock) -> str:
     """The agent sends requested blocks while it reconciles."""
-    return as_if_not_reconciling(good, core, sender, message)
+    return run_as_if_not_reconciling(good, core, sender, message)
 
 
 @quirk(17, helper=Core.send)

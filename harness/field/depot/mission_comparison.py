@@ -27,7 +27,7 @@ from harness.field.depot.mission_files import SUFFIX as MISSION_SUFFIX
 from harness.report.chain_tree import ranges
 from ucp.block import InceptionBlock
 from ucp.mission import Mission, MissionError, load_mission
-from ucp.quirks import in_force
+from ucp.quirks import active_quirks
 
 Kind = Literal["mission file", "manifest", "chain export", "trace"]
 INCEPTION, ROSTER, FINGERPRINT = "inception block", "roster", "settings fingerprint"
@@ -141,7 +141,7 @@ def differences(files: Sequence[ComparedFile]) -> list[MissionDifference]:
                 MissionDifference(
                     file.path, f"quirks.{name}", f"{file.path}: `quirks.{name}` asks for a mistake: set it to 0"
                 )
-                for name in in_force(file.mission.quirks)
+                for name in active_quirks(file.mission.quirks)
             ]
     return found
 

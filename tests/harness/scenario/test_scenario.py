@@ -111,7 +111,7 @@ def test_scenario_with_only_a_name_is_the_experiment_of_the_thesis(tmp_path: Pat
         ("name: x\nsettings: {vote: 1}", "vote is unknown: use one of vote_timeout_s"),
         ("name: x\nsettings: {vote_timeout_s: -1}", "vote_timeout_s must be more than 0"),
         ("name: x\nquirks: {ignore_commit: 2}", "probability 0..1"),
-        ("name: x\nquirks: {hide_commits: 1}", "hide_commits is true or false, not 1"),
+        ("name: x\nquirks: {hide_commits: 1}", "hide_commits must be true or false, not 1"),
         ("name: x\nquirks: {hide_commit: true}", "unknown quirk 'hide_commit': of the"),
         ("name: x\nquirks: {5: true}", "unknown quirk '5'"),
         (
@@ -119,8 +119,8 @@ def test_scenario_with_only_a_name_is_the_experiment_of_the_thesis(tmp_path: Pat
             "quirks.crash_on_tie.agents names vehicle 9, which is not on the roster",
         ),
         ("name: x\nquirks: {crash_on_tie: {agents: []}}", "at least 1 item"),
-        ("name: x\nquirks: {crash_on_tie: {agents: [1], value: 1}}", "crash_on_tie is true or false, not 1"),
-        ("name: x\nquirks: {ignore_commit: {agents: [1]}}", "ignore_commit is a probability 0..1, not True"),
+        ("name: x\nquirks: {crash_on_tie: {agents: [1], value: 1}}", "crash_on_tie must be true or false, not 1"),
+        ("name: x\nquirks: {ignore_commit: {agents: [1]}}", "ignore_commit must be a probability 0..1, not True"),
         (
             "name: x\nquirks: {crash_on_tie: {agents: [1], valu: false}}",
             "`quirks.crash_on_tie.valu` is unknown: use one of agents, value",
