@@ -1,14 +1,16 @@
 """ArduPilot's frames: the type of vehicle, the model name in its program, and the default parameters of each.
 
-The default parameters are files of ArduPilot's Tools/autotest, which are applied in order, as in its sim_vehicle.py. A
-frame that is missing in this table is passed on unchanged, if the program offers it, with the defaults of its type.
+The table has the frames of ArduPilot's sim_vehicle.py that its own simulation flies. The default parameters are files of
+ArduPilot's Tools/autotest, which are applied in order. Names must match exactly, because ArduPilot's programs compare
+only the start of a name: they take `hexacopter` for a `hexa`, but without the parameters of a hexa it never takes off.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 
-from sitl.vehicle import VehicleType
+from sitl.vehicle import VehicleError, VehicleType
 
 BINARIES: dict[VehicleType, str] = {"copter": "arducopter", "plane": "arduplane", "rover": "ardurover"}
 DEFAULTS: dict[VehicleType, str] = {"copter": "copter.parm", "plane": "plane.parm", "rover": "rover.parm"}
@@ -28,17 +30,26 @@ class Airframe:
 
 
 def airframe(name: str | None, vehicle_type: VehicleType) -> Airframe:
-    """Return the frame with this name. None selects the default frame of the type."""
+    """Return the frame with this name. None selects the default frame of the type.
+
+    Raises VehicleError if no frame has this name. The error names the nearest frame of the type.
+    """
     if name is None:
         name = USUAL[vehicle_type]
-    own = (DEFAULTS[vehicle_type],)
-    return _TABLE.get(_ALIASES.get(name, name)) or Airframe(vehicle_type, name, own, BINARIES[vehicle_type])
+    if frame := _TABLE.get(_ALIASES.get(name, name)):
+        return frame
+    raise VehicleError(f"a {vehicle_type} has no frame {name!r}: {_suggestion(name, vehicle_type)}")
 
 
-def type_of(name: str) -> VehicleType | None:
-    """Return the type of vehicle with this frame. None if unknown."""
-    known = _TABLE.get(_ALIASES.get(name, name))
-    return known.vehicle_type if known else None
+def _suggestion(name: str, vehicle_type: VehicleType) -> str:
+    known = [frame for frame, airframe in _TABLE.items() if airframe.vehicle_type == vehicle_type]
+    by_key = {frame.lower(): frame for frame in known}
+    wanted = name.lower()
+    if starts := [key for key in by_key if wanted.startswith(key)]:
+        return f"did you mean {by_key[max(starts, key=len)]}?"
+    if nearest := get_close_matches(wanted.removesuffix("copter"), by_key, n=1):
+        return f"did you mean {by_key[nearest[0]]}?"
+    return f"use one of {', '.join(known)}"
 
 
 USUAL: dict[VehicleType, str] = {"copter": "+", "plane": "plane", "rover": "rover"}
@@ -61,6 +72,9 @@ _COPTERS: dict[str, tuple[str, ...]] = {
     "octa-quad": ("copter-octaquad.parm",),
     "octa-quad-cwx": ("copter-octaquad.parm", "copter-octaquad-cwx.parm"),
     "dodeca-hexa": ("copter-dodecahexa.parm",),
+    "hexadeca-octa": ("copter-hexadeca_octa.parm",),
+    "hexadeca-octa-cwx": ("copter-hexadeca_octa.parm", "copter-hexadeca_octa_cwx.parm"),
+    "dotriaconta_octaquad_x": ("copter-dotriaconta_octaquad_x.parm",),
 }  # fmt: skip
 
 _ALONE: dict[str, tuple[str, ...]] = {"singlecopter": (), "coaxcopter": ("copter-coax.parm",)}

@@ -16,7 +16,6 @@ import shutil
 import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 
 from sitl._vehicle_state import Version
@@ -42,7 +41,6 @@ ENVIRONMENT = "ARDUPILOT_SITL"  # a directory that holds binaries and, better, t
 
 ANSWER_LIMIT_S = 5.0  # of our time
 PATIENT_S = 32_000.0  # simulated; LOG_FILE_TIMEOUT has 16 bits
-MAX_SHOWN = 60
 
 WAY_OUT = "give the path of an ArduPilot SITL binary, or fly embedded vehicles"
 
@@ -180,13 +178,15 @@ class ArduPilot:
             raise NoProgramError(f"no {self.setup.debugger} is on PATH: install it, or leave out `debugger`")
 
     def _check_model(self, frame: str) -> None:
-        """Raise VehicleError if the frame does not start with a name that the binary offers."""
+        """Raise VehicleError if the binary offers neither the frame nor, as `plane` of `plane-vtail`, its first words.
+
+        An older binary lacks some frames. It would take a frame for another one whose name has the same start.
+        """
         offered = models(self.binary)
-        model = self.frame.lower()
-        if offered and not any(model.startswith(name.lower()) for name in offered):
-            nearest = get_close_matches(frame, offered, n=1)
-            meant = f"did you mean {nearest[0]}?" if nearest else f"there are {', '.join(offered)}"
-            raise UnusableBinaryError(f"{self.binary} has no frame {frame[:MAX_SHOWN]!r}: {meant}")
+        words = self.frame.lower().split("-")
+        names = {"-".join(words[:count]) for count in range(1, len(words) + 1)}
+        if offered and names.isdisjoint(name.lower() for name in offered):
+            raise UnusableBinaryError(f"{self.binary} has no frame {frame!r}: it offers {', '.join(offered)}")
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
         """Write the parameters of the vehicle to `directory`, and return the command. Raises VehicleError."""

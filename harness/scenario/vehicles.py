@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 
 from harness.scenario.strict_model import Model, VehicleId, VehicleKey
 from sitl import parameters, start_places
-from sitl.airframes import NOT_FLOWN, type_of
+from sitl.airframes import NOT_FLOWN, airframe
 from sitl.plan import MAX_LEGS, By, GoTo, Land, Loiter, Plan, TakeOff
 from sitl.plan import Leg as PlannedLeg
 from sitl.setup import Debugger, Setup
@@ -146,8 +146,8 @@ class Vehicles(Model):
     binary: Path | None = None
     """ArduPilot binary. An error if the vehicles have more than one type."""
     frame: Frame | None = None
-    """Frame that ArduPilot simulates, such as quadplane, motorboat, heli or hexa. The binary decides which frames
-    exist. A frame of another type of vehicle is an error. Default: the frame of the type."""
+    """Frame that ArduPilot simulates, such as quadplane, motorboat, heli or hexa. An unknown frame, and a frame of
+    another type of vehicle, is an error. Default: the frame of the type."""
     parameters: Parameters = {}
     """ArduPilot parameters at the start, as pairs of name and value, or the name of a parameter file."""
     wind: Wind | None = None
@@ -208,12 +208,16 @@ class Vehicles(Model):
         return Home(*self.home[:3], self.home[3] % 360)
 
     def check_frames(self, roster: tuple[int, ...]) -> None:
-        """Raise ValueError for a frame of another type of vehicle."""
+        """Raise ValueError for an unknown frame, and for a frame of another type of vehicle."""
         for vehicle in roster:
             frame, own = self.setup_of(vehicle).frame, self.type_of(vehicle)
-            if frame and type_of(frame) not in (None, own):
+            try:
+                of_type = airframe(frame, own).vehicle_type
+            except VehicleError as error:
+                raise ValueError(str(error)) from None
+            if of_type != own:
                 raise ValueError(
-                    f"frame {frame} belongs to a {type_of(frame)}, but vehicle {vehicle} is a {own}: change "
+                    f"frame {frame} belongs to a {of_type}, but vehicle {vehicle} is a {own}: change "
                     "`vehicles.type` or `vehicles.types`, or give it another frame in `vehicles.each`"
                 )
 

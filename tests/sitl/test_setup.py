@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sitl import parameters, start_places
-from sitl.airframes import airframe, type_of
+from sitl.airframes import airframe
 from sitl.ardupilot import ArduPilot
 from sitl.embedded import Embedded
 from sitl.setup import Setup
@@ -131,15 +131,29 @@ def test_swarm_offsets_are_assigned_by_instance(tmp_path: Path) -> None:
         ("hexa-cwx", "copter", "hexa-cwx", ["copter.parm", "copter-hexa.parm", "copter-hexa-cwx.parm"]),
         ("boat", "rover", "motorboat", ["rover.parm", "motorboat.parm"]),
         ("quadplane-tilt", "plane", "quadplane-tilt", ["quadplane.parm", "quadplane-tilt.parm"]),
-        ("of-tomorrow", "plane", "of-tomorrow", ["plane.parm"]),
     ],
 )
 def test_frame_has_its_default_parameter_files(
     frame: str, vehicle_type: VehicleType, model: str, defaults: list[str]
 ) -> None:
     known = airframe(frame, vehicle_type)
-    assert (known.model, list(known.defaults)) == (model, defaults)
-    assert type_of(frame) in (None, vehicle_type)
+    assert (known.vehicle_type, known.model, list(known.defaults)) == (vehicle_type, model, defaults)
+
+
+@pytest.mark.parametrize(
+    ("frame", "vehicle_type", "advice"),
+    [
+        ("hexacopter", "copter", "did you mean hexa[?]"),
+        ("octocopter", "copter", "did you mean octa[?]"),
+        ("xfoo", "copter", "did you mean X[?]"),
+        ("x", "copter", "did you mean X[?]"),
+        ("plane-vtial", "plane", "did you mean plane[?]"),
+        ("hovercraft", "rover", "use one of rover, rover-skid"),
+    ],
+)
+def test_unknown_frame_is_refused_with_the_nearest_one(frame: str, vehicle_type: VehicleType, advice: str) -> None:
+    with pytest.raises(VehicleError, match=f"a {vehicle_type} has no frame '{frame}': {advice}"):
+        airframe(frame, vehicle_type)
 
 
 def test_parameter_files_are_copied_in_order_with_the_users_last(tmp_path: Path) -> None:
@@ -164,7 +178,7 @@ def test_missing_frame_and_missing_debugger_are_refused(tmp_path: Path, monkeypa
     binary = program(tmp_path / "arducopter", LISTS_ITS_MODELS)
     for name in ("copter.parm", "copter-octa.parm"):
         written(tmp_path / name, "")
-    with pytest.raises(VehicleError, match=r"has no frame 'octa': there are quadplane, \+, hexa, heli, plane"):
+    with pytest.raises(VehicleError, match=r"has no frame 'octa': it offers quadplane, \+, hexa, heli, plane"):
         ArduPilot.find(binary, {}, setup=Setup("octa")).check()
     with pytest.raises(NoBinaryError, match="no arducopter-heli is on PATH"):
         ArduPilot.find(None, {"ARDUPILOT_SITL": str(tmp_path), "PATH": ""}, setup=Setup("heli"))

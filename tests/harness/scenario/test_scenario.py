@@ -7,6 +7,7 @@ import pytest
 from harness.errors import ScenarioError
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.changes import NetworkChange, describe, timeline_of
+from harness.scenario.load import parse, parse_yaml
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 
 LIBRARY = sorted((Path(__file__).parents[3] / "scenarios").glob("*.yaml"))
@@ -306,3 +307,9 @@ def test_change_at_mission_second_0_is_the_first_network_state() -> None:
     scenario = Scenario.model_validate({"name": "x", "timeline": [{"at_s": 0, "partition": [[1], [2]]}]})
     (change,) = timeline_of(scenario)
     assert change.what == "partition"
+
+
+@pytest.mark.parametrize(("frame", "advice"), [("hexacopter", "hexa"), ("xfoo", "X")])
+def test_unknown_frame_is_refused_with_the_nearest_one(frame: str, advice: str) -> None:
+    with pytest.raises(ScenarioError, match=f"a copter has no frame '{frame}': did you mean {advice}[?]"):
+        parse(parse_yaml(f"name: x\nvehicles: {{each: {{2: {{frame: {frame}}}}}}}\n"))
