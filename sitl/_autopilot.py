@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl._failsafes import WIND, WIND_FROM, Failsafe, Failsafes
+from sitl._failsafes import STATION, WIND, WIND_FROM, Failsafe, Failsafes
 from sitl._kinematics import Course, Fall, Motion, Point, Rest, Segment, end_of
 from sitl._models import AT_ONCE, MODELS, MotionModel
 from sitl.modes import BOOT_MODES, MODES
@@ -62,6 +62,7 @@ class Autopilot:
         self.mission: Sequence[Any] = ()  # MISSION_ITEM_INTs; the first is home, as in ArduPilot
         self.current_item = 0
         self.failsafes = Failsafes(vehicle_type)
+        self.station_heard_s: float | None = None  # the last heartbeat of the ground station
         self._speed_ms = self._model.cruise_ms
         self._in_mission = False
         self._then: Callable[[], None] = self._stand
@@ -107,7 +108,7 @@ class Autopilot:
             self.now_s = self._course.end_s
             self._then()
         self.now_s = until_s
-        while self.has_booted and (failsafe := self.failsafes.look(self.now_s, self.battery_used)):
+        while self.has_booted and (failsafe := self._failsafe()):
             self._save(failsafe)
         if self.failsafes.lacks_a_motor and self.armed and self.airborne:
             self._lose_thrust()
@@ -232,6 +233,14 @@ class Autopilot:
             if item.command == mavlink.MAV_CMD_NAV_WAYPOINT:
                 self._go_on_to(self.place(item.frame, item.x, item.y, item.z), self.current_item)
 
+    def hear(self, system: int) -> None:
+        """Receive a heartbeat."""
+        if system == self.failsafes.parameters[STATION]:
+            self.station_heard_s = self.now_s
+
+    def _failsafe(self) -> Failsafe | None:
+        return self.failsafes.look(self.now_s, self.battery_used, self.motion.point, self.station_heard_s)
+
     def _save(self, failsafe: Failsafe) -> None:
         """Act as ArduPilot does by itself: without a position a copter lands, and a rover holds."""
         can_land = self.vehicle_type == "copter"
@@ -242,10 +251,11 @@ class Autopilot:
                 self.say(mavlink.MAV_SEVERITY_CRITICAL, f"EKF Failsafe: changed to {mode} Mode")
                 self._switch_to(mode)
             return
-        level = failsafe.removeprefix("battery ")
-        used = f"{self.volts:.2f}V used {self.used_mah:.0f} mAh"
-        self.say(mavlink.MAV_SEVERITY_WARNING, f"Battery 1 is {level} {used}")
-        self.say(mavlink.MAV_SEVERITY_WARNING, "Battery Failsafe")
+        if failsafe.startswith("battery"):
+            level = failsafe.removeprefix("battery ")
+            used = f"{self.volts:.2f}V used {self.used_mah:.0f} mAh"
+            self.say(mavlink.MAV_SEVERITY_WARNING, f"Battery 1 is {level} {used}")
+        self.say(mavlink.MAV_SEVERITY_WARNING, SAID[failsafe])
         action = self.failsafes.action(failsafe)
         if self.armed and action and self.mode != "LAND":
             self._switch_to("LAND" if can_land and not self.ready else action)
@@ -410,6 +420,14 @@ class Autopilot:
         north_m, east_m, _ = self.home.metres_to(lat_e7 / 1e7, lon_e7 / 1e7, 0.0)
         return Point(north_m, east_m, up_m)
 
+
+SAID: dict[Failsafe, str] = {
+    **dict.fromkeys(("battery low", "battery critical"), "Battery Failsafe"),
+    "station": "GCS Failsafe",
+    "radio": "Radio Failsafe",
+    "fence": "fence breached",
+}
+"""ArduPilot's texts."""
 
 ABSOLUTE_FRAMES = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)
 FRAMES = (*ABSOLUTE_FRAMES, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT)

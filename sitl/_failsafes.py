@@ -1,7 +1,8 @@
 """The environment and the parts of the embedded vehicle, and the conditions of its failsafes.
 
-Parameters have the names of ArduPilot and its simulation. The vehicle has a GPS, a battery and, if it is a copter,
-motors. A plane is affected by wind. There is no compass. Parameters of missing parts are unknown to the vehicle.
+Parameters have the names of ArduPilot and its simulation. The vehicle has a GPS, a battery, a receiver of a remote
+control, a fence and, if it is a copter, motors. A plane is affected by wind. There is no compass. Parameters of missing
+parts are unknown to the vehicle.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
+from sitl._kinematics import Point
 from sitl.vehicle import VehicleType
 
 BATTERY_FULL_V, BATTERY_USED_V = 16.8, 3.6  # full, and what of that a battery loses until it is empty
@@ -32,18 +34,48 @@ ACTIONS: dict[VehicleType, dict[float, str]] = {
 }
 """The modes that BATT_FS_..._ACT selects if no better way home is known. Other values select none."""
 
-Failsafe = Literal["ekf", "battery low", "battery critical"]
+RC_FAIL, RC_SILENT_S = "SIM_RC_FAIL", 1.0
+STATION = "MAV_GCS_SYSID"
+STATION_SILENT = "FS_GCS_TIMEOUT"
+WHEN_SILENT: dict[VehicleType, str] = {"copter": "FS_GCS_ENABLE", "plane": "FS_GCS_ENABL", "rover": "FS_GCS_ENABLE"}
+WHEN_NO_RC: dict[VehicleType, str] = {"copter": "FS_THR_ENABLE", "plane": "THR_FAILSAFE", "rover": "FS_THR_ENABLE"}
+LINKS: dict[VehicleType, dict[str, float]] = {
+    "copter": {STATION_SILENT: 5.0, "FS_GCS_ENABLE": 0.0, "FS_THR_ENABLE": 1.0},
+    "plane": {STATION_SILENT: 5.0, "FS_GCS_ENABL": 0.0, "THR_FAILSAFE": 1.0, "FS_LONG_ACTN": 0.0},
+    "rover": {STATION_SILENT: 5.0, "FS_GCS_ENABLE": 0.0, "FS_THR_ENABLE": 1.0, "FS_ACTION": 2.0},
+}
+"""Parameters of the failsafes for the ground station and the remote control, with ArduPilot's defaults. A plane of
+ArduPilot has its timeout in FS_LONG_TIMEOUT."""
+LINK_ACTION: dict[VehicleType, str] = {"plane": "FS_LONG_ACTN", "rover": "FS_ACTION"}
+"""The parameter with the action of both failsafes. A copter has it in the parameters that enable them."""
+STATION_ACTIONS = {1.0: "RTL", 2.0: "RTL", 3.0: "RTL", 4.0: "LAND", 5.0: "LAND", 6.0: "RTL", 7.0: "LAND"}
+RC_ACTIONS = {1.0: "RTL", 2.0: "RTL", 3.0: "LAND", 4.0: "RTL", 5.0: "LAND", 6.0: "RTL", 7.0: "LAND"}
+
+FENCE, FENCE_TYPE, FENCE_ACTION = "FENCE_ENABLE", "FENCE_TYPE", "FENCE_ACTION"
+FENCE_TOP, FENCE_RADIUS = "FENCE_ALT_MAX", "FENCE_RADIUS"
+TOP, CIRCLE = 1, 2  # bits of FENCE_TYPE
+FENCE_ACTIONS: dict[VehicleType, dict[float, str]] = {
+    "copter": {1: "RTL", 2: "LAND", 3: "RTL", 4: "LAND", 5: "RTL"},
+    "plane": {1: "RTL", 6: "RTL", 7: "RTL"},
+    "rover": {1: "RTL", 2: "HOLD", 3: "RTL", 4: "HOLD"},
+}
+
+Failsafe = Literal["ekf", "battery low", "battery critical", "station", "radio", "fence"]
 
 
 class Failsafes:
     """The failsafes of one vehicle. Times are its own seconds."""
 
     def __init__(self, vehicle_type: VehicleType) -> None:
-        self.parameters = {GPS: 1.0, VOLTS: BATTERY_FULL_V, **BATTERY}
+        self.parameters = {GPS: 1.0, VOLTS: BATTERY_FULL_V, **BATTERY, RC_FAIL: 0.0, STATION: 255.0}
+        self.parameters |= {**LINKS[vehicle_type], FENCE: 0.0, FENCE_TYPE: 2.0, FENCE_ACTION: 1.0, FENCE_RADIUS: 300.0}
+        self._vehicle_type: VehicleType = vehicle_type
         self._actions = ACTIONS[vehicle_type]
         self._needs_gps = vehicle_type != "plane"  # which knows its airspeed, and reckons from that where it is
         if vehicle_type == "copter":
             self.parameters |= {THRUST: 1.0, MOTOR: 0.0, LOW_AT: COPTER_LOW_V}
+        if vehicle_type != "rover":
+            self.parameters |= {FENCE_TYPE: 3.0, FENCE_TOP: 100.0}
         if vehicle_type == "plane":
             self.parameters |= {WIND: 0.0, WIND_FROM: 180.0}
         self.acting: list[Failsafe] = []
@@ -70,17 +102,46 @@ class Failsafes:
         return max(0.0, self.parameters[VOLTS] - BATTERY_USED_V * used)
 
     def action(self, failsafe: Failsafe) -> str | None:
-        """Return the mode that a battery failsafe selects, or None."""
+        """Return the mode that a failsafe of the battery, a link or the fence selects, or None."""
+        kind = self._vehicle_type
+        if failsafe == "fence":
+            return FENCE_ACTIONS[kind].get(self.parameters[FENCE_ACTION])
+        if failsafe in ("station", "radio"):
+            enabled = (WHEN_SILENT if failsafe == "station" else WHEN_NO_RC)[kind]
+            if kind != "copter":
+                return self._actions.get(self.parameters[LINK_ACTION[kind]])
+            return (STATION_ACTIONS if failsafe == "station" else RC_ACTIONS).get(self.parameters[enabled])
         return self._actions.get(self.parameters[WHEN_LOW if failsafe == "battery low" else WHEN_CRITICAL])
 
-    def look(self, now_s: float, used: float) -> Failsafe | None:
-        """Return the next failsafe that acts now, or None. The caller repeats the call until it returns None."""
+    def breaches_fence(self, place: Point) -> bool:
+        """Return whether a place, in metres from home, is outside of the fence."""
+        kind = int(self.parameters[FENCE_TYPE])
+        too_high = bool(kind & TOP) and place.up_m >= self.parameters.get(FENCE_TOP, math.inf)
+        too_far = bool(kind & CIRCLE) and math.hypot(place.north_m, place.east_m) >= self.parameters[FENCE_RADIUS]
+        return self.parameters[FENCE] != 0 and (too_high or too_far)
+
+    def _is_on(self, parameter: dict[VehicleType, str]) -> bool:
+        return self.parameters[parameter[self._vehicle_type]] != 0
+
+    def _misses_station(self, now_s: float, heard_s: float | None) -> bool:
+        silent = heard_s is not None and now_s - heard_s >= self.parameters[STATION_SILENT]
+        return silent and self._is_on(WHEN_SILENT)
+
+    def look(self, now_s: float, used: float, place: Point, station_heard_s: float | None) -> Failsafe | None:
+        """Return the next failsafe that acts now, or None. The caller repeats the call until it returns None.
+
+        `place` is in metres from home. `station_heard_s` is the time of the last heartbeat of the ground station. None
+        means that it was never heard, and the vehicle does not miss it then.
+        """
         volts = self.volts(used)
         low_for_s = self.parameters[LOW_FOR]
         causes: dict[Failsafe, tuple[bool, float]] = {
             "ekf": (self._needs_gps and not self.has_gps, NO_GPS_S),
             "battery critical": (volts <= self.parameters[CRITICAL_AT], low_for_s),
             "battery low": (volts <= self.parameters[LOW_AT], low_for_s),
+            "station": (self._misses_station(now_s, station_heard_s), 0.0),
+            "radio": (self._is_on(WHEN_NO_RC) and self.parameters[RC_FAIL] != 0, RC_SILENT_S),
+            "fence": (self.breaches_fence(place), 0.0),
         }
         for failsafe, (is_there, after_s) in causes.items():
             if not is_there:

@@ -6,6 +6,7 @@ One process has a link for each vehicle of a run. Therefore a link has no thread
 from __future__ import annotations
 
 import asyncio
+import math
 import socket
 import time
 from collections.abc import Callable
@@ -19,9 +20,14 @@ from sitl._vehicle_state import Battery, Position, VehicleState, Version
 from sitl.parameters import MAX_PARAMETERS
 from sitl.vehicle import Home
 
-GCS_SYSTEM = 255  # ArduPilot's default for the ground station
+STATION_SYSTEM = 255  # ArduPilot's default for the ground station
+STATION_PARAMETERS = ("MAV_GCS_SYSID", "SYSID_MYGCS")
+"""Parameters with the system ID of the vehicle's ground station, since ArduPilot 4.7 and before."""
+PILOT_SYSTEMS = (254, 253)
+"""System IDs of the pilot. The second one is for a vehicle that has the first one."""
 HEARTBEAT_INTERVAL_S = 1.0  # wall time
 MAX_HEARTBEAT_INTERVAL_S = 2.0  # simulated: ArduPilot's ground station failsafe acts after 5 (FS_GCS_TIMEOUT)
+LOW_M = 2.0  # a vehicle below this may lie on the ground
 TELEMETRY_INTERVAL_S = 0.25  # simulated
 MIN_TELEMETRY_INTERVAL_S = 0.1  # wall time per message: the cost of a link must not grow with the speedup
 PATIENCE_INTERVALS = 4  # a repeated request postpones the messages
@@ -39,6 +45,10 @@ TELEMETRY = (
 
 class Link(asyncio.Protocol):
     """A connection to one vehicle over a connected socket. It may be used in one event loop only.
+
+    The link sends two kinds of heartbeats. Those of the pilot have a system ID of their own. Those of a ground station
+    have the ID that the vehicle expects of its ground station, because its failsafe watches for them. They stop while
+    `station_is_heard` is false. A run with a real ground station sets `plays_station` to false.
 
     `heard` is set when data arrives and when the connection ends. `closed` is set only when it ends. Times in
     `heard_at`, `heartbeat_at` and `position_at` come from time.monotonic().
@@ -60,6 +70,7 @@ class Link(asyncio.Protocol):
         self.heartbeat_at: float | None = None
         self.position_at: float | None = None
         self.heartbeats = 0
+        self.plays_station = self.station_is_heard = True
         self.foreign_sysid: int | None = None
         self.acks: dict[int, int] = {}  # MAV_CMD: the last MAV_RESULT
         self.parameters: dict[str, float] = {}
@@ -70,7 +81,9 @@ class Link(asyncio.Protocol):
         self.on_mission: Callable[[Any], None] | None = None  # receives the messages of the mission protocol
         self._socket = sock
         self._tlog: TelemetryLog | None = TelemetryLog(tlog)
-        self._mav = mavlink.MAVLink(None, srcSystem=GCS_SYSTEM, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
+        system = next(number for number in PILOT_SYSTEMS if number != sysid)
+        self._mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
+        self._station = mavlink.MAVLink(None, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
         self._mav.robust_parsing = True  # garbage is reported as BAD_DATA, not raised
         self._handlers: dict[str, Callable[[Any], None]] = {
             "HEARTBEAT": self._on_heartbeat,
@@ -155,6 +168,11 @@ class Link(asyncio.Protocol):
     def has_disarmed(self) -> bool:
         return self._was_armed and not self.state.armed
 
+    @property
+    def has_armed(self) -> bool:
+        """True if the vehicle was armed at any time."""
+        return self._was_armed
+
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter. The answer of the vehicle appears in `parameters`."""
         target = (self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1)
@@ -182,9 +200,12 @@ class Link(asyncio.Protocol):
         return self.parameter_count is not None and len(self.listed) >= self.parameter_count
 
     def send(self, message: Any) -> None:
+        self._send(message, self._mav)
+
+    def _send(self, message: Any, sender: mavlink.MAVLink) -> None:
         if self._transport is not None and not self._transport.is_closing():
-            self._transport.write(message.pack(self._mav))
-            self._mav.seq = (self._mav.seq + 1) % 256
+            self._transport.write(message.pack(sender))
+            sender.seq = (sender.seq + 1) % 256
 
     # asyncio.Protocol
 
@@ -219,11 +240,14 @@ class Link(asyncio.Protocol):
         self.heard.set()
 
     def _beat(self) -> None:
-        self.send(
-            mavlink.MAVLink_heartbeat_message(
-                mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
-            )
+        heartbeat = mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
         )
+        self.send(heartbeat)
+        if self.plays_station and self.station_is_heard:
+            known = (self.parameters[name] for name in STATION_PARAMETERS if name in self.parameters)
+            self._station.srcSystem = int(next(known, STATION_SYSTEM)) & 0xFF
+            self._send(heartbeat, self._station)
         if self._tlog is not None:
             try:
                 self._tlog.flush()
@@ -297,6 +321,10 @@ class Link(asyncio.Protocol):
             message.vy / 100,
             -message.vz / 100,
             None if message.hdg == 0xFFFF else message.hdg / 100,
+        )
+        away_m = math.hypot(*self.home.metres_to(message.lat / 1e7, message.lon / 1e7, self.home.alt_m)[:2])
+        self.state.has_moved |= self.state.armed and (
+            away_m > LOW_M or (bool(self._knows_its_height) and height_m > LOW_M)
         )
 
     def _on_time(self, message: Any) -> None:

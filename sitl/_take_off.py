@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl._pilot_link import Link
+from sitl._pilot_link import LOW_M, Link
 from sitl._route import CLIMBED
 from sitl.procedure import ARM, HEARTBEAT, Commander, Step
 from sitl.vehicle import VehicleType
 
 SLOWEST_CLIMB_MS = 0.5
-LOW_M = 2.0  # a vehicle below this lies on the ground
 
 PARAMETER = Step("parameter TKOFF_ALT")
 TAKE_OFF = Step("the take-off command")

@@ -62,6 +62,7 @@ class VehicleState:
     armed: bool = False
     ready_to_arm: bool | None = None
     position: Position | None = None  # as it last said while its estimate was good
+    has_moved: bool = False  # it was armed and off its home
     battery: Battery | None = None
     time_s: float | None = None  # simulated, since boot
     item: int | None = None  # of the mission, where it is heading

@@ -1,8 +1,8 @@
 """ArduPilot's frames: the type of vehicle, the model name in its program, and the default parameters of each.
 
-The table has the frames of ArduPilot's sim_vehicle.py that its own simulation flies. The default parameters are files of
-ArduPilot's Tools/autotest, which are applied in order. Names must match exactly, because ArduPilot's programs compare
-only the start of a name: they take `hexacopter` for a `hexa`, but without the parameters of a hexa it never takes off.
+The table has the frames of ArduPilot's sim_vehicle.py that its own simulation flies. The default parameters are files
+of ArduPilot's Tools/autotest, which are applied in order. Names must match exactly. ArduPilot's programs compare only
+the start of a name: they take `hexacopter` for a `hexa`, but it never takes off without the parameters of a hexa.
 """
 
 from __future__ import annotations

@@ -28,6 +28,8 @@ LOOK_S = 0.01
 
 GPS_OFF = ({"SIM_GPS1_ENABLE": 0.0}, {"SIM_GPS_DISABLE": 1.0})
 GPS_ON = ({"SIM_GPS1_ENABLE": 1.0}, {"SIM_GPS_DISABLE": 0.0})
+FENCE_M = 2.0
+"""ArduPilot allows no fence smaller than FENCE_MARGIN, which is 2 m by default."""
 _COMPASSES = tuple(f"SIM_MAG{number}_FAIL" for number in (1, 2, 3))
 
 
@@ -37,10 +39,14 @@ class NotSimulatedError(VehicleError):
 
 @dataclass(frozen=True)
 class Circumstance:
-    """A circumstance. `what` completes "simulate ...". Each of `ways` has parameters with their values."""
+    """A circumstance. `what` completes "simulate ...". Each of `ways` has parameters with their values.
+
+    `station_is_heard` begins or ends the vehicle's contact with its ground station. None leaves it unchanged.
+    """
 
     what: str
     ways: tuple[Mapping[str, float], ...]
+    station_is_heard: bool | None = None
 
 
 GPS_LOST = Circumstance("the loss of its GPS", GPS_OFF)
@@ -49,6 +55,19 @@ COMPASS_LOST = Circumstance("the loss of its compasses", (dict.fromkeys(_COMPASS
 COMPASS_REGAINED = Circumstance("compasses that are back", (dict.fromkeys(_COMPASSES, 0.0), {_COMPASSES[0]: 0.0}))
 MOTOR_STOPPED = Circumstance("the failure of a motor", ({"SIM_ENGINE_MUL": 0.0, "SIM_ENGINE_FAIL": 1.0},))
 """SIM_ENGINE_FAIL 1 stops one motor: the second if the value is an output number, the first if it is a mask."""
+
+RC_LOST = Circumstance("the loss of its remote control", ({"SIM_RC_FAIL": 1.0},))
+"""SIM_RC_FAIL 1 means no pulses from the receiver."""
+RC_REGAINED = Circumstance("a remote control that is back", ({"SIM_RC_FAIL": 0.0},))
+STATION_LOST = Circumstance("the loss of its ground station", ({},), station_is_heard=False)
+STATION_REGAINED = Circumstance("a ground station that is back", ({},), station_is_heard=True)
+_AROUND_HOME = {"FENCE_RADIUS": FENCE_M, "FENCE_ENABLE": 1.0}
+FENCE_BREACHED = Circumstance(
+    "a breach of its fence",
+    ({"FENCE_TYPE": 3.0, "FENCE_ALT_MAX": FENCE_M, **_AROUND_HOME}, {"FENCE_TYPE": 2.0, **_AROUND_HOME}),
+)
+"""FENCE_TYPE 3 is a maximum altitude and a circle around home. 2 is the circle alone, for a rover."""
+FENCE_LIFTED = Circumstance("a flight without a fence", ({"FENCE_ENABLE": 0.0},))
 
 
 def battery(volts: float) -> Circumstance:

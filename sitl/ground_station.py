@@ -45,6 +45,7 @@ class GroundStation(asyncio.DatagramProtocol):
         self._transport: asyncio.DatagramTransport | None = None
         self._vehicles: dict[int, _Vehicle] = {}
         """The vehicles by MAVLink system ID."""
+        self._out_of_reach: set[int] = set()
         self._mav = mavlink.MAVLink(None)
         self._commands = CommandLog()
         self._sent = self._received = self._dropped = 0
@@ -67,11 +68,18 @@ class GroundStation(asyncio.DatagramProtocol):
         It replaces an earlier connection.
         """
         sock.setblocking(False)
-        vehicle = _Vehicle(vehicle_id, self._forward)
+        vehicle = _Vehicle(vehicle_id, lambda frames: self._forward(sysid, frames))
         await asyncio.get_running_loop().create_connection(lambda: vehicle, sock=sock)
         if before := self._vehicles.get(sysid):
             before.close()
         self._vehicles[sysid] = vehicle
+
+    def reach(self, sysid: int, *, reachable: bool) -> None:
+        """Begin or end the contact between a vehicle and the ground station. Frames are lost without contact."""
+        if reachable:
+            self._out_of_reach.discard(sysid)
+        else:
+            self._out_of_reach.add(sysid)
 
     def close(self) -> None:
         """End all connections. May be called twice."""
@@ -90,10 +98,10 @@ class GroundStation(asyncio.DatagramProtocol):
             "commands_left_out": self._commands.left_out,
         }
 
-    def _forward(self, frames: list[bytes]) -> None:
+    def _forward(self, sysid: int, frames: list[bytes]) -> None:
         """Forward frames from a vehicle to the ground station."""
         transport = self._transport
-        if transport is None or transport.is_closing():
+        if transport is None or transport.is_closing() or sysid in self._out_of_reach:
             return
         datagram = b""
         for frame in [*frames, b""]:
@@ -131,7 +139,8 @@ class GroundStation(asyncio.DatagramProtocol):
                 self._dropped += 1
                 continue
             target = getattr(message, "target_system", 0)
-            heard = [vehicle for sysid, vehicle in self._vehicles.items() if target in (0, sysid)]
+            reached = {sysid for sysid in self._vehicles if target in (0, sysid)} - self._out_of_reach
+            heard = [vehicle for sysid, vehicle in self._vehicles.items() if sysid in reached]
             for vehicle in heard:
                 vehicle.send(frame)
             vehicle_ids = [vehicle.vehicle_id for vehicle in heard]

@@ -59,6 +59,7 @@ class Pilot:
         self.vehicle_id = sysid if vehicle_id is None else vehicle_id
         self._terminated = self._handed_over = False
         self._befallen = False
+        self._awaited: Step | None = None
 
     @property
     def state(self) -> VehicleState:
@@ -123,8 +124,17 @@ class Pilot:
         procedure ends without an error. Raises NotSimulatedError if the vehicle cannot simulate the circumstance.
         """
         values = await bring_about(self.link, circumstance)
+        if circumstance.station_is_heard is not None:
+            self.link.station_is_heard = circumstance.station_is_heard
         self._befallen = True
         return values
+
+    def shortfall(self, flight: Procedure) -> str | None:
+        """Return a sentence if the vehicle has not left its home. None if it has, or if it is to fly no longer."""
+        if self.state.has_moved or self._terminated or self._handed_over or self._befallen:
+            return None
+        awaited = self._awaited.name if self._awaited else "its end"
+        return str(self._failed(flight, awaited, "it has not left its home when the mission ends"))
 
     def hand_over(self) -> None:
         """Hand the vehicle over to another pilot. The current procedure ends without an error."""
@@ -139,6 +149,7 @@ class Pilot:
         clocks = _StepClocks(self.link)
         asked: tuple[Step, int] | None = None
         while (step := self._next_step(procedure)) is not None:
+            self._awaited = step
             if self._is_over(procedure):
                 return
             if problem := clocks.lost():
@@ -178,7 +189,8 @@ class Pilot:
     def _telemetry_is_missing(self) -> bool:
         link = self.link
         stale = link.position_at is None or time.monotonic() - link.position_at > ASK_AGAIN_S
-        return stale or not link.state.ready_to_arm  # while it boots it may acknowledge and forget
+        boots = not link.state.ready_to_arm and not link.has_armed  # it may acknowledge and forget
+        return stale or boots
 
     def _failed(self, procedure: Procedure, awaited: str, reason: str) -> FlightError:
         state = self.state

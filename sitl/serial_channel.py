@@ -13,10 +13,13 @@ from pymavlink.dialects.v20 import common as mavlink
 from sitl._autopilot import FRAMES, MAX_ALTITUDE_M, Autopilot
 from sitl._mission_inbox import MissionInbox
 from sitl.modes import MODES
-from sitl.streams import STREAMS, autopilot_version
+from sitl.streams import ON_REQUEST, STREAMS
 
 DEFAULT_INTERVAL_S = 1.0
 MIN_INTERVAL_S = 0.02
+
+LOG_DATA_BYTES = 90
+FTP_BYTES, FTP_NAK, FTP_UNKNOWN_COMMAND = 251, 129, 7
 
 FORCE = 21196  # param2 of MAV_CMD_COMPONENT_ARM_DISARM
 NO_POSITION = (
@@ -48,6 +51,8 @@ class Channel:
         """Process bytes from the client, in pieces of any size and with any content."""
         for message in self._mav.parse_buffer(data) or ():
             kind = message.get_type()
+            if kind == "HEARTBEAT":
+                self._autopilot.hear(message.get_srcSystem())
             if getattr(message, "target_system", None) not in (0, self._autopilot.sysid):
                 continue  # BAD_DATA and heartbeats have no target
             if getattr(message, "target_component", 0) not in (0, mavlink.MAV_COMP_ID_AUTOPILOT1):
@@ -62,6 +67,12 @@ class Channel:
                 self._tell_parameters(message)
             elif kind == "REQUEST_DATA_STREAM":
                 self._set_rate(message)
+            elif kind == "FILE_TRANSFER_PROTOCOL":
+                self._refuse_file(message)
+            elif kind == "LOG_REQUEST_LIST":
+                self.send(mavlink.MAVLink_log_entry_message(0, 0, 0, 0, 0))
+            elif kind == "LOG_REQUEST_DATA":
+                self.send(mavlink.MAVLink_log_data_message(message.id, message.ofs, 0, [0] * LOG_DATA_BYTES))
             elif kind.startswith("MISSION_"):
                 for answer in self._mission.receive(kind, message):
                     self.send(answer)
@@ -128,6 +139,10 @@ class Channel:
                 return self._set_interval(message.param1, message.param2)
             case mavlink.MAV_CMD_REQUEST_MESSAGE:
                 return self._request(message.param1)
+            case mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES:
+                return self._request(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+            case mavlink.MAV_CMD_GET_HOME_POSITION:
+                return self._request(mavlink.MAVLINK_MSG_ID_HOME_POSITION)
         return int(mavlink.MAV_RESULT_UNSUPPORTED)
 
     def _set_mode(self, name: str) -> int:
@@ -217,11 +232,26 @@ class Channel:
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _request(self, message_id: float) -> int:
-        said = {**STREAMS, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version}
-        if message_id not in said:
+        if message_id not in ON_REQUEST:
             return int(mavlink.MAV_RESULT_FAILED)
-        self.send(said[int(message_id)](self._autopilot))
+        self.send(ON_REQUEST[int(message_id)](self._autopilot))
         return int(mavlink.MAV_RESULT_ACCEPTED)
+
+    def _refuse_file(self, message: Any) -> None:
+        """Refuse a request of MAVLink FTP, because the vehicle has no files.
+
+        A payload has a sequence number of two bytes, a session, an operation, a size, the requested operation, two
+        bytes, an offset of four bytes, and the data, here an error number. https://mavlink.io/en/services/ftp.html
+        """
+        sequence = (int.from_bytes(bytes(message.payload[:2]), "little") + 1) & 0xFFFF
+        session, operation = message.payload[2:4]
+        head = [*sequence.to_bytes(2, "little"), session, FTP_NAK, 1, operation, 0, 0, 0, 0, 0, 0, FTP_UNKNOWN_COMMAND]
+        payload = head + [0] * (FTP_BYTES - len(head))
+        self.send(
+            mavlink.MAVLink_file_transfer_protocol_message(
+                0, message.get_srcSystem(), message.get_srcComponent(), payload
+            )
+        )
 
 
 def _seventh(message: Any) -> float:

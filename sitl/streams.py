@@ -10,6 +10,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl._autopilot import CURRENT_ARMED_A, CURRENT_IDLE_A, Autopilot
+from sitl._failsafes import FENCE as FENCE_ENABLE
 from sitl.modes import MODES
 from sitl.vehicle import Home, VehicleType
 
@@ -24,11 +25,12 @@ SENSORS = (
     | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
     | mavlink.MAV_SYS_STATUS_SENSOR_GPS
     | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
+    | mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
     | mavlink.MAV_SYS_STATUS_AHRS
     | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 )
-NOT_ILL = mavlink.MAV_SYS_STATUS_GEOFENCE
-"""A missing sensor is reported as healthy, as in ArduPilot. Otherwise MAVProxy would report a breach of the fence."""
+FENCE = mavlink.MAV_SYS_STATUS_GEOFENCE
+"""Reported as healthy without a fence, as in ArduPilot. Otherwise MAVProxy would report a breach of the fence."""
 NOT_YET = mavlink.MAV_SYS_STATUS_SENSOR_GPS | mavlink.MAV_SYS_STATUS_AHRS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 
 
@@ -55,19 +57,23 @@ def _state(vehicle: Autopilot) -> int:
 
 def _health(vehicle: Autopilot) -> int:
     """Return the flags of the healthy sensors, and of functions that depend on them."""
-    low = any(failsafe.startswith("battery") for failsafe in vehicle.failsafes.acting)
+    acting = vehicle.failsafes.acting
+    low = any(failsafe.startswith("battery") for failsafe in acting)
     unwell = mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if low else 0
+    unwell |= mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if "radio" in acting else 0
+    unwell |= FENCE if "fence" in acting else 0
     if not vehicle.ready:
         unwell |= NOT_YET
     if vehicle.has_booted and vehicle.vehicle_type != "rover":  # without GPS they reckon on
         unwell &= ~mavlink.MAV_SYS_STATUS_AHRS
-    return int((SENSORS | NOT_ILL) & ~unwell)
+    return int((SENSORS | FENCE) & ~unwell)
 
 
 def sys_status(vehicle: Autopilot) -> Any:
+    sensors = SENSORS | (FENCE if vehicle.failsafes.parameters.get(FENCE_ENABLE) else 0)
     return mavlink.MAVLink_sys_status_message(
-        onboard_control_sensors_present=SENSORS,
-        onboard_control_sensors_enabled=SENSORS,
+        onboard_control_sensors_present=sensors,
+        onboard_control_sensors_enabled=sensors,
         onboard_control_sensors_health=_health(vehicle),
         load=50,
         voltage_battery=round(vehicle.volts * 1e3),
@@ -115,6 +121,13 @@ def mission_current(vehicle: Autopilot) -> Any:
     return mavlink.MAVLink_mission_current_message(vehicle.current_item)
 
 
+def home_position(vehicle: Autopilot) -> Any:
+    home = vehicle.home
+    place = (round(home.lat_deg * 1e7), round(home.lon_deg * 1e7), round(home.alt_m * 1e3))
+    level = [1.0, 0.0, 0.0, 0.0]
+    return mavlink.MAVLink_home_position_message(*place, 0.0, 0.0, 0.0, level, 0.0, 0.0, 0.0)
+
+
 def autopilot_version(vehicle: Autopilot) -> Any:
     """Return the version of this package, without a commit. It is sent on request only."""
     parts = [min(int(part), 255) for part in version("ucp-harness").split(".")[:3]]
@@ -143,3 +156,9 @@ STREAMS: dict[int, Callable[[Autopilot], Any]] = {
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: global_position_int,
     mavlink.MAVLINK_MSG_ID_MISSION_CURRENT: mission_current,
 }
+ON_REQUEST: dict[int, Callable[[Autopilot], Any]] = {
+    **STREAMS,
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION: home_position,
+}
+"""Messages that are sent once after MAV_CMD_REQUEST_MESSAGE. Requests for other messages are refused."""

@@ -7,7 +7,7 @@ missing file that a complete run would have.
 
 import os
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
@@ -31,7 +31,15 @@ from harness.archive.history import has_possible_time
 from harness.archive.lag import LAG_FILE, LagLine, MeasuredLag
 from harness.archive.record_file import RecordFile, read_record
 from harness.archive.run_record import JudgedRecord, RunRecord
-from harness.archive.traces import SUFFIX, HandlerRunLine, Trace, read_trace, read_trace_lines, why_not_a_trace
+from harness.archive.traces import (
+    SUFFIX,
+    HandlerRunLine,
+    Trace,
+    read_clock,
+    read_trace,
+    read_trace_lines,
+    why_not_a_trace,
+)
 from harness.archive.tracks import TRACKS_FILE, Tracks, read_tracks
 from harness.errors import RunDirectoryError
 from ucp.trace import HandlerRun
@@ -190,6 +198,14 @@ class RunArchive:
             for place, blocks in places.items():
                 for position, block in enumerate(blocks):
                     yield HeldBlock(agent_id, place, position, block)
+
+    @cached_property
+    def epoch_us(self) -> int | None:
+        """The timestamp of mission second 0, from the headers of most traces. None without a readable header."""
+        epochs = Counter(
+            epoch for path in self._trace_files if type(epoch := read_clock(path).get("epoch_us")) is int
+        ).most_common(1)
+        return epochs[0][0] if epochs else None
 
     @cached_property
     def large(self) -> bool:

@@ -96,6 +96,15 @@ HANDLER_RUN = TypeAdapter(HandlerRun)
 ASIDE = TypeAdapter(Dropped | Commanded)
 
 
+def read_clock(path: Path) -> dict[str, Any]:
+    """Return the clock in the header of a trace. Empty if the header cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return HEADER.validate_json(file.readline(MAX_LINE_BYTES)).clock
+    except (OSError, ValueError):
+        return {}
+
+
 class Gap(NamedTuple):
     """A place in a trace at which lines are missing or damaged. `position` is the number of runs before it.
 

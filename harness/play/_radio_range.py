@@ -71,11 +71,13 @@ def tracks_of(scenario: Scenario) -> dict[int, Track]:
     """
     if not (scenario.flight or scenario.network.radio or scenario.network.channel or scenario.gcs):
         return {}
-    return {vehicle: _track(scenario, vehicle, index) for index, vehicle in enumerate(scenario.roster)}
+    return {vehicle: track_of(scenario, vehicle) for vehicle in scenario.roster}
 
 
-def _track(scenario: Scenario, vehicle: int, index: int) -> Track:
+def track_of(scenario: Scenario, vehicle: int) -> Track:
+    """Return the computed track of a vehicle that takes off at mission second 0."""
     vehicles, flight = scenario.vehicles, scenario.flight_of(vehicle)
+    index = scenario.roster.index(vehicle)
     if index in vehicles.swarm or vehicle in vehicles.each:
         home = vehicles.home_of(vehicle, index)
         north_m, east_m, up_m = vehicles.field.metres_to(home.lat_deg, home.lon_deg, home.alt_m)

@@ -12,9 +12,14 @@ import sitl.circumstances
 from sitl._autopilot import Autopilot
 from sitl.circumstances import (
     COMPASS_LOST,
+    FENCE_BREACHED,
+    FENCE_LIFTED,
     GPS_LOST,
     GPS_REGAINED,
     MOTOR_STOPPED,
+    RC_LOST,
+    STATION_LOST,
+    STATION_REGAINED,
     Circumstance,
     NotSimulatedError,
     battery,
@@ -208,3 +213,136 @@ def test_plane_is_slower_against_the_wind_and_faster_with_it() -> None:
         arrivals[from_deg] = vehicle.now_s
     assert arrivals[180.0] < arrivals[None] - 30
     assert arrivals[0.0] > arrivals[None] + 60
+
+
+@pytest.mark.parametrize(
+    ("vehicle_type", "given", "mode"),
+    [
+        ("copter", {"FS_GCS_ENABLE": 1.0}, "RTL"),
+        ("copter", {"FS_GCS_ENABLE": 5.0}, "LAND"),
+        ("copter", {}, "GUIDED"),
+        ("plane", {"FS_GCS_ENABL": 1.0, "FS_LONG_ACTN": 1.0}, "RTL"),
+        ("rover", {"FS_GCS_ENABLE": 1.0}, "HOLD"),
+    ],
+)
+def test_vehicle_acts_when_its_ground_station_is_silent(
+    vehicle_type: VehicleType, given: dict[str, float], mode: str
+) -> None:
+    vehicle, texts = airborne(vehicle_type)
+    vehicle.failsafes.parameters |= given
+    vehicle.advance(100.0)
+    assert "GCS Failsafe" not in texts  # it never heard a ground station
+    vehicle.hear(254)
+    vehicle.advance(110.0)
+    assert vehicle.station_heard_s is None
+    vehicle.hear(255)
+    vehicle.advance(114.0)
+    assert "GCS Failsafe" not in texts
+    vehicle.advance(116.0)
+    assert (mode_of(vehicle), "GCS Failsafe" in texts) == (mode, bool(given))
+
+
+@pytest.mark.parametrize(("vehicle_type", "mode"), [("copter", "RTL"), ("plane", "TAKEOFF"), ("rover", "HOLD")])
+def test_vehicle_acts_when_its_remote_control_fails(vehicle_type: VehicleType, mode: str) -> None:
+    vehicle, texts = airborne(vehicle_type)
+    vehicle.failsafes.parameters["SIM_RC_FAIL"] = 1.0
+    vehicle.advance(61.0)
+    vehicle.advance(63.0)
+    assert (mode_of(vehicle), texts[:1]) == (mode, ["Radio Failsafe"])
+    status = sys_status(vehicle)
+    rc = mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+    assert status.onboard_control_sensors_enabled & rc and not status.onboard_control_sensors_health & rc
+
+
+@pytest.mark.parametrize(("action", "mode"), [(0.0, "GUIDED"), (1.0, "RTL"), (2.0, "LAND")])
+def test_copter_outside_of_its_fence_does_its_action(action: float, mode: str) -> None:
+    vehicle, texts = airborne()
+    fence = mavlink.MAV_SYS_STATUS_GEOFENCE
+    assert not sys_status(vehicle).onboard_control_sensors_enabled & fence
+    vehicle.failsafes.parameters |= {"FENCE_ACTION": action, **FENCE_BREACHED.ways[0]}
+    vehicle.advance(61.0)
+    assert (mode_of(vehicle), texts[:1]) == (mode, ["fence breached"])
+    status = sys_status(vehicle)
+    assert status.onboard_control_sensors_enabled & fence and not status.onboard_control_sensors_health & fence
+    vehicle.failsafes.parameters |= FENCE_LIFTED.ways[0]
+    vehicle.advance(62.0)
+    assert sys_status(vehicle).onboard_control_sensors_health & fence
+
+
+def test_pilot_has_a_system_id_of_its_own_and_the_station_falls_silent(tmp_path: Path) -> None:
+    async def fly() -> None:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            heard: list[int] = []
+            puppet.vehicle.hear = heard.append  # type: ignore[method-assign]
+            async with asyncio.timeout(20):
+                while not {254, 255} <= set(heard):
+                    await asyncio.sleep(0.01)
+                assert await pilot.befall(STATION_LOST) == {}
+                await asyncio.sleep(0.1)
+                heard.clear()
+                while heard.count(254) < 5:
+                    await asyncio.sleep(0.01)
+                assert 255 not in heard
+                await pilot.befall(STATION_REGAINED)
+                while 255 not in heard:
+                    await asyncio.sleep(0.01)
+
+    asyncio.run(fly())
+
+
+def test_lost_remote_control_is_set_and_ends_the_flight_without_failure(tmp_path: Path) -> None:
+    async def fly() -> None:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            flying = asyncio.create_task(pilot.fly(pilot.flight(FAR, "mission")))
+            while pilot.state.mode != MODES["copter"]["AUTO"]:
+                await asyncio.sleep(0.01)
+            assert await pilot.befall(RC_LOST) == {"SIM_RC_FAIL": 1.0}
+            await asyncio.wait_for(flying, 20)
+            assert mode_of(puppet.vehicle) == "RTL"
+
+    asyncio.run(fly())
+
+
+def test_pilot_asks_for_no_telemetry_that_arrives_after_a_battery_failsafe(tmp_path: Path) -> None:
+    async def fly() -> None:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            await pilot.fly(pilot.ascent(20.0))
+            await pilot.befall(battery(9.0))
+            listening = asyncio.create_task(pilot.stay_in_touch())
+            while not puppet.vehicle.failsafes.acting:
+                await asyncio.sleep(0.01)
+            puppet.vehicle.simulate("SIM_GPS1_ENABLE", 0.0)  # its checks before arming now fail for good
+            while pilot.state.ready_to_arm:
+                await asyncio.sleep(0.01)
+            asked: list[int] = []
+            pilot.link.command = lambda command, *params: asked.append(command)  # type: ignore[method-assign]
+            beats = pilot.link.heartbeats
+            pilot.link._asked_at = None
+            while pilot.link.heartbeats < beats + 5:
+                await asyncio.sleep(0.01)
+            assert mavlink.MAV_CMD_SET_MESSAGE_INTERVAL not in asked
+            listening.cancel()
+
+    asyncio.run(fly())
+
+
+def test_vehicle_that_never_left_its_home_is_reported(tmp_path: Path) -> None:
+    async def fly() -> None:
+        async with on_strings(tmp_path) as (pilot, puppet):
+            flight = pilot.flight(FAR, "mission")
+            puppet.vehicle.arm = lambda: 4  # type: ignore[method-assign]
+            flying = asyncio.create_task(pilot.fly(flight))
+            while not pilot.state.ready_to_arm:
+                await asyncio.sleep(0.01)
+            while pilot._awaited is None or pilot._awaited.name != "arming":
+                await asyncio.sleep(0.01)
+            sentence = pilot.shortfall(flight)
+            assert sentence is not None
+            assert "vehicle 3 did not fly its plan: waiting for arming, it has not left its home when" in sentence
+            del puppet.vehicle.arm
+            while not pilot.state.has_moved:
+                await asyncio.sleep(0.01)
+            assert pilot.shortfall(flight) is None
+            flying.cancel()
+
+    asyncio.run(fly())

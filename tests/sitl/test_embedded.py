@@ -266,3 +266,32 @@ def test_repeated_interval_requests_do_not_postpone_messages() -> None:
         cockpit.channel.send_due()
         attitudes += sum(message.get_type() == "ATTITUDE" for message in cockpit.listen())
     assert attitudes == 5
+
+
+def test_optional_services_are_answered() -> None:
+    with embedded() as vehicle:
+        client = Client(vehicle.station_port)
+        for command, result in (
+            (mavlink.MAV_CMD_GET_HOME_POSITION, mavlink.MAV_RESULT_ACCEPTED),
+            (mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, mavlink.MAV_RESULT_ACCEPTED),
+            (mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION, mavlink.MAV_RESULT_UNSUPPORTED),
+            (mavlink.MAV_CMD_REQUEST_STORAGE_INFORMATION, mavlink.MAV_RESULT_UNSUPPORTED),
+        ):
+            assert client.command(command, 1.0) == result
+        for protocol_version_metadata_or_modes in (300, 397, 435):
+            asked = client.command(mavlink.MAV_CMD_REQUEST_MESSAGE, protocol_version_metadata_or_modes)
+            assert asked == mavlink.MAV_RESULT_FAILED
+        home_position = mavlink.MAVLINK_MSG_ID_HOME_POSITION
+        message = mavlink.MAVLink_command_long_message(3, 1, 512, 0, home_position, *[0.0] * 6)
+        client.sock.sendall(message.pack(client.mav))
+        home = client.wait_for("HOME_POSITION")
+        assert (home.latitude, home.longitude, home.altitude) == (-353632620, 1491652370, 584000)
+        list_directory = [7, 0, 4, 3, 1, 0, 0, 0, 0, 0, 0, 0, ord("/")]
+        payload = list_directory + [0] * (251 - len(list_directory))
+        client.sock.sendall(mavlink.MAVLink_file_transfer_protocol_message(0, 3, 1, payload).pack(client.mav))
+        answer = client.wait_for("FILE_TRANSFER_PROTOCOL")
+        assert (answer.target_system, answer.payload[:6], answer.payload[12]) == (255, [8, 0, 4, 129, 1, 3], 7)
+        client.sock.sendall(mavlink.MAVLink_log_request_list_message(3, 1, 0, 0xFFFF).pack(client.mav))
+        assert client.wait_for("LOG_ENTRY").num_logs == 0
+        client.sock.sendall(mavlink.MAVLink_log_request_data_message(3, 1, 1, 0, 90).pack(client.mav))
+        assert client.wait_for("LOG_DATA").count == 0

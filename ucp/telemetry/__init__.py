@@ -43,7 +43,7 @@ has no battery levels. Its battery failsafe is event 7.
 
 from ucp.events import DEFAULT_LOG, EventKind
 from ucp.telemetry._connection import VehicleConnection
-from ucp.telemetry._event_text import describe
+from ucp.telemetry._event_text import describe, vehicle_type
 from ucp.telemetry._mode_names import mode_name
 from ucp.telemetry._records import (
     ARMED,
@@ -80,4 +80,5 @@ __all__ = [
     "describe",
     "mode_name",
     "position_of",
+    "vehicle_type",
 ]

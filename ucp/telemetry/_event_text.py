@@ -14,8 +14,19 @@ _STATES = (  # MAV_STATE
 )
 
 
-def describe(event_id: int, data: bytes) -> str:
-    """Return the data of an event of the `mavlink` source as text. Other data gives "unreadable"."""
+def vehicle_type(event_id: int, data: bytes) -> int | None:
+    """Return the MAV_TYPE that an event holds. None if it holds none."""
+    if event_id != _records.MODE_CHANGE or len(data) != _records.MODE_CHANGE_DATA.size:
+        return None
+    kind: int = _records.MODE_CHANGE_DATA.unpack(data)[1]
+    return kind
+
+
+def describe(event_id: int, data: bytes, of_type: int | None = None) -> str:
+    """Describe an event of this source in words. Return 'unreadable' for any other data.
+
+    `of_type` is the MAV_TYPE of the vehicle. Without it, some events have the number of a mode and not its name.
+    """
     try:
         match event_id:
             case _records.MODE_CHANGE:
@@ -24,14 +35,15 @@ def describe(event_id: int, data: bytes) -> str:
                 return f"{_time_prefix(ms)} mode {mode_name(mode, kind)}{change}"
             case _records.ARMED | _records.DISARMED:
                 ms, mode = _records.ARMING_DATA.unpack(data)
-                return f"{_time_prefix(ms)} {'armed' if event_id == _records.ARMED else 'disarmed'} in mode {mode}"
+                change = "armed" if event_id == _records.ARMED else "disarmed"
+                return f"{_time_prefix(ms)} {change} in mode {_mode(mode, of_type)}"
             case _records.STATUS_TEXT:
                 ms, severity = _records.STATUS_TEXT_DATA.unpack_from(data)
                 text = data[_records.STATUS_TEXT_DATA.size :].decode(errors="replace")
                 printable = "".join(char if char.isprintable() else "?" for char in text)
                 return f"{_time_prefix(ms)} {_SEVERITIES[severity]}: {printable}"
             case _records.POSITION:
-                return _position(Position.unpack(data))
+                return _position(Position.unpack(data), of_type)
             case _records.WAYPOINT:
                 ms, item = _records.WAYPOINT_DATA.unpack(data)
                 return f"{_time_prefix(ms)} reached mission item {item}"
@@ -47,7 +59,11 @@ def describe(event_id: int, data: bytes) -> str:
     return "unreadable"
 
 
-def _position(position: Position) -> str:
+def _mode(mode: int, of_type: int | None) -> str:
+    return str(mode) if of_type is None else mode_name(mode, of_type)
+
+
+def _position(position: Position, of_type: int | None) -> str:
     parts = [
         f"{_time_prefix(position.vehicle_ms)} at {position.lat_e7 / 1e7:.7f} {position.lon_e7 / 1e7:.7f}",
         f"{position.alt_mm / 1e3:.1f} m",
@@ -60,7 +76,7 @@ def _position(position: Position) -> str:
     if position.battery_mv != _records.UNKNOWN_VOLTAGE:
         left = f" {position.battery_percent} %" if position.battery_percent >= 0 else ""
         parts.append(f"battery {position.battery_mv / 1e3:.1f} V{left}")
-    parts.append(f"mode {position.mode}" + (" armed" if position.armed else ""))
+    parts.append(f"mode {_mode(position.mode, of_type)}" + (" armed" if position.armed else ""))
     return ", ".join(parts)
 
 

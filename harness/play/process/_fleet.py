@@ -1,11 +1,13 @@
 """The vehicles of a run as programs. Start them, fly them, connect them to a ground station, and replace lost ones."""
 
 import asyncio
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from harness.archive.directory import RunDirectory
 from harness.errors import ScenarioError
+from harness.play._radio_range import track_of
 from harness.play.process._run_lab import MissionLab
 from harness.play.process._vehicle_process import VehicleProcess
 from harness.play.process._watchers import Watchers
@@ -17,6 +19,10 @@ from sitl.ground_station import GroundStation
 from sitl.system_ids import system_ids
 from sitl.vehicle import Home, VehicleError, VehicleKind
 from ucp.clock import MissionClock
+
+LATE_S = 10.0
+"""Mission seconds by which ArduPilot, or a vehicle on a busy machine, may take off later than computed."""
+AWAY_M = 5.0
 
 
 class Fleet:
@@ -41,6 +47,7 @@ class Fleet:
         self._sysids = system_ids(scenario.roster)
         self._vehicles = {vehicle_id: self._vehicle(vehicle_id) for vehicle_id in scenario.roster if kinds}
         self._station: GroundStation | None = None
+        self._flies_since_s: dict[int, float] = {}
 
     def __bool__(self) -> bool:
         return bool(self._vehicles)
@@ -89,6 +96,7 @@ class Fleet:
         vehicle.prepare(flight, self._scenario.vehicles.takeoff_altitude_m)
         if self._station is not None:
             await vehicle.join(self._station, lab)
+            self._station.reach(vehicle.sysid, reachable=True)
 
     def take_off(self) -> None:
         """Start the flights of all vehicles."""
@@ -96,6 +104,7 @@ class Fleet:
             self._fly(vehicle)
 
     def _fly(self, vehicle: VehicleProcess) -> None:
+        self._flies_since_s[vehicle.vehicle_id] = self._clock.now()
         self._watchers.start(vehicle.fly(), of=f"flight {vehicle.vehicle_id}")
 
     def places(self) -> dict[int, Place]:
@@ -128,9 +137,24 @@ class Fleet:
 
     async def simulate(self, vehicle_id: int, what: str, circumstance: Circumstance, at_s: float) -> str | None:
         """Make a vehicle simulate a circumstance, as `VehicleProcess.simulate` does."""
+        if self._station is not None and circumstance.station_is_heard is not None:
+            self._station.reach(self._sysids[vehicle_id], reachable=circumstance.station_is_heard)
         return await self._vehicles[vehicle_id].simulate(what, circumstance, at_s)
 
     # End of the run
+
+    def shortfalls(self, mission_s: float) -> list[str]:
+        """Return a sentence for each vehicle that should have left its home, and has not."""
+        sentences = (
+            vehicle.shortfall() for vehicle in self._vehicles.values() if self._should_have_left(vehicle, mission_s)
+        )
+        return [sentence for sentence in sentences if sentence is not None]
+
+    def _should_have_left(self, vehicle: VehicleProcess, mission_s: float) -> bool:
+        """Return whether the computed track leaves home more than LATE_S seconds before the end."""
+        track = track_of(self._scenario, vehicle.vehicle_id)
+        flown_s = mission_s - LATE_S - self._flies_since_s.get(vehicle.vehicle_id, mission_s)
+        return any(math.hypot(*track.at(second)) > AWAY_M for second in range(max(0, math.ceil(flown_s))))
 
     def close_station(self) -> dict[str, Any] | None:
         """Disconnect the ground station, and return its record for run.json. None if the run has no ground station."""

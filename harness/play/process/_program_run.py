@@ -438,6 +438,8 @@ class ProgramRun:
             if error is not None and self.played.outcome == "completed":
                 self._end_early(error)
         self.played.vehicles = self._fleet.to_json()
+        if self.played.outcome == "completed":
+            self.played.unmatched_fates += self._fleet.shortfalls(self.played.mission_s)
         self.played.ground_station = self._fleet.close_station()
         try:
             if self._rogue is not None:

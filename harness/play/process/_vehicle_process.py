@@ -104,6 +104,8 @@ class VehicleProcess:
                 "ground station: leave out --gcs"
             ) from None
         await station.attach(self.vehicle_id, self.sysid, sock)
+        assert self.pilot is not None
+        self.pilot.link.plays_station = False
 
     def hand_over(self) -> None:
         """Let an operator fly the vehicle from now on."""
@@ -181,6 +183,12 @@ class VehicleProcess:
         """Stop the motors, end the flight, and let the vehicle fall to the ground. Raises VehicleFailedError."""
         assert self.pilot is not None
         await self._run_pilot(self.pilot.terminate_flight())
+
+    def shortfall(self) -> str | None:
+        """Return a sentence if it still flies and has not left its home."""
+        if self.pilot is None or self._flight is None or self._process is None or self._process.returncode is not None:
+            return None
+        return self.pilot.shortfall(self._flight)
 
     async def simulate(self, what: str, circumstance: Circumstance, at_s: float) -> str | None:
         """Make the vehicle simulate a circumstance. If the vehicle cannot, return the reason as a sentence."""

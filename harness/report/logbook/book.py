@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from harness.archive.archive import RunArchive
 from harness.archive.event_data import EventData
 from harness.archive.exports import SUFFIX, Export, name_blocks
+from harness.archive.history import LATEST_S
 from harness.archive.run_record import AgentRecord, RunRecord
 from harness.errors import ExportError, RunDirectoryError
 from harness.play.backends import in_virtual_time
@@ -20,7 +21,8 @@ class Logbook:
 
     names: names of the blocks by hash. telemetry: whether the events come from the source `mavlink`, which is assumed
     for exports without a run. absent: a sentence for each agent of the mission without an export. errors: a sentence
-    for each unusable file. event_data: the reader of events in blocks.
+    for each unusable file. event_data: the reader of events in blocks. epoch_us: the timestamp of mission second 0,
+    None if unknown.
     """
 
     exports: dict[int, Export]
@@ -29,9 +31,15 @@ class Logbook:
     absent: dict[int, str] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
     event_data: EventData = field(default_factory=EventData)
+    epoch_us: int | None = None
 
     def name(self, block_hash: str) -> str:
         return self.names.get(block_hash, block_hash[:12])
+
+    def mission_s(self, timestamp_us: int) -> float | None:
+        """Return the mission second of a timestamp. None if the start is unknown, or for the inception block."""
+        mission_s = None if self.epoch_us is None else (timestamp_us - self.epoch_us) / 1e6
+        return mission_s if mission_s is not None and abs(mission_s) <= LATEST_S else None
 
     def only(self, agent_id: int) -> "Logbook":
         """Return a logbook with one agent's export.
@@ -64,6 +72,7 @@ def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
         absent={agent_id: _absent(agent_id, record.agents.get(str(agent_id))) for agent_id in absent},
         errors=[*archive.record_problems, *exports.errors],
         event_data=EventData.of(exports.by_agent.values(), depot),
+        epoch_us=archive.epoch_us,
     )
 
 

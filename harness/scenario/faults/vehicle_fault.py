@@ -1,4 +1,5 @@
-"""Faults of a vehicle rather than of its agent: battery, compass, GPS, motor and wind."""
+"""Faults of a vehicle rather than of its agent: battery, compass, fence, GPS, ground station, motor, remote control
+and wind."""
 
 from __future__ import annotations
 
@@ -12,9 +13,15 @@ from harness.scenario.vehicles import Vehicles
 from sitl.circumstances import (
     COMPASS_LOST,
     COMPASS_REGAINED,
+    FENCE_BREACHED,
+    FENCE_LIFTED,
     GPS_LOST,
     GPS_REGAINED,
     MOTOR_STOPPED,
+    RC_LOST,
+    RC_REGAINED,
+    STATION_LOST,
+    STATION_REGAINED,
     Circumstance,
     battery,
 )
@@ -82,6 +89,30 @@ class Battery(VehicleFault):
         return f"{self.vehicles_in_words}, {self.volts:g} V"
 
 
+class BreachFence(VehicleFault):
+    """The fence of these vehicles shrinks to two metres around home. A vehicle that is away from home breaches it."""
+
+    what = "breach_fence"
+    mark = FALLING
+    meaning = TROUBLED
+
+    @property
+    def circumstance(self) -> Circumstance:
+        return FENCE_BREACHED
+
+
+class LiftFence(VehicleFault):
+    """The fence of these vehicles no longer applies."""
+
+    what = "lift_fence"
+    mark = RISING
+    meaning = WELL_AGAIN
+
+    @property
+    def circumstance(self) -> Circumstance:
+        return FENCE_LIFTED
+
+
 class LoseCompass(VehicleFault):
     """All compasses of these vehicles fail."""
 
@@ -106,6 +137,30 @@ class RegainCompass(VehicleFault):
         return COMPASS_REGAINED
 
 
+class LoseGcs(VehicleFault):
+    """These vehicles receive nothing from their ground station, and it receives nothing from them."""
+
+    what = "lose_gcs"
+    mark = FALLING
+    meaning = TROUBLED
+
+    @property
+    def circumstance(self) -> Circumstance:
+        return STATION_LOST
+
+
+class RegainGcs(VehicleFault):
+    """These vehicles and their ground station receive each other again."""
+
+    what = "regain_gcs"
+    mark = RISING
+    meaning = WELL_AGAIN
+
+    @property
+    def circumstance(self) -> Circumstance:
+        return STATION_REGAINED
+
+
 class LoseGps(VehicleFault):
     """These vehicles lose GPS."""
 
@@ -128,6 +183,30 @@ class RegainGps(VehicleFault):
     @property
     def circumstance(self) -> Circumstance:
         return GPS_REGAINED
+
+
+class LoseRc(VehicleFault):
+    """The receivers of these vehicles lose the remote control."""
+
+    what = "lose_rc"
+    mark = FALLING
+    meaning = TROUBLED
+
+    @property
+    def circumstance(self) -> Circumstance:
+        return RC_LOST
+
+
+class RegainRc(VehicleFault):
+    """The receivers of these vehicles have the remote control again."""
+
+    what = "regain_rc"
+    mark = RISING
+    meaning = WELL_AGAIN
+
+    @property
+    def circumstance(self) -> Circumstance:
+        return RC_REGAINED
 
 
 class StopMotor(VehicleFault):
