@@ -35,7 +35,7 @@ FAR = Plan((TakeOff(20.0), GoTo(5000.0, 0.0)))
 
 
 def airborne(vehicle_type: VehicleType = "copter") -> tuple[Autopilot, list[str]]:
-    """A vehicle in the air, or on its way, and what it says."""
+    """Return a vehicle in flight or on its way, and its texts."""
     vehicle, texts = Autopilot(3, HOME, 0, vehicle_type), list[str]()
 
     class Ear:

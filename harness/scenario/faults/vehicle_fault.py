@@ -94,7 +94,7 @@ class BreachFence(VehicleFault):
 
     what = "breach_fence"
     mark = FALLING
-    meaning = TROUBLED
+    meaning = HAS_FAULT
 
     @property
     def circumstance(self) -> Circumstance:
@@ -106,7 +106,7 @@ class LiftFence(VehicleFault):
 
     what = "lift_fence"
     mark = RISING
-    meaning = WELL_AGAIN
+    meaning = RECOVERED
 
     @property
     def circumstance(self) -> Circumstance:
@@ -142,7 +142,7 @@ class LoseGcs(VehicleFault):
 
     what = "lose_gcs"
     mark = FALLING
-    meaning = TROUBLED
+    meaning = HAS_FAULT
 
     @property
     def circumstance(self) -> Circumstance:
@@ -154,7 +154,7 @@ class RegainGcs(VehicleFault):
 
     what = "regain_gcs"
     mark = RISING
-    meaning = WELL_AGAIN
+    meaning = RECOVERED
 
     @property
     def circumstance(self) -> Circumstance:
@@ -190,7 +190,7 @@ class LoseRc(VehicleFault):
 
     what = "lose_rc"
     mark = FALLING
-    meaning = TROUBLED
+    meaning = HAS_FAULT
 
     @property
     def circumstance(self) -> Circumstance:
@@ -202,7 +202,7 @@ class RegainRc(VehicleFault):
 
     what = "regain_rc"
     mark = RISING
-    meaning = WELL_AGAIN
+    meaning = RECOVERED
 
     @property
     def circumstance(self) -> Circumstance:

@@ -21,7 +21,7 @@ from harness.report.logbook.logbook_text import document, lines
 from harness.report.logbook.map_files import geojson, kml
 from harness.report.logbook.positions import LAST_TIMESTAMP_US, Track, tracks
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
-from tests.harness.mission import CONNECTED, edit, fly, write_exports, write_run
+from tests.harness.mission import CONNECTED, edit, edit_lines, fly, write_exports, write_run
 from tests.ucp.air import Air
 from tests.ucp.test_telemetry import frames, good_estimate, heartbeat, place, text
 from ucp.events import LoggableEvent, decode_events
@@ -106,6 +106,19 @@ def test_decoded_each_event_is_a_line_in_words(flown: Air, run_dir: Path) -> Non
     assert "    2026-11-21 10:51:48.000 UTC  [30.0 s] reached mission item 0\n" in done.stdout
     assert "] info: <EKF> & ?[31mGPS\n" in done.stdout
     assert "\x1b" not in done.stdout
+
+
+def test_decoded_events_have_mission_seconds_and_names_of_modes(flown: Air, run_dir: Path) -> None:
+    def begin(lines: list[dict[str, Any]]) -> None:
+        lines[0]["clock"]["epoch_us"] = EPOCH_US
+
+    for trace in (run_dir / "agents").glob("*.trace.jsonl"):
+        edit_lines(trace, begin)
+    printed = harness("chain", run_dir, "--decode", "--agent", "2").stdout
+    assert "        30.0 s  2026-11-21 10:51:48.000 UTC  [30.0 s] reached mission item 0\n" in printed
+    assert "armed in mode GUIDED\n" in printed and ", mode GUIDED armed\n" in printed
+    (first, *_) = json.loads(harness("chain", run_dir, "--json").stdout)["agents"]["2"]["chain"]
+    assert first["mission_s"] == (first["timestamp_us"] - EPOCH_US) / 1e6
 
 
 def test_exports_without_a_run_are_decoded_as_telemetry(flown: Air, tmp_path: Path) -> None:

@@ -32,10 +32,16 @@ def test_every_vehicle_fault_is_a_timeline_key_with_a_record() -> None:
     words = [kind.what for kind in TIMELINE_FAULTS if issubclass(kind, VehicleFault)]
     assert sorted(words) == [
         "battery",
+        "breach_fence",
+        "lift_fence",
         "lose_compass",
+        "lose_gcs",
         "lose_gps",
+        "lose_rc",
         "regain_compass",
+        "regain_gcs",
         "regain_gps",
+        "regain_rc",
         "stop_motor",
         "wind",
     ]
