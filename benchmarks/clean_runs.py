@@ -13,7 +13,7 @@ from collections import Counter
 from random import Random
 from typing import Any
 
-from harness.run.parallel import Failed, sweep
+from harness.run.parallel import FailedTask, sweep
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from ucp.settings import ALTERNATIVES, CHOICES
@@ -93,7 +93,7 @@ def main(arguments: list[str]) -> int:
     counts: Counter[tuple[str, str]] = Counter()
     with sweep(range(first, first + runs), judge, JOBS, what="runs" if sys.stderr.isatty() else None) as outcomes:
         for number, outcome in outcomes:
-            if isinstance(outcome, Failed):
+            if isinstance(outcome, FailedTask):
                 findings += 1
                 say(f"run {number} failed: {outcome.reason}")
                 continue

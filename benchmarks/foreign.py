@@ -19,7 +19,7 @@ from pathlib import Path
 
 from harness.errors import UnsupportedError
 from harness.play.simulation.foreign._virtual_program import SHARED
-from harness.run.parallel import Failed, sweep
+from harness.run.parallel import FailedTask, sweep
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario, load, load_scenario
 
@@ -41,7 +41,7 @@ def measure(scenario: Scenario, missions: int, jobs: int) -> tuple[float, int]:
     began, runs = time.monotonic(), 0
     with sweep(range(missions), work, jobs) as outcomes:
         for seed, outcome in outcomes:
-            if isinstance(outcome, Failed):
+            if isinstance(outcome, FailedTask):
                 sys.exit(f"seed {seed}: {outcome.reason}")
             runs += outcome
     return time.monotonic() - began, runs
@@ -87,11 +87,11 @@ def same(command: list[str], seeds: int, jobs: int) -> int:
         return "the same" if next(alike) == next(alike) else "different"
 
     came_to: Counter[str] = Counter()
-    names = [name for name in load.names() if not name.endswith("matrix")]
+    names = [name for name in load.scenario_names() if not name.endswith("matrix")]
     tasks = [(name, seed) for name in names for seed in range(seeds)]
     with sweep(tasks, work, jobs, what="missions") as outcomes:
         for (name, seed), outcome in outcomes:
-            what = outcome.reason if isinstance(outcome, Failed) else outcome
+            what = outcome.reason if isinstance(outcome, FailedTask) else outcome
             came_to[what] += 1
             if what != "the same":
                 sys.stdout.write(f"{name}, seed {seed}: {what}\n")

@@ -12,7 +12,7 @@ from random import Random
 from typing import Any
 
 from docs.generate.cures import STAGGER
-from harness.run.parallel import Failed, cores, sweep
+from harness.run.parallel import FailedTask, cores, sweep
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 
@@ -81,7 +81,7 @@ def main() -> None:
         restless, uniform = [], 0
         with sweep(range(arguments.runs), play, arguments.jobs) as outcomes:
             for seed, outcome in outcomes:
-                if isinstance(outcome, Failed):
+                if isinstance(outcome, FailedTask):
                     raise SystemExit(f"{name}, seed {seed}: {outcome.reason}")
                 settled, chains = outcome
                 uniform += chains == 1

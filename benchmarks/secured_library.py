@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from harness.errors import HarnessError
-from harness.run.parallel import Failed, cores, sweep
+from harness.run.parallel import FailedTask, cores, sweep
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load, load_scenario, read_yaml
 from harness.sweep.matrix._matrix_file import load_matrix
@@ -51,7 +51,7 @@ def in_both(name: str, scenario: Scenario) -> Compared:
 def all_of(names: Sequence[str]) -> Iterator[Compared]:
     """Yield all scenarios to compare. Raises ScenarioError for an invalid file."""
     for name in names:
-        path = load.find(Path(name))
+        path = load.find_file(Path(name))
         if "loss" not in read_yaml(path, "scenario"):
             yield in_both(name, load_scenario(path))
             continue
@@ -82,7 +82,7 @@ def compare(asked: Sequence[Compared], seeds: range, jobs: int) -> dict[str, lis
     tasks = [(compared, seed) for compared in asked for seed in seeds]
     with sweep(tasks, difference, jobs, what="missions" if sys.stderr.isatty() else None) as outcomes:
         for (compared, seed), outcome in outcomes:
-            if isinstance(outcome, Failed):
+            if isinstance(outcome, FailedTask):
                 different[compared.name].append(f"seed {seed}: {outcome.reason}")
             elif outcome is not None:
                 different[compared.name].append(f"seed {seed}: {outcome}")
@@ -93,7 +93,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=8, help="number of seeds, from 1")
     parser.add_argument("--jobs", type=int, default=cores(), help="number of parallel missions")
-    scenarios = [name for name in load.names() if name != TOO_LARGE]
+    scenarios = [name for name in load.scenario_names() if name != TOO_LARGE]
     parser.add_argument("scenarios", nargs="*", default=scenarios, help=f"scenarios; default: all but {TOO_LARGE}")
     arguments = parser.parse_args()
     seeds = range(1, arguments.seeds + 1)

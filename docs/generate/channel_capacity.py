@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from harness.present import svg
 from harness.present.svg import Area
-from harness.run.parallel import Failed, sweep
+from harness.run.parallel import FailedTask, sweep
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from harness.sweep.matrix._estimate import estimate_mean, estimate_share
@@ -448,7 +448,7 @@ def main(jobs: int) -> None:
     tasks = [(cell, seed) for cell in cells() for seed in range(1, SEEDS + 1)]
     with sweep(tasks, play, jobs, what="runs") as outcomes:
         for task, outcome in outcomes:
-            if isinstance(outcome, Failed):
+            if isinstance(outcome, FailedTask):
                 raise SystemExit(f"{task}: {outcome.reason}")
             runs[task[0]].append(outcome)
     page = PAGE.read_text(encoding="utf-8")

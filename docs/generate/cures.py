@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from harness.present import text
-from harness.run.parallel import Failed, cores, sweep
+from harness.run.parallel import FailedTask, cores, sweep
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from harness.scenario.agent_options import Stagger
@@ -71,7 +71,7 @@ def tables(jobs: int) -> str:
     settled: dict[str, list[bool]] = defaultdict(list)
     with sweep(tasks, partial(play, matrix), jobs, what="runs") as outcomes:
         for task, outcome in outcomes:
-            if isinstance(outcome, Failed):
+            if isinstance(outcome, FailedTask):
                 raise SystemExit(f"{task}: {outcome.reason}")
             figures[task.cure, task.point.loss].append(outcome[0])
             settled[task.cure].append(outcome[1])

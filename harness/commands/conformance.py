@@ -18,7 +18,7 @@ from harness.conformance.results_table import progress, render, summary, to_juni
 from harness.conformance.vectors import generate, to_lines
 from harness.errors import HarnessError, MachineError
 from harness.play.agent_control import resolve_command
-from harness.run.parallel import terminated_is_interrupted
+from harness.run.parallel import sigterm_as_ctrl_c
 from ucp.agent import HANDLERS
 
 
@@ -81,7 +81,7 @@ def conformance_command(
         )
     console = Console(stderr=as_json, highlight=False)
     place = keep or Path("conformance-failures")
-    with TemporaryDirectory(prefix="ucp-conformance-") as scratch, terminated_is_interrupted(), progress() as told:
+    with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as told:
         asked = Asked(tuple(resolve_command(command, "the agent")), only, _fresh(place), virtual)
         results = conform(asked, Path(scratch), told)
     if junit is not None:
@@ -100,7 +100,7 @@ def _all_of(agents: Mapping[str, Sequence[str]], only: str | None, page: Path, *
     console = Console(highlight=False)
     outcomes: dict[str, Results | str] = {}
     for name, command in agents.items():
-        with TemporaryDirectory(prefix="ucp-conformance-") as scratch, terminated_is_interrupted(), progress() as told:
+        with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as told:
             try:
                 asked = Asked(tuple(resolve_command(list(command), "the agent")), only, None, virtual)
                 outcomes[name] = conform(asked, Path(scratch), told)

@@ -16,7 +16,7 @@ from harness.errors import INTERRUPTED
 from harness.play.core_version import edited_files
 from harness.play.variant import variant_in_use
 from harness.proof import Bounds, BoundsError, Limits, Progress, original, specification
-from harness.run.parallel import cores, terminated_is_interrupted
+from harness.run.parallel import cores, sigterm_as_ctrl_c
 
 GIGABYTE = 1e9
 TIMERS = ("duration", "any")
@@ -155,7 +155,7 @@ def prove_command(
     )
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s, cores() if cores_ is None else cores_)
     if second_opinion:
-        with Watcher() as watcher, terminated_is_interrupted():
+        with Watcher() as watcher, sigterm_as_ctrl_c():
             opinion = specification.second_opinion(
                 bounds, limits, watch=lambda progress: watcher.show(_how_far(progress))
             )
@@ -163,7 +163,7 @@ def prove_command(
         raise typer.Exit(opinion.exit_status)
     if against is not None:
         _compare(against, bounds, limits, out, as_json)
-    with Watcher() as watcher, terminated_is_interrupted():
+    with Watcher() as watcher, sigterm_as_ctrl_c():
         proof = prove.prove(bounds, limits, out, watch=lambda progress: watcher.show(_how_far(progress)))
     _say(proof.to_json(), prove.in_words(proof), as_json)
     if proof.exit_status == INTERRUPTED:
@@ -173,7 +173,7 @@ def prove_command(
 
 def _compare(against: str, bounds: Bounds, limits: Limits, out: Path | None, as_json: bool) -> NoReturn:
     """Prove the same for the original. Both proofs reduce states, or neither: their livelocks are then comparable."""
-    with original.code_of(against) as code, Watcher() as watcher, terminated_is_interrupted():
+    with original.code_of(against) as code, Watcher() as watcher, sigterm_as_ctrl_c():
         if bounds.reduced and original.is_edited(code):
             complain(f"state reduction is disabled: it assumes the released core, and {against} has another one")
             bounds = replace(bounds, reduced=False)

@@ -23,7 +23,7 @@ from harness.proof.questions import _livelock
 from harness.proof.questions._convergence import Liveness
 from harness.proof.questions._graph_cycles import cycles
 from harness.proof.questions._livelock import Livelock
-from harness.run.simulate import ENDED, claim
+from harness.run.simulate import ENDED, choose_path
 
 """Exit status: the proof reached a limit before it had explored all states."""
 CLAIMS = {
@@ -256,7 +256,7 @@ def _with_instants(bounds: Bounds) -> Bounds:
 def _claimed(bounds: Bounds, out: Path | None) -> tuple[str, Path]:
     """Name and file of a scenario."""
     name = f"proof {bounds.agents} agents {bounds.blocks} blocks"
-    return name, claim(out or default_path(name).with_suffix(".yaml"), name)
+    return name, choose_path(out or default_path(name).with_suffix(".yaml"), name)
 
 
 def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Progress], None]) -> Proof:

@@ -22,7 +22,7 @@ from harness.play.mission import RunOutcome, SoughtRun
 from harness.play.progress import Silent
 from harness.pytest_plugin._live_timeline import Action, LiveTimeline
 from harness.pytest_plugin.findings import Findings, JudgementInTest
-from harness.run.run import Recording, Run
+from harness.run.run import Run, RunRecording
 from harness.scenario import Scenario
 from harness.scenario.faults import TIMELINE_FAULTS
 from harness.scenario.injection import INJECTIONS
@@ -59,7 +59,7 @@ class Swarm:
         self._timeline = LiveTimeline(scenario)
         chosen = BACKENDS[backend]
         chosen.refuse(scenario)
-        self._recording = Recording(scenario, seed, out, backend)
+        self._recording = RunRecording(scenario, seed, out, backend)
         self._judged = False
         self._seen: Findings | None = None
         self._interrupted = asyncio.Event()
@@ -279,8 +279,8 @@ class Swarm:
         return self._seen
 
     def _judge_by_now(self, played: RunOutcome) -> Findings:
-        self._recording.tell(self._timeline.scenario)
-        self._recording.take_down(played)
+        self._recording.update_scenario(self._timeline.scenario)
+        self._recording.record_outcome(played)
         return Findings(self.directory, checker.check(checker.gather(RunArchive(self.directory))))
 
     def _change(self, **entry: Any) -> float:
@@ -335,7 +335,7 @@ class Swarm:
     def _judge(self) -> Run:
         played = self._playing.result()
         self._judged = True
-        self._recording.tell(self._timeline.scenario)
+        self._recording.update_scenario(self._timeline.scenario)
         return self._recording.end(played)
 
 

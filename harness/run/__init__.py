@@ -1,1 +1,1 @@
-"""From a scenario to a verdict: one run in a directory, one in memory, and many on all cores."""
+"""Functions that play and judge a scenario: one run in a directory or in memory, or many runs on all cores."""

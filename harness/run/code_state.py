@@ -33,12 +33,14 @@ class ProcessResult:
 
     @property
     def last_error_line(self) -> str:
+        """The last line of standard error, without the name of the program."""
         lines = [line.strip() for line in self.stderr.splitlines() if line.strip()]
         return lines[-1].removeprefix("ucp-harness: ")[:300] if lines else "it said nothing"
 
     def raised_in(self, directory: Path) -> str | None:
-        """Return the exception that ended the process, with the innermost line in `directory` of its traceback, else
-        None.
+        """Return the exception that ended the process, with its innermost line in `directory`.
+
+        None if there is no such line.
         """
         if "Traceback (most recent call last)" not in self.stderr:
             return None

@@ -1,12 +1,12 @@
-"""Many tasks on all cores of this machine: an outcome for each, a progress bar, nothing left behind.
+"""Play many tasks on all cores of this machine, with a progress bar. No process remains afterwards.
 
     with sweep(tasks, work, jobs, what="runs") as outcomes:
         for task, outcome in outcomes:
             ...
 
-`work` runs in forked processes, so it may be any function and hold anything; a task and its outcome are pickled and
-should be small. Why not `concurrent.futures`: there one killed process ends the whole pool. Here each task has its own
-outcome, and a task that fails, or whose process is killed, has `Failed`.
+`work` runs in forked processes, so it may be any function with any data. Tasks and outcomes are pickled and should be
+small. A task that raises an exception, or whose process is killed, has the outcome `FailedTask`. All other tasks go on.
+`concurrent.futures` was rejected, because there a killed process ends the whole pool.
 """
 
 import contextlib
@@ -35,7 +35,7 @@ R = TypeVar("R")
 REDRAW_EVERY_S = 0.1
 LINE_EVERY_S = 10.0
 WAKE_EVERY_S = 1.0
-"""A signal that comes in the moment before we fall asleep is heard when we wake."""
+"""Maximum time until the parent process handles a signal that arrives just before it waits."""
 
 _FORK = multiprocessing.get_context("fork")
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -43,32 +43,33 @@ _PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Failed:
-    """The outcome of a task that has none: why, in one sentence."""
+class FailedTask:
+    """The outcome of a task that failed. `reason` is one sentence."""
 
     reason: str
 
 
 def cores() -> int:
-    """How many processes this machine lets us run at the same time."""
+    """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
 @contextlib.contextmanager
 def sweep(
     tasks: Iterable[T], work: Callable[[T], R], jobs: int, *, what: str | None = None, in_order: bool = True
-) -> Iterator[Iterator[tuple[T, R | Failed]]]:
-    """Each task with its outcome, in the order of `tasks` however many `jobs` there are; 1 forks nothing.
+) -> Iterator[Iterator[tuple[T, R | FailedTask]]]:
+    """Yield each task with its outcome, in the order of `tasks`, or with `in_order` false as soon as it is known.
 
-    An outcome is handed over when all before it are, or if not `in_order`, as soon as it is there. A HarnessError that
-    `work` raises because the request is wrong, or cannot be met on this machine, is raised here: it would be the same
-    for every task. Ctrl-C and SIGTERM raise KeyboardInterrupt; leaving the block, however, ends all processes at once.
-    `what` names the tasks on a progress bar on standard error; None shows nothing.
+    - `jobs`: number of processes. With 1, the tasks run in this process.
+    - `what`: name of the tasks for a progress bar on standard error. None shows no bar.
+
+    A HarnessError of `work` that means a wrong request or an unsuitable machine is raised here, because it would occur
+    in every task. Ctrl-C and SIGTERM raise KeyboardInterrupt. The end of the context ends all processes at once.
     """
     total = len(tasks) if isinstance(tasks, Sized) else None
-    with terminated_is_interrupted(), shown(what, total) as count:
+    with sigterm_as_ctrl_c(), progress_bar(what, total) as count:
         if jobs == 1:
-            yield ((task, raised(count(outcome_of(work, task)))) for task in tasks)
+            yield ((task, raise_error(count(outcome_of(work, task)))) for task in tasks)
             return
         pool = _Pool(work, jobs, count, in_order)
         try:
@@ -77,35 +78,36 @@ def sweep(
             pool.stop()
 
 
-def outcome_of(work: Callable[[T], R], task: T) -> R | Failed | HarnessError:
-    """What comes of one task. A HarnessError is for `raised` to raise where the tasks are handed out."""
+def outcome_of(work: Callable[[T], R], task: T) -> R | FailedTask | HarnessError:
+    """Return the outcome of one task. The parent process passes it to `raise_error`."""
     try:
         return work(task)
     except HarnessError as error:
-        return Failed(str(error)) if error.exit_status == VIOLATED else error
+        return FailedTask(str(error)) if error.exit_status == VIOLATED else error
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         detail = f": {error}" if str(error) else ""
-        return Failed(f"{type(error).__name__}{detail} ({Path(place.filename).name} line {place.lineno})")
+        return FailedTask(f"{type(error).__name__}{detail} ({Path(place.filename).name} line {place.lineno})")
 
 
-def raised(outcome: R | HarnessError) -> R:
+def raise_error(outcome: R | HarnessError) -> R:
+    """Raise the outcome if it is an error. Otherwise return it."""
     if isinstance(outcome, HarnessError):
         raise outcome
     return outcome
 
 
 class Worker(Generic[T, R]):
-    """A process that answers each task with an outcome, until it is killed; it dies with this process."""
+    """A process that answers each task with an outcome, until it is killed. It ends with this process."""
 
     def __init__(self, work: Callable[[T], R]) -> None:
         self.connection, its_end = _FORK.Pipe()
         self._process: BaseProcess = _FORK.Process(target=_serve, args=(work, its_end, os.getpid()), daemon=True)
         self._process.start()
-        its_end.close()  # so that its death ends the connection
+        its_end.close()  # otherwise the end of the process would not end the connection
 
     def stop(self) -> int:
-        """Returns its exit code, as `multiprocessing` has it: minus the signal that ended it."""
+        """Kill the process. Return its exit code, or the negative number of the signal that ended it."""
         self._process.kill()
         self._process.join()
         exit_code = self._process.exitcode or 0
@@ -116,7 +118,7 @@ class Worker(Generic[T, R]):
 
 def _serve(work: Callable[[T], R], connection: Connection, parent: int) -> None:
     CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    os.setpgid(0, 0)  # Ctrl-C reaches the process group that a terminal runs; our parent, which is in it, decides
+    os.setpgid(0, 0)  # Ctrl-C on the terminal must reach only the parent
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     while os.getppid() == parent:
@@ -124,17 +126,17 @@ def _serve(work: Callable[[T], R], connection: Connection, parent: int) -> None:
 
 
 class _Pool(Generic[T, R]):
-    """One task at a time to each worker: its death then concerns that task only, and another takes its place."""
+    """A pool of workers with one task each. If a worker dies, only its task fails, and a new worker replaces it."""
 
     def __init__(self, work: Callable[[T], R], jobs: int, count: Callable[[Any], Any], in_order: bool) -> None:
         self._work, self._jobs, self._count, self._in_order = work, jobs, count, in_order
         self._idle: list[Worker[T, R]] = []
         self._busy: dict[Connection, tuple[int, Worker[T, R]]] = {}
 
-    def outcomes(self, tasks: Iterable[T]) -> Iterator[tuple[T, R | Failed]]:
+    def outcomes(self, tasks: Iterable[T]) -> Iterator[tuple[T, R | FailedTask]]:
         numbered = enumerate(tasks)
         begun: dict[int, T] = {}
-        ended: dict[int, R | Failed] = {}
+        ended: dict[int, R | FailedTask] = {}
         due = 0
         while True:
             while len(self._busy) < self._jobs and (following := next(numbered, None)):
@@ -143,35 +145,35 @@ class _Pool(Generic[T, R]):
             if not self._busy:
                 return
             for connection in wait(list(self._busy), timeout=WAKE_EVERY_S):
-                number, outcome = self._end(connection)  # type: ignore[arg-type]  # it waits for other things too
-                ended[number] = raised(self._count(outcome))
+                number, outcome = self._end(connection)  # type: ignore[arg-type]  # `wait` also accepts other objects
+                ended[number] = raise_error(self._count(outcome))
             while ended and (due in ended or not self._in_order):
                 number = due if self._in_order else next(iter(ended))
                 yield begun.pop(number), ended.pop(number)
                 due += 1
 
     def stop(self) -> None:
-        with signals_held():
+        with signals_blocked():
             for worker in [*self._idle, *(worker for _, worker in self._busy.values())]:
                 worker.stop()
             self._idle.clear()
             self._busy.clear()
 
     def _begin(self, number: int, task: T) -> None:
-        with signals_held():  # no worker is ever unknown to us
+        with signals_blocked():  # an interruption here would leave a worker that `stop` does not know
             worker = self._idle.pop() if self._idle else Worker(self._work)
             self._busy[worker.connection] = number, worker
-        with contextlib.suppress(BrokenPipeError):  # killed while it waited: told when its connection is read
+        with contextlib.suppress(BrokenPipeError):  # a killed worker is noticed when its connection is read
             worker.connection.send(task)
 
-    def _end(self, connection: Connection) -> tuple[int, R | Failed | HarnessError]:
+    def _end(self, connection: Connection) -> tuple[int, R | FailedTask | HarnessError]:
         try:
             outcome = connection.recv()
         except (EOFError, OSError):
-            with signals_held():
+            with signals_blocked():
                 number, worker = self._busy.pop(connection)
-                return number, Failed(_death(worker.stop()))
-        with signals_held():
+                return number, FailedTask(_death(worker.stop()))
+        with signals_blocked():
             number, worker = self._busy.pop(connection)
             self._idle.append(worker)
         return number, outcome
@@ -186,8 +188,8 @@ def _death(exit_code: int) -> str:
 
 
 @contextlib.contextmanager
-def signals_held() -> Iterator[None]:
-    """What must not be interrupted half-way. A process that is forked here begins with the signals held."""
+def signals_blocked() -> Iterator[None]:
+    """Block SIGINT and SIGTERM inside the context. A process that is forked here starts with blocked signals."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         yield
@@ -196,9 +198,9 @@ def signals_held() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def terminated_is_interrupted() -> Iterator[None]:
-    """SIGTERM, too, raises KeyboardInterrupt."""
-    if threading.current_thread() is not threading.main_thread():  # only there can handlers be set
+def sigterm_as_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM raise KeyboardInterrupt inside the context."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread can set handlers
         yield
         return
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -209,10 +211,11 @@ def terminated_is_interrupted() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def shown(what: str | None, total: int | None) -> Iterator[Callable[[Any], Any]]:
-    """A function that counts what passes through it: on a bar, or where there is no terminal, in a line now and then.
+def progress_bar(what: str | None, total: int | None) -> Iterator[Callable[[Any], Any]]:
+    """Yield a function that counts the outcomes that pass through it, and shows their number.
 
-    No thread draws, because a process must not be forked beside one.
+    It shows a bar on a terminal, and otherwise a line every few seconds. It draws without a thread, because forking a
+    process with threads is unsafe.
     """
     if what is None:
         yield lambda outcome: outcome

@@ -61,14 +61,14 @@ def differing_versions(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
 
 @cache
 def _reference_version() -> str:
-    """The digest of the reference that judges steps."""
+    """Return the digest of the reference that judges steps."""
     files = sorted(Path(reference.__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 
 @cache
 def _commit() -> str | None:
-    """The commit of the clone from which the harness runs; None if it runs from an installed package."""
+    """Return the commit of the clone from which the harness runs. None for an installed package."""
     if not (ROOT / ".git").exists():
         return None
     try:

@@ -1,4 +1,4 @@
-"""One run from scenario to verdict: play, check, write the record, the report and the file that replays it."""
+"""One run from scenario to verdict: play, check, and write the record, the report and the replay file."""
 
 import asyncio
 import signal
@@ -102,13 +102,13 @@ def run(
     out = out or default_path(scenario.name)
     chosen = BACKENDS[backend]
     chosen.refuse(scenario)
-    recording = Recording(scenario, seed, out, backend, all_delivered=delivers_all and in_virtual_time(backend))
+    recording = RunRecording(scenario, seed, out, backend, all_delivered=delivers_all and in_virtual_time(backend))
     story: mission.Story = mission.play
     options: dict[str, Any] = {"delivers_all": delivers_all}
     if interventions is not None:
-        story = partial(_by_hand, interventions, recording.directory)
+        story = partial(_play_with_requests, interventions, recording.directory)
         options |= {"interactive": interventions.prepares_all_agents, "pace": interventions.pace}
-        interventions.on_entry_added = partial(recording.take_down_by_hand, interventions)
+        interventions.on_entry_added = partial(recording.record_requests, interventions)
     interrupted = asyncio.Event()
     try:
         played = _outcome_of(
@@ -123,7 +123,7 @@ def run(
     return recording.end(played)
 
 
-class Recording:
+class RunRecording:
     """The directory of a run and its record, from its start to the verdict.
 
     Raises RunDirectoryError if `out` is neither new nor empty, and MachineError if the record cannot be written.
@@ -150,14 +150,14 @@ class Recording:
         """Record that the run could not start."""
         self._update(outcome="failed", outcome_detail=str(error))
 
-    def tell(self, scenario: Scenario) -> None:
+    def update_scenario(self, scenario: Scenario) -> None:
         """Record the played scenario: the original one with the requests of the user so far."""
         self._scenario = scenario
         self._update(scenario=scenario)
 
-    def take_down_by_hand(self, interventions: Interventions) -> None:
+    def record_requests(self, interventions: Interventions) -> None:
         """Write the requests of the user so far to the record, and a scenario that plays them again."""
-        self.tell(interventions.scenario)
+        self.update_scenario(interventions.scenario)
         by_hand_s = [entry.at_s for entry in interventions.by_hand]
         replay = replay_of(self._record, by_hand_s)
         try:
@@ -165,7 +165,7 @@ class Recording:
         except OSError as error:
             raise MachineError(f"{self.directory.path / REPLAY_FILE} cannot be written: {error.strerror}") from None
 
-    def take_down(self, played: RunOutcome) -> None:
+    def record_outcome(self, played: RunOutcome) -> None:
         """Write the outcome so far to the record."""
         self._update(
             engine=played.engine,
@@ -188,7 +188,7 @@ class Recording:
     def end(self, played: RunOutcome) -> Run:
         """Check the run, and write record and report. Raises MachineError if they cannot be written."""
         self._record = _updated(self._record, outcome=played.outcome, outcome_detail=played.outcome_detail)
-        self.take_down(played)
+        self.record_outcome(played)
         archive = RunArchive(self.directory.path)
         evidence = checker.gather(archive)
         result, survived = checker.check(evidence), survival(evidence)
@@ -221,14 +221,16 @@ def _updated(record: RunRecord, **keys: Any) -> RunRecord:
     return RunRecord.model_validate({**record.to_json(), **keys})
 
 
-async def _by_hand(hand: Interventions, directory: RunDirectory, swarm: mission.Swarm, scenario: Scenario) -> None:
-    """Play a mission in which a user can intervene, also from another process."""
-    async with serve_requests(hand, directory.path):
-        await hand.story(swarm, scenario)
+async def _play_with_requests(
+    interventions: Interventions, directory: RunDirectory, swarm: mission.Swarm, scenario: Scenario
+) -> None:
+    """Play a mission with requests of a user, which may also come from another process."""
+    async with serve_requests(interventions, directory.path):
+        await interventions.story(swarm, scenario)
 
 
 def _outcome_of(run: Coroutine[Any, Any, RunOutcome], interrupted: asyncio.Event) -> RunOutcome:
-    """Run a coroutine to its end, in another thread if this thread already runs an event loop, as a notebook does."""
+    """Run a coroutine to its end. Use another thread if this thread runs an event loop, as in a notebook."""
     try:
         asyncio.get_running_loop()
     except RuntimeError:
@@ -260,8 +262,8 @@ async def _until_interrupted(
     **options: Any,
 ) -> RunOutcome:
     loop = asyncio.get_running_loop()
-    heard = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
-    before = {number: signal.getsignal(number) for number in heard}
+    handled = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    before = {number: signal.getsignal(number) for number in handled}
     for number in before:
         loop.add_signal_handler(number, interrupted.set)
     try:

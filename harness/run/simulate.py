@@ -1,6 +1,6 @@
-"""Scenarios in virtual time, in memory: play them, judge them, and state the findings.
+"""Play and judge scenarios in virtual time and in memory, without a run directory.
 
-The checker is that of any other run; the evidence comes straight from the agents, without files between.
+The checker is the same as for other runs. It gets the evidence directly from the agents instead of from files.
 """
 
 from collections.abc import Callable, Coroutine, Iterable, Mapping
@@ -53,7 +53,7 @@ def simulate(
     - `seed`: 0 or more. The same scenario and seed give the same run.
     - `tracing`: record handler runs. Without them characteristic 1 cannot be judged, and 2 and 3 only at the end.
     - `deliver_all`: also deliver messages that have no effect.
-    - `again`: give other agents than ours their input a second time, and compare. If the run is bad, this always
+    - `again`: give foreign agents their inputs a second time, and compare the answers. If the run is bad, this always
       happens.
 
     Raises ScenarioError if the scenario needs real processes, and HarnessError if an agent fails or behaves
@@ -70,7 +70,7 @@ def simulate_in_memory(
     VirtualTime().refuse(scenario)
     simulation = Simulation(scenario, seed, memory, **options)
     with closing(simulation):
-        without_waiting(mission.play(simulation, scenario))
+        run_to_end(mission.play(simulation, scenario))
         simulation.end()
         evidence = memory.evidence(simulation)
     result = checker.check(evidence)
@@ -83,28 +83,28 @@ def simulate_in_memory(
     return Simulated(simulation.played, evidence, result)
 
 
-def same_twice(scenario: Scenario, seed: int) -> None:
-    """Check that agents with a command of their own repeat their answers when they get the same input again.
+def check_determinism(scenario: Scenario, seed: int) -> None:
+    """Check that foreign agents repeat their answers when they get the same inputs again.
 
-    Raises HarnessError if an agent does not, or does not support this. A crashed or hung agent raises no error here,
-    because its run reports it.
+    Raises HarnessError if an agent does not, or does not support the mission. A crashed or hung agent raises no error
+    here, because its run reports it.
     """
     with suppress(AgentFailedError):
         simulate(scenario, seed, tracing=True, again=True)
 
 
-def without_waiting(story: Coroutine[Any, Any, Returned]) -> Returned:
-    """Run a coroutine that waits for nothing, as virtual time does not, without an event loop."""
+def run_to_end(story: Coroutine[Any, Any, Returned]) -> Returned:
+    """Run a coroutine without an event loop. It must not wait. A mission in virtual time does not wait."""
     try:
         story.send(None)
     except StopIteration as end:
         result: Returned = end.value
         return result
-    raise AssertionError("virtual time waits for nothing")
+    raise AssertionError("the coroutine waits")
 
 
-def _header(life: Incarnation) -> Header:
-    named = header(life)
+def _header(incarnation: Incarnation) -> Header:
+    named = header(incarnation)
     return Header(**{**named, "schema": SCHEMA, "initial_data": in_base64(named["initial_data"])})
 
 
@@ -118,12 +118,12 @@ class MemoryRecorder:
         self._kept: dict[int, Export] = {}
         self._injected = RogueTraffic()
 
-    def begin(self, life: Incarnation) -> None:
+    def begin(self, incarnation: Incarnation) -> None:
         if not self.tracing:
             return
-        trace = self._traces.get(life.agent.agent_id)
+        trace = self._traces.get(incarnation.agent.agent_id)
         if trace is None:
-            self._traces[life.agent.agent_id] = Trace(_header(life))
+            self._traces[incarnation.agent.agent_id] = Trace(_header(incarnation))
         else:
             trace.starts.append(len(trace.runs))
 
@@ -145,10 +145,10 @@ class MemoryRecorder:
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Do nothing: the checker needs no positions."""
 
-    def keep_chains(self, at_s: float, lives: Iterable[Incarnation]) -> None:
-        self._kept = self._exports(at_s, lives)
+    def keep_chains(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
+        self._kept = self._exports(at_s, incarnations)
 
-    def export(self, at_s: float, lives: Iterable[Incarnation]) -> None:
+    def export(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
         """Do nothing: the evidence comes from the agents."""
 
     def evidence(self, simulation: Simulation) -> Evidence:
@@ -177,16 +177,16 @@ class MemoryRecorder:
             verified=simulation.verified,
         )
 
-    def _exports(self, at_s: float, lives: Iterable[Incarnation]) -> dict[int, Export]:
+    def _exports(self, at_s: float, incarnations: Iterable[Incarnation]) -> dict[int, Export]:
         return {
-            life.agent.agent_id: Export.model_validate(life.export(at_s))
-            if life.state is None
+            incarnation.agent.agent_id: Export.model_validate(incarnation.export(at_s))
+            if incarnation.state is None
             else self._maker.export(
-                life.state,
-                life.timestamp_us(at_s),
-                cast("SecuredAgent", life.secured).signatures if life.secured else None,
+                incarnation.state,
+                incarnation.timestamp_us(at_s),
+                cast("SecuredAgent", incarnation.secured).signatures if incarnation.secured else None,
             )
-            for life in lives
+            for incarnation in incarnations
         }
 
 
@@ -206,10 +206,10 @@ def simulated(scenario: Scenario, seed: int) -> Result:
     try:
         return simulate(scenario, seed, tracing=True).result
     except AgentFailedError as error:
-        return ended_by(error)
+        return result_of_failure(error)
 
 
-def ended_by(error: AgentFailedError) -> Result:
+def result_of_failure(error: AgentFailedError) -> Result:
     """Return the verdict on a run that ended because an agent crashed or hung."""
     finding = Finding(error.agent_id, f"{error.outcome}: it {error.detail}")
     judgement = Judgement("every agent to the end", "violated", f"agent {error.agent_id} {error.outcome}", [finding])
@@ -230,7 +230,7 @@ def evidence_lines(violated: dict[str, Judgement]) -> list[str]:
     return lines
 
 
-def claim(out: Path | None, name: str) -> Path:
+def choose_path(out: Path | None, name: str) -> Path:
     """Return the path of the new file: `out`, or a new name under `runs/`. Raises RunDirectoryError if it exists."""
     if out is not None and out.exists():
         raise RunDirectoryError(f"{out} exists: choose another --out; existing files are not overwritten")
@@ -242,7 +242,7 @@ def claim(out: Path | None, name: str) -> Path:
     return path
 
 
-def write(path: Path, text: str) -> Path:
+def write_new_file(path: Path, text: str) -> Path:
     """Write the file and return its path, with a number if another process took the name. Raises MachineError."""
     free, number = path, 2
     while True:

@@ -20,7 +20,7 @@ from harness.archive.traces import SUFFIX
 from harness.field.replay import Player, open_record
 from harness.field.replay.replay_names import ReplayNames
 from harness.play.progress import Silent
-from harness.run.parallel import Failed, sweep
+from harness.run.parallel import FailedTask, sweep
 from harness.run.run import run
 from harness.scenario import load_scenario
 from ucp.agent import HANDLERS
@@ -108,7 +108,7 @@ def main(names: Sequence[str]) -> None:
     """Run these quirks, or all if none is named. The rows of other quirks stay the same."""
     with sweep(list(names or QUIRKS), at_the_desk, JOBS, what="quirks", in_order=False) as outcomes:
         for quirk, brought in outcomes:
-            if isinstance(brought, Failed):
+            if isinstance(brought, FailedTask):
                 sys.stderr.write(f"{quirk}: {brought.reason}\n")
                 continue
             page = PAGE.read_text(encoding="utf-8")

@@ -14,7 +14,7 @@ from statistics import median
 
 from docs.generate.matrix_thesis import BEGIN, END, put_between_markers
 from docs.generate.wrong_agents.wrong_trial import Trial, play
-from harness.run.parallel import Failed, cores, sweep
+from harness.run.parallel import FailedTask, cores, sweep
 from ucp.agent import HANDLERS
 from ucp.agent_files import write_atomically
 from ucp.quirks import QUIRKS
@@ -85,7 +85,7 @@ def main(names: Sequence[str]) -> None:
     tasks = list(product([None, *(names or QUIRKS)], SEEDS))
     with sweep(tasks, lambda task: play(*task), cores(), what="runs") as outcomes:
         for (name, seed), trial in outcomes:
-            if isinstance(trial, Failed):
+            if isinstance(trial, FailedTask):
                 raise SystemExit(f"{name}, seed {seed}: {trial.reason}")
             played.setdefault(name, {})[seed] = trial
     right = played.pop(None)

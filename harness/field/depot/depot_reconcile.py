@@ -21,7 +21,7 @@ from harness.field.depot.record_lines import ReconcileResult, Vehicle
 from harness.play.mission import reconcile_finally
 from harness.play.simulation.restored_swarm import RestoredSwarm
 from harness.play.simulation.simulation import Simulation
-from harness.run.simulate import MemoryRecorder, without_waiting
+from harness.run.simulate import MemoryRecorder, run_to_end
 from harness.scenario import Scenario
 from harness.scenario.changes import timeline_of
 from harness.scenario.load import parse
@@ -54,7 +54,7 @@ def reconcile(record: Consolidation, report_progress: Callable[[str], None] = la
         )
 
     swarm = RestoredSwarm(_scenario(record), stored, MemoryRecorder(tracing=False), on_progress=show_progress)
-    rounds = without_waiting(_play(swarm, [agent_id for agent_id, state in stored.items() if state.deque]))
+    rounds = run_to_end(_play(swarm, [agent_id for agent_id, state in stored.items() if state.deque]))
     swarm.end()
     exported_at_us = max(export.exported_at_us for export in collected.exports.values()) + round(
         swarm.now() * MICROSECONDS

@@ -12,7 +12,7 @@ from harness.checker.recurring_cycles import cycle_of
 from harness.errors import AgentFailedError
 from harness.play.variant import variant_in_use
 from harness.proof.bounds import Bounds
-from harness.run.simulate import ended_by, evidence_lines, simulate, write
+from harness.run.simulate import evidence_lines, result_of_failure, simulate, write_new_file
 from harness.scenario.load import parse
 from harness.scenario.scenario_file import to_yaml
 
@@ -63,7 +63,7 @@ def play(document: Document) -> Played:
         simulated = simulate(parse(document), SEED, tracing=True)
         result, cycle = simulated.result, simulated.evidence.once(cycle_of)
     except AgentFailedError as error:
-        result, cycle = ended_by(error), None
+        result, cycle = result_of_failure(error), None
     return Played(document, _bad(result), cycle, len({*result.chains.values()}))
 
 
@@ -79,4 +79,4 @@ def keep(played: Played, path: Path, bounds: Bounds, instants: int, sentences: S
         *evidence_lines(played.judged),
         f"  ucp-harness run {path} --backend sim --seed {SEED}",
     ]
-    return Example(write(path, to_yaml(played.document, comment)), instants, played.judged, played.chains)
+    return Example(write_new_file(path, to_yaml(played.document, comment)), instants, played.judged, played.chains)

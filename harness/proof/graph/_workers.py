@@ -21,7 +21,7 @@ from harness.proof.model._global_states import AGENTS, ZONE, State, Swarm
 from harness.proof.model._known_states import DEAD
 from harness.proof.questions._attractor import Check
 from harness.proof.questions._extra_votes import UndecidedError, Votes
-from harness.run.parallel import Failed, Worker, signals_held
+from harness.run.parallel import FailedTask, Worker, signals_blocked
 
 WAIT_S = 0.5
 """So long it is waited for an answer until memory and time are looked at once more."""
@@ -217,7 +217,7 @@ class _Other:
             ) from None
         if isinstance(answer, HarnessError):
             raise answer
-        if isinstance(answer, Failed):
+        if isinstance(answer, FailedTask):
             raise HarnessError(f"a worker process failed: {answer.reason}")
         assert isinstance(answer, Answer)
         self.memory_bytes = answer.memory_bytes
@@ -298,7 +298,7 @@ class Crew:
     ) -> Iterator[tuple[_Other, int, Following | Needed]]:
         """Each with whose it is and the first state that it is of; in order, also of states added meanwhile."""
         if not self._others:
-            with signals_held():  # what a fork calls lets no Ctrl-C out
+            with signals_blocked():  # what a fork calls lets no Ctrl-C out
                 self._others = [_Other(self._swarm) for _ in range(self._size)]
         idle = deque(self._others)
         busy: dict[int, _Other] = {}

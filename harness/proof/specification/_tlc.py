@@ -15,7 +15,7 @@ from pathlib import Path
 
 import ucp
 from harness.errors import MachineError
-from harness.run.parallel import terminated_is_interrupted
+from harness.run.parallel import sigterm_as_ctrl_c
 
 MODULES = Path(ucp.__file__).parent / "contract" / "spec"
 JAVA = ("java", "-XX:+UseSerialGC", "-XX:TieredStopAtLevel=1", "-Xss64m")
@@ -77,7 +77,7 @@ def checked(
     Raises NoCheckerError, CheckerError, and TimeoutError after `most_s`.
     """
     call = command(memory_mb)
-    with terminated_is_interrupted(), tempfile.TemporaryDirectory(prefix="ucp-spec-") as name:
+    with sigterm_as_ctrl_c(), tempfile.TemporaryDirectory(prefix="ucp-spec-") as name:
         folder = Path(name)
         for path in MODULES.glob("*.tla"):
             shutil.copy(path, folder)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from harness.checker.judgement import Judgement
 from harness.errors import INTERRUPTED, VIOLATED
-from harness.run.parallel import Failed, cores, sweep
-from harness.run.simulate import Judge, claim, evidence_lines, same_twice, simulated, write
+from harness.run.parallel import FailedTask, cores, sweep
+from harness.run.simulate import Judge, check_determinism, choose_path, evidence_lines, simulated, write_new_file
 from harness.scenario import Scenario
 from harness.sweep.explore._recording import Recording, record
 from harness.sweep.explore._scenario_document import Document, document_of
@@ -44,7 +44,7 @@ def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: 
         with sweep(seeds, lambda seed: judge(scenario, seed).wrong, jobs, what="seeds" if shown else None) as outcomes:
             for seed, outcome in outcomes:
                 searched.played += 1
-                if isinstance(outcome, Failed):
+                if isinstance(outcome, FailedTask):
                     searched.failed[seed] = outcome.reason
                 elif outcome:
                     searched.violation = Violation(seed, outcome)
@@ -122,9 +122,9 @@ def explore(
     two runs of the same seed.
     """
     watcher, jobs, source = watcher or Watcher(), jobs or cores(), source or scenario.name
-    path = claim(out, scenario.name)
+    path = choose_path(out, scenario.name)
     if scenario.foreign:
-        same_twice(scenario, seeds[0])
+        check_determinism(scenario, seeds[0])
     searched = search(scenario, seeds, jobs, judge, shown=watcher.shown)
     explored = Explored(searched, interrupted=searched.interrupted)
     if searched.violation is None:
@@ -196,5 +196,5 @@ def _written(
         f"Shrunk from {source}, seed {seed}: {words}.",
         f"  {replay}",
     ]
-    written = write(path, file_of(document, header, recorded(document)))
+    written = write_new_file(path, file_of(document, header, recorded(document)))
     return Shrunk(written, seed, judgements, words, replay.replace(str(path), str(written)))

@@ -15,7 +15,7 @@ from typing import Any
 from harness.checker import Result
 from harness.errors import AgentFailedError
 from harness.play.simulation.fate_script import DecidedDelivery, FateScript, NameOf
-from harness.run.simulate import MemoryRecorder, ended_by, simulate_in_memory
+from harness.run.simulate import MemoryRecorder, result_of_failure, simulate_in_memory
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
 from netem.medium import RandomDraws
@@ -65,7 +65,7 @@ def record(scenario: Scenario, seed: int) -> Recording:
     try:
         result = simulate_in_memory(tape, scenario, seed, fate_script=partial(_RecordingScript, tape=tape)).result
     except AgentFailedError as error:
-        result = ended_by(error)
+        result = result_of_failure(error)
     return Recording(result, tape.events, sorted(tape.lost, key=lambda lost: lost.at_s))
 
 

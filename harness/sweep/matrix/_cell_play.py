@@ -49,9 +49,9 @@ def play_with_coverage(scenario: Scenario, seed: int, reached: Reached) -> tuple
 
 
 def _same_twice(scenario: Scenario, seed: int) -> None:
-    from harness.run.simulate import same_twice
+    from harness.run.simulate import check_determinism
 
-    same_twice(scenario, seed)
+    check_determinism(scenario, seed)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from harness.errors import HarnessError, MachineError
-from harness.run.parallel import Failed, outcome_of, raised, shown, terminated_is_interrupted
+from harness.run.parallel import FailedTask, outcome_of, progress_bar, raise_error, sigterm_as_ctrl_c
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -27,7 +27,7 @@ SAME_VERSIONS = ("dask", "distributed", "ucp-harness")
 @contextlib.contextmanager
 def cluster(
     tasks: Sequence[T], work: Callable[[T], R], address: str, *, what: str | None = None
-) -> Iterator[Iterator[tuple[T, R | Failed]]]:
+) -> Iterator[Iterator[tuple[T, R | FailedTask]]]:
     """Yield each task with its outcome, in order of completion, from the scheduler at `address` (tcp://host:port).
 
     Outcomes, errors and interrupts are as in `harness.run.parallel.sweep`. The workers must be able to import `work`.
@@ -36,7 +36,7 @@ def cluster(
     Raises HarnessError for an invalid address. Raises MachineError if no scheduler answers, if it has no workers or
     other versions, or if the connection is lost.
     """
-    with terminated_is_interrupted(), shown(what, len(tasks)) as count, _connected(address) as client:
+    with sigterm_as_ctrl_c(), progress_bar(what, len(tasks)) as count, _connected(address) as client:
         yield _outcomes(client, tasks, work, address, count)
 
 
@@ -97,7 +97,7 @@ def _refuse_other_versions(versions: dict[str, dict[str, str | None]], address: 
 
 def _outcomes(
     client: Any, tasks: Sequence[T], work: Callable[[T], R], address: str, count: Callable[[Any], Any]
-) -> Iterator[tuple[T, R | Failed]]:
+) -> Iterator[tuple[T, R | FailedTask]]:
     from distributed import as_completed
 
     if not tasks:
@@ -117,8 +117,8 @@ def _outcomes(
                 raise MachineError(
                     f"the scheduler at {address} was lost: the same command with the same --out goes on"
                 ) from None
-            outcome = Failed(f"{type(error).__name__}: {error}")
-        yield task, raised(count(outcome))
+            outcome = FailedTask(f"{type(error).__name__}: {error}")
+        yield task, raise_error(count(outcome))
 
 
 def _same(work: T) -> T:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from harness.archive.directory import default_path
 from harness.errors import InterruptedRunError, ScenarioError
-from harness.run.parallel import Failed, cores, sweep
+from harness.run.parallel import FailedTask, cores, sweep
 from harness.run.provenance import versions
 from harness.scenario import Scenario
 from harness.sweep.matrix._cell import Run, sum_up
@@ -23,7 +23,7 @@ from harness.sweep.matrix._matrix_file import Matrix, Point, Task
 from harness.sweep.matrix._results_file import Results, opened
 from harness.sweep.matrix.matrix_record import MatrixRecord, RunWithoutResult
 
-Outcomes = Iterator[tuple[Task, Run | Failed]]
+Outcomes = Iterator[tuple[Task, Run | FailedTask]]
 Spread = Callable[[Sequence[Task], Callable[[Task], Run]], AbstractContextManager[Outcomes]]
 """Distributes tasks, and yields their outcomes in order of completion."""
 
@@ -90,7 +90,7 @@ def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge,
     try:
         with spread(tasks, play) as outcomes:
             for task, run in outcomes:
-                results.add(_failed(task, run.reason) if isinstance(run, Failed) else run)
+                results.add(_failed(task, run.reason) if isinstance(run, FailedTask) else run)
                 if tally is not None and isinstance(run, Run) and run.reached is not None:
                     tally.add(task.point, run.reached)
     except (KeyboardInterrupt, InterruptedRunError):

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from harness.archive.connectivity import NETWORK_FILE, Connectivity, read_connectivity
-from harness.play._radio_range import in_words
+from harness.play._radio_range import groups_text
 from harness.scenario import Scenario
 from tests.harness.report.flights import still, write_flight, write_lines
 
@@ -20,7 +20,7 @@ def network(directory: Path, *lines: dict[str, Any], vehicles: int = 4) -> Conne
 
 
 def states_of(connectivity: Connectivity) -> list[tuple[float, str, str]]:
-    return [(state.at_s, state.what, in_words(state.components)) for state in connectivity.states]
+    return [(state.at_s, state.what, groups_text(state.components)) for state in connectivity.states]
 
 
 def out_of_range(at_s: float, *pairs: str, loss: float = 1.0) -> dict[str, Any]:
@@ -131,7 +131,7 @@ def test_flight_changes_agree_with_the_recorded_details(tmp_path: Path) -> None:
     assert len(set(details.values())) > 4
     for at_s, detail in details.items():
         state = [state for state in found.states if state.at_s <= at_s][-1]
-        assert in_words(state.components) == detail
+        assert groups_text(state.components) == detail
 
 
 @pytest.mark.parametrize(

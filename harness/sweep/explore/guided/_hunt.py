@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from harness.errors import ScenarioError, UnsupportedError
 from harness.proof.coverage import Reached
 from harness.proof.coverage.reached import MOST
-from harness.run.parallel import Failed, sweep
+from harness.run.parallel import FailedTask, sweep
 from harness.scenario import Scenario
 from harness.sweep.explore._scenario_document import Document, with_key
 from harness.sweep.explore.guided._finding_identity import Identity
@@ -170,7 +170,7 @@ class Hunt:
                 if outcome is None:
                     continue
                 self.runs += 1
-                if isinstance(outcome, Failed):
+                if isinstance(outcome, FailedTask):
                     self.failures += 1
                     if len(self.failed) < MOST_FAILED:
                         self.failed.append((candidate, outcome.reason))

@@ -22,7 +22,7 @@ from harness.errors import AgentFailedError
 from harness.gc_pause import gc_paused
 from harness.proof.coverage import Reached, Watcher
 from harness.proof.coverage.reached import simulate_watched
-from harness.run.simulate import ended_by
+from harness.run.simulate import result_of_failure
 from harness.scenario import Scenario
 from harness.sweep.explore._recording import Logged, record
 from harness.sweep.explore._scenario_document import Document, at, cut_after, document_of, timeline, with_key
@@ -136,7 +136,7 @@ def _played(scenario: Scenario, seed: int, watch: Watch) -> tuple[Result, Eviden
     try:
         simulated = simulate_watched(scenario, seed, watch)
     except AgentFailedError as error:
-        return ended_by(error), None
+        return result_of_failure(error), None
     return simulated.result, simulated.evidence
 
 

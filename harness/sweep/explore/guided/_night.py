@@ -18,7 +18,7 @@ from harness.proof.coverage import Existing, existing
 from harness.proof.coverage import to_json as coverage_to_json
 from harness.run.parallel import sweep
 from harness.run.provenance import versions
-from harness.run.simulate import evidence_lines, same_twice, simulated
+from harness.run.simulate import check_determinism, evidence_lines, simulated
 from harness.scenario import Scenario
 from harness.sweep.explore._exploring import smallest_of
 from harness.sweep.explore._recording import record
@@ -149,7 +149,7 @@ def spend(
     Raises HarnessError if the scenario cannot be played, or if the directory cannot be used.
     """
     if scenario.foreign:
-        same_twice(scenario, first_seed)
+        check_determinism(scenario, first_seed)
     limits, initial = initial_documents(scenario, range(first_seed, first_seed + INITIAL_RUNS))
     corpus = opened(directory, scenario, limits)
     try:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from harness.errors import MachineError
-from harness.run.parallel import Failed, sweep
+from harness.run.parallel import FailedTask, sweep
 from tests.harness.command import DEADLINE_S
 
 INTERRUPTED = r"""
@@ -63,7 +63,7 @@ def test_a_task_that_fails_says_why_and_the_others_go_on(jobs: int) -> None:
     with sweep([1, 0, 2], work, jobs) as outcomes:
         (_, first), (_, failed), (_, last) = outcomes
     assert (first, last) == (1.0, 0.5)
-    assert isinstance(failed, Failed)
+    assert isinstance(failed, FailedTask)
     assert failed.reason.startswith("ZeroDivisionError: division by zero (test_sweep.py line ")
 
 
@@ -75,7 +75,7 @@ def test_a_killed_process_costs_one_task() -> None:
 
     with sweep(range(10), work, 2) as outcomes:
         results = dict(outcomes)
-    failed = {number: one.reason for number, one in results.items() if isinstance(one, Failed)}
+    failed = {number: one.reason for number, one in results.items() if isinstance(one, FailedTask)}
     assert set(failed) == {3, 4, 9}
     assert "killed by SIGKILL" in failed[3]
     assert [results[number] for number in (0, 1, 2, 5, 6, 7, 8)] == [0, 1, 2, 5, 6, 7, 8]
