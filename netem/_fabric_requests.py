@@ -9,7 +9,7 @@ import socket
 import struct
 
 from netem._attributes import attribute, nested, number, parse, text
-from netem._netlink import NEW, RTM_GETLINK, RTM_NEWADDR, RTM_NEWLINK, RTM_NEWROUTE, Netlink, Request
+from netem._netlink import NEW, RTM_GETLINK, RTM_NEWADDR, RTM_NEWLINK, RTM_NEWROUTE, RTM_SETLINK, Netlink, Request
 
 _IFINFOMSG = struct.Struct("=BxHiII")  # family, type, index, flags, mask of changed flags
 _IFADDRMSG = struct.Struct("=4BI")  # family, prefix length, flags, scope, index
@@ -20,6 +20,7 @@ _IFLA_ADDRESS, _IFLA_IFNAME, _IFLA_MASTER, _IFLA_PROTINFO, _IFLA_LINKINFO, _IFLA
 _IFLA_INFO_KIND, _IFLA_INFO_DATA = 1, 2
 _IFLA_BR_FORWARD_DELAY, _IFLA_BR_STP_STATE, _IFLA_BR_MCAST_SNOOPING = 1, 5, 23
 _IFLA_BRPORT_STATE, _BR_STATE_FORWARDING = 1, 3
+_IFLA_BRPORT_BCAST_FLOOD = 30
 _VETH_INFO_PEER = 1
 _IFA_ADDRESS, _IFA_LOCAL, _IFA_BROADCAST = 1, 2, 4
 _RTA_OIF = 4
@@ -84,6 +85,12 @@ def forwarding(netlink: Netlink) -> set[int]:
 def _forwards(port: bytes) -> bool:
     of_bridge = parse(parse(port[_IFINFOMSG.size :]).get(_IFLA_PROTINFO, b""))
     return of_bridge.get(_IFLA_BRPORT_STATE) == bytes([_BR_STATE_FORWARDING])
+
+
+def flood_broadcasts(port: str, index: int, on: bool) -> Request:
+    """Return a request that makes the bridge send broadcasts of other ports to this port, or keeps it from that."""
+    flag = nested(_IFLA_PROTINFO, attribute(_IFLA_BRPORT_BCAST_FLOOD, bytes([on])))
+    return Request(f"set bcast_flood of {port}", RTM_SETLINK, _IFINFOMSG.pack(socket.AF_BRIDGE, 0, index, 0, 0) + flag)
 
 
 def _link(what: str, index: int, name: str, *attributes: bytes) -> Request:

@@ -37,6 +37,9 @@ from netem.link import MAX_LIMIT, Delay, Distribution, GilbertElliott, LinkCondi
 MAX_KIND = 0x7FFF
 """Highest class number for which a number remains for its netem."""
 
+RELAYED = 0x10000
+"""Mark of frames that `netem.relay` delivers. It is no number of a group, and these frames have no class."""
+
 _SET = NLM_F_CREATE | 0x100  # NLM_F_REPLACE: create or replace
 _ROOT = 0xFFFFFFFF
 _CLSACT = 0xFFFFFFF1
@@ -88,12 +91,16 @@ class TrafficControl:
         return [Request("add qdisc htb", RTM_NEWQDISC, self._message("htb", _ROOT, _HTB, attribute(2, settings)), NEW)]
 
     def guard(self) -> list[Request]:
-        """Return requests for filters that drop all packets at this port until `accept_group` allows a group."""
+        """Return requests for filters that drop all packets at this port until `accept_group` allows a group.
+
+        Frames with the mark of a relay pass.
+        """
         drop = nested(1, text(1, "gact"), nested(2, attribute(2, struct.pack("=IIiii", 0, 0, _ACT_SHOT, 0, 0))))
         message = self._filter("basic", _EGRESS, _DROP_PRIORITY, _ONLY, nested(3, drop))
         return [
             Request("add qdisc clsact", RTM_NEWQDISC, self._message("clsact", _CLSACT, _CLSACT_HANDLE), NEW),
             Request("add filter basic with action gact", RTM_NEWTFILTER, message, NEW),
+            self.accept_group(RELAYED),
         ]
 
     def uninstall(self) -> list[Request]:
@@ -151,7 +158,7 @@ class TrafficControl:
                 groups.add(handle)
             elif counted := _inside(attributes, _OPTIONS, 3, 1, 4).get(1):
                 (cut,) = struct.unpack_from("=8xI", counted)
-        return groups, cut
+        return groups - {RELAYED}, cut
 
     @staticmethod
     def classes(netlink: Netlink) -> dict[int, dict[int, Class]]:
