@@ -11,12 +11,12 @@ from random import Random
 from typing import TYPE_CHECKING, cast
 
 from harness.gc_pause import gc_paused
+from harness.play._shared_channel import ChannelTraffic
 from harness.play.backend import agent_seed
 from harness.play.core_version import edited_files
 from harness.play.mission import SoughtRun
 from harness.play.simulation._crash import core_crash
 from harness.play.simulation._recurrence import Recurrence
-from harness.play.simulation._shared_channel import ChannelTraffic
 from harness.play.simulation._simulated_agent import DiskContents, OwnAgent, VirtualAgent
 from harness.play.simulation.air import DueEvent, MessageInFlight, ScheduledInput, StrayDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, LateTimers, NameOf

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from typing import Literal
 
-from harness.play.simulation._shared_channel import ChannelTraffic
+from harness.play._shared_channel import ChannelTraffic
 from harness.play.simulation.fate_script import RIGHT_AFTER_S, FateScript
 from netem.channel import Transmission, numbers
 from netem.conditions import NetworkConditions

@@ -1,7 +1,8 @@
-"""The messages of agents on a radio channel that they share, in virtual time.
+"""The messages of agents on a radio channel that they share, in virtual time and in real time.
 
 A message waits for the processing time of its agent, then in the queue of its radio. It arrives, if at all, when its
-frame ends. `ChannelTraffic` connects the messages with their frames, and counts their fates.
+frame ends. `ChannelTraffic` connects the messages with their frames, and counts their fates. It reads no clock: the
+caller gives it the times.
 """
 
 from collections import Counter
