@@ -31,11 +31,14 @@ class Loop:
     """An event loop. `run` calls due callbacks one after another until `stop`.
 
     `failed` gets the exception of a callback, and the loop continues. Without `failed`, the exception ends the loop.
+    `selector` waits for sockets. The default one rounds times up to milliseconds.
     """
 
-    def __init__(self, failed: Callable[[Exception], object] | None = None) -> None:
+    def __init__(
+        self, failed: Callable[[Exception], object] | None = None, selector: selectors.BaseSelector | None = None
+    ) -> None:
         self.failed = failed
-        self._selector = selectors.DefaultSelector()
+        self._selector = selector or selectors.DefaultSelector()
         self._waiting: dict[socket.socket, tuple[Callback | None, Callback | None]] = {}
         self._due: list[tuple[float, int, Timer]] = []
         self._number = count()

@@ -16,6 +16,9 @@ from harness.scenario.verdict_names import FURTHER_CHECKS, CharacteristicVerdict
 
 SCHEMA = "ucp-run/1"
 
+TOLERATED_LATENESS_S = 0.05
+"""Mission seconds. Without a channel, virtual time delivers messages after 2 to 50 ms."""
+
 
 AgentKey = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,4}$")]
 """The ID of an agent, or of its vehicle, as a JSON key."""
@@ -194,6 +197,37 @@ class CapturedFrames(_Model):
     dropped: int
 
 
+class ChannelLateness(_Model):
+    """How late the process of a shared channel delivered messages, in mission seconds."""
+
+    deliveries: int
+    median_s: float
+    p95_s: float
+    """One in twenty deliveries was later than this."""
+    most_s: float
+    by_interval_s: list[float]
+    """The latest delivery in each interval of the load."""
+    missed: int
+    """Number of broadcasts that the process did not hear, because its buffer was full."""
+    unsent: int
+    """Number of deliveries that the kernel did not accept."""
+    processor_s: float
+    """Processor time of the process, in seconds."""
+
+    @property
+    def tolerable(self) -> bool:
+        """True if nineteen in twenty deliveries were at most `TOLERATED_LATENESS_S` late, and none was missing."""
+        return self.p95_s <= TOLERATED_LATENESS_S and not self.missed and not self.unsent
+
+    def in_words(self) -> str:
+        """Return a sentence about the lateness of deliveries, and about missing ones."""
+        late = (
+            f"One in twenty messages arrived {self.p95_s:.2g} s or more late, and the latest {self.most_s:.2g} s late"
+        )
+        missing = f"; {self.missed} broadcasts and {self.unsent} deliveries are missing"
+        return f"{late}{missing if self.missed or self.unsent else ''}"
+
+
 class ChannelRecord(_Model):
     """Frames on a radio channel that all vehicles shared. `model` has the preset and all figures of the radio."""
 
@@ -209,6 +243,8 @@ class ChannelRecord(_Model):
     load_interval_s: Annotated[float, Field(gt=0)]
     load: list[float]
     """Share of each interval in which at least one frame was on the channel, from mission second 0 on."""
+    lateness: ChannelLateness | None = None
+    """null in virtual time, where each message arrives at its exact time."""
 
     def total(self, reason: str) -> int:
         """Return the number of frames or messages lost for this reason."""

@@ -249,6 +249,11 @@ def _show_end(console: Console, finished: Run) -> None:
     ]
     if slow:
         complain(f"vehicles {', '.join(slow)} did not keep up with the clock: choose a smaller --speedup")
+    channel = finished.record.channel
+    if channel is not None and channel.lateness is not None and not channel.lateness.tolerable:
+        complain(
+            f"this machine was too slow for the channel. {channel.lateness.in_words()}: choose a smaller --speedup"
+        )
     late = finished.timer_lag
     if late is not None and not late.tolerable:
         lateness = f"one in twenty vote timers expired {late.late_s:.1f} or more mission seconds late"

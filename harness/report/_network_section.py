@@ -72,15 +72,23 @@ def channel(record: RunRecord) -> list[str]:
     mean = sum(found.load) * found.load_interval_s / record.mission_s if record.mission_s else 0.0
     preset, airtime = found.model.get("preset"), text.value(round(found.airtime_s, 1))
     sentences = [
-        f"All vehicles shared one channel, {preset}: {text.value(found.frames)} frames with an airtime of {airtime} s. "
+        f"All vehicles shared one channel, {preset}, {_played_by(found)}.",
+        f"There were {text.value(found.frames)} frames with an airtime of {airtime} s. "
         f"The channel was busy for {text.percent(round(mean, 3))} of the mission, and for "
-        f"{text.percent(max(found.load, default=0.0))} of the busiest {text.value(found.load_interval_s)} s."
+        f"{text.percent(max(found.load, default=0.0))} of the busiest {text.value(found.load_interval_s)} s.",
     ]
     for reason, by_vehicle in {**found.lost, **found.dropped}.items():
         counts = ", ".join(f"{vehicle}: {text.value(count)}" for vehicle, count in by_vehicle.items())
         whose = "Frames lost by receiver" if reason in found.lost else "Messages dropped by sender"
         sentences.append(f"{whose}, {REASONS.get(reason, reason)}: {counts}.")
+    if (late := found.lateness) is not None:
+        too_slow = "" if late.tolerable else " The machine was too slow: repeat the run with a smaller speedup."
+        sentences.append(f"{late.in_words()}, in mission time.{too_slow}")
     return sentences
+
+
+def _played_by(channel: ChannelRecord) -> str:
+    return "computed in virtual time" if channel.lateness is None else "played in real time between the vehicles"
 
 
 def _pairs(network: Connectivity, end_s: float) -> list[tuple[str, list[_network_strip.Span]]]:

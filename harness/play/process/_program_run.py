@@ -20,6 +20,7 @@ from harness.play._vehicle_keys import KeyDirectories, key_directories
 from harness.play.agent_control import AgentRefusedError, Status
 from harness.play.mission import RunOutcome, SoughtRun
 from harness.play.process._agent_process import AgentProcess, reboots_with_disk
+from harness.play.process._channel_process import ChannelProcess
 from harness.play.process._fleet import Fleet
 from harness.play.process._lag_meter import LagMeter
 from harness.play.process._rogue_process import RogueProcess
@@ -83,6 +84,7 @@ class ProgramRun:
         self._kinds = kinds
         self._keeps_disks = keeps_disks
         self._rogue = RogueProcess(scenario.rogue, scenario, seed, rundir) if scenario.rogue else None
+        self._channel = ChannelProcess(scenario, seed, rundir) if scenario.network.channel else None
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
@@ -161,6 +163,9 @@ class ProgramRun:
     async def begin(self, first: Change) -> None:
         await self._fleet.start(self._lab, self._show)
         await self._start_agents(self._lab)
+        if self._channel is not None:
+            await self._channel.start(self._lab.network)
+            self._watchers.start(self._channel.watch())
         await self.apply(first)
         if self.scenario.capture:
             self._capture = await LiveCapture.start(self._lab.network, self.rundir.capture(), self.scenario.roster)
@@ -207,6 +212,8 @@ class ProgramRun:
         epoch_us = round((time.time() + START_DELAY_S) * MICROSECONDS)
         if self._capture:
             await self._capture.begin(epoch_us, self.scenario.speedup)
+        if self._channel is not None:
+            await self._channel.begin(epoch_us, self._fleet.places())
         await asyncio.gather(*(agent.ask("start", epoch_us=epoch_us) for agent in self.agents))
         if self._rogue is not None:
             captured = self.scenario.security.captured if self.scenario.security else None
@@ -320,6 +327,8 @@ class ProgramRun:
         async with self._changing_network:  # apply changes in the order of their requests
             conditions = add_rogue_listener(change.conditions, self.scenario)
             applied = await self._lab.apply(conditions.at_speed(self.scenario.speedup))
+            if self._channel is not None:
+                await (self._channel.clear() if change.clears_all else self._channel.apply(change.conditions))
         self.network = change.detail
         record = change.to_json(round(max(change.at_s, self.clock.now()), 3))
         self.played.record(record)
@@ -343,6 +352,8 @@ class ProgramRun:
             self.rundir.append_tracks(self.clock.now(), places)
             if change := self._reach.move(self.clock.now(), places):
                 await self._apply_conditions(change)
+            if self._channel is not None:
+                await self._channel.move(places)
             await asyncio.sleep(every_s)
 
     async def until(self, mission_s: float) -> None:
@@ -403,7 +414,8 @@ class ProgramRun:
         for agent in self.agents:
             agent.collect_files()
         agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
-        return replace(self.played, mission_s=round(self.clock.now(), 1), agents=agents)
+        channel = await self._channel.totals() if self._channel is not None else None
+        return replace(self.played, mission_s=round(self.clock.now(), 1), agents=agents, channel=channel)
 
     def _awake(self) -> list[AgentProcess]:
         """Return the agents that are neither dead nor paused."""
@@ -448,6 +460,7 @@ class ProgramRun:
             self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
             await asyncio.gather(*(agent.stop() for agent in self.agents), self._fleet.stop())
             self.played.datagrams = self._datagram_counters(await lab.network.datagrams())
+            await self._end_channel()
             for agent in self.agents:
                 agent.collect_files()
         except NetemError as error:  # the loss of the lab explains the crashes
@@ -476,6 +489,16 @@ class ProgramRun:
             for agent in agents
             if agent not in self._kinds or not self._kinds[agent].uses_udp
         }
+
+    async def _end_channel(self) -> None:
+        if self._channel is None:
+            return
+        try:
+            self.played.channel = await self._channel.totals()
+        except MachineError as error:
+            if self.played.outcome == "completed":
+                self._end_early(error)
+        await self._channel.stop()
 
     async def _end_capture(self) -> None:
         if self._capture is None:

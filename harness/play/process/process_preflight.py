@@ -30,7 +30,6 @@ def refuse_virtual_time_keys(scenario: Scenario) -> None:
         *(["fates"] if scenario.fates else []),
         *(["datagrams"] if scenario.datagrams else []),
         *(["lateness"] if scenario.lateness else []),
-        *(["network.channel"] if scenario.network.channel else []),
         *(["clocks"] if scenario.clocks else []),
         *(["timeline.lie"] if any(entry.lie for entry in scenario.timeline) else []),
         *(["events.script.timestamp_us"] if any(event.timestamp_us for event in scenario.events.script) else []),

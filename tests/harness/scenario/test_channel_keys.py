@@ -6,7 +6,6 @@ from dataclasses import fields
 import pytest
 
 from harness.errors import ScenarioError
-from harness.play.process.process_preflight import refuse_unplayable
 from harness.scenario import Scenario
 from harness.scenario._channel import OWN_KEYS, ChannelModel, Preset
 from harness.scenario.load import parse, parse_yaml
@@ -78,8 +77,3 @@ def test_channel_refuses_conditions_that_it_computes_itself(network: str, more: 
 def test_unknown_preset_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ScenarioError, match="preset"):
         parse(parse_yaml("name: Channel\nnetwork: {channel: {preset: wifi_2}}\n"))
-
-
-def test_backend_in_real_time_refuses_a_channel_before_it_starts() -> None:
-    with pytest.raises(ScenarioError, match=r"^`network.channel` needs virtual time: use --backend sim$"):
-        refuse_unplayable(scenario())

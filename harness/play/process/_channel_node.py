@@ -1,0 +1,217 @@
+"""The process of a shared channel: `python -m harness.play.process._channel_node`, in the lab's own network.
+
+It takes over the broadcasts of all vehicles from the switch (`netem.relay`), and delivers them as `LiveChannel`
+decides. Its working directory is the run directory: it contains the socket `channel.control` for the commands below,
+and the journal `channel.jsonl`. Large values of commands are files there, because a line of a control socket is short.
+SIGTERM ends the process.
+
+The process waits with `select`, whose timeouts are exact to microseconds. It measures how late each delivery is.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import resource
+import selectors
+import signal
+import sys
+import time
+from array import array
+from pathlib import Path
+from typing import Any
+
+from harness.play._shared_channel import LOAD_S, NEVER
+from harness.play.process._live_channel import LiveChannel
+from netem.channel import PRESETS
+from netem.conditions import NetworkConditions
+from netem.errors import NetemError
+from netem.radio import Place
+from netem.relay import Heard, Relay
+from ucp.clock import MissionClock
+from ucp.control import Command, CommandError, ControlServer
+from ucp.loop import Loop, Timer
+from ucp.messages import HEADER, MAGIC
+
+CONTROL = "channel.control"
+VALUE = "channel.value"
+"""File with a large value of a command or an answer."""
+
+NANOSECONDS = 1e9
+
+
+class ChannelNode:
+    """The process in `directory`. It writes the journal to `journal`. Raises OSError without access to packets."""
+
+    def __init__(self, directory: Path, journal: Path, port: int) -> None:
+        self._directory = directory
+        self._port = port
+        self._clock = MissionClock(1.0)
+        self._channel: LiveChannel | None = None
+        self._relay: Relay | None = None
+        self._lateness = Lateness()
+        self._timer: Timer | None = None
+        self._loop = Loop(selector=selectors.SelectSelector())
+        self._journal = journal.open("a", encoding="utf-8")
+        commands: dict[str, Command] = {
+            "start": self._start,
+            "move": self._move,
+            "apply": self._apply,
+            "clear": self._clear,
+            "totals": self._totals,
+        }
+        self._control = ControlServer(directory / CONTROL, commands, self._loop)
+
+    def run(self) -> None:
+        """Serve until SIGTERM or SIGINT."""
+        self._loop.stop_on(signal.SIGTERM, signal.SIGINT)
+        self._control.start()
+        self._loop.run()
+        self._journal.close()
+        self._control.close()
+        self._loop.close()
+
+    def _turn(self) -> None:
+        """Read the broadcasts that wait, deliver the frames that are due, and set a timer for the next event."""
+        channel, relay, clock = self._channel, self._relay, self._clock
+        if channel is None or relay is None:
+            return
+        now, now_ns = clock.now(), time.monotonic_ns()
+        for heard in relay.take():
+            self._take(channel, heard, max(0.0, now - (now_ns - heard.at_ns) / NANOSECONDS * clock.speedup))
+        for at_s, _, vehicle, frame in channel.advance(now):
+            try:
+                relay.deliver(vehicle, frame)
+            except OSError:
+                self._lateness.unsent += 1
+            self._lateness.add(at_s, clock.now())
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if (next_s := channel.next_s) != NEVER:
+            self._timer = self._loop.call_later(clock.wall_s(next_s - clock.now()), self._turn)
+
+    def _take(self, channel: LiveChannel, heard: Heard, at_s: float) -> None:
+        data = heard.udp_data(self._port)
+        if data is None:
+            channel.pass_by(at_s, heard.vehicle, heard.frame)
+        else:
+            channel.send(at_s, heard.vehicle, heard.frame, len(data), _sequence(data, heard.vehicle))
+
+    def _write(self, line: dict[str, Any]) -> None:
+        self._journal.write(json.dumps(line, separators=(",", ":")) + "\n")
+
+    # Commands of the control socket. Only the harness sends them.
+
+    def _start(self, request: dict[str, Any]) -> dict[str, Any]:
+        roster = request["roster"]
+        radio = dataclasses.replace(PRESETS[request["preset"]], **request["figures"])
+        self._channel = LiveChannel(roster, radio, request["processing_s"], request["seed"], self._write)
+        self._clock = MissionClock(request["speedup"])
+        self._clock.start(request["epoch_us"])
+        try:
+            self._relay = Relay(roster)
+            self._relay.open()
+        except (OSError, NetemError) as error:
+            raise CommandError(f"the kernel does not hand over broadcasts: {error}") from None
+        self._loop.watch(self._relay.input, readable=self._turn)
+        return {}
+
+    def _move(self, request: dict[str, Any]) -> dict[str, Any]:
+        coordinates = iter(request["places"])
+        places = [Place(*triple) for triple in zip(coordinates, coordinates, coordinates, strict=True)]
+        channel = self._started()
+        channel.move(places, self._clock.now())
+        self._turn()
+        return {}
+
+    def _apply(self, request: dict[str, Any]) -> dict[str, Any]:
+        conditions = NetworkConditions.from_json(json.loads((self._directory / VALUE).read_text(encoding="utf-8")))
+        self._started().apply(conditions, self._clock.now())
+        self._turn()
+        return {}
+
+    def _clear(self, request: dict[str, Any]) -> dict[str, Any]:
+        """End the channel. Messages on it are lost, and the switch floods later broadcasts."""
+        if self._relay is not None:
+            self._lateness.missed = self._relay.count_missed()
+            self._loop.watch(self._relay.input)
+            self._relay.close()
+            self._relay = None
+        return {}
+
+    def _totals(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Write what `run.json` has of the channel to the file of values."""
+        if self._relay is not None:
+            self._lateness.missed = self._relay.count_missed()
+        self._journal.flush()
+        totals = {**self._started().totals.to_json(), **self._lateness.to_json()}
+        (self._directory / VALUE).write_text(json.dumps(totals), encoding="utf-8")
+        return {}
+
+    def _started(self) -> LiveChannel:
+        if self._channel is None:
+            raise CommandError("the channel has not started")
+        return self._channel
+
+
+class Lateness:
+    """How late the deliveries were, in mission seconds."""
+
+    def __init__(self) -> None:
+        self.missed = 0
+        """Broadcasts that the process did not hear."""
+        self.unsent = 0
+        """Deliveries that a port did not accept."""
+        self._all = array("f")
+        self._most: list[float] = []
+        """Greatest lateness in each interval of the load."""
+
+    def add(self, due_s: float, now: float) -> None:
+        """Count a delivery that was due at `due_s`."""
+        late_s = max(0.0, now - due_s)
+        self._all.append(late_s)
+        index = int(due_s / LOAD_S)
+        if len(self._most) <= index:
+            self._most.extend([0.0] * (index + 1 - len(self._most)))
+        self._most[index] = max(self._most[index], late_s)
+
+    def to_json(self) -> dict[str, Any]:
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        ordered = sorted(self._all)
+        return {
+            "lateness": {
+                "deliveries": len(ordered),
+                "median_s": round(ordered[len(ordered) // 2], 6) if ordered else 0.0,
+                "p95_s": round(ordered[len(ordered) * 95 // 100], 6) if ordered else 0.0,
+                "most_s": round(ordered[-1], 6) if ordered else 0.0,
+                "by_interval_s": [round(late_s, 4) for late_s in self._most],
+                "missed": self.missed,
+                "unsent": self.unsent,
+                "processor_s": round(used.ru_utime + used.ru_stime, 3),
+            }
+        }
+
+
+def _sequence(data: bytes, vehicle: int) -> int | None:
+    """Return the number of a message; None if it is no message of the vehicle's agent."""
+    if len(data) < HEADER.size:
+        return None
+    magic, _, _, sender, sequence, _ = HEADER.unpack_from(data)
+    return sequence if magic == MAGIC and sender == vehicle else None
+
+
+def main() -> int:
+    """Run the node. Return exit status 1 if it has no access to the network."""
+    with contextlib.suppress(OSError):  # an ordinary user may not run before all other programs
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(os.sched_get_priority_min(os.SCHED_RR)))
+    try:
+        ChannelNode(Path.cwd(), Path(sys.argv[1]), int(sys.argv[2])).run()
+    except OSError as error:
+        sys.stderr.write(f"the channel: {error.strerror}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

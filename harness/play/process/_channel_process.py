@@ -1,0 +1,144 @@
+"""Start the process of a shared channel in the lab's own network, forward each change to it, and stop it.
+
+It belongs to the harness and not to the system under test. If it fails, the machine or the harness has failed, and the
+run ends.
+"""
+
+import asyncio
+import dataclasses
+import json
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from harness.archive.directory import CHANNEL_FILE, RunDirectory
+from harness.errors import MachineError
+from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
+from harness.play.process._channel_node import CONTROL, VALUE
+from harness.scenario import Scenario
+from netem.conditions import NetworkConditions
+from netem.lab import Lab, LabProcess
+from netem.radio import Place
+from ucp.messages import PORT
+
+START_LIMIT_S = 30.0
+ANSWER_LIMIT_S = 30.0
+STOP_GRACE_S = 5.0
+ASK_AGAIN_S = 0.02
+LOG = "channel.log"
+
+
+class ChannelProcess:
+    """The channel of one run, whose scenario has one."""
+
+    def __init__(self, scenario: Scenario, seed: int, rundir: RunDirectory) -> None:
+        assert scenario.network.channel is not None, "the caller checks this"
+        self._model = scenario.network.channel
+        self._scenario = scenario
+        self._seed = seed
+        self._rundir = rundir
+        self._control = AgentControl(rundir.path / CONTROL)
+        self._process: LabProcess | None = None
+        self._conditions = NetworkConditions()
+        self._begun = False
+        self._asking = asyncio.Lock()
+        """The file of values belongs to one command at a time."""
+
+    async def start(self, lab: Lab) -> None:
+        """Start the process and wait until it listens. Raises MachineError."""
+        log = self._rundir.path / LOG
+        self._process = await lab.spawn(
+            None,
+            [sys.executable, "-P", "-m", "harness.play.process._channel_node", CHANNEL_FILE, str(PORT)],
+            cwd=self._rundir.path,
+            env=dict(os.environ),
+            stdout=log,
+            stderr=log,
+            role="channel",
+        )
+        control = self._rundir.path / CONTROL
+        deadline = asyncio.get_running_loop().time() + START_LIMIT_S
+        while not control.exists():
+            if self._process.returncode is not None:
+                raise self._ended(self._process)
+            if asyncio.get_running_loop().time() > deadline:
+                raise self._failed(f"was not ready within {START_LIMIT_S:g} s")
+            await asyncio.sleep(ASK_AGAIN_S)
+
+    async def begin(self, epoch_us: int, places: Mapping[int, Place]) -> None:
+        """Take over the broadcasts of all vehicles from the switch. Mission second 0 is `epoch_us`."""
+        roster = list(self._scenario.roster)
+        figures = dataclasses.asdict(self._model.radio())
+        await self._ask(
+            "start",
+            roster=roster,
+            preset=self._model.preset,
+            figures=figures,
+            processing_s=self._model.processing_s,
+            seed=self._seed,
+            speedup=self._scenario.speedup,
+            epoch_us=epoch_us,
+        )
+        self._begun = True
+        await self.move(places)
+        await self.apply(self._conditions)
+
+    async def move(self, places: Mapping[int, Place]) -> None:
+        """Put the vehicles at these places."""
+        ordered = [places[vehicle] for vehicle in self._scenario.roster]
+        coordinates = [value for place in ordered for value in dataclasses.astuple(place)]
+        await self._ask("move", places=coordinates)
+
+    async def apply(self, conditions: NetworkConditions) -> None:
+        """Apply these conditions to frames that end later, and from the beginning if it is still to come."""
+        self._conditions = conditions
+        if not self._begun:
+            return
+        async with self._asking:
+            self._value.write_text(json.dumps(conditions.to_json()), encoding="utf-8")
+            await self._ask("apply")
+            self._value.unlink()
+
+    async def clear(self) -> None:
+        """End the channel, so that the switch delivers all later broadcasts."""
+        await self._ask("clear")
+
+    async def totals(self) -> dict[str, Any] | None:
+        """Return what run.json has of the channel so far; None before it began."""
+        if not self._begun:
+            return None
+        async with self._asking:
+            await self._ask("totals")
+            totals = json.loads(self._value.read_text(encoding="utf-8"))
+            self._value.unlink()
+        return {"model": self._model.to_json(), **totals}
+
+    async def watch(self) -> None:
+        """Wait until the process ends by itself, then raise MachineError."""
+        assert self._process is not None, "it is watched after its start"
+        await self._process.wait()
+        raise self._ended(self._process)
+
+    async def stop(self) -> None:
+        """End the process."""
+        self._control.close()
+        if self._process is not None and self._process.returncode is None:
+            await self._process.terminate(STOP_GRACE_S)
+
+    @property
+    def _value(self) -> Path:
+        return self._rundir.path / VALUE
+
+    async def _ask(self, command: str, **arguments: Any) -> None:
+        try:
+            await self._control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
+        except (AgentSilentError, AgentRefusedError) as error:
+            raise self._failed(f"cannot {command}: {error}") from None
+
+    def _ended(self, process: LabProcess) -> MachineError:
+        return self._failed(f"ended by itself with {process.end}")
+
+    def _failed(self, detail: str) -> MachineError:
+        return MachineError(f"the process of the shared channel {detail}; its log is {LOG}")

@@ -1,0 +1,108 @@
+"""A shared channel in real time: which broadcast reaches which vehicle when. No I/O, and no clock.
+
+The model and the random draws are those of virtual time. A message of an agent waits for its processing time and in the
+queue of its radio. When its frame ends, the conditions of the network apply to each copy that the channel delivers.
+Other broadcasts, such as ARP requests, do not use the channel, and only the conditions apply to them.
+
+The caller is always a little late: it hears of a broadcast after it was sent, and of an event after its time. Both have
+their exact times, so lateness delays a delivery but changes no other decision of the model.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from heapq import heappop, heappush
+from itertools import count
+from typing import NamedTuple
+
+from harness.play._shared_channel import NEVER, ChannelTotals, ChannelTraffic, Journal
+from netem.channel import Radio, numbers
+from netem.conditions import NetworkConditions
+from netem.medium import AT_ONCE, Medium, RandomDraws
+from netem.radio import Place
+
+
+@dataclass(slots=True, eq=False)
+class _Message:
+    frame: bytes
+    sequence: int | None
+    """The number of the message, if it is one of an agent."""
+
+
+class Delivery(NamedTuple):
+    """A frame that reaches a vehicle at mission second `at_s`."""
+
+    at_s: float
+    order: int
+    """Deliveries at the same time keep this order."""
+    vehicle: int
+    frame: bytes
+
+
+class LiveChannel:
+    """The channel of `roster`. Times are mission seconds. No call may go back in time."""
+
+    def __init__(self, roster: Sequence[int], radio: Radio, processing_s: float, seed: int, journal: Journal) -> None:
+        self._roster = tuple(roster)
+        self._number = {vehicle: number for number, vehicle in enumerate(roster)}
+        self._traffic: ChannelTraffic[_Message] = ChannelTraffic(self._roster, radio, processing_s, seed, journal)
+        self._medium = Medium(self._roster, seed, AT_ONCE)
+        self._due: list[Delivery] = []
+        self._order = count()
+        self._played_s = 0.0
+
+    @property
+    def totals(self) -> ChannelTotals:
+        return self._traffic.totals
+
+    @property
+    def next_s(self) -> float:
+        """When the next event takes place; NEVER without one."""
+        return min(self._traffic.next_s, self._due[0].at_s if self._due else NEVER)
+
+    def send(self, at_s: float, vehicle: int, frame: bytes, data_bytes: int, sequence: int | None) -> None:
+        """Let a vehicle send this frame, with a message of this length, on the channel."""
+        at_s = max(at_s, self._played_s)
+        self._traffic.send(at_s, self._number[vehicle], _Message(frame, sequence), data_bytes)
+
+    def pass_by(self, at_s: float, vehicle: int, frame: bytes) -> None:
+        """Let a vehicle broadcast this frame without the channel."""
+        sender = self._number[vehicle]
+        everyone = (1 << len(self._roster)) - 1
+        self._copy(at_s, self._medium.draw(sender, at_s, len(frame)), everyone, frame)
+
+    def advance(self, now: float) -> list[Delivery]:
+        """Play all events up to `now`, and return the deliveries that are due, in order."""
+        self._play(now)
+        deliveries = []
+        while self._due and self._due[0].at_s <= now:
+            deliveries.append(heappop(self._due))
+        return deliveries
+
+    def move(self, places: Sequence[Place], now: float) -> None:
+        """Put the vehicles at these places, in the order of the roster."""
+        self._play(now)
+        self._traffic.move(places, now)
+
+    def apply(self, conditions: NetworkConditions, now: float) -> None:
+        """Apply these conditions to frames that end later. A partition puts vehicles on different channels."""
+        self._play(now)
+        self._medium.apply(conditions)
+        groups = conditions.groups(self._roster)
+        self._traffic.tune(
+            [next(index for index, group in enumerate(groups) if vehicle in group) for vehicle in self._roster], now
+        )
+
+    def _play(self, now: float) -> None:
+        traffic = self._traffic
+        while traffic.next_s <= now:
+            at_s = traffic.next_s
+            for transmission, message in traffic.advance():
+                draws = self._medium.draw(transmission.sender, at_s, transmission.data_bytes)
+                self._copy(at_s, draws, transmission.received, message.frame)
+        self._played_s = max(self._played_s, now)
+
+    def _copy(self, at_s: float, draws: RandomDraws, receivers: int, frame: bytes) -> None:
+        """Let the copies of a frame arrive at these receivers, given as bits, as the draws of the conditions decide."""
+        for receiver in numbers(receivers):
+            for delay_s in draws.copies_to(receiver):
+                heappush(self._due, Delivery(at_s + delay_s, next(self._order), self._roster[receiver], frame))
