@@ -27,7 +27,7 @@ from ucp.secure.crypto_suite import SenderKeys
 from ucp.secure.envelope import CLEAR, SIGNATURE_BYTES
 from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
-from ucp.trace import Recorded
+from ucp.trace import RecordedBytes
 
 ROSTER = (1, 2, 3)
 KEYS = KeySet.derived(b"forgeries".ljust(32, b"\0"), ROSTER)
@@ -219,7 +219,7 @@ class ReplayingAir(VirtualAir):
         sequence: int,
         message: Message,
         data_bytes: int,
-        datagram: Recorded | None = None,
+        datagram: RecordedBytes | None = None,
         sealed: bytes | None = None,
     ) -> None:
         super().broadcast(now, number, sequence, message, data_bytes, datagram, sealed)

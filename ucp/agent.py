@@ -69,7 +69,7 @@ from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.store import StoredState
 from ucp.timers import Timer
-from ucp.trace import Dropped, Entry, HandlerRun, Recorded, StateSummary, Tally, in_base64
+from ucp.trace import DroppedDatagram, Entry, HandlerRun, RecordedBytes, StateSummary, Tally, in_base64
 from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger, Trigger
 
 ON_MESSAGE: dict[type[Message], EventHandler[Any]] = {
@@ -149,7 +149,7 @@ class Agent:
         self._waiting_answers = WaitingAnswers(agent_id, spread_s) if spread_s else None
         self._tracing = tracing
         self._trace: list[Entry] = []
-        self._traced_state = self._state_now()
+        self._traced_state = self._state_summary()
         self._on_message, self._on_timer, self._on_local_event = ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT
         if handlers:
             self.replace_handlers(handlers)
@@ -168,18 +168,18 @@ class Agent:
         try:
             sender, sequence, message = decode(data)
         except MalformedDatagramError as malformed:
-            self._drop(now, malformed.reason, Recorded(in_base64(data)))
+            self._drop(now, malformed.reason, RecordedBytes(in_base64(data)))
             return
-        self.receive_message(sender, sequence, message, now, Recorded(in_base64(data)))
+        self.receive_message(sender, sequence, message, now, RecordedBytes(in_base64(data)))
 
     def receive_message(
-        self, sender: int, sequence: int, message: Message, now: float, datagram: Recorded | None = None
+        self, sender: int, sequence: int, message: Message, now: float, datagram: RecordedBytes | None = None
     ) -> None:
         """Handle a decoded message from another agent on the roster, with blocks of agents on the roster only.
 
         `datagram` is the encoded message, for the trace. Other messages are counted in `dropped`.
         """
-        if reason := why_not_handled(self.agent_id, self.roster, sender, message):
+        if reason := drop_reason(self.agent_id, self.roster, sender, message):
             self._drop(now, reason, datagram)
             return
         self.received[message.NAME] += 1
@@ -194,8 +194,8 @@ class Agent:
     def add_event(self, event: LoggableEvent, now: float) -> None:
         """Log an event. Raises ValueError if it is larger than `max_event_bytes`."""
         self.check_size(event)
-        came = Recorded(None, event) if self._tracing else None
-        self._handle(now, EventTrigger(event.event_id), came, self._on_local_event["Build Data Block"], event)
+        trace_input = RecordedBytes(None, event) if self._tracing else None
+        self._handle(now, EventTrigger(event.event_id), trace_input, self._on_local_event["Build Data Block"], event)
 
     def check_size(self, event: LoggableEvent) -> None:
         """Raise ValueError if the event is larger than `max_event_bytes`."""
@@ -205,7 +205,7 @@ class Agent:
 
     def next_timer(self) -> float | None:
         """Return the mission second at which `handle_timer` is due. None if no timer runs and no answer waits."""
-        timer = self._soonest()
+        timer = self._next_running_timer()
         deadline = None if timer is None else timer.deadline
         answer_s = self.next_answer()
         if answer_s is None or deadline is None:
@@ -216,7 +216,7 @@ class Agent:
         """Return the mission second at which the next waiting answer is due. None if none waits."""
         return None if self._waiting_answers is None else self._waiting_answers.next_s()
 
-    def _soonest(self) -> Timer | None:
+    def _next_running_timer(self) -> Timer | None:
         """Return the timer that expires next. None if no timer runs."""
         soonest, ends = None, math.inf
         for timer in self.state.timers:
@@ -225,7 +225,7 @@ class Agent:
                 soonest, ends = timer, deadline
         return soonest
 
-    def answers_nobody_until(self) -> float | None:
+    def silent_until(self) -> float | None:
         """Return the mission second until which the agent answers no message, because it reconciles.
 
         That is when the running timer of its reconcile expires. None if it does not reconcile, or no such timer runs.
@@ -238,7 +238,9 @@ class Agent:
 
     def handle_timer(self, now: float) -> None:
         """Run the handlers of all timers that have expired by `now`, earliest first, and release due answers."""
-        while (timer := self._soonest()) is not None and timer.deadline is not None and timer.deadline <= now:
+        while (
+            (timer := self._next_running_timer()) is not None and timer.deadline is not None and timer.deadline <= now
+        ):
             self.end_timer(timer, now)
         self.release_answers(now)
 
@@ -261,8 +263,8 @@ class Agent:
         core = self._core
         core.now = now
         core.restore(recovered.completed, recovered.chain, recovered.deque, recovered.stack)
-        came = Recorded(None, recovered) if self._tracing else None
-        self._handle(now, BootTrigger(len(core.chain)), came, self._on_local_event["Reconcile Finalize"])
+        trace_input = RecordedBytes(None, recovered) if self._tracing else None
+        self._handle(now, BootTrigger(len(core.chain)), trace_input, self._on_local_event["Reconcile Finalize"])
 
     def begin_reconcile(self, now: float) -> None:
         """Start a reconcile by the operator's command (a final reconcile at the depot, Section 5.1)."""
@@ -273,9 +275,9 @@ class Agent:
 
         `answer_spread_s` has no effect on them. A driver of the network calls `datagrams_to_send`.
         """
-        return [(sequence, message) for sequence, message, _ in self._taken_from_outbox()]
+        return [(sequence, message) for sequence, message, _ in self._take_outbox()]
 
-    def _taken_from_outbox(self) -> list[Outgoing]:
+    def _take_outbox(self) -> list[Outgoing]:
         outbox = self._core.outbox
         if outbox:
             self._core.outbox = []
@@ -283,7 +285,7 @@ class Agent:
 
     def _due_to_send(self) -> list[Outgoing]:
         """Return the messages to broadcast now, in order. Answers wait by `answer_spread_s`."""
-        outbox = self._taken_from_outbox()
+        outbox = self._take_outbox()
         return outbox if self._waiting_answers is None else self._waiting_answers.exchange(outbox, self._core.now)
 
     def datagrams_to_send(self) -> list[bytes]:
@@ -297,21 +299,26 @@ class Agent:
 
     # How a handler runs
 
-    def _drop(self, now: float, reason: str, datagram: Recorded | None) -> None:
+    def _drop(self, now: float, reason: str, datagram: RecordedBytes | None) -> None:
         """Count a datagram that no handler gets."""
         self.dropped[reason] += 1
         if self._tracing:
-            self._trace.append(Dropped(now, reason, datagram or Recorded("")))
+            self._trace.append(DroppedDatagram(now, reason, datagram or RecordedBytes("")))
 
     def _handle(
-        self, now: float, trigger: Trigger, came: Recorded | None, handler: EventHandler[Any], *inputs: object
+        self,
+        now: float,
+        trigger: Trigger,
+        trace_input: RecordedBytes | None,
+        handler: EventHandler[Any],
+        *inputs: object,
     ) -> None:
-        """Run a handler, and then those that it triggered, in order. `came` is the trace's `input`."""
+        """Run a handler, and then those that it triggered, in order. `trace_input` is the trace's `input`."""
         core = self._core
         core.now, core.running = now, handler
         branch = handler.run(core, *inputs)
         if self._tracing:
-            self._trace_run(trigger, came, handler, branch)
+            self._trace_run(trigger, trace_input, handler, branch)
         if core.triggered:
             self._run_triggered()
 
@@ -325,12 +332,14 @@ class Agent:
             if self._tracing:
                 self._trace_run(LocalTrigger(by), None, handler, branch)
 
-    def _trace_run(self, trigger: Trigger, came: Recorded | None, handler: EventHandler[Any], branch: str) -> None:
+    def _trace_run(
+        self, trigger: Trigger, trace_input: RecordedBytes | None, handler: EventHandler[Any], branch: str
+    ) -> None:
         core, state = self._core, self._traced_state
         if core.changes or state.reconciling != core.reconcile_in_progress or state.idle != core.idle:
-            state = self._traced_state = self._state_now()
+            state = self._traced_state = self._state_summary()
         run = HandlerRun(
-            core.now, handler.name, handler.algorithm, trigger, branch, core.changes, core.announced, state, came
+            core.now, handler.name, handler.algorithm, trigger, branch, core.changes, core.announced, state, trace_input
         )
         core.changes, core.announced = [], []
         if handler.tally is not None:
@@ -338,10 +347,10 @@ class Agent:
         if core.started:
             run.started, core.started = core.started, {}
         if core.sealed is not None:
-            run.sealed, core.sealed = Recorded(in_base64(core.sealed)), None
+            run.sealed, core.sealed = RecordedBytes(in_base64(core.sealed)), None
         self._trace.append(run)
 
-    def _state_now(self) -> StateSummary:
+    def _state_summary(self) -> StateSummary:
         state = self.state
         return StateSummary(
             len(state.chain),
@@ -353,7 +362,7 @@ class Agent:
         )
 
 
-def why_not_handled(agent_id: int, roster: Container[int], sender: int, message: Message) -> str | None:
+def drop_reason(agent_id: int, roster: Container[int], sender: int, message: Message) -> str | None:
     """Return the reason why the agent drops a well-formed message. None if it handles the message."""
     if sender == agent_id:
         return "own sender"

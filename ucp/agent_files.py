@@ -39,7 +39,7 @@ class LogFile:
     def __init__(self, path: Path) -> None:
         self._file: BinaryIO = path.open("ab", buffering=0)
 
-    def say(self, sentence: str) -> None:
+    def write_line(self, sentence: str) -> None:
         now = time.time()
         at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(now))
         with contextlib.suppress(OSError):

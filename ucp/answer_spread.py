@@ -19,12 +19,12 @@ from ucp.messages import (
     NextInSequenceResponse,
     encode,
 )
-from ucp.trace import Recorded
+from ucp.trace import RecordedBytes
 
 ANSWERS = frozenset((BlockAddResponse, ChainContainResponse, NextInSequenceResponse, BlockResponse))
 """The messages that wait. Algorithms 3, 9, 13 and 17 send them."""
 
-Outgoing = tuple[int, Message, Recorded | None]
+Outgoing = tuple[int, Message, RecordedBytes | None]
 """Sequence number, message, and the datagram as the trace has it. None without a trace."""
 
 

@@ -1,4 +1,4 @@
-"""Mission time: seconds since the mission's start, running `speedup` times as fast as the wall clock."""
+"""Mission time: seconds since the start of the mission, `speedup` times as fast as wall time."""
 
 import time
 
@@ -6,7 +6,7 @@ MICROSECONDS = 1_000_000
 
 
 class MissionClock:
-    """Does not run before `start`. Never goes back, whatever happens to the machine's wall clock."""
+    """A clock for mission time. It runs from `start` on, and never goes back, even if the wall clock is changed."""
 
     def __init__(self, speedup: float) -> None:
         self.speedup = speedup
@@ -18,20 +18,20 @@ class MissionClock:
         return self.epoch_us is not None
 
     def start(self, epoch_us: int) -> None:
-        """Let mission time be 0 at `epoch_us`, microseconds since the Unix epoch; it may lie in the past or future."""
+        """Set mission time 0 to `epoch_us`, in microseconds since the Unix epoch, in the past or the future."""
         self.epoch_us = epoch_us
         self._started = time.monotonic() - (time.time() - epoch_us / MICROSECONDS)
 
     def now(self) -> float:
-        """Mission seconds; 0 before the start."""
+        """Return the mission time in seconds. It is 0 before the start."""
         if self.epoch_us is None:
             return 0.0
         return max(0.0, (time.monotonic() - self._started) * self.speedup)
 
     def timestamp_us(self, now: float) -> int:
-        """Microseconds since the Unix epoch at mission time `now`; at a speedup they run ahead of the wall clock."""
+        """Return mission time `now` in microseconds since the Unix epoch. With a speedup it runs ahead of wall time."""
         return (self.epoch_us or 0) + round(now * MICROSECONDS)
 
     def wall_s(self, mission_s: float) -> float:
-        """How long `mission_s` take on the wall clock."""
+        """Return the seconds of wall time that `mission_s` mission seconds take."""
         return mission_s / self.speedup

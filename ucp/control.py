@@ -16,7 +16,7 @@ from ucp.loop import Loop
 
 MAX_LINE_BYTES = 64 * 1024
 MAX_NAME = 40
-"""Characters of a wrong command that an error shows."""
+"""Maximum number of characters of an unknown command in an error message."""
 
 Command = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -42,18 +42,18 @@ class ControlServer:
         """Begin to serve. Replace the socket of an agent that has ended. Raises OSError."""
         self._listener = listener = socket.socket(socket.AF_UNIX)
         listener.setblocking(False)
-        # Under its name it is there only once it listens: whoever sees it can connect.
-        unready = self._path.with_name(f".{self._path.name}")
-        unready.unlink(missing_ok=True)
-        # A socket's address holds 107 bytes, and run directories lie deep: name it from its own directory.
+        # The socket gets its name only after it listens, so a client that sees the name can connect.
+        temporary = self._path.with_name(f".{self._path.name}")
+        temporary.unlink(missing_ok=True)
+        # The address of a socket has at most 107 bytes, and paths of run directories are long: use a relative path.
         directory = os.open(self._path.parent, os.O_PATH)
         try:
-            listener.bind(f"/proc/self/fd/{directory}/{unready.name}")
+            listener.bind(f"/proc/self/fd/{directory}/{temporary.name}")
         finally:
             os.close(directory)
         listener.listen()
         self._loop.watch(listener, readable=self._accept)
-        unready.replace(self._path)
+        temporary.replace(self._path)
 
     def close(self) -> None:
         if self._listener is not None:
@@ -63,13 +63,13 @@ class ControlServer:
 
     def _accept(self) -> None:
         assert self._listener is not None, "it listens"
-        with contextlib.suppress(OSError):  # a client that went away before
+        with contextlib.suppress(OSError):  # the client may have disconnected already
             _Client(self._listener.accept()[0], self.answer, self._loop)
 
     def answer(self, line: bytes) -> dict[str, Any]:
         """Return the answer to a line."""
         try:
-            request = json.loads(line.decode())  # of bytes, json would also read UTF-16
+            request = json.loads(line.decode())  # given bytes, json would also accept UTF-16
             if not isinstance(request, dict):
                 return {"ok": False, "error": "not a JSON object"}
             check_request(request)
@@ -110,7 +110,7 @@ class _Client:
             data = b""
         self._received += data
         if data:
-            self._go_on()
+            self._answer_next_line()
         else:
             self._close()
 
@@ -124,9 +124,9 @@ class _Client:
             return
         if not self._unsent:
             self._loop.watch(self._connection, readable=self._read)
-            self._go_on()
+            self._answer_next_line()
 
-    def _go_on(self) -> None:
+    def _answer_next_line(self) -> None:
         """Answer the next complete line, if there is one."""
         line, newline, rest = self._received.partition(b"\n")
         if newline:

@@ -14,7 +14,7 @@ from ucp.sealed import SEAL_BYTES
 from ucp.settings import Settings
 from ucp.state import AgentState
 from ucp.timers import Timer
-from ucp.trace import Recorded, Sent
+from ucp.trace import RecordedBytes, SentMessage
 
 Seal = Callable[[bytes, int], bytes]
 """A function that seals event data, given this data and the timestamp of its block."""
@@ -41,9 +41,9 @@ class Core(AgentState):
         seal: Seal | None = None,
     ) -> None:
         super().__init__(agent_id, initial_data, settings)
-        self.outbox: list[tuple[int, Message, Recorded | None]] = []
+        self.outbox: list[tuple[int, Message, RecordedBytes | None]] = []
         self.changes: list[tuple[str, str]] = []
-        self.announced: list[Sent] = []
+        self.announced: list[SentMessage] = []
         self.started: dict[str, float] = {}
         if seal is not None and settings.max_block_bytes + SEAL_BYTES > MAX_EVENT_DATA_BYTES:
             raise ValueError(f"sealed event data leaves {MAX_EVENT_DATA_BYTES - SEAL_BYTES} for max_block_bytes")
@@ -63,7 +63,7 @@ class Core(AgentState):
         self.sent[message.NAME] += 1
         datagram = None
         if self._tracing:
-            announced = Sent.of(self.agent_id, self._sequence, message)
+            announced = SentMessage.of(self.agent_id, self._sequence, message)
             self.announced.append(announced)
             datagram = announced.datagram
         self.outbox.append((self._sequence, message, datagram))

@@ -1,7 +1,7 @@
-"""Features: what a mission needs of an agent beyond the base of contract/CONTRACT.md, by name.
+"""Features: optional parts of contract/CONTRACT.md that some missions need.
 
-A mission file lists those that it needs, so that an agent that lacks one can end with status 127 instead of doing
-something else than it was asked for.
+A mission file lists the features that it needs. An agent that lacks one of them ends with status 127 instead of running
+a different mission.
 """
 
 from base64 import b64decode
@@ -12,7 +12,7 @@ from ucp.sealed import sealed_to
 from ucp.settings import ALTERNATIVES, NUMBERS
 
 CONTRACT = 2
-"""The version of contract/CONTRACT.md by which mission files are written."""
+"""The version of contract/CONTRACT.md that mission files follow."""
 
 UNSUPPORTED = 127
 """Exit status of an agent that lacks a feature of its mission."""
@@ -35,9 +35,12 @@ FEATURES: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     **{feature: _has(name, value) for feature, (name, value) in ALTERNATIVES.items()},
     **{name: _is_not_zero(name) for name, number in NUMBERS.items() if number.is_feature},
 }
-"""Feature -> whether a mission file that has all keys needs it, but those of `ucp.settings.ADDED`."""
+"""Feature -> function that returns true if a mission file needs it. The file must be complete.
+
+Only the settings of `ucp.settings.ADDED` may be missing in the file.
+"""
 
 
-def needed(mission: Mapping[str, Any]) -> list[str]:
-    """The features that a mission file needs; it has all keys."""
+def needed_features(mission: Mapping[str, Any]) -> list[str]:
+    """Return the features that a complete mission file needs."""
     return [name for name, is_needed in FEATURES.items() if is_needed(mission)]

@@ -43,7 +43,7 @@ class EventHandler(Generic[P]):
     def title(self) -> str:
         """Return number and name of the algorithm. The docstring of each handler begins with them."""
         algorithm = re.match(rf"Algorithm ({self.algorithm}), (\w[\w ]+\w)", self.run.__doc__ or "")
-        assert algorithm, f"{self.name} says which algorithm it is"
+        assert algorithm, f"the docstring of {self.name} begins with its algorithm"
         return " ".join(algorithm.groups())
 
 

@@ -30,46 +30,46 @@ class Timer:
 class Loop:
     """An event loop. `run` calls due callbacks one after another until `stop`.
 
-    `failed` gets the exception of a callback, and the loop continues. Without `failed`, the exception ends the loop.
-    `selector` waits for sockets. The default one rounds times up to milliseconds.
+    `on_error` gets the exception of a callback, and the loop continues. Without `on_error`, the exception ends the
+    loop. `selector` waits for sockets. The default one rounds times up to milliseconds.
     """
 
     def __init__(
-        self, failed: Callable[[Exception], object] | None = None, selector: selectors.BaseSelector | None = None
+        self, on_error: Callable[[Exception], object] | None = None, selector: selectors.BaseSelector | None = None
     ) -> None:
-        self.failed = failed
+        self.on_error = on_error
         self._selector = selector or selectors.DefaultSelector()
-        self._waiting: dict[socket.socket, tuple[Callback | None, Callback | None]] = {}
-        self._due: list[tuple[float, int, Timer]] = []
-        self._number = count()
+        self._callbacks: dict[socket.socket, tuple[Callback | None, Callback | None]] = {}
+        self._timers: list[tuple[float, int, Timer]] = []
+        self._order = count()
         self._running = True
-        self._awakens: socket.socket | None = None
+        self._wakeup_sender: socket.socket | None = None
 
     def watch(self, sock: socket.socket, *, readable: Callback | None = None, writable: Callback | None = None) -> None:
         """Call back whenever `sock` can be read or written. Without a callback, stop watching the socket."""
         events = (selectors.EVENT_READ if readable else 0) | (selectors.EVENT_WRITE if writable else 0)
-        if sock in self._waiting and events:
+        if sock in self._callbacks and events:
             self._selector.modify(sock, events)
         elif events:
             self._selector.register(sock, events)
-        elif self._waiting.pop(sock, None):
+        elif self._callbacks.pop(sock, None):
             self._selector.unregister(sock)
         if events:
-            self._waiting[sock] = readable, writable
+            self._callbacks[sock] = readable, writable
 
     def call_later(self, delay_s: float, callback: Callback) -> Timer:
         """Call back after `delay_s` seconds of wall time. A negative delay counts as 0."""
         timer = Timer(callback)
-        heapq.heappush(self._due, (time.monotonic() + max(0.0, delay_s), next(self._number), timer))
+        heapq.heappush(self._timers, (time.monotonic() + max(0.0, delay_s), next(self._order), timer))
         return timer
 
     def stop_on(self, *signals: int) -> None:
         """Stop on these signals, until `close`."""
-        awoken, self._awakens = socket.socketpair()
-        for end in (awoken, self._awakens):
+        wakeup_receiver, self._wakeup_sender = socket.socketpair()
+        for end in (wakeup_receiver, self._wakeup_sender):
             end.setblocking(False)
-        signal.set_wakeup_fd(self._awakens.fileno(), warn_on_full_buffer=False)
-        self.watch(awoken, readable=lambda: awoken.recv(64))
+        signal.set_wakeup_fd(self._wakeup_sender.fileno(), warn_on_full_buffer=False)
+        self.watch(wakeup_receiver, readable=lambda: wakeup_receiver.recv(64))
         for number in signals:
             signal.signal(number, lambda *_: self.stop())
 
@@ -79,32 +79,32 @@ class Loop:
     def run(self) -> None:
         """Run until `stop`. The loop may run again afterwards."""
         while self._running:
-            self._call_back(self._selector.select(self._due_in_s()))
-            self._call_what_is_due()
+            self._call_back(self._selector.select(self._seconds_to_next_timer()))
+            self._call_due_timers()
         self._running = True
 
     def close(self) -> None:
         """Stop watching sockets and signals. The caller closes the sockets that it opened."""
-        if self._awakens is not None:
+        if self._wakeup_sender is not None:
             signal.set_wakeup_fd(-1)
-            self._awakens.close()
-        self._waiting.clear()
+            self._wakeup_sender.close()
+        self._callbacks.clear()
         self._selector.close()
 
     def _call_back(self, ready: list[tuple[selectors.SelectorKey, int]]) -> None:
         """Call back for a socket that can be read or written."""
         for key, events in ready:
-            readable, writable = self._waiting.get(key.fileobj, (None, None))  # type: ignore[call-overload]
+            readable, writable = self._callbacks.get(key.fileobj, (None, None))  # type: ignore[call-overload]
             self._call(readable if events & selectors.EVENT_READ and readable else writable)
 
-    def _due_in_s(self) -> float | None:
+    def _seconds_to_next_timer(self) -> float | None:
         """Return the seconds until the next callback is due. None without one."""
-        return max(0.0, self._due[0][0] - time.monotonic()) if self._due else None
+        return max(0.0, self._timers[0][0] - time.monotonic()) if self._timers else None
 
-    def _call_what_is_due(self) -> None:
+    def _call_due_timers(self) -> None:
         now = time.monotonic()
-        while self._running and self._due and self._due[0][0] <= now:
-            self._call(heapq.heappop(self._due)[2].callback)
+        while self._running and self._timers and self._timers[0][0] <= now:
+            self._call(heapq.heappop(self._timers)[2].callback)
 
     def _call(self, callback: Callback | None) -> None:
         if callback is None or not self._running:
@@ -112,6 +112,6 @@ class Loop:
         try:
             callback()
         except Exception as error:
-            if self.failed is None:
+            if self.on_error is None:
                 raise
-            self.failed(error)
+            self.on_error(error)

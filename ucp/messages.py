@@ -47,8 +47,7 @@ class MalformedDatagramError(ValueError):
 
 @dataclass(unsafe_hash=True, slots=True)
 class BlockAddRequest:
-    """A request for votes: may the block with this hash go on top of the chain with this chain hash? (Algorithms 2 and
-    3)"""
+    """A request for votes on a block that goes on top of the chain with this chain hash (Algorithms 2 and 3)."""
 
     NAME: ClassVar[str] = "Block Add Request"
     WIRE: ClassVar[Fields] = {"block_hash": Kind.HASH, "chain_hash": Kind.HASH}
@@ -312,7 +311,7 @@ def decode(datagram: bytes) -> Datagram:
 
 
 def decode_body(code: int, body: bytes) -> Message:
-    """The message of this type with this body. Raises MalformedDatagramError if there is none."""
+    """Parse the body of a message of type `code`. Raises MalformedDatagramError."""
     from_body = _FROM_BODY.get(code)
     if from_body is None:
         raise MalformedDatagramError("unknown type")
@@ -332,7 +331,7 @@ def _flag(body: bytes) -> bool:
 
 
 def decode_block(body: bytes) -> Block:
-    """The block with this block data. Raises MalformedDatagramError if no message can carry it."""
+    """Parse the block data of a block. Raises MalformedDatagramError if no message can carry the block."""
     if not BLOCK_HEADER.size < len(body) <= BLOCK_HEADER.size + MAX_EVENT_DATA_BYTES:
         raise MalformedDatagramError("wrong length")
     agent_id, timestamp_us = BLOCK_HEADER.unpack_from(body)

@@ -24,7 +24,7 @@ MAX_SPEEDUP = 1000.0
 LATEST_EPOCH_US = 2**63 - 1
 """Latest start of a mission. Timestamps of the next centuries then fit into a block."""
 MAX_NAME = 40
-"""Characters of a wrong name that an error shows."""
+"""Maximum number of characters of an unknown name in an error message."""
 
 
 class MissionError(Exception):
@@ -87,7 +87,7 @@ class Mission:
 
 
 def load_mission(path: Path) -> Mission:
-    """Raises MissionError."""
+    """Read a mission file. Raises MissionError."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
@@ -106,9 +106,9 @@ def load_mission(path: Path) -> Mission:
 
 
 def parse_mission(document: Any) -> Mission:
-    """Raises MissionError; UnsupportedMissionError if it needs what this agent does not have."""
+    """Parse a mission. Raises MissionError, or UnsupportedMissionError if it needs a feature that this agent lacks."""
     if not isinstance(document, dict):
-        raise MissionError("not a mission: a JSON object is needed")
+        raise MissionError("not a mission: a JSON object is needed_features")
     if document.get("schema") != SCHEMA:
         raise MissionError(f"`schema` is {shown(document.get('schema'))}, and this agent reads {SCHEMA!r}")
     _check_features(document.get("features", []))
@@ -128,7 +128,7 @@ def parse_mission(document: Any) -> Mission:
     security = _security(document.get("security"))
     if sealed_to(initial_data) is not None:
         if security is None:
-            raise MissionError("`initial_data` ends in a depot's key, to which no agent seals without `security`")
+            raise MissionError("`initial_data` ends in a depot's key, and sealing to it needs `security`")
         if settings.max_block_bytes > (most := MAX_EVENT_DATA_BYTES - SEAL_BYTES):
             raise MissionError(f"`settings.max_block_bytes` is at most {most} where event data is sealed")
     return Mission(
@@ -252,7 +252,7 @@ def _quirks(document: Any) -> dict[str, bool | float]:
         raise MissionError("`quirks` must be a JSON object")
     asked = {name: value for name, value in document.items() if value is not False and value != 0}
     if asked:
-        from ucp.quirks import UnknownQuirkError, check_quirk  # of which a right agent knows none
+        from ucp.quirks import UnknownQuirkError, check_quirk  # correct agents do not load quirks
 
         try:
             for name, value in asked.items():

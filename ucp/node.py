@@ -29,7 +29,7 @@ from ucp.loop import Loop, Timer
 from ucp.messages import MalformedDatagramError
 from ucp.mission import Mission, MissionError, UnsupportedMissionError, is_epoch, load_mission
 from ucp.store import Store, StoreError
-from ucp.trace import Commanded, Entry, HandlerRun, header_line
+from ucp.trace import CommandEntry, Entry, HandlerRun, header_line
 
 if TYPE_CHECKING:
     from ucp.secure.secured_agent import SecuredAgent
@@ -40,39 +40,40 @@ WRONG_MISSION = 2
 
 
 class Node:
-    """Files go to `directory`; `loop` is the main loop of whoever has one (examples/ros2 is one of rclpy).
+    """An agent with its socket, files, clock and event source.
 
-    Raises OSError if the port or a file cannot be had, StoreError for another's store, MissionError for keys that are
-    none.
+    Its files are in `directory`. `loop` replaces the main loop; contract/examples/ros2 passes one of rclpy. Raises
+    OSError if the port or a file cannot be opened, StoreError for the store of another agent, and MissionError for
+    unusable keys.
     """
 
     def __init__(self, mission: Mission, directory: Path, loop: Loop | None = None) -> None:
         self.mission = mission
         self._log_file = LogFile(directory / f"{mission.agent_id}.log")
         self.clock = MissionClock(mission.speedup)
-        self._lots = Random(mission.seed)  # the random draws of its quirks
-        self.agent = self._maker_of_agents(mission, directory)(
+        self._rng = Random(mission.seed)  # the random draws of its quirks
+        self.agent = self._agent_factory(mission, directory)(
             mission.agent_id,
             mission.roster,
             mission.initial_data,
             mission.settings,
         )
         if any(mission.quirks.values()):
-            self._make_wrong()
+            self._apply_quirks()
         self._secured = None if mission.security is None else cast("SecuredAgent", self.agent)
         self.generating = False
         self.handled = 0
         self.bytes_sent = 0
         self.send_failures = 0
-        self._born_s = 0.0  # mission seconds at which the agent joined a mission that was under way
+        self._joined_s = 0.0  # mission seconds at which the agent joined a mission that was under way
         self._directory = directory
         self._trace = TraceFile(directory / f"{mission.agent_id}.trace.jsonl")
         self._store = Store(directory / mission.store, self.agent.state) if mission.store else None
         self._socket = _broadcast_socket(mission)
         self._loop = Loop() if loop is None else loop
-        self._loop.failed = self._failed
+        self._loop.on_error = self._log_exception
         self._timer: Timer | None = None
-        self._end_source: Callable[[], object] = lambda: None
+        self._close_source: Callable[[], object] = lambda: None
         self._control = ControlServer(
             directory / f"{mission.agent_id}.control",
             {
@@ -88,7 +89,7 @@ class Node:
             self._loop,
         )
 
-    def _maker_of_agents(self, mission: Mission, directory: Path) -> "Callable[..., Agent]":
+    def _agent_factory(self, mission: Mission, directory: Path) -> "Callable[..., Agent]":
         if mission.security is None:
             return Agent
         try:
@@ -99,7 +100,7 @@ class Node:
             ) from None
 
         def report_write_error(error: OSError) -> None:
-            self._say(f"the group's last secret is still on disk: {error.strerror}")
+            self._log_line(f"the previous group secret is still on disk: {error.strerror}")
 
         return agent_factory(mission, directory, report_write_error)
 
@@ -108,7 +109,7 @@ class Node:
         self._loop.stop_on(signal.SIGTERM, signal.SIGINT)
         self._loop.watch(self._socket, readable=self._receive)
         self._control.start()
-        self._say(f"agent {self.mission.agent_id} of {list(self.mission.roster)} ready")
+        self._log_line(f"agent {self.mission.agent_id} of {list(self.mission.roster)} ready")
         if self.mission.epoch_us is not None:
             self._begin(self.mission.epoch_us)
         self._loop.run()
@@ -118,21 +119,21 @@ class Node:
         try:
             self.export()
         except OSError as error:
-            self._say(f"could not export the chain: {error.strerror}")
+            self._log_line(f"could not export the chain: {error.strerror}")
             status = 1
         self._trace.close()
         if self._store is not None:
             self._store.close()
         self._control.close()
         self._loop.close()
-        self._say(f"agent {self.mission.agent_id} ended")
+        self._log_line(f"agent {self.mission.agent_id} ended")
         return status
 
-    def _failed(self, error: Exception) -> None:
+    def _log_exception(self, error: Exception) -> None:
         """Record an exception of a handler, and continue, because other agents still need this one."""
         import traceback
 
-        self._say("".join(traceback.format_exception(error)).rstrip())
+        self._log_line("".join(traceback.format_exception(error)).rstrip())
 
     def export(self) -> Path:
         """Write the chain export whole or not at all. Raises OSError."""
@@ -142,13 +143,13 @@ class Node:
         write_json_atomically(path, export_chain(self.agent.state, self.clock.timestamp_us(now), signatures))
         return path
 
-    def _make_wrong(self) -> None:
+    def _apply_quirks(self) -> None:
         from ucp.quirks import wrong_handlers
 
-        self.agent.replace_handlers(wrong_handlers(self.mission.quirks, self._lots))
+        self.agent.replace_handlers(wrong_handlers(self.mission.quirks, self._rng))
 
-    def _say(self, sentence: str) -> None:
-        self._log_file.say(sentence)
+    def _log_line(self, sentence: str) -> None:
+        self._log_file.write_line(sentence)
 
     # Inputs of the agent
 
@@ -156,11 +157,11 @@ class Node:
         for _ in range(DATAGRAMS_PER_TURN):
             try:
                 data, (address, _) = self._socket.recvfrom(MAX_READ_BYTES)
-            except OSError:  # nothing more, or the network is gone for a while
+            except OSError:  # no further datagram, or the network is down for a while
                 return
             if address == self.mission.network.address or not self.clock.running:
                 continue  # the echo of our own broadcast
-            self._drive(partial(self.agent.receive_datagram, data))
+            self._feed(partial(self.agent.receive_datagram, data))
 
     def log_event(self, event_id: int, data: bytes) -> None:
         """Log an event. It has no effect before the mission and after its end."""
@@ -168,28 +169,28 @@ class Node:
             return
         event = LoggableEvent(self.clock.timestamp_us(self.clock.now()), event_id, data)
         try:
-            self._drive(partial(self.agent.add_event, event))
+            self._feed(partial(self.agent.add_event, event))
         except ValueError as error:  # larger than this mission allows
-            self._say(f"event {event_id} not logged: {error}")
+            self._log_line(f"event {event_id} not logged: {error}")
 
     def _handle_timer(self) -> None:
         self._timer = None
-        self._drive(self.agent.handle_timer)
+        self._feed(self.agent.handle_timer)
 
-    def _drive(self, feed: Callable[[float], None]) -> None:
+    def _feed(self, feed: Callable[[float], None]) -> None:
         """Give the agent one input. Then write store and trace, broadcast its messages, and set its next timer.
 
         Store and trace come before the broadcast, because the process can be killed in between.
         """
         feed(self.clock.now())
-        self._keep(self.agent.trace())
+        self._record_entries(self.agent.trace())
         for datagram in self.agent.datagrams_to_send():
             try:
                 self._socket.sendto(datagram, (self.mission.network.broadcast, self.mission.network.port))
                 self.bytes_sent += len(datagram)
-            except OSError as error:  # a radio that cannot send loses the message, as radios do
+            except OSError as error:  # the message is lost, as with a radio that cannot send
                 self.send_failures += 1
-                self._say(f"could not broadcast: {error.strerror}")
+                self._log_line(f"could not broadcast: {error.strerror}")
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -198,57 +199,57 @@ class Node:
             delay = self.clock.wall_s(deadline - self.clock.now())
             self._timer = self._loop.call_later(delay, self._handle_timer)
 
-    def _keep(self, entries: list[Entry]) -> None:
+    def _record_entries(self, entries: list[Entry]) -> None:
         runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
         self.handled += len(runs)
         if self._store is not None and self._store.problem is None:
             secured = None if self._secured is None else self._secured.secured_state()
             self._store.write([change for run in runs for change in run.changes], secured)
             if self._store.problem:
-                self._say(f"the store ends here: {self._store.problem}")
+                self._log_line(f"the store ends here: {self._store.problem}")
         if self._trace.problem is None:
             self._trace.write("".join(entry.to_line() for entry in entries))
             if self._trace.problem:
-                self._say(f"the trace ends here: {self._trace.problem}")
+                self._log_line(f"the trace ends here: {self._trace.problem}")
 
     # Event sources
 
     def _begin(self, epoch_us: int) -> None:
         self.clock.start(epoch_us)
         if self.mission.epoch_us is not None:
-            self._born_s = self.clock.now()
+            self._joined_s = self.clock.now()
         self._trace.write(
             header_line(
                 self.mission.agent_id,
                 list(self.mission.roster),
                 self.mission.initial_data,
-                self.mission.settings.told(),
+                self.mission.settings.to_json(),
                 {"epoch_us": epoch_us, "speedup": self.mission.speedup},
                 self._secured is not None,
             )
         )
         if self._store is not None and self._store.recovered is not None:
-            self._drive(partial(self.agent.boot, self._store.recovered))
-            self._say(f"went on from a store of {len(self.agent.state.chain)} blocks")
+            self._feed(partial(self.agent.boot, self._store.recovered))
+            self._log_line(f"went on from a store of {len(self.agent.state.chain)} blocks")
         self.generating = True
         if self.mission.events.source == "random":
-            self._expect_random_event(RandomEvents(Random(self.mission.seed), self.mission.events.mean_s))
+            self._schedule_random_event(RandomEvents(Random(self.mission.seed), self.mission.events.mean_s))
         elif self.mission.events.source == "mavlink":
-            self._follow_vehicle()
-        self._say(f"mission started, events from {self.mission.events.source}")
+            self._connect_vehicle()
+        self._log_line(f"mission started, events from {self.mission.events.source}")
 
-    def _expect_random_event(self, source: RandomEvents) -> None:
+    def _schedule_random_event(self, source: RandomEvents) -> None:
         due, event_id, data = source.next()
 
         def log() -> None:
-            self._expect_random_event(source)
+            self._schedule_random_event(source)
             self.log_event(event_id, data)
 
-        expected = self._loop.call_later(self.clock.wall_s(self._born_s + due - self.clock.now()), log)
-        self._end_source = expected.cancel
+        expected = self._loop.call_later(self.clock.wall_s(self._joined_s + due - self.clock.now()), log)
+        self._close_source = expected.cancel
 
-    def _follow_vehicle(self) -> None:
-        from ucp.telemetry import TelemetryEvents, VehicleConnection  # for whom there is a vehicle
+    def _connect_vehicle(self) -> None:
+        from ucp.telemetry import TelemetryEvents, VehicleConnection  # only missions with a vehicle load it
 
         source = self.mission.events
         events = TelemetryEvents(source.position_interval_s, Random(self.mission.seed), source.log)
@@ -257,11 +258,11 @@ class Node:
             for event_id, event_data in events.receive(data, self.clock.now()):
                 self.log_event(event_id, event_data)
 
-        self._end_source = VehicleConnection(self._loop, source.vehicle_host, source.vehicle_port, sink).close
+        self._close_source = VehicleConnection(self._loop, source.vehicle_host, source.vehicle_port, sink).close
 
     def _stop_source(self) -> None:
         self.generating = False
-        self._end_source()
+        self._close_source()
 
     # Commands of the control socket
 
@@ -304,21 +305,21 @@ class Node:
 
     def _stop_events(self, request: dict[str, Any]) -> dict[str, Any]:
         self._stop_source()
-        self._take_down_command(request)
+        self._trace_command(request)
         return {}
 
     def _export_command(self, request: dict[str, Any]) -> dict[str, Any]:
-        self._take_down_command(request)
+        self._trace_command(request)
         try:
             return {"path": str(self.export())}
         except OSError as error:
-            self._say(f"could not export the chain: {error.strerror}")
+            self._log_line(f"could not export the chain: {error.strerror}")
             raise CommandError(f"could not export the chain: {error.strerror}") from None
 
     def _quirk(self, request: dict[str, Any]) -> dict[str, Any]:
         name: str = str(request.get("name"))
         value: Any = request.get("value")
-        from ucp.quirks import UnknownQuirkError, check_quirk  # of which a right agent knows none
+        from ucp.quirks import UnknownQuirkError, check_quirk  # correct agents do not load quirks
 
         try:
             check_quirk(name, value)
@@ -327,28 +328,28 @@ class Node:
         except ValueError as error:
             raise CommandError(str(error)) from None
         self.mission.quirks[name] = value
-        self._make_wrong()
-        self._take_down_command(request)
+        self._apply_quirks()
+        self._trace_command(request)
         return self.mission.quirks
 
-    def _take_down_command(self, request: dict[str, Any]) -> None:
+    def _trace_command(self, request: dict[str, Any]) -> None:
         """Write commands that trigger no handler to the trace, except before the mission."""
         if self.clock.running:
-            self._keep([Commanded(self.clock.now(), str(request.get("command")), request)])
+            self._record_entries([CommandEntry(self.clock.now(), str(request.get("command")), request)])
 
     def _revoke(self, request: dict[str, Any]) -> dict[str, Any]:
         revocation = request.get("revocation")
         agent = self._secured
-        assert agent is not None, "no other has this command"
+        assert agent is not None, "only secured agents have this command"
         if not self.clock.running:
             raise CommandError("the mission has not started")
         try:
             body = base64.b64decode(revocation, validate=True)  # type: ignore[arg-type]
 
-            def tell(now: float) -> None:
+            def revoke(now: float) -> None:
                 agent.revoke(body, now)
 
-            self._drive(tell)
+            self._feed(revoke)
         except (TypeError, ValueError) as error:
             why = str(error) if isinstance(error, MalformedDatagramError) else "not in base64"
             raise CommandError(f"no revocation: {why}") from None
@@ -357,7 +358,7 @@ class Node:
     def _reconcile(self, request: dict[str, Any]) -> dict[str, Any]:
         if not self.clock.running:
             raise CommandError("the mission has not started")
-        self._drive(self.agent.begin_reconcile)
+        self._feed(self.agent.begin_reconcile)
         return {}
 
 

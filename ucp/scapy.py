@@ -8,15 +8,16 @@
     air = Ether(dst="ff:ff:ff:ff:ff:ff") / IP(src="10.77.0.1", dst="10.79.255.255") / UDP()
     air / UCP(sender=1) / BlockAddRequest(block_hash=block.block_hash, chain_hash=...)
 
-The layers are made from the declarations in `ucp.messages`, `ucp.block` and `ucp.events`, and bear the thesis's names.
-What is left out is computed: UDP's ports, type and length in the header, an event's length, and a block's timestamp,
-which is that of its newest event (Section 4.2). Addresses that are left out scapy itself looks up, by ARP for one.
+The layers are made from the declarations in `ucp.messages`, `ucp.block` and `ucp.events`, and have the names of the
+thesis. Omitted fields are computed: the UDP ports, type and length in the header, the length of an event, and the
+timestamp of a block, which is that of its newest event (Section 4.2). Omitted addresses are looked up by scapy, for
+example with ARP.
 
-What came over the air becomes a message's layer if and only if the codec accepts the datagram. The body of any other
-is Raw behind the UCP header, and a datagram that does not begin with a header of UCP is Raw as a whole.
+A received datagram gets the layer of its message if and only if the codec accepts the datagram. Otherwise its body is
+Raw after the UCP header. A datagram without a UCP header is Raw as a whole.
 
-Datagrams of secured missions have version 2: SecuredUCP is their header, in clear; behind it is what is Sealed, or a
-Revocation. With a vehicle's bundle the former is a plain packet again:
+Datagrams of secured missions have version 2. SecuredUCP is their clear header. The layer Sealed or Revocation follows
+it. `opened` decrypts a Sealed packet with the bundle of a vehicle:
 
     from ucp.scapy import SecuredUCP, opened
     from ucp.secure.bundle import load_bundle
@@ -86,7 +87,7 @@ class HashField(XStrFixedLenField):
 
 
 class OptionalHashField(HashField):
-    """None where nothing is left for it."""
+    """A hash at the end of a message. It is None if no bytes are left."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, None)
@@ -99,7 +100,7 @@ class OptionalHashField(HashField):
 
 
 class BlockTimestampField(LongField):
-    """If None, the timestamp of the block's newest event."""
+    """The timestamp of a block. None stands for the timestamp of the block's newest event."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, None)  # type: ignore[arg-type]
@@ -111,7 +112,7 @@ class BlockTimestampField(LongField):
 
 
 class CiphertextField(XStrField):
-    """All but the tag and the signature behind it."""
+    """The bytes before the tag and the signature."""
 
     def getfield(self, pkt: Packet, s: bytes) -> tuple[bytes, bytes]:
         return s[-SEAL_BYTES:], s[:-SEAL_BYTES]
@@ -132,7 +133,7 @@ _FIELDS: dict[Kind, Callable[[str], Any]] = {
 
 
 def _fields(declared: Fields, *last: Any, **special: Any) -> list[Any]:
-    """What is declared, then `last`; `special` fields mean more than their kind says."""
+    """Return the scapy fields for declared fields, then `last`. `special` replaces declared fields by name."""
     return [*(special[name] if name in special else _FIELDS[kind](name) for name, kind in declared.items()), *last]
 
 
@@ -159,7 +160,7 @@ def _event_or_raw(block: Packet, before: list[Any], last: Packet | None, rest: b
 
 
 class Block(Packet):
-    """A block as a message carries it. What is no run of whole events is Raw at the end of `events`."""
+    """A block in a message. Event data that is not a run of whole events is Raw at the end of `events`."""
 
     name = "Block"
     fields_desc = _fields(
@@ -170,12 +171,12 @@ class Block(Packet):
 
     @property
     def block_hash(self) -> bytes:
-        """BH_n (eq. 3.1); it is never sent with the block."""
+        """The block hash BH_n (eq. 3.1). It is not part of the message."""
         return hash_digest(bytes(self))
 
 
 class UCP(Packet):
-    """The header. `type` and `length` are those of the message that follows, unless they are given."""
+    """The header. If they are omitted, `type` and `length` are computed from the message that follows."""
 
     name = "UCP"
     fields_desc = _fields(
@@ -206,7 +207,7 @@ class UCP(Packet):
 
 
 class SecuredUCP(Packet):
-    """The clear header of a datagram of a secured mission. `type` and `length` are those of what follows."""
+    """The clear header of a datagram of a secured mission. `length` is computed if it is omitted."""
 
     name = "Secured UCP"
     fields_desc = _fields(
@@ -232,7 +233,7 @@ class SecuredUCP(Packet):
 
 
 class Sealed(Packet):
-    """What only those who have keys can read; `opened` reads it."""
+    """The encrypted part of a datagram with its masked signature. `opened` decrypts it."""
 
     name = "Sealed"
     fields_desc = _fields(
@@ -244,7 +245,7 @@ class Sealed(Packet):
 
 
 class Revocation(Packet):
-    """Which agents' keys are revoked, signed by the authority; `count` is computed if it is left out."""
+    """The agents whose keys are revoked, signed by the authority. `count` is computed if it is omitted."""
 
     name = "Revocation"
     fields_desc = _fields(
@@ -287,7 +288,7 @@ class ChainHashSuccessorQuery(Packet):
 
 
 class NextInSequenceResponse(Packet):
-    """`block_hash` None: Is Top Of Chain."""
+    """A response of phase 2. `block_hash` None stands for "Is Top Of Chain"."""
 
     name = messages.NextInSequenceResponse.NAME
     fields_desc = _fields(messages.NextInSequenceResponse.WIRE)
@@ -323,14 +324,14 @@ bind_bottom_up(UDP, UCP, dport=PORT)
 
 
 def to_layer(message: Message) -> Packet:
-    """The layer of a codec's message, to put behind a UCP header."""
+    """Return the layer of a message of the codec, to put after a UCP header."""
     return LAYERS[type(message)](message.body())
 
 
 def opened(packet: Packet, opener: "Opener") -> Packet:
-    """The plain packet, UCP and a message, that says what a secured one does.
+    """Return the plain packet (UCP and a message) with the content of a secured packet.
 
-    Raises MalformedDatagramError for what these keys do not open, and says why.
+    Raises MalformedDatagramError with the reason if the keys do not open the packet.
     """
     header = packet.getlayer(SecuredUCP)
     if header is None:
@@ -339,8 +340,8 @@ def opened(packet: Packet, opener: "Opener") -> Packet:
 
 
 def message_of(packet: Packet) -> tuple[int, int, Message]:
-    """(sender, sequence, message) as the codec reads them from a packet. Raises MalformedDatagramError."""
+    """Return (sender, sequence, message) of a packet, as the codec reads them. Raises MalformedDatagramError."""
     header = packet.getlayer(UCP)
     if header is None:
         raise MalformedDatagramError("no UCP")
-    return decode(header.do_build())  # without what the link may have added
+    return decode(header.do_build())  # without bytes that the link may have added

@@ -1,6 +1,6 @@
 """Settings of an agent: timers, sizes, readings of an ambiguous thesis, and changes of the protocol.
 
-Each setting is declared once, as a field of `Settings`. The declaration says what the field may be and what it does.
+Each setting is declared once, as a field of `Settings`. The declaration has its allowed values and its effect.
 Other modules read the declarations and do not name the settings: features, schemas, the table in contract/CONTRACT.md,
 the variants of the conformance test, the changes that `explore` tries, and the constants of the TLA+ specification. A
 new setting needs a field here and the handler that acts on it. `Annotated` carries a declaration because it needs no
@@ -16,7 +16,7 @@ from ucp.events import MAX_EVENT_BYTES
 from ucp.short_value import shown
 
 MAX_TIMER_S = 1e9
-"""Thirty years."""
+"""Maximum duration of a timer: 30 years."""
 
 
 @dataclass(eq=False, frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Choice:
 
     @property
     def allowed(self) -> str:
-        """The values in words."""
+        """The allowed values as text."""
         return "true or false" if self.values == (False, True) else f"one of {', '.join(map(str, self.values))}"
 
 
@@ -166,14 +166,14 @@ class Settings:
             if not isinstance(value, type(choice.values[0])) or value not in choice.values:
                 raise ValueError(f"{name} must be {choice.allowed}, not {shown(value)}")
 
-    def told(self) -> dict[str, Any]:
-        """Return the settings as missions and traces have them, without those of `ADDED` that have their default.
+    def to_json(self) -> dict[str, Any]:
+        """Return the settings for missions and traces, without those of `ADDED` that have their default.
 
         An agent that does not know such a setting can then play a mission that does not need it.
         """
         usual = Settings()
-        told = {name: getattr(self, name) for name in self.__match_args__}
-        return {name: value for name, value in told.items() if name not in ADDED or value != getattr(usual, name)}
+        values = {name: getattr(self, name) for name in self.__match_args__}
+        return {name: value for name, value in values.items() if name not in ADDED or value != getattr(usual, name)}
 
 
 DECLARED: dict[str, Number | Choice] = {name: kind.__metadata__[0] for name, kind in Settings.__annotations__.items()}

@@ -1,8 +1,8 @@
-"""A value that anybody may have written, as an error's sentence shows it: short, on one line, whatever it is."""
+"""Show a value of external input in an error message, short and on one line."""
 
 import reprlib
 
-MOST_CHARACTERS = 120
+MAX_CHARACTERS = 120
 
 
 class _Short(reprlib.Repr):
@@ -18,11 +18,11 @@ class _Short(reprlib.Repr):
 
 
 def shown_key(key: object) -> str:
-    """A key of a mapping, as it stands there; or its beginning."""
-    return key if isinstance(key, str) and key.isprintable() and len(key) <= MOST_CHARACTERS else shown(key)
+    """Return a key of a mapping for an error message. A long key is shortened."""
+    return key if isinstance(key, str) and key.isprintable() and len(key) <= MAX_CHARACTERS else shown(key)
 
 
 def shown(value: object) -> str:
-    """The value as Python writes it, or its beginning."""
+    """Return the `repr` of a value for an error message. A long one is shortened."""
     text = _Short().repr(value)
-    return text if len(text) <= MOST_CHARACTERS else f"{text[: MOST_CHARACTERS - 3]}..."
+    return text if len(text) <= MAX_CHARACTERS else f"{text[: MAX_CHARACTERS - 3]}..."

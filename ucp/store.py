@@ -181,38 +181,38 @@ class Store:
         """
         if self.problem is not None:
             return
-        beside = {} if secured is None else secured.entry(self._secured)
+        secured_entry = {} if secured is None else secured.entry(self._secured)
         self._secured = secured
-        if not (changes or beside):
+        if not (changes or secured_entry):
             return
         new = dict.fromkeys(block_hash for _, block_hash in changes if block_hash not in self._written)
         blocks = [self._block(block_hash) for block_hash in new]
         entry = {
             "changes": changes,
             "blocks": [[block.agent_id, block.timestamp_us, _base64(block.event_data)] for block in blocks],
-            **({"secured": beside} if beside else {}),
+            **({"secured": secured_entry} if secured_entry else {}),
         }
         try:
             if self._file is None:
-                self._file = self._begin(_line(self._header) + _line(entry))
+                self._file = self._replace_journal(_line(self._header) + _line(entry))
             else:
                 _append(self._file, _line(entry))
         except OSError as error:
             self.problem = error.strerror or str(error)
         self._written.update(new)
 
-    def _begin(self, lines: bytes) -> BinaryIO:
+    def _replace_journal(self, lines: bytes) -> BinaryIO:
         """Replace the journal by a new one that begins with these lines."""
-        beside = self._path.with_name(f".{self._path.name}.new")
-        file = beside.open("wb", buffering=0)
+        temporary = self._path.with_name(f".{self._path.name}.new")
+        file = temporary.open("wb", buffering=0)
         try:
             _append(file, lines)
-            beside.replace(self._path)
+            temporary.replace(self._path)
             _sync_directory(self._path.parent)
         except BaseException:
             file.close()
             with contextlib.suppress(OSError):
-                beside.unlink()
+                temporary.unlink()
             raise
         return file
 

@@ -1,15 +1,15 @@
-"""The thesis's timer (Section 3.2): counts down, can be paused and resumed, and fires once. Time is an argument."""
+"""The timer of the thesis (Section 3.2). It expires once, and can be paused and resumed. Time is an argument."""
 
 
 class Timer:
-    """`deadline` is in mission seconds; None while the timer is stopped or paused."""
+    """A timer. `deadline` is in mission seconds, and None while the timer is stopped or paused."""
 
     __slots__ = ("_paused", "deadline", "name")
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.deadline: float | None = None
-        self._paused: tuple[float, float] | None = None  # when, and the deadline that it had
+        self._paused: tuple[float, float] | None = None  # time of the pause, deadline before it
 
     @property
     def active(self) -> bool:

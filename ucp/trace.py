@@ -27,7 +27,7 @@ class Encodable(Protocol):
     def encode(self) -> bytes: ...
 
 
-class Recorded:
+class RecordedBytes:
     """Recorded bytes: `text` is base64, and `content` the decoded object, None if it was read from a trace.
 
     Sender and receivers of a datagram share one object.
@@ -36,21 +36,21 @@ class Recorded:
     __slots__ = ("_text", "content")
 
     def __init__(self, text: str | None = None, content: Encodable | None = None) -> None:
-        """Either is needed."""
+        """Create a record from its base64 text or its decoded object. One of them is enough."""
         self._text = text
         self.content = content
 
     @property
     def text(self) -> str:
         if self._text is None:
-            assert self.content is not None, "a record has a text, or what to make it of"
+            assert self.content is not None, "a record has a text or a content"
             self._text = in_base64(self.content.encode())
         return self._text
 
     def __eq__(self, other: object) -> bool:
         if self is other:
             return True
-        if not isinstance(other, Recorded):
+        if not isinstance(other, RecordedBytes):
             return False
         if type(self.content) is type(other.content) is not type(None) and self.content == other.content:
             return True
@@ -64,13 +64,13 @@ class Recorded:
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> dict[str, Any]:
-        """In a line of a trace it is a string."""
+        """Read the record from a string of a trace line."""
         made = {"type": "no-info", "function": cls}
         return {"type": "function-after", "function": made, "schema": handler(str)}
 
 
 @dataclass(slots=True)
-class Sent:
+class SentMessage:
     """A sent message. `block` is the hash of the block that it concerns, or None.
 
     `datagram` is None in a trace of version 1, which lacks it.
@@ -79,12 +79,12 @@ class Sent:
     message: str
     seq: int
     block: str | None = None
-    datagram: Recorded | None = None
+    datagram: RecordedBytes | None = None
 
     @classmethod
-    def of(cls, sender: int, sequence: int, message: Message) -> "Sent":
+    def of(cls, sender: int, sequence: int, message: Message) -> "SentMessage":
         block_hash = block_named(message)
-        datagram = Recorded(None, Datagram(sender, sequence, message))
+        datagram = RecordedBytes(None, Datagram(sender, sequence, message))
         return cls(message.NAME, sequence, block_hash.hex() if block_hash else None, datagram)
 
 
@@ -123,12 +123,12 @@ class HandlerRun:
     trigger: Trigger
     branch: str
     changes: list[tuple[str, str]]
-    sent: list[Sent]
+    sent: list[SentMessage]
     state: StateSummary
-    input: Recorded | None = None
+    input: RecordedBytes | None = None
     tally: Tally | None = None
     started: dict[str, float] | None = None
-    sealed: Recorded | None = None
+    sealed: RecordedBytes | None = None
 
     def to_line(self) -> str:
         state = self.state
@@ -168,19 +168,19 @@ class HandlerRun:
 
 
 @dataclass(slots=True)
-class Dropped:
+class DroppedDatagram:
     """A datagram that the agent dropped, and the reason."""
 
     t: float
     dropped: str
-    datagram: Recorded
+    datagram: RecordedBytes
 
     def to_line(self) -> str:
         return _encode({"t": round(self.t, 6), "dropped": self.dropped, "datagram": self.datagram.text}) + "\n"
 
 
 @dataclass(slots=True)
-class Commanded:
+class CommandEntry:
     """A command that triggers no handler, with its arguments."""
 
     t: float
@@ -191,7 +191,7 @@ class Commanded:
         return _encode({"t": round(self.t, 6), "command": self.command, "request": self.request}) + "\n"
 
 
-Entry = HandlerRun | Dropped | Commanded
+Entry = HandlerRun | DroppedDatagram | CommandEntry
 """The content of a line of a trace, except the header."""
 
 

@@ -24,7 +24,7 @@ from ucp.export import export_chain
 from ucp.messages import MalformedDatagramError
 from ucp.mission import MAX_MISSION_BYTES, Mission, MissionError, UnsupportedMissionError, is_epoch, parse_mission
 from ucp.store import SecuredState, StoredState, block_on_disk
-from ucp.trace import Commanded, HandlerRun, in_base64
+from ucp.trace import CommandEntry, HandlerRun, in_base64
 
 if TYPE_CHECKING:
     from ucp.secure.secured_agent import SecuredAgent
@@ -48,7 +48,7 @@ def serve(lines: BinaryIO, answers: BinaryIO) -> None:
     agent: VirtualAgent | None = None
     while line := lines.readline(MAX_LINE_BYTES):
         try:
-            given = _read(line)
+            given = _parse_line(line)
             if "mission" in given:
                 agent = None
                 agent = VirtualAgent(given)
@@ -82,9 +82,9 @@ class VirtualAgent:
             )
         self._epoch_us = mission.epoch_us
         self._tracing = given.get("trace", True) is True
-        self._lots = Random(mission.seed)
+        self._rng = Random(mission.seed)
         """The random draws of its quirks."""
-        make, self._secured = _maker(mission, given), mission.security is not None
+        make, self._secured = _agent_factory(mission, given), mission.security is not None
         self._agent = make(
             mission.agent_id,
             mission.roster,
@@ -93,16 +93,16 @@ class VirtualAgent:
             tracing=self._tracing,
         )
         if any(mission.quirks.values()):
-            self._make_wrong()
+            self._apply_quirks()
         self._now = -math.inf
         self._generating = True
         self._handled = self._bytes_sent = 0
-        self._told: dict[str, Any] | None = None
+        self._command_answer: dict[str, Any] | None = None
         """The answer to the last command."""
-        self._noted: list[Commanded] = []
+        self._traced_commands: list[CommandEntry] = []
         now = self._advance(given)
         if given.get("store") is not None:
-            self._agent.boot(_stored(given["store"], secured=self._secured), now)
+            self._agent.boot(_parse_store(given["store"], secured=self._secured), now)
 
     def give(self, given: dict[str, Any]) -> None:
         """Handle one input. Raises InputError for a refused input, which changes nothing, not even the agent's time."""
@@ -114,22 +114,22 @@ class VirtualAgent:
             raise
 
     def _give(self, given: dict[str, Any], now: float) -> None:
-        self._told = None
+        self._command_answer = None
         if "datagram" in given:
-            self._agent.receive_datagram(_decoded(given, "datagram"), now)
+            self._agent.receive_datagram(_decode_base64(given, "datagram"), now)
         elif "timer" in given:
             self._agent.handle_timer(now)
         elif "event_id" in given:
             self._log(given, now)
         elif "command" in given:
-            self._told = self._do(given, now)
+            self._command_answer = self._do(given, now)
         else:
             raise InputError("neither a mission, a datagram, an event, a timer nor a command")
 
     def answer(self) -> str:
         """Return the results of the last input as a line."""
-        entries = [*self._agent.trace(), *self._noted]
-        self._noted = []
+        entries = [*self._agent.trace(), *self._traced_commands]
+        self._traced_commands = []
         self._handled += sum(isinstance(entry, HandlerRun) for entry in entries)
         datagrams = self._agent.datagrams_to_send()
         self._bytes_sent += sum(map(len, datagrams))
@@ -139,8 +139,8 @@ class VirtualAgent:
         ]
         if self._tracing:
             parts.append(f'"trace":[{",".join(entry.to_line().rstrip() for entry in entries)}]')
-        if self._told is not None:
-            parts.append(f'"answer":{json.dumps(self._told)}')
+        if self._command_answer is not None:
+            parts.append(f'"answer":{json.dumps(self._command_answer)}')
         return "{" + ",".join(parts) + "}"
 
     def _advance(self, given: dict[str, Any]) -> float:
@@ -157,7 +157,7 @@ class VirtualAgent:
         if type(event_id) is not int or type(timestamp_us) is not int or not is_epoch(timestamp_us):
             raise InputError("an event needs `event_id` and `timestamp_us`, whole numbers, of at most 2^63-1")
         try:
-            event = LoggableEvent(timestamp_us, event_id, _decoded(given, "data"))
+            event = LoggableEvent(timestamp_us, event_id, _decode_base64(given, "data"))
             self._agent.check_size(event)
         except ValueError as error:
             raise InputError(f"the event cannot be logged: {error}") from None
@@ -188,7 +188,7 @@ class VirtualAgent:
         return {"ok": True}
 
     def _export(self, given: dict[str, Any], now: float) -> dict[str, Any]:
-        self._note(given, now)
+        self._trace_command(given, now)
         exported_at_us = max(0, self._epoch_us + round(now * MICROSECONDS))
         signatures = cast("SecuredAgent", self._agent).signatures if self._secured else None
         return export_chain(self._agent.state, exported_at_us, signatures)
@@ -197,12 +197,12 @@ class VirtualAgent:
         stored = StoredState.of(self._agent.state)
         if self._secured:
             stored.secured = cast("SecuredAgent", self._agent).secured_state()
-        return {"ok": True, "store": _to_store(stored)}
+        return {"ok": True, "store": _store_document(stored)}
 
     def _revoke(self, given: dict[str, Any], now: float) -> dict[str, Any]:
         agent = cast("SecuredAgent", self._agent)
         try:
-            agent.revoke(_decoded(given, "revocation"), now)
+            agent.revoke(_decode_base64(given, "revocation"), now)
         except InputError as error:
             return {"ok": False, "error": str(error)}
         except MalformedDatagramError as malformed:
@@ -211,11 +211,11 @@ class VirtualAgent:
 
     def _stop_events(self, given: dict[str, Any], now: float) -> dict[str, Any]:
         self._generating = False
-        self._note(given, now)
+        self._trace_command(given, now)
         return {"ok": True}
 
     def _quirk(self, given: dict[str, Any], now: float) -> dict[str, Any]:
-        from ucp.quirks import UnknownQuirkError, check_quirk  # of which a right agent knows none
+        from ucp.quirks import UnknownQuirkError, check_quirk  # correct agents do not load quirks
 
         name, value = str(given.get("name")), given.get("value")
         try:
@@ -226,20 +226,20 @@ class VirtualAgent:
             return {"ok": False, "error": str(error)}
         quirks = self._mission.quirks
         quirks[name] = value  # type: ignore[assignment]  # it was checked
-        self._make_wrong()
-        self._note(given, now)
+        self._apply_quirks()
+        self._trace_command(given, now)
         return {"ok": True, **quirks}
 
-    def _make_wrong(self) -> None:
+    def _apply_quirks(self) -> None:
         from ucp.quirks import wrong_handlers
 
-        self._agent.replace_handlers(wrong_handlers(self._mission.quirks, self._lots))
+        self._agent.replace_handlers(wrong_handlers(self._mission.quirks, self._rng))
 
-    def _note(self, given: dict[str, Any], now: float) -> None:
+    def _trace_command(self, given: dict[str, Any], now: float) -> None:
         """Write a command that triggers no handler to the trace."""
         if self._tracing:
             request = {key: value for key, value in given.items() if key != "t"}
-            self._noted.append(Commanded(now, str(given["command"]), request))
+            self._traced_commands.append(CommandEntry(now, str(given["command"]), request))
 
 
 _COMMANDS: dict[str, Callable[[VirtualAgent, dict[str, Any], float], dict[str, Any]]] = {
@@ -252,7 +252,7 @@ _COMMANDS: dict[str, Callable[[VirtualAgent, dict[str, Any], float], dict[str, A
 }
 
 
-def _maker(mission: Mission, given: dict[str, Any]) -> Callable[..., Agent]:
+def _agent_factory(mission: Mission, given: dict[str, Any]) -> Callable[..., Agent]:
     """Return a function that makes the agent of the mission, with the arguments of Agent. Raises InputError."""
     if mission.security is None:
         return Agent
@@ -267,9 +267,9 @@ def _maker(mission: Mission, given: dict[str, Any]) -> Callable[..., Agent]:
         raise InputError(str(error)) from None
 
 
-def _read(line: bytes) -> dict[str, Any]:
+def _parse_line(line: bytes) -> dict[str, Any]:
     try:
-        given = json.loads(line.decode())  # of bytes, json would also read UTF-16
+        given = json.loads(line.decode())  # given bytes, json would also accept UTF-16
     except (ValueError, RecursionError):
         raise InputError("not a line of JSON") from None
     if not isinstance(given, dict):
@@ -277,17 +277,17 @@ def _read(line: bytes) -> dict[str, Any]:
     return given
 
 
-def _decoded(given: dict[str, Any], key: str) -> bytes:
+def _decode_base64(given: dict[str, Any], key: str) -> bytes:
     try:
         return base64.b64decode(given[key], validate=True)
     except (KeyError, TypeError, binascii.Error, ValueError):
         raise InputError(f"`{key}` must be in base64") from None
 
 
-# What a brown-out leaves
+# The store of a brown-out as JSON
 
 
-def _to_store(stored: StoredState) -> dict[str, Any]:
+def _store_document(stored: StoredState) -> dict[str, Any]:
     def listed(blocks: list[Block]) -> list[list[Any]]:
         return [[block.agent_id, block.timestamp_us, in_base64(block.event_data)] for block in blocks]
 
@@ -300,8 +300,8 @@ def _to_store(stored: StoredState) -> dict[str, Any]:
     }
 
 
-def _stored(value: Any, *, secured: bool) -> StoredState:
-    """Raises InputError."""
+def _parse_store(value: Any, *, secured: bool) -> StoredState:
+    """Parse the answer to the command `store`. Raises InputError."""
 
     def blocks(place: str) -> list[Block]:
         return [
@@ -322,6 +322,6 @@ def _stored(value: Any, *, secured: bool) -> StoredState:
 
 
 def main() -> int:
-    """Exit status 0, at the end of standard input."""
+    """Serve until the end of standard input. The exit status is 0."""
     serve(sys.stdin.buffer, sys.stdout.buffer)
     return 0

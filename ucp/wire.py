@@ -1,7 +1,7 @@
 """Kinds of fields on the wire.
 
-Messages, blocks and events declare their fields: by name, in the order in which they are sent, each with its kind. The
-scapy layers (`ucp.scapy`) are made from the declarations; tests hold the codec and the Wireshark dissector to them.
+Messages, blocks and events declare their fields with names and kinds, in the order on the wire. `ucp.scapy` makes its
+layers from these declarations. Tests compare the codec and the Wireshark dissector with them.
 """
 
 from collections.abc import Mapping

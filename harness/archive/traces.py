@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple, TypeVar, get_args
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
 from harness.errors import RunDirectoryError
-from ucp.trace import Commanded, Dropped, Entry, HandlerRun
+from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun
 
 SUFFIX = ".trace.jsonl"
 MAX_LINE_BYTES = 16 * 1024 * 1024
@@ -93,7 +93,7 @@ _LOST = re.compile(rb'\{"lost_lines":(\d{1,9}),"lost_bytes":(\d{1,12})\}')
 
 HEADER: TypeAdapter[Header] = TypeAdapter(_VersionedHeader)
 HANDLER_RUN = TypeAdapter(HandlerRun)
-ASIDE = TypeAdapter(Dropped | Commanded)
+ASIDE = TypeAdapter(DroppedDatagram | CommandEntry)
 
 
 def read_clock(path: Path) -> dict[str, Any]:
@@ -129,7 +129,7 @@ class Trace:
     header: Header
     runs: list[HandlerRun] = field(default_factory=list)
     starts: list[int] = field(default_factory=list)
-    asides: list[tuple[int, Dropped | Commanded]] = field(default_factory=list)
+    asides: list[tuple[int, DroppedDatagram | CommandEntry]] = field(default_factory=list)
     problem: str | None = None
     cut_off: bool = False
     """True if the file ends within a line. That line is not read."""
@@ -159,7 +159,7 @@ class Trace:
             for number, run in enumerate(islice(self.runs, start, end), start)
         )
 
-    def numbered_asides(self) -> Iterator[tuple[int, Dropped | Commanded]]:
+    def numbered_asides(self) -> Iterator[tuple[int, DroppedDatagram | CommandEntry]]:
         """Yield the asides with their line numbers."""
         if self.lines is not None:
             yield from zip(self.lines[1], (aside for _, aside in self.asides), strict=True)

@@ -34,7 +34,7 @@ from harness.scenario.changes import NO_MORE_FATES
 from netem.conditions import NetworkConditions
 from netem.link import LinkConditions
 from ucp.block import HASH_BYTES
-from ucp.trace import HandlerRun, Sent
+from ucp.trace import HandlerRun, SentMessage
 from ucp.trigger import MessageTrigger
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 Derived = TypeVar("Derived")
 
-Sending = tuple[tuple[float, Sent], ...]
+Sending = tuple[tuple[float, SentMessage], ...]
 """Mission seconds and messages of one agent with one type and sequence number: at most one in each incarnation."""
 Sendings = dict[Any, dict[Any, Sending]]
 """The messages that one agent sent: type -> sequence number -> sendings."""

@@ -9,7 +9,7 @@ from ucp.block import BLOCK_HEADER, Block
 from ucp.events import LoggableEvent, MalformedEventsError, decode_event
 from ucp.messages import BlockResponse, CommitBlock, Datagram, MalformedDatagramError, Message, decode
 from ucp.store import StoredState
-from ucp.trace import Recorded
+from ucp.trace import RecordedBytes
 
 KEPT = 4096
 """Number of decoded datagrams in the cache. One datagram reaches many agents."""
@@ -21,7 +21,7 @@ class NotOnRecordError(Exception):
     """A required value is not in the records. The message is one sentence."""
 
 
-def decoded(record: Recorded | None) -> Datagram:
+def decoded(record: RecordedBytes | None) -> Datagram:
     """Return the decoded datagram. Raises MalformedDatagramError."""
     if record is None:
         return _decoded("")
@@ -38,7 +38,7 @@ def _decoded(text: str) -> Datagram:
     return decode(data)
 
 
-def event_of(record: Recorded | None) -> LoggableEvent:
+def event_of(record: RecordedBytes | None) -> LoggableEvent:
     """Return the decoded event. Raises MalformedEventsError."""
     if record is not None and isinstance(record.content, LoggableEvent):
         return record.content
@@ -52,7 +52,7 @@ def event_of(record: Recorded | None) -> LoggableEvent:
     return event
 
 
-def sealed_of(record: Recorded | None) -> bytes | None:
+def sealed_of(record: RecordedBytes | None) -> bytes | None:
     """Return the sealed data of an agent. None if the record has none, or is not base64."""
     try:
         return None if record is None else base64.b64decode(record.text, validate=True)
@@ -60,7 +60,7 @@ def sealed_of(record: Recorded | None) -> bytes | None:
         return None
 
 
-def stored_blocks(record: Recorded | None) -> Iterator[Block]:
+def stored_blocks(record: RecordedBytes | None) -> Iterator[Block]:
     """Yield the blocks of a store. Each follows its length. Raises ValueError."""
     if record is not None and isinstance(record.content, StoredState):
         yield from record.content.blocks()

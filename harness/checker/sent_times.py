@@ -9,7 +9,7 @@ from binascii import Error
 from hashlib import sha256
 
 from harness.archive.traces import Trace
-from ucp.trace import HandlerRun, Sent
+from ucp.trace import HandlerRun, SentMessage
 
 ANSWERS = frozenset(
     ("Block Add Response", "Chain Contain Response", "Next in Sequence Response", "Block Response"),
@@ -22,7 +22,7 @@ def spread_of(trace: Trace) -> float:
     return float(spread_s) if isinstance(spread_s, int | float) and spread_s > 0 else 0.0
 
 
-def sent_at(run: HandlerRun, message: Sent, spread_s: float) -> float:
+def sent_at(run: HandlerRun, message: SentMessage, spread_s: float) -> float:
     """Return the mission second at which a message of the run is sent."""
     if not spread_s or message.message not in ANSWERS or message.datagram is None:
         return run.t

@@ -60,7 +60,7 @@ def scenario_of(name: str, command: Sequence[str], variant: Variant, way: Sequen
         "agent_command": {AGENT: list(command)},
         "duration_s": math.ceil(writer.now) + 1,
         "initial_data": base64.b64encode(INITIAL_DATA).decode("ascii"),
-        "settings": _unusual(variant.settings.told()),
+        "settings": _unusual(variant.settings.to_json()),
         "timeline": timeline,
         "events": {"source": "scripted"} | ({"script": script} if script else {}),
         "datagrams": datagrams,
@@ -69,7 +69,7 @@ def scenario_of(name: str, command: Sequence[str], variant: Variant, way: Sequen
 
 
 def _unusual(settings: dict[str, Any]) -> dict[str, Any]:
-    usual = Settings().told()
+    usual = Settings().to_json()
     return {name: value for name, value in settings.items() if name not in usual or usual[name] != value}
 
 

@@ -81,7 +81,7 @@ def mission(
             "vehicle_host": "127.0.0.1",
             "vehicle_port": 5762,
         },
-        "settings": variant.settings.told(),
+        "settings": variant.settings.to_json(),
         "quirks": dict(NO_QUIRKS),
         "seed": 1,
         "speedup": speedup,

@@ -14,7 +14,7 @@ from ucp.block import Block, next_chain_hash
 from ucp.messages import CommitBlock, Message, decode, encode
 from ucp.quirks import wrong_handlers
 from ucp.store import StoredState
-from ucp.trace import Dropped
+from ucp.trace import DroppedDatagram
 
 
 def state_of(agent: Agent) -> bytes:
@@ -56,7 +56,7 @@ def test_hostile_input_is_counted_and_dropped_and_changes_nothing(datagrams: lis
         agent.receive_datagram(datagram, 1.0)
     assert sum(agent.dropped.values()) == len(datagrams)
     assert not agent.received
-    assert [entry.datagram.text for entry in agent.trace() if isinstance(entry, Dropped)] == [
+    assert [entry.datagram.text for entry in agent.trace() if isinstance(entry, DroppedDatagram)] == [
         base64.b64encode(datagram).decode() for datagram in datagrams
     ]
     assert state_of(agent) == before

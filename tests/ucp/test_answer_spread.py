@@ -92,5 +92,5 @@ def test_impossible_spread_is_refused(spread_s: object) -> None:
 
 def test_scenario_has_the_setting() -> None:
     scenario = Scenario.model_validate({"name": "spread", "agents": 3, "settings": {"answer_spread_s": 0.5}})
-    assert scenario.settings.told()["answer_spread_s"] == 0.5
-    assert "answer_spread_s" not in Settings().told()
+    assert scenario.settings.to_json()["answer_spread_s"] == 0.5
+    assert "answer_spread_s" not in Settings().to_json()

@@ -25,7 +25,7 @@ from ucp.contract import schemas, vectors
 from ucp.contract.schemas._control_schema import MAY_BE_MISSING, REQUESTS, STATUS
 from ucp.contract.schemas._trace_schema import DROPS, OPERATIONS, SECURED_DROPS
 from ucp.contract.vectors.replay import differences
-from ucp.features import FEATURES, needed
+from ucp.features import FEATURES, needed_features
 from ucp.messages import RequestForBlock, encode
 from ucp.sealed import seal_to
 from ucp.settings import ALTERNATIVES, Settings
@@ -154,7 +154,7 @@ def test_mission_files_fit_their_schema_and_name_the_features_that_they_need() -
         1, rich, 0, seal_to(b"", bytes(32)), with_vehicle=True, store="1.store", bundle="1.bundle.json", **told
     )
     assert (without["contract"], without["features"]) == (2, [])
-    assert with_all["features"] == [*FEATURES] == needed(with_all)
+    assert with_all["features"] == [*FEATURES] == needed_features(with_all)
     for document in (without, with_all):
         validator("mission").validate(document)
 

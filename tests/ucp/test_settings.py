@@ -22,7 +22,7 @@ def test_each_default_is_allowed_and_is_the_first_choice() -> None:
 
 @pytest.mark.parametrize(("name", "value"), ALTERNATIVES.values(), ids=ALTERNATIVES)
 def test_settings_take_each_alternative_and_write_it(name: str, value: Any) -> None:
-    assert Settings(**{name: value}).told()[name] == value
+    assert Settings(**{name: value}).to_json()[name] == value
 
 
 def test_specification_has_each_constant() -> None:

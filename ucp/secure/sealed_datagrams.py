@@ -22,7 +22,7 @@ from ucp.secure.envelope import (
     ClearHeader,
     read_clear_header,
 )
-from ucp.trace import Recorded
+from ucp.trace import RecordedBytes
 
 _DATAGRAM = b"UCP datagram\0"
 
@@ -44,7 +44,7 @@ class OpenedDatagram(NamedTuple):
 
     clear: ClearHeader
     datagram: Datagram
-    recorded: Recorded
+    recorded: RecordedBytes
     """The datagram of version 1 with the same content, as the trace records it."""
     request: Request | None
     """The request that it answers. None if it is not a response."""
@@ -82,7 +82,7 @@ def parse_body(clear: ClearHeader, body: bytes) -> OpenedDatagram:
             raise MalformedDatagramError("wrong length")
         body, block_signature = body[:-SIGNATURE_BYTES], body[-SIGNATURE_BYTES:]
     datagram = Datagram(clear.sender, clear.sequence, decode_body(clear.type, body))
-    return OpenedDatagram(clear, datagram, Recorded(None, datagram), request, block_signature)
+    return OpenedDatagram(clear, datagram, RecordedBytes(None, datagram), request, block_signature)
 
 
 class Signer(Protocol):

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
-from ucp.agent import Agent, why_not_handled
+from ucp.agent import Agent, drop_reason
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
 from ucp.secure._signatures import BlockSignatures
 from ucp.secure.envelope import BOOT_BYTES, CLEAR, LAST_SEQUENCE, REQUESTS, REVOCATION, ClearHeader
@@ -22,7 +22,7 @@ from ucp.secure.revocation import Revocation, RevocationError
 from ucp.secure.sealed_datagrams import OpenedDatagram, Request
 from ucp.secure.session import Session
 from ucp.store import SecuredState, StoredState
-from ucp.trace import Commanded, Recorded, in_base64
+from ucp.trace import CommandEntry, RecordedBytes, in_base64
 
 REVOCATION_INTERVAL_S = 5.0
 """Minimum time in mission seconds between two broadcasts of a revocation."""
@@ -35,7 +35,7 @@ class OutgoingDatagram(NamedTuple):
     sealed: bytes
     sequence: int = 0
     message: Message | None = None
-    plain: Recorded | None = None
+    plain: RecordedBytes | None = None
 
 
 def make_boot(started_us: int, random_bytes: bytes) -> bytes:
@@ -90,7 +90,7 @@ class SecuredAgent(Agent):
                 self._schedule_revocation(now)
             self._check_opened(opened)
         except MalformedDatagramError as malformed:
-            self._drop(now, malformed.reason, Recorded(in_base64(data)))
+            self._drop(now, malformed.reason, RecordedBytes(in_base64(data)))
             return
         self._handle_opened(opened, now)
 
@@ -106,7 +106,7 @@ class SecuredAgent(Agent):
     def _check_opened(self, opened: OpenedDatagram) -> None:
         """Raise MalformedDatagramError if no handler may receive this authentic message."""
         sender, _, message = opened.datagram
-        if reason := why_not_handled(self.agent_id, self.roster, sender, message):
+        if reason := drop_reason(self.agent_id, self.roster, sender, message):
             raise MalformedDatagramError(reason)
         if opened.request is not None and not self.session.is_newest_request(opened.request, opened.clear.type):
             raise MalformedDatagramError("answers no request")
@@ -170,7 +170,7 @@ class SecuredAgent(Agent):
         self.revocation = revocation
         request = {"command": "revoke", "revocation": in_base64(body), **(origin or {})}
         if self._tracing:
-            self._trace.append(Commanded(now, "revoke", request))
+            self._trace.append(CommandEntry(now, "revoke", request))
         self._revocation_sent_at = None
         self._schedule_revocation(now)
         return True

@@ -13,7 +13,7 @@ from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import Contradiction, in_virtual_time, of_agent, slack_s
 from ucp.messages import Datagram, datagram_bytes
 from ucp.secure.envelope import ADDED_BYTES
-from ucp.trace import Commanded, Dropped, Recorded
+from ucp.trace import CommandEntry, DroppedDatagram, RecordedBytes
 from ucp.trigger import BootTrigger
 
 ROUNDED_S = 5e-4
@@ -141,14 +141,14 @@ def _counted(
 
 def _bytes_sent(trace: Trace) -> int | None:
     """Return the bytes of all sent datagrams. None if the agent sent revocations, which the trace lacks."""
-    if any(isinstance(aside, Commanded) and aside.command == "revoke" for _, aside in trace.asides):
+    if any(isinstance(aside, CommandEntry) and aside.command == "revoke" for _, aside in trace.asides):
         return None
     added = ADDED_BYTES if trace.header.secured else {}
     sent = [message for run in trace.runs for message in run.sent]
     return sum([_bytes(message.datagram) + added.get(message.message, 0) for message in sent if message.datagram])
 
 
-def _bytes(datagram: Recorded) -> int:
+def _bytes(datagram: RecordedBytes) -> int:
     """Return the size of a datagram. In base64, four characters are three bytes."""
     if isinstance(datagram.content, Datagram):
         return datagram_bytes(datagram.content.message)
@@ -159,7 +159,7 @@ def _dropped(agent_id: int, recorded: AgentRecord, trace: Trace) -> Iterator[Con
     """The trace has a line for each counted drop. The agent may have dropped further datagrams since its report."""
     if recorded.dropped is None or not trace.header.has_inputs:
         return
-    traced = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, Dropped))
+    traced = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, DroppedDatagram))
     for reason, count in recorded.dropped.items():
         if traced[reason] < count:
             detail = (

@@ -16,7 +16,7 @@ from harness.archive.run_record import DatagramsRead
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.records.contradiction import Contradiction, of_agent
-from ucp.trace import Commanded, Dropped
+from ucp.trace import CommandEntry, DroppedDatagram
 from ucp.trigger import MessageTrigger
 
 UNDER_WAY_WALL_S = 0.25
@@ -41,7 +41,7 @@ def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
         if evidence.injected.messages and _killed_at(evidence, agent_id):
             continue  # the datagrams of a rogue node may have been under way
         handled = sum(isinstance(run.trigger, MessageTrigger) for run in trace.runs)
-        dropped = sum(isinstance(aside, Dropped) for _, aside in trace.asides)
+        dropped = sum(isinstance(aside, DroppedDatagram) for _, aside in trace.asides)
         own = sum(len(run.sent) for run in trace.runs)
         read = counted.read - counted.before_start - counted.others
         unrecorded = read - handled - dropped - own
@@ -67,8 +67,8 @@ def find_unread(evidence: Evidence) -> Iterator[Contradiction]:
             yield of_agent(agent_id, detail)
 
 
-def _is_revocation(aside: Dropped | Commanded) -> bool:
-    return isinstance(aside, Commanded) and aside.command == "revoke"
+def _is_revocation(aside: DroppedDatagram | CommandEntry) -> bool:
+    return isinstance(aside, CommandEntry) and aside.command == "revoke"
 
 
 def _sentence(counted: DatagramsRead, unrecorded: int, handled: int, dropped: int, own: int) -> str:

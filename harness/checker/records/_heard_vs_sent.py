@@ -12,7 +12,7 @@ from harness.checker.evidence import Evidence, Sending
 from harness.checker.records._export_vs_trace import finding
 from harness.checker.records.contradiction import Contradiction, slack_s
 from ucp.messages import BlockResponse, CommitBlock
-from ucp.trace import HandlerRun, Recorded
+from ucp.trace import HandlerRun, RecordedBytes
 from ucp.trigger import MessageTrigger
 
 CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
@@ -76,7 +76,7 @@ def _named(trigger: MessageTrigger) -> str:
     return f"{trigger.message} number {trigger.sequence} of agent {trigger.sender}"
 
 
-def _as_it_went(datagram: Recorded, sent: Sending) -> bool:
+def _as_it_went(datagram: RecordedBytes, sent: Sending) -> bool:
     told = [message.datagram for _, message in sent]
     return None in told or datagram in told
 

@@ -13,7 +13,7 @@ from harness.checker.reference.state import Handler, Settings, State, Timer
 from ucp.events import LoggableEvent
 from ucp.messages import MalformedDatagramError, Message, decode, encode
 from ucp.store import StoredState
-from ucp.trace import HandlerRun, Sent, StateSummary
+from ucp.trace import HandlerRun, SentMessage, StateSummary
 from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger, Trigger
 
 
@@ -127,7 +127,7 @@ class ReferenceAgent:
             state.idle,
             state.chain.top_chain_hash.hex(),
         )
-        sent = [Sent.of(self.agent_id, sequence, message) for sequence, message in state.outbox]
+        sent = [SentMessage.of(self.agent_id, sequence, message) for sequence, message in state.outbox]
         run = HandlerRun(state.now, handler.name, handler.algorithm, trigger, branch, state.changes, sent, summary)
         run.tally, run.started = tally_of(state, handler), state.started or None
         self._trace.append(run)

@@ -22,7 +22,7 @@ from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, OptionalParts
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, UnknownSettingError, checked
 from ucp.messages import MalformedDatagramError
-from ucp.trace import Commanded, Dropped
+from ucp.trace import CommandEntry, DroppedDatagram
 
 NAME = "every step"
 
@@ -103,9 +103,9 @@ def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Fol
         followers[-1].end(evidence.end_of(agent_id))
 
 
-def wrongly_dropped(header: CheckedHeader, line: int, aside: Dropped | Commanded) -> Deviation | None:
+def wrongly_dropped(header: CheckedHeader, line: int, aside: DroppedDatagram | CommandEntry) -> Deviation | None:
     """Return a deviation if the agent dropped a datagram that it should have handled, else None."""
-    if not isinstance(aside, Dropped) or header.secured:
+    if not isinstance(aside, DroppedDatagram) or header.secured:
         return None  # a secured agent drops datagrams before it decrypts them
     try:
         sender, _, message = decoded(aside.datagram)

@@ -21,7 +21,7 @@ from ucp.messages import (
     block_named,
 )
 from ucp.sealed import SEAL_BYTES, sealed_to
-from ucp.trace import HandlerRun, Sent
+from ucp.trace import HandlerRun, SentMessage
 
 
 class Before(NamedTuple):
@@ -93,7 +93,7 @@ class Adopting(_Core):
         if self.started:
             self.started = {}
 
-    def has_sent(self, sent: Sequence[Sent]) -> bool:
+    def has_sent(self, sent: Sequence[SentMessage]) -> bool:
         """Return whether the step has sent these messages."""
         if len(sent) != len(self.outbox):
             return False
@@ -110,9 +110,9 @@ class Adopting(_Core):
                 return False
         return True
 
-    def sent_in_full(self) -> list[Sent]:
+    def sent_in_full(self) -> list[SentMessage]:
         """Return the messages of the step in the form of a trace."""
-        return [Sent.of(self.agent_id, sequence, message) for sequence, message in self.outbox]
+        return [SentMessage.of(self.agent_id, sequence, message) for sequence, message in self.outbox]
 
     def go_along(self, run: HandlerRun) -> None:
         """Take the block of phase 3 from a run that the agent, after a deviation, triggered by itself."""
@@ -207,7 +207,7 @@ class Adopting(_Core):
                 raise NotOnRecordError("its top chain hash is not a hash")
             self.chain.top_chain_hash = chain_hash
 
-    def _adopt_sent(self, sent: Iterable[Sent]) -> None:
+    def _adopt_sent(self, sent: Iterable[SentMessage]) -> None:
         """Start the timers of the questions that the agent sent."""
         for announced in sent:
             self.sequence = announced.seq + 1

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from harness.checker.recorded_inputs import decoded
 from harness.checker.reference.algorithms import HANDLERS
 from ucp.messages import MalformedDatagramError
-from ucp.trace import HandlerRun, Sent, Tally
+from ucp.trace import HandlerRun, SentMessage, Tally
 
 NameOf = Callable[[str], str]
 """A function from the hash of a block to its name."""
@@ -80,13 +80,13 @@ def _changes(changes: Sequence[tuple[str, str]], name: NameOf) -> str:
     return f"changed {', '.join(words)}{_more(changes)}"
 
 
-def _sent(sent: Sequence[Sent], others: Sequence[Sent], name: NameOf) -> str:
+def _sent(sent: Sequence[SentMessage], others: Sequence[SentMessage], name: NameOf) -> str:
     if not sent:
         return "sent nothing"
     return f"sent {', '.join(_message(message, others, name) for message in sent[:SHOWN])}{_more(sent)}"
 
 
-def _message(message: Sent, others: Sequence[Sent], name: NameOf) -> str:
+def _message(message: SentMessage, others: Sequence[SentMessage], name: NameOf) -> str:
     about = f" about block {name(message.block)}" if message.block else ""
     words = f"{message.message[:60]}{about}"
     alike = [other for other in others if (other.message, other.block) == (message.message, message.block)]
@@ -97,7 +97,7 @@ def _message(message: Sent, others: Sequence[Sent], name: NameOf) -> str:
     return words
 
 
-def _content(message: Sent, other: Sent) -> str:
+def _content(message: SentMessage, other: SentMessage) -> str:
     """Return the content that differs from another message of the same type about the same block."""
     try:
         content = decoded(message.datagram).message

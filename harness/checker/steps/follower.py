@@ -29,7 +29,7 @@ from harness.checker.steps.trace_header import CheckedHeader
 from ucp.block import Block
 from ucp.events import MalformedEventsError
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
-from ucp.trace import HandlerRun, Recorded, StateSummary
+from ucp.trace import HandlerRun, RecordedBytes, StateSummary
 from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger
 
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
@@ -348,7 +348,7 @@ class Follower:
         handler: Handler = self._implementation.on_timer[name]
         return handler
 
-    def _event(self, record: Recorded | None, event_id: int) -> tuple[Any, ...]:
+    def _event(self, record: RecordedBytes | None, event_id: int) -> tuple[Any, ...]:
         try:
             event = event_of(record)
         except MalformedEventsError as malformed:

@@ -7,7 +7,7 @@ from ucp.block import next_chain_hash
 from ucp.events import decode_events
 from ucp.messages import BlockAddRequest, BlockAddResponse, ChainContainQuery, CommitBlock
 
-SMALL = {**VARIANTS["default"].settings.told(), "max_block_bytes": 1024, "max_event_bytes": 267}
+SMALL = {**VARIANTS["default"].settings.to_json(), "max_block_bytes": 1024, "max_event_bytes": 267}
 FULL_FROM = 1024 - 267
 EVENT_DATA_BYTES = 100
 

@@ -34,7 +34,7 @@ from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
 
 WRONG_MISSION = 2
 REFUSALS: dict[str, Any] = json.loads((DIRECTORY / "refusals.json").read_text(encoding="ascii"))
-NO_EXPIRY = {**VARIANTS["default"].settings.told(), "vote_timeout_s": 10_000.0}
+NO_EXPIRY = {**VARIANTS["default"].settings.to_json(), "vote_timeout_s": 10_000.0}
 """Settings with which no vote ends during a case."""
 INPUTS = 50
 SECONDS_WITHOUT_EVENT = 20.0

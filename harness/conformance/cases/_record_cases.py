@@ -26,9 +26,9 @@ from ucp.messages import (
     CommitBlock,
     RequestForBlock,
 )
-from ucp.trace import Dropped, Recorded
+from ucp.trace import DroppedDatagram, RecordedBytes
 
-SETTINGS = {**VARIANTS["default"].settings.told(), "max_block_bytes": 1024, "max_event_bytes": 267}
+SETTINGS = {**VARIANTS["default"].settings.to_json(), "max_block_bytes": 1024, "max_event_bytes": 267}
 LARGEST_EVENT = bytes(256)
 EVENTS_OF_A_BLOCK = 3
 MOMENT_S = 1.0
@@ -101,7 +101,7 @@ async def _played(bench: Bench) -> _Records:
     return _Records(trace, export, status, said, sent, export_s, round(epoch_s * MICROSECONDS))
 
 
-def _bytes(recorded: Recorded | None) -> bytes:
+def _bytes(recorded: RecordedBytes | None) -> bytes:
     return base64.b64decode(recorded.text) if recorded is not None else b""
 
 
@@ -109,7 +109,7 @@ def _bytes(recorded: Recorded | None) -> bytes:
 async def _inputs(bench: Bench) -> None:
     played = await _played(bench)
     runs, asides = played.trace.runs, [aside for _, aside in played.trace.asides]
-    drops = {aside.datagram.text: aside.dropped for aside in asides if isinstance(aside, Dropped)}
+    drops = {aside.datagram.text: aside.dropped for aside in asides if isinstance(aside, DroppedDatagram)}
     said = dict.fromkeys(data for _, data in played.said)
     expected = {base64.b64encode(b"UC").decode(): "truncated"}
     stranger = next(data for data in said if data[4:8] == STRANGER.to_bytes(4, "big"))
@@ -127,7 +127,7 @@ async def _inputs(bench: Bench) -> None:
     must(sent == played.sent, f"lines with {len(played.sent)} sent messages", f"{len(sent)} messages")
     events = sum(run.trigger.kind == "event" for run in runs)
     must(events == EVENTS_OF_A_BLOCK + 1, f"{EVENTS_OF_A_BLOCK + 1} lines for events", events)
-    commands = [aside.command for aside in asides if not isinstance(aside, Dropped)]
+    commands = [aside.command for aside in asides if not isinstance(aside, DroppedDatagram)]
     must(commands == ["stop_events", "export"], "lines for the commands stop_events and export", commands)
 
 
@@ -157,7 +157,7 @@ async def _agree(bench: Bench) -> None:
     must(status["handled"] == runs, f"`handled` {runs}, the number of lines of handler runs", status["handled"])
     sent_bytes = sum(map(len, played.sent))
     must(status["bytes_sent"] == sent_bytes, f"`bytes_sent` {sent_bytes}", status["bytes_sent"])
-    drops = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, Dropped))
+    drops = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, DroppedDatagram))
     must(status.get("dropped", drops) == drops, f"`dropped` {dict(drops)}", status.get("dropped"))
     completed = trace.completed()
     must(export.completed == completed, "the completed blocks of the trace in the export", export.completed)

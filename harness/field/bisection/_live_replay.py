@@ -47,7 +47,7 @@ from ucp.messages import (
     RequestForBlock,
     encode,
 )
-from ucp.trace import Dropped, HandlerRun, Recorded, in_base64
+from ucp.trace import DroppedDatagram, HandlerRun, RecordedBytes, in_base64
 from ucp.trigger import LocalTrigger, MessageTrigger, OperatorTrigger
 
 START_LIMIT_S, ANSWER_LIMIT_S, GRACE_S = 30.0, 10.0, 5.0
@@ -133,7 +133,7 @@ def script_of(record: Record) -> Script:
     peer = min(member for member in record.header.roster if member != record.agent_id)
     runs = [(entry.line, entry.content) for entry in record.entries if entry.incarnation <= 1]
     for line, run in runs:
-        if isinstance(run, Dropped):
+        if isinstance(run, DroppedDatagram):
             datagrams.append(ScriptedDatagram(run.t, run.datagram.text))
         elif isinstance(run, HandlerRun):
             if reconciling and not run.state.reconciling:
@@ -176,7 +176,7 @@ def _question_key(message: Message) -> tuple[type, bytes] | None:
 
 
 def _scripted_answer(
-    questions: Mapping[tuple[type, bytes], tuple[float, str]], t: float, datagram: Recorded
+    questions: Mapping[tuple[type, bytes], tuple[float, str]], t: float, datagram: RecordedBytes
 ) -> ScriptedDatagram:
     try:
         message = decoded(datagram).message
@@ -341,7 +341,7 @@ def _received(path: Path, agent_id: int) -> list[tuple[float, Message]]:
     for text in path.read_text(encoding="utf-8").splitlines():
         line = json.loads(text)
         try:
-            datagram = decoded(Recorded(line["datagram"]))
+            datagram = decoded(RecordedBytes(line["datagram"]))
         except MalformedDatagramError:
             continue
         if datagram.sender == agent_id and not isinstance(datagram.message, BlockAddRequest):

@@ -24,7 +24,7 @@ from harness.scenario.strict_model import VehicleKey
 from netem.addresses import BROADCAST, address
 from ucp.agent_files import write_json_atomically
 from ucp.block import MAX_EVENT_DATA_BYTES, InceptionBlock, hash_digest
-from ucp.features import needed
+from ucp.features import needed_features
 from ucp.messages import PORT
 from ucp.mission import MAX_INITIAL_DATA_BYTES, Mission, MissionError, parse_mission
 from ucp.sealed import SEAL_BYTES, sealed_to
@@ -73,7 +73,8 @@ def fingerprint(settings: Settings) -> str:
     floats.
     """
     values = {
-        name: float(value) if type(value) is int and value < EXACT else value for name, value in settings.told().items()
+        name: float(value) if type(value) is int and value < EXACT else value
+        for name, value in settings.to_json().items()
     }
     return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
@@ -144,7 +145,7 @@ class Plan:
             document["settings"]["max_block_bytes"] = MAX_EVENT_DATA_BYTES - SEAL_BYTES
         document["settings"].update(self.settings)
         document["events"].update(self.events)
-        document["features"] = needed(document)
+        document["features"] = needed_features(document)
         try:
             parse_mission(document)
         except MissionError as error:

@@ -18,7 +18,7 @@ from harness.archive.traces import MAX_LINE_BYTES, Gap, Header, parse_gap, parse
 from harness.field.ingest._ingest import Omission
 from ucp.messages import HEADER as DATAGRAM_HEADER
 from ucp.messages import MAGIC
-from ucp.trace import Commanded, Dropped, Entry, HandlerRun
+from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun
 
 MAX_TRACE_BYTES = 256 * 1024 * 1024
 """Only the beginning of a larger file is read."""
@@ -55,7 +55,7 @@ class TraceIncarnation:
     """The unit of line numbers."""
     runs: list[HandlerRun] = field(default_factory=list)
     run_lines: list[int] = field(default_factory=list)
-    asides: list[tuple[int, Dropped | Commanded]] = field(default_factory=list)
+    asides: list[tuple[int, DroppedDatagram | CommandEntry]] = field(default_factory=list)
     aside_lines: list[int] = field(default_factory=list)
     gaps: list[Gap] = field(default_factory=list)
     jumps: list[int] = field(default_factory=list)
@@ -75,7 +75,7 @@ class TraceIncarnation:
         name = self.path.name.partition(".")[0]
         return int(name) if name.isascii() and name.isdecimal() and len(name) <= 5 else None
 
-    def add(self, entry: HandlerRun | Dropped | Commanded, line: int) -> None:
+    def add(self, entry: HandlerRun | DroppedDatagram | CommandEntry, line: int) -> None:
         if isinstance(entry, HandlerRun):
             if self.runs and _jumps(self.runs[-1], entry):
                 self.jumps.append(len(self.runs))
@@ -85,7 +85,7 @@ class TraceIncarnation:
             self.asides.append((len(self.runs), entry))
             self.aside_lines.append(line)
 
-    def numbered_asides(self) -> Iterator[tuple[tuple[int, Dropped | Commanded], int]]:
+    def numbered_asides(self) -> Iterator[tuple[tuple[int, DroppedDatagram | CommandEntry], int]]:
         return zip(self.asides, self.aside_lines, strict=True)
 
     def add_gap(self, lines: int, lost_bytes: int) -> None:

@@ -24,13 +24,13 @@ from harness.field.reconstruct._agent_inputs import (
     TimerExpired,
 )
 from harness.play.simulation.fate_script import LateTimers, RunningTimer
-from ucp.agent import Agent, why_not_handled
+from ucp.agent import Agent, drop_reason
 from ucp.block import next_chain_hash
 from ucp.interest import MATTERS, ONLY_COUNTED
 from ucp.messages import CommitBlock, MalformedDatagramError, decode, encode
 from ucp.quirks import Quirks, wrong_handlers
 from ucp.store import StoredState
-from ucp.trace import Entry, HandlerRun, Sent
+from ucp.trace import Entry, HandlerRun, SentMessage
 from ucp.trigger import LocalTrigger
 
 MAX_NAME = 40
@@ -251,7 +251,7 @@ class _IncarnationRehearsal:
         except MalformedDatagramError:
             return False
         agent = self.agent
-        if why_not_handled(agent.agent_id, agent.roster, sender, message):
+        if drop_reason(agent.agent_id, agent.roster, sender, message):
             return False
         return MATTERS[type(message)](agent.state, sender, message)
 
@@ -293,14 +293,14 @@ def _difference(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str
     return None
 
 
-def same_sent(ours: Sequence[Sent], theirs: Sequence[Sent]) -> bool:
+def same_sent(ours: Sequence[SentMessage], theirs: Sequence[SentMessage]) -> bool:
     """Return whether the messages are equal. Sequence numbers are ignored, because the protocol does not use them."""
     if len(ours) != len(theirs):
         return False
     return all(_same_message(our, their) for our, their in zip(ours, theirs, strict=True))
 
 
-def _same_message(ours: Sent, theirs: Sent) -> bool:
+def _same_message(ours: SentMessage, theirs: SentMessage) -> bool:
     if (ours.message, ours.block) != (theirs.message, theirs.block):
         return False
     try:

@@ -15,7 +15,7 @@ from harness.checker.evidence import Evidence
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import FieldError
 from ucp.clock import MICROSECONDS
-from ucp.trace import Commanded, Dropped, HandlerRun
+from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 
 MAX_JUMPS, MAX_JUMP_SHARE = 3, 0.1
 """Limits for jumps in an agent's sequence numbers: their number, and their share. An agent with more jumps numbers
@@ -31,7 +31,7 @@ class Entry:
 
     line: int
     incarnation: int
-    content: HandlerRun | Dropped | Commanded
+    content: HandlerRun | DroppedDatagram | CommandEntry
     gap: str | None = None
 
 

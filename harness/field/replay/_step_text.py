@@ -17,7 +17,7 @@ from ucp.agent import HANDLERS
 from ucp.block import Block
 from ucp.events import MalformedEventsError, decode_events
 from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError, Message
-from ucp.trace import Dropped, HandlerRun, Recorded, Sent
+from ucp.trace import DroppedDatagram, HandlerRun, RecordedBytes, SentMessage
 from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger
 
 BLOCKS_SHOWN = 8
@@ -40,7 +40,7 @@ class StepText:
         match entry.content:
             case HandlerRun() as run:
                 text = f"A{run.algorithm:<3}{run.handler[:40]}: {run.branch[:40]}"
-            case Dropped() as entry_content:
+            case DroppedDatagram() as entry_content:
                 text = f"    dropped a datagram: {entry_content.dropped[:60]}"
             case entry_content:
                 text = f"    command {entry_content.command[:40]}"
@@ -63,7 +63,7 @@ class StepText:
         match entry.content:
             case HandlerRun() as run:
                 yield from self._run(run, place)
-            case Dropped() as entry_content:
+            case DroppedDatagram() as entry_content:
                 yield shown(f"{place}: dropped, {entry_content.dropped[:60]}", style="bold")
                 yield _row("came", self._datagram(entry_content.datagram))
             case entry_content:
@@ -141,7 +141,7 @@ class StepText:
                 return f"it restarted with a chain of {blocks} blocks from its disk"
         return "an unknown trigger"
 
-    def _datagram(self, record: Recorded | None) -> str:
+    def _datagram(self, record: RecordedBytes | None) -> str:
         try:
             return self._message(decoded(record).message)
         except MalformedDatagramError as malformed:
@@ -173,7 +173,7 @@ class StepText:
             own = "not in our chain"
         return f"chain {chain_hash.hex()[:SHOWN]} ({own})"
 
-    def sent(self, sent: Sent) -> str:
+    def sent(self, sent: SentMessage) -> str:
         return f"{sent.message[:60]} {sent.seq}: {self._datagram(sent.datagram)}"
 
     def _counted(self, key: str, count: object) -> str:

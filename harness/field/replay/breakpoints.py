@@ -14,7 +14,7 @@ from harness.field.replay._player import Player
 from harness.field.replay.replay_names import ReplayNames, is_block
 from ucp.agent import HANDLERS
 from ucp.messages import MalformedDatagramError, block_named
-from ucp.trace import Commanded, Dropped, HandlerRun
+from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
 
 Breakpoint = Callable[[Entry], bool]
@@ -55,7 +55,7 @@ def next_stop(player: Player, stops_at: Breakpoint, backward: bool = False) -> i
 def blocks_of(entry: Entry) -> set[str]:
     """Return the hashes of the blocks that an entry changes, receives or sends."""
     content = entry.content
-    if isinstance(content, Commanded):
+    if isinstance(content, CommandEntry):
         return set()
     hashes: set[str] = set()
     if isinstance(content, HandlerRun):
@@ -63,7 +63,7 @@ def blocks_of(entry: Entry) -> set[str]:
         hashes.update(sent.block for sent in content.sent if sent.block)
     datagram = (
         content.datagram
-        if isinstance(content, Dropped)
+        if isinstance(content, DroppedDatagram)
         else content.input
         if isinstance(content.trigger, MessageTrigger)
         else None

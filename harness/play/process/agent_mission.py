@@ -7,7 +7,7 @@ from harness.play.backend import agent_seed
 from harness.scenario import Scenario
 from harness.scenario.agent_options import Events
 from sitl.vehicle import AGENT_PORT
-from ucp.features import CONTRACT, needed
+from ucp.features import CONTRACT, needed_features
 from ucp.messages import PORT
 from ucp.mission import SCHEMA
 
@@ -53,7 +53,7 @@ def mission_file(
             "vehicle_host": "127.0.0.1",
             "vehicle_port": AGENT_PORT,
         },
-        "settings": scenario.settings_of(agent_id).told(),
+        "settings": scenario.settings_of(agent_id).to_json(),
         "quirks": {**NO_QUIRKS, **scenario.quirks_of(agent_id)},
         "seed": agent_seed(seed, agent_id, incarnation),
         "speedup": scenario.speedup,
@@ -62,7 +62,7 @@ def mission_file(
     }
     if bundle is not None:
         document["security"] = {"bundle": bundle}
-    return document | {"features": needed(document)}
+    return document | {"features": needed_features(document)}
 
 
 def _source(events: Events, with_vehicle: bool) -> str:

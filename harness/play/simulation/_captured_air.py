@@ -16,7 +16,7 @@ from netem.capture import begin_file
 from netem.frames import udp_broadcast
 from netem.pcapng import PcapngFile
 from ucp.messages import PORT, Message, encode
-from ucp.trace import Recorded
+from ucp.trace import RecordedBytes
 
 NANOSECONDS = 1_000_000_000
 FRAMES_KEPT = 4096
@@ -81,7 +81,7 @@ class CapturedAir(VirtualAir):
         sequence: int,
         message: Message,
         data_bytes: int,
-        datagram: Recorded | None = None,
+        datagram: RecordedBytes | None = None,
         sealed: bytes | None = None,
     ) -> None:
         self._capture.record(now, number, _frame(self._roster[number], sequence, message, sealed), outbound=True)

@@ -326,7 +326,7 @@ class EventLoop:
             incarnation.deadline = deadline
             if deadline is not None:
                 self._air.schedule(deadline, number, None)
-        busy_until = agent.answers_nobody_until()
+        busy_until = agent.silent_until()
         self._air.busy_until[number] = 0.0 if busy_until is None else incarnation.mission_s(busy_until)
 
     def _timer_end(self, number: int, incarnation: Incarnation, soonest: float) -> float:

@@ -13,9 +13,9 @@ from ucp.export import export_chain
 from ucp.messages import Message
 from ucp.settings import Settings
 from ucp.store import StoredState
-from ucp.trace import Entry, Recorded
+from ucp.trace import Entry, RecordedBytes
 
-AgentOutput = tuple[int, Message | None, Recorded | None]
+AgentOutput = tuple[int, Message | None, RecordedBytes | None]
 """(sequence, message, datagram): an output of an agent. The datagram is None if nothing has encoded it yet.
 
 An output that is not a message of the agent has only the datagram, with sequence 0 and no message.
@@ -48,7 +48,7 @@ class VirtualAgent(Protocol):
     def settings(self) -> Settings: ...
 
     def receive_message(
-        self, sender: int, sequence: int, message: Message, now: float, datagram: Recorded | None = None
+        self, sender: int, sequence: int, message: Message, now: float, datagram: RecordedBytes | None = None
     ) -> None: ...
 
     def receive_datagram(self, data: bytes, now: float) -> None: ...
@@ -61,7 +61,7 @@ class VirtualAgent(Protocol):
 
     def next_timer(self) -> float | None: ...
 
-    def answers_nobody_until(self) -> float | None: ...
+    def silent_until(self) -> float | None: ...
 
     def outgoing(self) -> Sequence[AgentOutput]:
         """Return the outputs since the previous call, in order."""

@@ -33,7 +33,7 @@ from ucp.interest import ANSWERED, ASKED, MATTERS, ONLY_COUNTED, STILL_ASKED, Qu
 from ucp.messages import BlockAddResponse, Message
 from ucp.settings import Settings
 from ucp.state import AgentState
-from ucp.trace import Recorded
+from ucp.trace import RecordedBytes
 
 NEVER = float("inf")
 DISCARD_EVERY = 1000
@@ -51,7 +51,7 @@ class MessageInFlight:
     sent_at: float
     rank: int
     draws: RandomDraws
-    datagram: Recorded | None
+    datagram: RecordedBytes | None
     """The datagram as traces record it. None if nothing has encoded it yet."""
     sealed: bytes | None = None
     """The sealed datagram. None if the mission is not secured."""
@@ -242,7 +242,7 @@ class VirtualAir:
         sequence: int,
         message: Message,
         data_bytes: int,
-        datagram: Recorded | None = None,
+        datagram: RecordedBytes | None = None,
         sealed: bytes | None = None,
     ) -> None:
         """Send a message of the agent, in a datagram with `data_bytes` bytes of data."""

@@ -70,7 +70,7 @@ def header(incarnation: Incarnation) -> dict[str, Any]:
         "agent_id": agent.agent_id,
         "roster": sorted(agent.roster),
         "initial_data": agent.initial_data,
-        "settings": agent.settings.told(),
+        "settings": agent.settings.to_json(),
         "clock": clock,
         "secured": incarnation.secured is not None,
     }

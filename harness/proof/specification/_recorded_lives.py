@@ -20,7 +20,7 @@ from harness.archive.vocabulary import (
 from harness.checker.recorded_inputs import decoded, event_of, sealed_of, stored_blocks
 from harness.checker.steps.follower import COUNTING, OptionalParts
 from harness.checker.steps.trace_header import CheckedHeader
-from ucp.agent import HANDLERS, ON_TIMER, why_not_handled
+from ucp.agent import HANDLERS, ON_TIMER, drop_reason
 from ucp.block import LATEST_US, Block, InceptionBlock, next_chain_hash
 from ucp.messages import (
     CARRY_A_BLOCK,
@@ -34,7 +34,7 @@ from ucp.messages import (
     RequestForBlock,
 )
 from ucp.sealed import SEAL_BYTES, sealed_to
-from ucp.trace import HandlerRun, Sent
+from ucp.trace import HandlerRun, SentMessage
 from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, TimerTrigger
 
 INCEPTION = 1
@@ -183,7 +183,7 @@ class _Writer:
         trigger = run.trigger
         if isinstance(trigger, MessageTrigger):
             sender, _, message = decoded(run.input)
-            dropped = why_not_handled(self._header.agent_id, self._header.roster, sender, message)
+            dropped = drop_reason(self._header.agent_id, self._header.roster, sender, message)
             if isinstance(message, CommitBlock):
                 self._on_top(self._tops[-1], message.block.block_hash)
             return (HEARD, sender, *self._message(message)), dropped is not None
@@ -273,7 +273,7 @@ class _Writer:
             return code, chain_number, successor, Stamp(message.timestamp_us)
         return code, chain_number
 
-    def _sent(self, sent: Sent) -> Item:
+    def _sent(self, sent: SentMessage) -> Item:
         try:
             sender, _, message = decoded(sent.datagram)
         except ValueError:

@@ -44,7 +44,7 @@ from harness.report.logbook.positions import tracks
 from harness.scenario.strict_model import MAX_AGENTS
 from harness.scenario.verdict_names import kind_of
 from sitl.vehicle import Home
-from ucp.trace import Dropped
+from ucp.trace import DroppedDatagram
 
 if TYPE_CHECKING:
     from ucp.secure.sealing import Depot
@@ -235,7 +235,7 @@ class ExportedRun:
 
     def _drops(self, agent: int) -> Iterator[DropSample]:
         for _, aside in self.archive.traces[agent].asides:
-            if isinstance(aside, Dropped) and 0 <= aside.t <= LATEST_S:
+            if isinstance(aside, DroppedDatagram) and 0 <= aside.t <= LATEST_S:
                 yield DropSample(self.time.at(aside.t, agent), agent, aside.dropped)
 
     def _messages(self) -> Iterator[MessageSample]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from harness.archive.history import COMMITTED_BY, LATEST_S, ActivityStart, HistoryReader, Reconcile, Tie, Vote
 from harness.archive.traces import Header, HeldBlocks, parse_line
 from harness.report.live._live_trace import AgentTrace
-from ucp.trace import Commanded, Dropped, Entry, HandlerRun
+from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun
 from ucp.trigger import MessageTrigger
 
 Change = list[Any]
@@ -60,7 +60,7 @@ class AgentCourse:
         self.has_messages_without_effect = False
         """True if the trace contains a message without effect. Traces of virtual time omit these by default."""
         self._trace = AgentTrace(agents, agent_id)
-        self._ahead: Receipt | HandlerRun | Dropped | None = None
+        self._ahead: Receipt | HandlerRun | DroppedDatagram | None = None
         """An entry that was read, but is later than the requested mission second."""
         self._has_started = False
         self._held = HeldBlocks()
@@ -96,7 +96,7 @@ class AgentCourse:
     def close(self) -> None:
         self._trace.close()
 
-    def _next(self) -> Receipt | HandlerRun | Dropped | None:
+    def _next(self) -> Receipt | HandlerRun | DroppedDatagram | None:
         """Return the next entry with a valid time, or None."""
         while self.problem is None:
             line = self._trace.next()
@@ -115,7 +115,7 @@ class AgentCourse:
                     return None
             if isinstance(entry, Header):
                 self._begin()
-            elif not isinstance(entry, Commanded) and 0 <= entry.t <= LATEST_S:
+            elif not isinstance(entry, CommandEntry) and 0 <= entry.t <= LATEST_S:
                 return entry
         return None
 

@@ -16,7 +16,7 @@ from harness.archive.traces import Trace
 from harness.report.stories.story_file import Section
 from harness.report.stories.story_names import ANSWERS, INCEPTION, LocalChain, Names, message_text
 from ucp.agent import HANDLERS
-from ucp.trace import HandlerRun, Sent
+from ucp.trace import HandlerRun, SentMessage
 from ucp.trigger import LocalTrigger, MessageTrigger, TimerTrigger
 
 INSTANT_S = 1.5
@@ -56,7 +56,7 @@ class Action:
         trigger = self.runs[0].trigger
         return trigger if isinstance(trigger, MessageTrigger) and trigger.message in ANSWERS else None
 
-    def message(self, sequence: int) -> Sent | None:
+    def message(self, sequence: int) -> SentMessage | None:
         """Return the sent message with this number."""
         return next((sent for run in self.runs for sent in run.sent if sent.seq == sequence), None)
 
@@ -148,7 +148,7 @@ class Narrator:
         name = self._names.block(block)
         return f"completes {name}" if operation == "complete" else f"{operation[:-1]} {operation[-1]}{name}"
 
-    def _missing_receivers(self, action: Action, sent: Sent) -> str:
+    def _missing_receivers(self, action: Action, sent: SentMessage) -> str:
         """Return a note about agents that did not receive the message.
 
         An answer only matters to the agent that asked.

@@ -21,7 +21,7 @@ from ucp.messages import (
     RequestForBlock,
     decode,
 )
-from ucp.trace import HandlerRun, Sent
+from ucp.trace import HandlerRun, SentMessage
 
 INCEPTION = "inception"
 MAX_FULL_CHAIN = 4
@@ -139,7 +139,7 @@ _FORMATS: dict[type[Message], Callable[[Any, NameSource], str]] = {
 }
 
 
-def message_text(sent: Sent, names: Names) -> str:
+def message_text(sent: SentMessage, names: Names) -> str:
     """Return the text of a message that a trace contains."""
     if sent.datagram is None:
         return f"{sent.message} (not recorded)"

@@ -37,7 +37,7 @@ from ucp.messages import (
 )
 from ucp.settings import Settings
 from ucp.store import StoredState
-from ucp.trace import Dropped, HandlerRun, header_line
+from ucp.trace import DroppedDatagram, HandlerRun, header_line
 
 ROSTER = (1, 2, 3, 4)
 INITIAL_DATA = b"fuzz"
@@ -208,7 +208,10 @@ class _Driven:
             require(not follower.deviations, f"it deviates: {follower.deviations[:1]}")
             require(follower.lost is None, f"it cannot be followed: {follower.lost}")
         for line, aside in self.trace.numbered_asides():
-            require(not isinstance(aside, Dropped) or wrongly_dropped(header, line, aside) is None, "wrongly dropped")
+            require(
+                not isinstance(aside, DroppedDatagram) or wrongly_dropped(header, line, aside) is None,
+                "wrongly dropped",
+            )
 
 
 def _of(agent: Agent) -> bytes:

@@ -17,7 +17,7 @@ from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
 from tests.harness.virtual import scenario
-from ucp.trace import HandlerRun, Sent, StateSummary
+from ucp.trace import HandlerRun, SentMessage, StateSummary
 from ucp.trigger import EventTrigger, MessageTrigger, OperatorTrigger
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -101,7 +101,9 @@ def test_lost_commit_lacks_the_receipt_of_one_agent() -> None:
 
 
 def test_vote_ends_at_the_loss_or_at_the_end_of_the_run() -> None:
-    proposed = handler_run(5.0, "process_next_deque_block", "proposed", sent=[Sent("Block Add Request", 0, "aa")])
+    proposed = handler_run(
+        5.0, "process_next_deque_block", "proposed", sent=[SentMessage("Block Add Request", 0, "aa")]
+    )
     begun = [
         handler_run(6.0, "reconcile_begin", "begun", trigger=OperatorTrigger("reconcile")),
         handler_run(6.0, "reconcile_phase_1"),
@@ -124,7 +126,9 @@ def test_vote_of_killed_agent_ends_before_its_next_incarnation() -> None:
 
 
 def test_receipt_belongs_to_the_sending_incarnation() -> None:
-    sends = [[handler_run(at_s, "build_data_block", sent=[Sent("Commit Block", 0, None)])] for at_s in (1.0, 20.0)]
+    sends = [
+        [handler_run(at_s, "build_data_block", sent=[SentMessage("Commit Block", 0, None)])] for at_s in (1.0, 20.0)
+    ]
     hears = [
         handler_run(at_s, "receive_commit_block", trigger=MessageTrigger("Commit Block", 1, 0)) for at_s in (2.0, 21.0)
     ]

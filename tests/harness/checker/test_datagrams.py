@@ -23,12 +23,12 @@ from ucp import node
 class Silent(node.Node):
     read = 0
 
-    def _drive(self, feed):
+    def _feed(self, feed):
         if isinstance(feed, partial) and feed.func == self.agent.receive_datagram:
             self.read += 1
             if self.read % 10 == 0:
                 return
-        super()._drive(feed)
+        super()._feed(feed)
 
 sys.exit(node.main(sys.argv[1:], Silent))
 """

@@ -25,7 +25,7 @@ from ucp.handler import EventHandler
 from ucp.messages import TYPE_CODES
 from ucp.quirks import CRASHED, QUIRKS, Quirk
 from ucp.store import StoredState
-from ucp.trace import SCHEMA, Dropped, HandlerRun, Recorded, in_base64
+from ucp.trace import SCHEMA, DroppedDatagram, HandlerRun, RecordedBytes, in_base64
 from ucp.trigger import EventTrigger, LocalTrigger, TimerTrigger, UnknownTrigger
 
 LOSSY = {"network": {"loss": 0.25}, "duration_s": 600}
@@ -174,7 +174,7 @@ def test_an_agent_that_goes_on_is_compared_from_its_own_state(honest: Evidence) 
             "it ran without a trigger",
         ),
         (lambda runs: setattr(commit(runs).trigger, "sequence", 77), "it recorded Commit Block 77 from agent"),
-        (lambda runs: setattr(commit(runs), "input", Recorded("!")), "a datagram that it must drop: not base64"),
+        (lambda runs: setattr(commit(runs), "input", RecordedBytes("!")), "a datagram that it must drop: not base64"),
         (lambda runs: setattr(commit(runs), "input", None), "a datagram that it must drop: truncated"),
         (lambda runs: proposal(runs).sent.clear(), "it sent nothing; it should have sent"),
         (lambda runs: setattr(proposal(runs).sent[0], "seq", 9), "with sequence number 9"),
@@ -221,7 +221,10 @@ def test_a_datagram_that_was_dropped_and_is_good_is_found(honest: Evidence) -> N
     trace = honest.traces[3]
     request = first_run(trace.runs, "receive_request_add_block")
     assert request.input is not None
-    asides = [(1, Dropped(1.0, "wrong length", request.input)), (1, Dropped(1.0, "truncated", Recorded("AAAA")))]
+    asides = [
+        (1, DroppedDatagram(1.0, "wrong length", request.input)),
+        (1, DroppedDatagram(1.0, "truncated", RecordedBytes("AAAA"))),
+    ]
     judgement = steps.check(with_traces(honest, {**honest.traces, 3: dataclasses.replace(trace, asides=asides)}))
     (finding,) = judgement.evidence
     assert "trace line 3" in finding.detail

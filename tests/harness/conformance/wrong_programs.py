@@ -47,7 +47,7 @@ def _hang_after(limit: int) -> None:
             time.sleep(LONG_S)
         return old(*arguments)
 
-    _patch(Node, "_drive", count)
+    _patch(Node, "_feed", count)
 
 
 @mistake
@@ -71,7 +71,7 @@ def ends_after_50_inputs() -> None:
             sys.exit(3)
         return old(*arguments)
 
-    _patch(Node, "_drive", count)
+    _patch(Node, "_feed", count)
     _patch(virtual.VirtualAgent, "give", count)
 
 
@@ -249,7 +249,7 @@ def answers_its_own_echo() -> None:
             except OSError:
                 return
             if self.clock.running:
-                self._drive(partial(self.agent.receive_datagram, data))
+                self._feed(partial(self.agent.receive_datagram, data))
 
     _patch(Node, "_receive", receive)
 
@@ -273,7 +273,7 @@ def leaks_descriptors() -> None:
         os.open("/dev/null", os.O_RDONLY)
         old(*arguments)
 
-    _patch(Node, "_drive", drive)
+    _patch(Node, "_feed", drive)
 
 
 @mistake
@@ -294,7 +294,7 @@ def logs_random_events_without_source() -> None:
 def sends_after_sigterm() -> None:
     def run(old: Callable[..., Any], self: Node) -> int:
         def stop(stop_loop: Callable[..., Any]) -> None:
-            self._drive(self.agent.begin_reconcile)
+            self._feed(self.agent.begin_reconcile)
             stop_loop()
 
         _patch(self._loop, "stop", stop)
@@ -321,8 +321,8 @@ def needs_20_s_to_end() -> None:
 
 @mistake
 def ignores_requested_quirks() -> None:
-    _patch(Node, "_make_wrong", lambda old, self: None)
-    _patch(virtual.VirtualAgent, "_make_wrong", lambda old, self: None)
+    _patch(Node, "_apply_quirks", lambda old, self: None)
+    _patch(virtual.VirtualAgent, "_apply_quirks", lambda old, self: None)
 
 
 @mistake
@@ -362,7 +362,7 @@ def answers_requests_only_one_by_one() -> None:
             self._received = line + newline
         old(self)
 
-    _patch(_Client, "_go_on", go_on)
+    _patch(_Client, "_answer_next_line", go_on)
 
 
 def main(arguments: Sequence[str]) -> int:

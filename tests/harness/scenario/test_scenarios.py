@@ -17,7 +17,7 @@ from harness.scenario import load_scenario
 from harness.scenario.changes import RANGE
 from harness.scenario.expect import CHARACTERISTIC_NUMBERS
 from tests.harness.command import harness
-from ucp.trace import Commanded, StateSummary
+from ucp.trace import CommandEntry, StateSummary
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 MATRIX = SCENARIOS / "thesis_matrix.yaml"
@@ -318,7 +318,7 @@ def revoked_in_partition(run: Simulated, seed: int) -> None:
     """All running agents receive the revocation when they can, and forward it to agents that start later."""
     heard_s = {}
     for agent_id, trace in run.evidence.traces.items():
-        heard = [aside.t for _, aside in trace.asides if isinstance(aside, Commanded) and aside.command == "revoke"]
+        heard = [aside.t for _, aside in trace.asides if isinstance(aside, CommandEntry) and aside.command == "revoke"]
         if heard:
             heard_s[agent_id] = heard[-1]
     assert heard_s.keys() == {1, 2, 4, 5}

@@ -18,7 +18,7 @@ from ucp.export import export_chain
 from ucp.sealed import seal_to
 from ucp.secure.sealing import make_seal
 from ucp.settings import Settings
-from ucp.trace import SCHEMA, Recorded, in_base64
+from ucp.trace import SCHEMA, RecordedBytes, in_base64
 
 ROSTER = (1, 2, 3)
 SETTINGS = Settings(max_block_bytes=976)
@@ -55,7 +55,7 @@ class SealedSwarm:
                     schema=SCHEMA,
                     agent_id=agent_id,
                     roster=list(ROSTER),
-                    settings=SETTINGS.told(),
+                    settings=SETTINGS.to_json(),
                     clock=clock,
                     initial_data=in_base64(self.initial_data),
                 ),
@@ -89,7 +89,9 @@ def test_the_judge_finds_an_agent_that_tells_of_another_seal(swarm: SealedSwarm,
     evidence = swarm.evidence()
     runs = evidence.traces[2].runs
     position = next(position for position, run in enumerate(runs) if run.sealed is not None)
-    runs[position] = dataclasses.replace(runs[position], sealed=None if told is None else Recorded(in_base64(told)))
+    runs[position] = dataclasses.replace(
+        runs[position], sealed=None if told is None else RecordedBytes(in_base64(told))
+    )
     judgement = steps.check(evidence)
     assert judgement.verdict == "deviates"
     assert judgement.evidence[0].handler == "build_data_block"

@@ -8,7 +8,7 @@ from ucp.block import Block, InceptionBlock
 from ucp.chain import Chain
 from ucp.contract.schemas._control_schema import STATUS
 from ucp.events import LoggableEvent
-from ucp.features import CONTRACT, needed
+from ucp.features import CONTRACT, needed_features
 from ucp.messages import (
     BlockAddRequest,
     BlockAddResponse,
@@ -54,7 +54,7 @@ class Story:
     def begin(self, **store: Any) -> None:
         """A life begins; with `store` from what an earlier one left."""
         self._agent: VirtualAgent | None = None
-        settings = Settings().told() | self._settings
+        settings = Settings().to_json() | self._settings
         mission: dict[str, Any] = {
             "schema": SCHEMA,
             "contract": CONTRACT,
@@ -72,7 +72,7 @@ class Story:
             "store": None,
             **self._of_mission(),
         }
-        mission["features"] = needed(mission)
+        mission["features"] = needed_features(mission)
         self._exchange({"mission": mission, "trace": True, **self._of_life(), **store})
 
     def _of_mission(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pydantic_core import from_json
 from harness.archive.traces import ASIDE, HANDLER_RUN
 from harness.errors import UnsupportedError
 from ucp.messages import Datagram, MalformedDatagramError, decode
-from ucp.trace import Entry, HandlerRun, Recorded
+from ucp.trace import Entry, HandlerRun, RecordedBytes
 
 MAX_SENT = 1000
 """Maximum number of datagrams in one answer."""
@@ -37,7 +37,7 @@ class RefusedError(Exception):
 class Answer:
     """A valid answer of an agent."""
 
-    sent: list[tuple[bytes, Recorded]]
+    sent: list[tuple[bytes, RecordedBytes]]
     """Datagrams, each with its record, which contains the message if the datagram is one."""
     timer: float | None
     """Time of the next end of a timer, by the agent's clock."""
@@ -75,7 +75,7 @@ def read_answer(line: bytes, *, tracing: bool) -> Answer:
     return answer
 
 
-def _datagram(text: Any) -> tuple[bytes, Recorded]:
+def _datagram(text: Any) -> tuple[bytes, RecordedBytes]:
     try:
         data = base64.b64decode(text, validate=True)
     except (TypeError, ValueError):
@@ -87,7 +87,7 @@ def _datagram(text: Any) -> tuple[bytes, Recorded]:
         content = decode(data)
     except MalformedDatagramError:
         content = None
-    return data, Recorded(text, content)
+    return data, RecordedBytes(text, content)
 
 
 def _entries(trace: list[Any]) -> Iterable[Entry]:

@@ -29,7 +29,7 @@ from harness.play.simulation.foreign._virtual_program import LineProgram, Progra
 from ucp.events import LoggableEvent
 from ucp.messages import Datagram, Message
 from ucp.settings import Settings
-from ucp.trace import Entry, HandlerRun, Recorded, in_base64
+from ucp.trace import Entry, HandlerRun, RecordedBytes, in_base64
 
 MAX_TIMERS_PER_S = 10_000
 """Maximum number of ends of timers in a mission second. An agent with more of them counts as hung."""
@@ -113,7 +113,7 @@ class ForeignAgent:
         self._now = now
         self._timer: float | None = None
         self._timers_ended, self._datagrams_sent = _CounterPerSecond(), _CounterPerSecond()
-        self._sent: list[tuple[bytes, Recorded]] = []
+        self._sent: list[tuple[bytes, RecordedBytes]] = []
         self._trace: list[Entry] = []
         self._completed: list[bytes] | None = [] if tracing else None
         """Hashes of the completed blocks from the trace. None without a trace."""
@@ -133,9 +133,9 @@ class ForeignAgent:
     # Inputs
 
     def receive_message(
-        self, sender: int, sequence: int, message: Message, now: float, datagram: Recorded | None = None
+        self, sender: int, sequence: int, message: Message, now: float, datagram: RecordedBytes | None = None
     ) -> None:
-        self._receive((datagram or Recorded(None, Datagram(sender, sequence, message))).text, now)
+        self._receive((datagram or RecordedBytes(None, Datagram(sender, sequence, message))).text, now)
 
     def receive_datagram(self, data: bytes, now: float) -> None:
         self._receive(in_base64(data), now)
@@ -163,7 +163,7 @@ class ForeignAgent:
     def next_timer(self) -> float | None:
         return self._timer
 
-    def answers_nobody_until(self) -> float | None:
+    def silent_until(self) -> float | None:
         """Return None, because the state of a foreign agent is unknown."""
         return None
 

@@ -17,7 +17,7 @@ from harness.report.live.change_log import FAR_BEHIND_BYTES, ChangeLog
 from harness.report.live.feed import Feed
 from tests.harness.archive.test_history import handler_run, trace_of
 from tests.harness.report.live.runs import film, of_kind, played
-from ucp.trace import Sent
+from ucp.trace import SentMessage
 from ucp.trigger import TimerTrigger
 
 
@@ -191,7 +191,7 @@ def reconcile_during_a_vote(directory: Path) -> tuple[list[Change], Trace]:
     """Return changes and trace of an agent that begins a reconcile before its vote timer expires."""
     trigger = TimerTrigger("vote_timer_expiration")
     runs = [
-        handler_run(1.0, "process_next_deque_block", "proposed", sent=[Sent("Block Add Request", 0, "aa")]),
+        handler_run(1.0, "process_next_deque_block", "proposed", sent=[SentMessage("Block Add Request", 0, "aa")]),
         handler_run(3.0, "reconcile_begin", "begun", trigger=trigger),
         handler_run(3.0, "reconcile_phase_1"),
         handler_run(11.0, "vote_timer_expiration", "approved"),

@@ -1,6 +1,6 @@
-"""Talks to a UCP agent that is a ROS 2 node: python talk.py AGENT_ID TEXT (docs/how-to/run-a-ros-node.md).
+"""Send events to a UCP agent that is a ROS 2 node: python talk.py AGENT_ID TEXT (docs/how-to/run-a-ros-node.md).
 
-It has the agent log the text, an event a second, until a block with it is in the agent's chain, and shows that block.
+The program sends one event with the text per second, until the agent's chain has a block with it. It prints this block.
 """
 
 import json
@@ -13,47 +13,47 @@ import rclpy
 from rclpy.task import Future
 from std_msgs.msg import String, UInt8MultiArray
 
-from ucp.contract.examples.ros2.ucp_node import LATER_TOO, NO_FILES, ON_THIS_VEHICLE
+from ucp.contract.examples.ros2.ucp_node import KEEP_LAST, NO_LOG_FILES, THIS_VEHICLE_ONLY
 from ucp.events import decode_events
 
 EVENT_ID = 1
-EVERY_S = 1.0
+PERIOD_S = 1.0
 
 
 class Talker:
-    """`done` is done once the text is in the agent's chain."""
+    """A ROS node that sends events. `done` is completed when the text is in the agent's chain."""
 
     def __init__(self, agent_id: int, text: str) -> None:
         self._text = text
-        self._greeted = False
+        self._printed_status = False
         self.done = Future()
         self.ros = rclpy.create_node(f"talker_to_{agent_id}", namespace="ucp")
         agent = f"/ucp/agent_{agent_id}"
         event = UInt8MultiArray(data=bytes([EVENT_ID, *text.encode()]))
         event_out = self.ros.create_publisher(UInt8MultiArray, f"{agent}/event", 10)
-        self.ros.create_timer(EVERY_S, lambda: event_out.publish(event))
-        self.ros.create_subscription(String, f"{agent}/status", self._status_came, LATER_TOO)
-        self.ros.create_subscription(String, f"{agent}/chain", self._chain_came, LATER_TOO)
+        self.ros.create_timer(PERIOD_S, lambda: event_out.publish(event))
+        self.ros.create_subscription(String, f"{agent}/status", self._receive_status, KEEP_LAST)
+        self.ros.create_subscription(String, f"{agent}/chain", self._receive_chain, KEEP_LAST)
 
-    def _status_came(self, message: String) -> None:
+    def _receive_status(self, message: String) -> None:
         status: dict[str, Any] = json.loads(message.data)
-        if not self._greeted:
-            self._greeted = True
-            self._say(f"agent {status['agent_id']}: {status['chain']} blocks in its chain, {status['version']}")
+        if not self._printed_status:
+            self._printed_status = True
+            self._print_line(f"agent {status['agent_id']}: {status['chain']} blocks in its chain, {status['version']}")
 
-    def _chain_came(self, message: String) -> None:
+    def _receive_chain(self, message: String) -> None:
         for number, block in enumerate(json.loads(message.data)["chain"], 1):
             texts = [event.data.decode(errors="replace") for event in decode_events(b64decode(block["event_data"]))]
             if self._text in texts and not self.done.done():
-                self._say(f"block {number}: {', '.join(texts)}")
+                self._print_line(f"block {number}: {', '.join(texts)}")
                 self.done.set_result(None)
 
-    def _say(self, line: str) -> None:
+    def _print_line(self, line: str) -> None:
         sys.stdout.write(f"{line}\n")
 
 
 if __name__ == "__main__":
-    os.environ.update(ON_THIS_VEHICLE)
-    rclpy.init(args=NO_FILES)
+    os.environ.update(THIS_VEHICLE_ONLY)
+    rclpy.init(args=NO_LOG_FILES)
     talker = Talker(int(sys.argv[1]), sys.argv[2])
     rclpy.spin_until_future_complete(talker.ros, talker.done)
