@@ -1,11 +1,11 @@
-"""The programs that tests run inside vehicles: started by its path, with this checkout as PYTHONPATH and no packages.
+"""The programs that tests run inside vehicles. They start by path, with this checkout as PYTHONPATH and no packages.
 
-    air.py listen            every frame that arrives on eth0, by AF_PACKET
-    air.py frames DESTINATION_MAC,... ETHERTYPE...   one frame of each
-    air.py stream ETHERTYPE...   a frame of each to everyone, with the time, every few milliseconds until SIGTERM
-    air.py serve PORT        a TCP server that greets
+    air.py listen            record each frame that arrives on eth0, by AF_PACKET
+    air.py frames DESTINATION_MAC,... ETHERTYPE...   send one frame of each
+    air.py stream ETHERTYPE...   broadcast a frame of each with the time, every few milliseconds until SIGTERM
+    air.py serve PORT        serve a greeting over TCP
 
-and `receive` and `broadcast` of `netem._probe`. `listen` says "ready", and on SIGTERM what it got, one JSON object.
+and `receive` and `broadcast` of `netem._probe`. `listen` prints "ready", and on SIGTERM its frames as one JSON object.
 Times are nanoseconds of the real-time clock, which every process of a kernel shares.
 """
 

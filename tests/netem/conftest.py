@@ -48,7 +48,7 @@ class Program:
         return [json.loads(line) for line in self.output.read_text().splitlines()]
 
     async def finish(self) -> Any:
-        """Have it stop listening, and return what it got."""
+        """Stop the program with SIGTERM, and return its last line of output."""
         await self.process.send_signal(15)
         assert await asyncio.wait_for(self.process.wait(), DEADLINE_S) == 0, self.output.read_text()
         return self.said()[-1]

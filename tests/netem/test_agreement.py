@@ -41,9 +41,9 @@ class Heard:
     """Numbered packets that a receiver received."""
 
     sent_at: list[float]
-    """Seconds, by number."""
+    """Sending time of each packet in seconds."""
     delays: list[list[float]]
-    """Seconds, of each copy that came, by number."""
+    """Delays of the received copies of each packet, in seconds."""
 
     @property
     def came(self) -> list[bool]:
@@ -55,7 +55,7 @@ class Heard:
 
     @property
     def arrivals(self) -> list[float]:
-        """When each copy came, by number."""
+        """The arrival times of the copies, in the order of their packets."""
         return [at + delay for at, copies in zip(self.sent_at, self.delays, strict=True) for delay in copies]
 
 
@@ -110,9 +110,9 @@ class Both:
 async def broadcast(
     air: Air, conditions: NetworkConditions, sender: int, receivers: Iterable[int], at_once: int = PACKETS
 ) -> dict[int, Both]:
-    """What each receiver hears of packets as fast as `sender` can, under conditions that the lab already has.
+    """Send packets as fast as `sender` can, under the current conditions, and return the packets at each receiver.
 
-    `at_once`: with a pause after so many, for what many receivers are due at one moment a kernel may drop.
+    `at_once`: number of packets before each pause. Without pauses, a kernel may drop packets for many receivers.
     """
     receivers = sorted({WITNESS, *receivers})
     listeners = {vehicle: await air.start_ready(vehicle, "receive", PORT) for vehicle in receivers}
@@ -272,5 +272,5 @@ def assert_overtakers_take_no_time(both: Both, each_s: float) -> None:
 
 
 def in_order(arrivals: list[float]) -> bool:
-    """As far as the clocks tell."""
+    """Return whether the arrivals are in order, within the accuracy of the clocks."""
     return all(later > before - EARLY_S for before, later in pairwise(arrivals))

@@ -1,4 +1,4 @@
-"""The air in virtual time does what conditions ask: counted over many broadcasts of a fixed seed."""
+"""The medium of virtual time applies the requested conditions. Tests count many broadcasts with a fixed seed."""
 
 from collections import Counter
 from itertools import pairwise
@@ -27,7 +27,7 @@ def draw(air: Medium, sender: int, now: float = 0.0) -> RandomDraws:
 
 
 def delays(air: Medium, sender: int, receiver: int, broadcasts: int = BROADCASTS) -> list[list[float]]:
-    """The delays of the copies of each broadcast of one sender at one receiver, by their numbers."""
+    """Return the delays of the copies at one receiver, for each broadcast of one sender."""
     return [[delay for number, delay in draw(air, sender).to_all() if number == receiver] for _ in range(broadcasts)]
 
 
@@ -36,16 +36,16 @@ def lost(copies: list[list[float]]) -> float:
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.15, 0.5, 1.0])
-def test_every_receiver_loses_independently_what_was_asked(loss: float) -> None:
+def test_each_receiver_loses_the_requested_share_independently(loss: float) -> None:
     air = medium(loss=loss)
     heard = Counter(number for _ in range(BROADCASTS) for number, _ in draw(air, 0).to_all())
     assert [1 - heard[number] / BROADCASTS for number in (1, 2)] == [pytest.approx(loss, abs=0.012)] * 2
     both = sum(len(draw(air, 0).to_all()) == 2 for _ in range(BROADCASTS)) / BROADCASTS
     assert both == pytest.approx((1 - loss) ** 2, abs=0.012)
-    assert heard[0] == 0  # nobody hears itself
+    assert heard[0] == 0  # a sender does not receive its own broadcast
 
 
-def test_loss_in_bursts_has_the_mean_and_the_length_of_its_model() -> None:
+def test_bursts_have_the_mean_and_length_of_their_model() -> None:
     bursts = GilbertElliott(p=0.05, r=0.25)
     copies = delays(medium(loss=bursts), 0, 1, 40_000)
     assert lost(copies) == pytest.approx(bursts.mean, abs=0.01)
@@ -53,7 +53,7 @@ def test_loss_in_bursts_has_the_mean_and_the_length_of_its_model() -> None:
     assert fmean(map(len, runs)) == pytest.approx(1 / 0.25, rel=0.05)
 
 
-def test_without_a_delay_messages_take_2_to_50_ms_uniformly() -> None:
+def test_default_delay_is_uniform_between_2_and_50_ms() -> None:
     taken = [delay for copies in delays(medium(), 0, 1) for delay in copies]
     assert 0.002 <= min(taken) < 0.003
     assert 0.049 < max(taken) <= 0.05
@@ -62,7 +62,7 @@ def test_without_a_delay_messages_take_2_to_50_ms_uniformly() -> None:
 
 
 @pytest.mark.parametrize("distribution", ["uniform", "normal", "pareto", "paretonormal"])
-def test_a_delay_has_its_mean_and_jitter(distribution: str) -> None:
+def test_delay_has_its_mean_and_jitter(distribution: str) -> None:
     asked = Delay(0.5, 0.1, distribution)  # type: ignore[arg-type]
     taken = [delay for copies in delays(medium(delay=asked), 0, 1) for delay in copies]
     assert fmean(taken) == pytest.approx(0.5, abs=0.01)
@@ -81,9 +81,7 @@ def test_no_delay_is_negative() -> None:
 
 
 @pytest.mark.parametrize(("loss", "duplicate"), [(0.2, 0.1), (0.4, 0.6), (1.0, 0.3)])
-def test_of_a_packet_lost_and_duplicated_one_is_left_and_a_second_copy_can_be_lost_itself(
-    loss: float, duplicate: float
-) -> None:
+def test_lost_packet_with_a_duplicate_leaves_one_copy(loss: float, duplicate: float) -> None:
     copies = Counter(map(len, delays(medium(loss=loss, duplicate=duplicate), 0, 1)))
     expected = [
         loss * (1 - duplicate),
@@ -93,7 +91,7 @@ def test_of_a_packet_lost_and_duplicated_one_is_left_and_a_second_copy_can_be_lo
     assert [copies[number] / BROADCASTS for number in range(3)] == [pytest.approx(one, abs=0.012) for one in expected]
 
 
-def test_overtakers_come_at_once_and_a_second_copy_takes_its_own_time() -> None:
+def test_reordered_packets_arrive_at_once_and_copies_have_own_delays() -> None:
     copies = delays(medium(delay=Delay(1.0, 0.5), duplicate=0.3, reorder=0.25), 0, 1)
     each = [delay for one in copies for delay in one]
     assert sum(delay == 0.0 for delay in each) / len(each) == pytest.approx(0.25, abs=0.012)
@@ -103,28 +101,28 @@ def test_overtakers_come_at_once_and_a_second_copy_takes_its_own_time() -> None:
 
 
 def arrivals(air: Medium, sent_at: list[float], receiver: int = 1) -> list[list[float]]:
-    """When the copies of each broadcast of the first vehicle come."""
+    """Return the arrival times of the copies, for each broadcast of the first vehicle."""
     return [[at + delay for delay in draw(air, 0, at).copies_to(receiver)] for at in sent_at]
 
 
-def test_under_a_rate_a_packet_leaves_after_the_last_one_and_its_own_time() -> None:
-    """1000 bits at 1000 bit/s: a second each."""
+def test_packet_on_a_rate_leaves_after_earlier_ones() -> None:
+    """Frames of 1000 bits at 1000 bit/s take one second each."""
     assert arrivals(medium(rate=1000), [0.0, 0.25, 0.5, 5.0]) == [[1.0], [2.0], [3.0], [6.0]]
-    # The rate is waited for after the delay, or after whoever is before; the queue is empty again at 8.
+    # A packet waits for the rate after its delay and after earlier packets. The queue is empty again at 8.
     air = medium(rate=1000, delay=Delay(2.0))
     assert arrivals(air, [0.0, 0.25, 0.5, 4.75, 9.0]) == [[3.0], [4.0], [5.0], [7.75], [12.0]]
     # Each frame has 42 bytes of headers.
     assert medium(rate=8).draw(0, 0.0, 0).copies_to(1) == (42.0,)
 
 
-def test_each_directed_pair_has_a_queue_of_its_own() -> None:
+def test_each_directed_pair_has_its_own_queue() -> None:
     air = medium(conditions=NetworkConditions(links={(1, 2): LinkConditions(rate=1000), (2, 1): CONSTANT}))
     assert arrivals(air, [0.0, 0.0]) == [[1.0], [2.0]]
     assert draw(air, 1).copies_to(0) == (1.5,)
     assert arrivals(air, [0.0]) == [[3.0]]
 
 
-def test_jitter_reorders_without_a_rate_only() -> None:
+def test_jitter_reorders_only_without_a_rate() -> None:
     sent_at = [index / 100 for index in range(500)]
     jitter = Delay(1.0, 1.0, "normal")
     free = [at for (at,) in arrivals(medium(delay=jitter), sent_at)]
@@ -133,20 +131,20 @@ def test_jitter_reorders_without_a_rate_only() -> None:
     assert all(later - before >= 0.000999 for before, later in pairwise(ordered))
 
 
-def test_what_comes_when_the_limit_is_reached_is_lost() -> None:
+def test_packet_beyond_the_limit_is_lost() -> None:
     air = medium(rate=1000, limit=2)
-    # The first leaves at 1: at that moment there is room again.
+    # The first packet leaves at 1. At this time, the queue accepts a packet again.
     assert arrivals(air, [0.0, 0.0, 0.5, 1.0, 1.5, 2.0]) == [[1.0], [2.0], [], [3.0], [], [4.0]]
     air = medium(delay=Delay(1.5), limit=3)
     assert arrivals(air, [0.0, 0.25, 0.5, 1.0, 1.5, 1.5]) == [[1.5], [1.75], [2.0], [], [3.0], []]
 
 
-def test_what_overtakes_leaves_at_once_and_takes_no_place() -> None:
+def test_reordered_packet_takes_no_place_in_the_queue() -> None:
     air = medium(rate=1000, delay=Delay(2.0), reorder=1.0, limit=1)
     assert arrivals(air, [0.0, 0.0, 0.5]) == [[0.0], [0.0], [0.5]]
 
 
-def test_what_is_corrupted_takes_its_place_in_the_queue_and_what_is_lost_takes_none() -> None:
+def test_corrupted_packet_takes_a_place_and_a_lost_one_does_not() -> None:
     found = arrivals(medium(rate=1000, corrupt=0.5), [0.0] * 100)
     assert 20 < sum(map(len, found)) < 80
     assert all(copies in ([], [at]) for at, copies in enumerate(found, 1))
@@ -154,14 +152,14 @@ def test_what_is_corrupted_takes_its_place_in_the_queue_and_what_is_lost_takes_n
     assert heard == list(range(1, len(heard) + 1))
 
 
-def test_a_second_copy_goes_through_the_queue_before_the_first() -> None:
-    """And so a packet that finds one place left takes two."""
+def test_second_copy_leaves_the_queue_before_the_first() -> None:
+    """A packet with two copies therefore needs only one free place, and then occupies two."""
     assert arrivals(medium(rate=1000, duplicate=1.0), [0.0, 0.0]) == [[2.0, 1.0], [4.0, 3.0]]
     one_waits = medium(rate=1000, duplicate=1.0, limit=1)
     assert arrivals(one_waits, [0.0, 0.0, 1.5, 2.0]) == [[2.0, 1.0], [], [], [4.0, 3.0]]
 
 
-def test_a_queue_lives_on_while_conditions_remember() -> None:
+def test_queue_survives_a_change_between_conditions_with_memory() -> None:
     air = medium(rate=1000)
     assert arrivals(air, [0.0, 0.0]) == [[1.0], [2.0]]
     air.apply(NetworkConditions(LinkConditions(rate=2000, limit=3)))
@@ -177,7 +175,7 @@ def test_a_queue_lives_on_while_conditions_remember() -> None:
         assert arrivals(air, [1.0]) == [[2.0]]
 
 
-def test_a_partition_stands_before_the_queue() -> None:
+def test_partition_drops_packets_before_the_queue() -> None:
     air = medium(rate=1000)
     open_ = NetworkConditions(LinkConditions(rate=1000))
     assert arrivals(air, [0.0]) == [[1.0]]
@@ -187,7 +185,7 @@ def test_a_partition_stands_before_the_queue() -> None:
     assert arrivals(air, [0.0]) == [[2.0]]
 
 
-def test_bursts_begin_in_the_good_state_whenever_the_conditions_change_but_not_with_a_partition() -> None:
+def test_bursts_restart_at_new_conditions_but_not_at_a_partition() -> None:
     bursts = NetworkConditions(LinkConditions(GilbertElliott(1, 0)))  # good for one packet, then bad for good
     air = medium(conditions=bursts)
     heard = [bool(draw(air, 0).copies_to(1)) for _ in range(2)]
@@ -198,12 +196,12 @@ def test_bursts_begin_in_the_good_state_whenever_the_conditions_change_but_not_w
     assert heard == [True, False, False, True]
 
 
-def test_a_bit_error_is_a_loss_of_its_own() -> None:
+def test_corruption_adds_to_the_loss() -> None:
     assert lost(delays(medium(corrupt=0.2), 0, 1)) == pytest.approx(0.2, abs=0.012)
     assert lost(delays(medium(corrupt=0.2, loss=0.5), 0, 1)) == pytest.approx(0.6, abs=0.012)
 
 
-def test_receivers_and_links_differ_in_one_direction_only() -> None:
+def test_conditions_of_receivers_and_links_have_one_direction() -> None:
     air = medium(
         conditions=NetworkConditions(
             receivers={2: LinkConditions(loss=0.5)}, links={(3, 1): LinkConditions(loss=1.0, delay=Delay(1.0))}
@@ -215,7 +213,7 @@ def test_receivers_and_links_differ_in_one_direction_only() -> None:
     assert lost(delays(air, 1, 0, 100)) == 0.0
 
 
-def test_nothing_crosses_a_partition_and_all_does_after_heal() -> None:
+def test_nothing_crosses_a_partition_until_it_heals() -> None:
     air = medium(4)
     cut = NetworkConditions(partition=(frozenset({1, 2}),))
     air.apply(cut)
@@ -227,17 +225,17 @@ def test_nothing_crosses_a_partition_and_all_does_after_heal() -> None:
     assert {number for number, _ in draw(air, 0).to_all()} == {1, 2, 3}
 
 
-def test_lots_read_one_by_one_are_those_read_all_at_once() -> None:
+def test_draws_are_equal_one_by_one_and_all_at_once() -> None:
     for link in ({"loss": 0.3}, {"loss": GilbertElliott(0.1, 0.5), "duplicate": 0.5}):
         one, other = medium(5, **link), medium(5, **link)
         for _ in range(200):
-            lots, all_ = draw(one, 2), draw(other, 2).to_all()
-            assert [(number, delay) for number in range(5) for delay in lots.copies_to(number)] == all_
-            assert all(delay <= lots.latest for _, delay in all_)
+            draws, all_ = draw(one, 2), draw(other, 2).to_all()
+            assert [(number, delay) for number in range(5) for delay in draws.copies_to(number)] == all_
+            assert all(delay <= draws.latest for _, delay in all_)
 
 
-def test_streams_are_one_per_sender_and_concern() -> None:
-    """Neither another sender's words nor more loss change how long a message takes."""
+def test_each_sender_and_effect_has_its_own_random_stream() -> None:
+    """Messages of other senders and a higher loss do not change the delay of a message."""
     quiet, busy, lossy = medium(), medium(), medium(loss=0.9)
     for _ in range(500):
         draw(busy, 1)
@@ -246,11 +244,11 @@ def test_streams_are_one_per_sender_and_concern() -> None:
         assert dict(draw(lossy, 0).to_all()).items() <= expected.items()
 
 
-def test_a_seed_is_another_air() -> None:
+def test_other_seed_gives_other_draws() -> None:
     one, same, other = (draw(medium(seed=seed), 0).to_all() for seed in (1, 1, 2))
     assert one == same != other
 
 
-def test_an_unknown_vehicle_is_refused() -> None:
+def test_unknown_vehicle_is_refused() -> None:
     with pytest.raises(ConditionsError, match="unknown vehicle 9"):
         medium(conditions=NetworkConditions(receivers={9: LinkConditions(loss=1.0)}))

@@ -1,4 +1,4 @@
-"""Range makes links: what a radio loses, and what becomes of conditions and of the network."""
+"""The radio model: losses by distance, and their effect on conditions and groups."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ def test_distance_counts_all_three_directions() -> None:
     assert Place(1.0, 2.0, 3.0).distance_m(Place(3.0, 5.0, 9.0)) == 7.0
 
 
-def test_a_hard_range_is_all_or_nothing() -> None:
+def test_hard_range_loses_all_or_nothing() -> None:
     assert [HardRange(100.0).loss(metres) for metres in (0.0, 100.0, 100.1)] == [0.0, 0.0, 1.0]
 
 
-def test_log_distance_loses_what_its_docstring_says() -> None:
+def test_log_distance_has_the_documented_losses() -> None:
     radio = LogDistance()
     assert [round(radio.loss(metres), 2) for metres in (231.0, 462.0, 924.0)] == [0.01, 0.5, 0.99]
-    # By hand: 20 dBm - 40.18 dB over the first metre - 2.32 * 20 dB over the next hundredfold + 82 dBm.
+    # Computed by hand: 20 dBm - 40.18 dB over the first metre - 2.32 * 20 dB over the next hundredfold + 82 dBm.
     assert radio.margin_db(100.0) == pytest.approx(20 - 40.18 - 46.4 + 82, abs=0.01)
     assert radio.margin_db(100.0) - radio.margin_db(1000.0) == pytest.approx(23.2)
-    # One deviation of shadowing below and above half: the normal distribution's 15.87 %.
+    # One standard deviation of shadowing from the half: 15.87 % of the normal distribution.
     half_m = 10 ** (radio.margin_db(1.0) / 23.2)
     assert radio.loss(half_m * 10 ** (-3 / 23.2)) == pytest.approx(0.1587, abs=1e-4)
     assert radio.loss(half_m * 10 ** (3 / 23.2)) == pytest.approx(0.8413, abs=1e-4)
 
 
-def test_without_shadowing_it_is_a_hard_range() -> None:
+def test_log_distance_without_shadowing_is_a_hard_range() -> None:
     radio = LogDistance(shadowing_db=0.0)
     assert [radio.loss(metres) for metres in (461.0, 464.0)] == [0.0, 1.0]
 
 
 @pytest.mark.parametrize("radio", [HardRange(), LogDistance(), LogDistance(shadowing_db=8.0, exponent=3.5)])
 @given(metres=st.lists(st.floats(0, 1e7), min_size=2))
-def test_farther_never_loses_less(radio: Radio, metres: list[float]) -> None:
+def test_larger_distance_never_loses_less(radio: Radio, metres: list[float]) -> None:
     losses = [radio.loss(one) for one in sorted(metres)]
     assert all(0.0 <= near <= distant <= 1.0 for near, distant in pairwise(losses))
 
@@ -63,12 +63,12 @@ def test_farther_never_loses_less(radio: Radio, metres: list[float]) -> None:
         (lambda: LogDistance(power_dbm=math.nan), r"radio\.power_dbm: nan is not a finite number"),
     ],
 )
-def test_a_radio_that_means_nothing_is_refused(make: object, word: str) -> None:
+def test_invalid_radio_is_refused(make: object, word: str) -> None:
     with pytest.raises(ConditionsError, match=word):
         make()  # type: ignore[operator]
 
 
-def test_links_are_held_in_steps_so_that_hovering_changes_nothing() -> None:
+def test_losses_have_steps_so_that_hovering_changes_nothing() -> None:
     radio = LogDistance()
     assert links(radio, far(0.0, 100.0)) == {}
     found = links(radio, far(0.0, 400.0, 5000.0))
@@ -76,7 +76,7 @@ def test_links_are_held_in_steps_so_that_hovering_changes_nothing() -> None:
     assert links(radio, far(0.05, 400.0, 5000.05)) == found
 
 
-def test_a_message_has_to_get_past_the_radio_and_what_was_asked_besides() -> None:
+def test_radio_losses_add_to_the_requested_conditions() -> None:
     slow = LinkConditions(0.2, Delay(0.1))
     bursts = LinkConditions(GilbertElliott(0.1, 0.5, 1.0, 0.2))
     asked = NetworkConditions(LinkConditions(0.5), {3: bursts}, {(1, 2): slow}, (frozenset({4}),))
@@ -89,12 +89,12 @@ def test_a_message_has_to_get_past_the_radio_and_what_was_asked_besides() -> Non
     assert over_the_air(asked, {}) is asked
 
 
-def test_components_are_who_can_reach_whom_through_others_too() -> None:
+def test_components_include_vehicles_reached_through_others() -> None:
     chain = over_the_air(NetworkConditions(), links(HardRange(100.0), far(0.0, 90.0, 180.0, 400.0, 480.0)))
     assert components(chain, (1, 2, 3, 4, 5)) == ({1, 2, 3}, {4, 5})
     assert components(chain.with_partition([[1, 3]]), (1, 2, 3, 4, 5)) == ({4, 5}, {1}, {2}, {3})
     for deaf in ((1, 2), (2, 1)):
         one_way = NetworkConditions(links={deaf: LinkConditions(1.0)})
-        assert components(one_way, (1, 2)) == ({1}, {2}), "a link in one direction answers no question"
+        assert components(one_way, (1, 2)) == ({1}, {2}), "a link in one direction connects no group"
     bursts = NetworkConditions(LinkConditions(GilbertElliott(0.1, 0.5, 1.0, 1.0)))
     assert components(bursts, (1, 2)) == ({1}, {2})

@@ -1,7 +1,6 @@
-"""An edit of the core in place is found, and the handler is named. The judge does not share code with the agents.
+"""The step judge finds an error in an edited core, and names the handler. It does not share code with the agents.
 
-Each edit is made in a copy of `ucp`, and a scenario is played with the copy, as an engineer would who develops the
-protocol in a clone.
+Each test edits a copy of `ucp`, as an engineer edits a clone, and plays a scenario with the copy.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Runs as a user meets them: real processes, real namespaces, and everything that can go wrong."""
+"""Runs with real processes and namespaces, and the errors that a user can meet."""
 
 import json
 import os
@@ -22,10 +22,10 @@ def verdicts(record: dict[str, Any]) -> dict[str, str]:
     return {number: one["verdict"] for number, one in record["characteristics"].items()}
 
 
-def test_a_run_with_vehicles_leaves_everything_that_it_promises(tmp_path: Path) -> None:
+def test_run_with_vehicles_writes_all_files(tmp_path: Path) -> None:
     scenario = write_scenario(
         tmp_path,
-        speedup=50,  # so that agents of a busy machine, which log late, still fill a block
+        speedup=50,  # on a busy machine agents log late, and must still fill a block
         events={"source": "random", "mean_s": 4},
         network={"loss": 0.1},
         timeline=[{"at_s": 50, "partition": [[1]]}, {"at_s": 100, "heal": True}],
@@ -63,7 +63,7 @@ def test_a_run_with_vehicles_leaves_everything_that_it_promises(tmp_path: Path) 
 
 
 @pytest.mark.any_user
-def test_a_partition_without_heal_keeps_chains_apart_and_5_and_6_do_not_apply(tmp_path: Path) -> None:
+def test_partition_without_heal_makes_5_and_6_not_applicable(tmp_path: Path) -> None:
     scenario = write_scenario(
         tmp_path,
         agents=[7, 300, 65535],
@@ -84,17 +84,17 @@ def test_a_partition_without_heal_keeps_chains_apart_and_5_and_6_do_not_apply(tm
 
 
 @pytest.mark.any_user
-def test_the_options_of_the_command_line_come_before_the_scenario_s(tmp_path: Path) -> None:
+def test_command_line_options_override_the_scenario(tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path, speedup=1)
     done = harness("run", scenario, "--speedup", 200, "--vehicles", "none", "--seed", 0, "--out", tmp_path / "run")
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert done.returncode == 0
     assert record["scenario"]["speedup"] == 200
     assert record["vehicles"] == {}
-    assert record["wall_s"] < 200, "at the scenario's own speedup it takes 200 s"
+    assert record["wall_s"] < 200, "the mission takes 200 s at the speedup of the scenario"
 
 
-def test_ctrl_c_stops_cleanly_and_still_exports_and_checks(tmp_path: Path) -> None:
+def test_ctrl_c_ends_the_run_with_exports_and_verdicts(tmp_path: Path) -> None:
     run = Running(write_scenario(tmp_path, duration_s=100_000), tmp_path / "run")
     run.wait_for_mission(1, 2, 3)
     run.process.send_signal(signal.SIGINT)
@@ -110,7 +110,7 @@ def test_ctrl_c_stops_cleanly_and_still_exports_and_checks(tmp_path: Path) -> No
     assert not processes(run.out)
 
 
-def test_an_agent_that_crashes_ends_the_run_and_is_named_and_the_others_export(tmp_path: Path) -> None:
+def test_crashed_agent_ends_the_run_and_the_others_export(tmp_path: Path) -> None:
     run = Running(write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}), tmp_path / "run")
     run.wait_for_mission(1, 2, 3)
     run.signal_agent(2, signal.SIGKILL)
@@ -129,7 +129,7 @@ def test_an_agent_that_crashes_ends_the_run_and_is_named_and_the_others_export(t
 
 
 @pytest.mark.any_user
-def test_an_agent_that_hangs_ends_the_run_and_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hanging_agent_ends_the_run_and_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = Running(write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}), tmp_path / "run")
     run.wait_for_mission(1, 2, 3)
     run.signal_agent(3, signal.SIGSTOP)
@@ -147,7 +147,7 @@ def executable(path: Path, text: str, mode: int = 0o755) -> Path:
 
 
 @pytest.mark.any_user
-def test_a_vehicle_binary_that_will_not_do_is_one_sentence_before_anything_starts(tmp_path: Path) -> None:
+def test_unusable_vehicle_binary_is_refused_before_the_start(tmp_path: Path) -> None:
     not_executable = executable(tmp_path / "arducopter", "#!/bin/sh\n", 0o644)
     for binary, sentence in ((tmp_path / "nowhere", "does not exist"), (not_executable, "is not executable")):
         scenario = write_scenario(tmp_path, vehicles={"kind": "ardupilot", "binary": str(binary)})
@@ -160,7 +160,7 @@ def test_a_vehicle_binary_that_will_not_do_is_one_sentence_before_anything_start
 
 
 @pytest.mark.any_user
-def test_asking_for_ardupilot_without_having_it_says_how_to_get_it(tmp_path: Path) -> None:
+def test_missing_ardupilot_is_refused_with_a_solution(tmp_path: Path) -> None:
     environment = {**os.environ, "PATH": "/usr/bin:/bin"}
     environment.pop("ARDUPILOT_SITL", None)
     done = harness(
@@ -171,7 +171,7 @@ def test_asking_for_ardupilot_without_having_it_says_how_to_get_it(tmp_path: Pat
 
 
 @pytest.mark.any_user
-def test_a_vehicle_that_exits_at_once_ends_the_run_with_its_last_words(tmp_path: Path) -> None:
+def test_vehicle_that_exits_at_once_ends_the_run_with_its_output(tmp_path: Path) -> None:
     binary = executable(tmp_path / "arducopter", "#!/bin/sh\necho bind failed >&2\nexit 1\n")
     scenario = write_scenario(tmp_path, vehicles={"kind": "ardupilot", "binary": str(binary)})
     done = harness("run", scenario, "--out", tmp_path / "run")
@@ -182,7 +182,7 @@ def test_a_vehicle_that_exits_at_once_ends_the_run_with_its_last_words(tmp_path:
 
 
 @pytest.mark.any_user
-def test_a_run_directory_is_never_overwritten(tmp_path: Path) -> None:
+def test_run_directory_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "precious").write_text("data")
     done = harness("run", write_scenario(tmp_path), "--out", tmp_path / "run")
@@ -191,7 +191,7 @@ def test_a_run_directory_is_never_overwritten(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["precious"]
 
 
-def test_two_runs_at_once_do_not_meet(tmp_path: Path) -> None:
+def test_simultaneous_runs_do_not_receive_each_other(tmp_path: Path) -> None:
     runs = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
@@ -203,7 +203,7 @@ def test_two_runs_at_once_do_not_meet(tmp_path: Path) -> None:
         assert {agent["dropped"].get("sender not on the roster", 0) for agent in run.record()["agents"].values()} == {0}
 
 
-def test_a_full_disk_is_one_sentence_and_status_3_and_what_was_written_stays(tmp_path: Path) -> None:
+def test_full_disk_gives_status_3_and_keeps_written_files(tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()
     scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, events={"mean_s": 1}, duration_s=100_000)
@@ -239,9 +239,9 @@ sys.exit(status)
     assert "No space left on device" in done.stdout
 
 
-def test_where_user_namespaces_are_forbidden_a_run_and_doctor_say_so_with_status_3(tmp_path: Path) -> None:
-    # A user namespace may forbid further ones inside it, as an administrator does for a machine; root's rights are
-    # taken away too, for root needs no user namespace.
+def test_forbidden_user_namespaces_give_status_3_in_run_and_doctor(tmp_path: Path) -> None:
+    # A user namespace can forbid further ones inside it, as an administrator can for a machine. The capabilities of
+    # root are dropped, because root needs no user namespace.
     forbid = 'echo 0 > /proc/sys/user/max_user_namespaces && exec setpriv --bounding-set=-all "$@"'
     forbidden = ["unshare", "--user", "--map-root-user", "sh", "-c", forbid, "sh"]
     for command in (["run", write_scenario(tmp_path), "--out", tmp_path / "run"], ["doctor"]):
@@ -255,7 +255,7 @@ def test_where_user_namespaces_are_forbidden_a_run_and_doctor_say_so_with_status
 
 
 @pytest.mark.any_user
-def test_any_program_that_follows_the_contract_can_be_put_under_test(tmp_path: Path) -> None:
+def test_any_program_that_follows_the_contract_can_be_tested(tmp_path: Path) -> None:
     agent = executable(
         tmp_path / "my-agent",
         f"#!/bin/sh\necho $1 >>'{tmp_path}/started'\nexec {shlex.quote(sys.executable)} -m ucp.node \"$2\"\n",
@@ -267,7 +267,7 @@ def test_any_program_that_follows_the_contract_can_be_put_under_test(tmp_path: P
 
 
 @pytest.mark.any_user
-def test_some_agents_run_another_program_and_the_others_ours(tmp_path: Path) -> None:
+def test_some_agents_run_another_program(tmp_path: Path) -> None:
     agent = tmp_path / "my agent.py"
     agent.write_text(
         f"""
@@ -318,9 +318,7 @@ sys.exit(ucp.node.main(sys.argv[1:], Mine))
     ],
 )
 @pytest.mark.any_user
-def test_an_agent_command_that_is_no_program_is_one_sentence_before_anything_starts(
-    tmp_path: Path, command: Any, sentence: str
-) -> None:
+def test_missing_agent_program_is_refused_before_the_start(tmp_path: Path, command: Any, sentence: str) -> None:
     notes = tmp_path / "notes.txt"
     notes.touch()
     script = executable(tmp_path / "script", "#!/no/such interpreter\n")
@@ -331,7 +329,7 @@ def test_an_agent_command_that_is_no_program_is_one_sentence_before_anything_sta
     assert not (tmp_path / "run").exists()
 
 
-def test_a_file_that_is_no_program_after_all_is_the_scenarios_mistake(tmp_path: Path) -> None:
+def test_file_that_cannot_be_executed_is_a_scenario_error(tmp_path: Path) -> None:
     agent = executable(tmp_path / "my-agent", "no program\n")
     done = harness(
         "run", write_scenario(tmp_path, agent_command={3: [str(agent), "[/bold]"]}), "--out", tmp_path / "run"
@@ -342,7 +340,7 @@ def test_a_file_that_is_no_program_after_all_is_the_scenarios_mistake(tmp_path: 
 
 
 @pytest.mark.any_user
-def test_an_agent_that_ends_at_once_is_named_with_its_status(tmp_path: Path) -> None:
+def test_agent_that_ends_at_once_is_named_with_its_status(tmp_path: Path) -> None:
     agent = executable(tmp_path / "my-agent", "#!/bin/sh\necho no licence >&2\nexit 4\n")
     scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command=[str(agent)])
     done = harness("run", scenario, "--out", tmp_path / "run")
@@ -353,7 +351,7 @@ def test_an_agent_that_ends_at_once_is_named_with_its_status(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("words", ["mine has no telemetry", ""])
 @pytest.mark.any_user
-def test_an_agent_that_ends_with_127_at_its_start_is_not_judged(tmp_path: Path, words: str) -> None:
+def test_agent_that_ends_with_127_at_its_start_is_not_judged(tmp_path: Path, words: str) -> None:
     agent = refusing_to_start(tmp_path / "my-agent", words)
     scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command={2: [str(agent), "--x"]})
     done = harness("run", scenario, "--out", tmp_path / "run")
@@ -370,7 +368,7 @@ def test_an_agent_that_ends_with_127_at_its_start_is_not_judged(tmp_path: Path, 
 
 
 @pytest.mark.any_user
-def test_what_is_not_supported_half_way_leaves_no_verdict_either(tmp_path: Path) -> None:
+def test_unsupported_command_during_a_run_leaves_no_verdict(tmp_path: Path) -> None:
     command = lacking(tmp_path / "my_agent.py", "stop_events")
     keys = {"vehicles": {"kind": "none"}, "timeline": [{"at_s": 60, "stop_events": [2]}]}
     done = harness("run", write_scenario(tmp_path, agent_command={2: command}, **keys), "--out", tmp_path / "run")
@@ -384,7 +382,7 @@ def test_what_is_not_supported_half_way_leaves_no_verdict_either(tmp_path: Path)
 
 
 @pytest.mark.any_user
-def test_a_shell_that_does_not_find_the_agent_is_a_failure_and_no_agent_that_lacks_something(tmp_path: Path) -> None:
+def test_shell_that_does_not_find_the_agent_fails_the_run(tmp_path: Path) -> None:
     agent = executable(tmp_path / "my-agent", '#!/bin/sh\nno_such_program "$1"\n')
     scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, agent_command={2: [str(agent)]})
     done = harness("run", scenario, "--out", tmp_path / "run")
@@ -393,7 +391,7 @@ def test_a_shell_that_does_not_find_the_agent_is_a_failure_and_no_agent_that_lac
     assert "no_such_program: not found); its log is agents/2.log" in sentences(done.stderr)[0]
 
 
-def test_a_lab_that_dies_is_blamed_and_not_the_agents_that_die_with_it(tmp_path: Path) -> None:
+def test_end_of_the_lab_is_reported_instead_of_crashed_agents(tmp_path: Path) -> None:
     run = Running(write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}), tmp_path / "run")
     run.wait_for_mission(1, 2, 3)
     children = Path(f"/proc/{run.process.pid}/task/{run.process.pid}/children").read_text().split()
@@ -407,7 +405,7 @@ def test_a_lab_that_dies_is_blamed_and_not_the_agents_that_die_with_it(tmp_path:
 
 
 @pytest.mark.any_user
-def test_an_agent_that_does_not_follow_the_contract_is_told_so(tmp_path: Path) -> None:
+def test_agent_that_violates_the_contract_gets_the_reason(tmp_path: Path) -> None:
     program = """
 import os, socket, sys
 control = sys.argv[1].replace("mission.json", "control")

@@ -1,4 +1,4 @@
-"""Protocol variants: agents play them, the judge judges by them, and records name them."""
+"""Agents play protocol variants, the step judge uses them, and records name them."""
 
 import json
 import sys
@@ -67,20 +67,20 @@ def refuses(state, sender, message):
 
 
 @pytest.fixture
-def pops(tmp_path: Path) -> Path:
-    """The setting `phase1_tie: pop`, written as a variant."""
-    return written(tmp_path, HEAD + CORE + REFERENCE)
+def pop_variant(tmp_path: Path) -> Path:
+    """Return the file of a variant that equals the setting `phase1_tie: pop`."""
+    return write_variant(tmp_path, HEAD + CORE + REFERENCE)
 
 
-def written(directory: Path, text: str) -> Path:
+def write_variant(directory: Path, text: str) -> Path:
     path = directory / "pops.py"
     path.write_text(text)
     return path
 
 
-def test_variant_of_a_setting_plays_as_the_setting(pops: Path) -> None:
+def test_variant_of_a_setting_plays_as_the_setting(pop_variant: Path) -> None:
     original = digest(simulate(scenario(**LOSSY), 1, tracing=True, deliver_all=True))
-    with in_force(pops):
+    with in_force(pop_variant):
         variant = simulate(scenario(**LOSSY), 1, tracing=True)
     setting = simulate(scenario(**LOSSY, settings={"phase1_tie": "pop"}), 1, tracing=True, deliver_all=True)
     assert [run.branch for trace in variant.evidence.traces.values() for run in trace.runs] == [
@@ -93,65 +93,65 @@ def test_variant_of_a_setting_plays_as_the_setting(pops: Path) -> None:
 
 
 def test_judge_names_the_handler_if_the_transcriptions_differ(tmp_path: Path) -> None:
-    wrong = written(tmp_path, HEAD + CORE.replace("yes <= no", "yes < no") + REFERENCE)
+    wrong = write_variant(tmp_path, HEAD + CORE.replace("yes <= no", "yes < no") + REFERENCE)
     with in_force(wrong):
         result = simulate(scenario(**LOSSY), 1, tracing=True).result
     assert result.beside["steps"].verdict == "deviates"
     assert "Algorithm 11" in result.beside["steps"].reason
 
 
-def test_original_judge_finds_a_run_of_the_variant(pops: Path) -> None:
-    with in_force(pops):
+def test_original_judge_finds_a_run_of_the_variant(pop_variant: Path) -> None:
+    with in_force(pop_variant):
         run = simulate(scenario(**LOSSY), 1, tracing=True)
     assert check(run.evidence).beside["steps"].verdict == "deviates"
 
 
 def test_new_branch_of_a_variant_is_a_known_word(tmp_path: Path) -> None:
-    with in_force(written(tmp_path, HEAD + NEW_BRANCH)):
+    with in_force(write_variant(tmp_path, HEAD + NEW_BRANCH)):
         result = simulate(scenario(agents=3, duration_s=200.0), 1, tracing=True).result
     assert result.beside["steps"].verdict == "as specified"
 
 
-def test_run_is_judged_only_with_the_variant_that_made_it(pops: Path, tmp_path: Path) -> None:
+def test_run_is_judged_only_with_the_variant_that_made_it(pop_variant: Path, tmp_path: Path) -> None:
     def run(out: str, *options: object) -> None:
         done = harness("run", "loss_30", "--backend", "sim", "--seed", 1, "--out", tmp_path / out, *options)
         assert done.returncode == 0, done.stdout + done.stderr
 
-    run("changed", "--variant", pops)
+    run("changed", "--variant", pop_variant)
     run("original")
     versions = json.loads((tmp_path / "changed" / "run.json").read_text())["versions"]
-    assert versions["variant"] == load_variant(pops).version
-    assert harness("check", tmp_path / "changed", "--variant", pops).returncode == 0
+    assert versions["variant"] == load_variant(pop_variant).version
+    assert harness("check", tmp_path / "changed", "--variant", pop_variant).returncode == 0
     other = tmp_path / "other"
     other.mkdir()
-    written(other, pops.read_text() + "# edited\n")
+    write_variant(other, pop_variant.read_text() + "# edited\n")
     for command in (("check",), ("replay", "--agent", 1)):
         for options, why in (
             ((tmp_path / "changed",), "was made with the variant pops"),
             ((tmp_path / "changed", "--variant", other / "pops.py"), "not with pops"),
-            ((tmp_path / "original", "--variant", pops), "was made without a variant: leave out --variant"),
+            ((tmp_path / "original", "--variant", pop_variant), "was made without a variant: leave out --variant"),
         ):
             done = harness(command[0], *options, *command[1:])
             assert done.returncode == 2, (command, options, done.stdout)
             assert why in sentences(done.stderr)[-1]
 
 
-def test_agent_process_runs_with_the_variant(pops: Path) -> None:
-    with in_force(pops):
-        assert agent_command(scenario(), 1)[-2:] == ["harness.play.variant_agent", str(pops)]
+def test_agent_process_runs_with_the_variant(pop_variant: Path) -> None:
+    with in_force(pop_variant):
+        assert agent_command(scenario(), 1)[-2:] == ["harness.play.variant_agent", str(pop_variant)]
     assert agent_command(scenario(), 1)[-1] == "ucp.node"
 
 
-def test_conformance_expects_the_variant(pops: Path, tmp_path: Path) -> None:
-    agent = (sys.executable, "-m", "harness.play.variant_agent", pops)
-    asked = ("conformance", "--virtual", "--only", 11, "--variant", pops, "--keep", tmp_path / "kept")
+def test_conformance_expects_the_variant(pop_variant: Path, tmp_path: Path) -> None:
+    agent = (sys.executable, "-m", "harness.play.variant_agent", pop_variant)
+    asked = ("conformance", "--virtual", "--only", 11, "--variant", pop_variant, "--keep", tmp_path / "kept")
     done = harness(*asked, "--", *agent, deadline_s=300)
     assert done.returncode == 0, done.stdout
 
 
-def test_proof_of_a_variant_does_not_reduce_states(pops: Path, tmp_path: Path) -> None:
+def test_proof_of_a_variant_does_not_reduce_states(pop_variant: Path, tmp_path: Path) -> None:
     bounds = ("--agents", 2, "--blocks", 2, "--losses", 1, "--steps")
-    done = harness("prove", *bounds, "--variant", pops, "--json", "--out", tmp_path / "found.yaml")
+    done = harness("prove", *bounds, "--variant", pop_variant, "--json", "--out", tmp_path / "found.yaml")
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads(done.stdout)["reduced"] is False
     assert "the variant is pops (Algorithm 11)" in done.stderr
@@ -170,7 +170,7 @@ def test_proof_of_a_variant_does_not_reduce_states(pops: Path, tmp_path: Path) -
 )
 def test_unusable_variant_is_refused_in_a_sentence(text: str, why: str, tmp_path: Path) -> None:
     with pytest.raises(VariantError, match=why):
-        load_variant(written(tmp_path, text))
+        load_variant(write_variant(tmp_path, text))
 
 
 def test_missing_variant_is_refused_in_a_sentence(tmp_path: Path) -> None:
