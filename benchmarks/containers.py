@@ -20,10 +20,10 @@ from benchmarks.rounds import Spread, show
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
 from harness.play._vehicle_keys import KeyDirectories
-from harness.play.containers._container_backend import Containers
+from harness.play.containers._container_backend import DockerBackend
 from harness.play.containers._container_preflight import require_root
 from harness.play.process._agent_process import AgentProcess, agent_command
-from harness.play.process._process_backend import Processes
+from harness.play.process._process_backend import ProcessBackend
 from harness.play.process._run_lab import OpenLab
 from harness.scenario.load import parse
 from netem.errors import NetemError
@@ -60,7 +60,7 @@ async def once(agents: int, open_lab: OpenLab, directory: Path) -> tuple[float, 
 def up_and_down(agents: int, rounds: int, folder: Path) -> _Row:
     found: dict[str, list[tuple[float, float]]] = {"docker": [], "process": []}
     for number in range(rounds):
-        for name, open_lab in (("docker", Containers().open_lab), ("process", Processes().open_lab)):
+        for name, open_lab in (("docker", DockerBackend().open_lab), ("process", ProcessBackend().open_lab)):
             found[name].append(asyncio.run(once(agents, open_lab, folder / f"{name}-{agents}-{number}")))
     row: _Row = {"agents": agents}
     for place, key in enumerate(("up", "down")):

@@ -1,6 +1,6 @@
-"""The backends by name, as scenarios, records and the command line say it: what they are is in `harness.play`.
+"""The names of the backends in scenarios, in records and on the command line. `harness.play` implements them.
 
-It is in no room, for the pytest plugin needs it where nobody asked for a swarm, and should cost nothing there.
+The module is in no room, because the pytest plugin always imports it, and the import must be fast.
 """
 
 from typing import Literal, get_args

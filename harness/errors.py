@@ -7,8 +7,7 @@ from typing import Self
 VIOLATED, WRONG_REQUEST, CANNOT_HERE, INCOMPLETE, INTERRUPTED = 1, 2, 3, 4, 130
 """Exit statuses besides 0. 1: a verdict is bad, an agent failed, or the result of a command is negative. 2: the
 scenario, an argument or an input file is wrong. 3: this machine cannot do it. 4: more time is needed for a
-result. 130: interrupted. `harness.cli` lists
-all."""
+result. 130: interrupted. `harness.cli` lists all of them."""
 
 
 class HarnessError(Exception):
@@ -74,6 +73,6 @@ class AgentFailedError(HarnessError):
 
 
 class InterruptedRunError(HarnessError):
-    """The user asked to stop."""
+    """The user interrupted the run."""
 
     exit_status = INTERRUPTED

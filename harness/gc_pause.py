@@ -1,7 +1,7 @@
-"""Python's cycle collector, for what makes a million objects and no cycle: it would look at them again and again.
+"""A pause of Python's cycle collector, for code that makes a million objects without cycles.
 
-For handler runs, made by a simulation or read for a report, that is a third of the time; of the import of a command
-an eighth. A simulated run leaves no cycles: all of it goes when it is let go.
+The collector would scan these objects again and again. It takes a third of the time to make or read handler runs, and
+an eighth of the time to import a command. A simulated run leaves no cycles, so reference counting frees all of it.
 """
 
 import contextlib
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def gc_paused() -> Iterator[None]:
-    """A context, or a decorator, in which it does not look."""
+    """Stop the collector inside the context. It is also a decorator."""
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -19,5 +19,5 @@ def gc_paused() -> Iterator[None]:
     finally:
         if collects:
             gc.freeze()
-            gc.unfreeze()  # what was made meanwhile counts as old now, and nobody looks at it at once
+            gc.unfreeze()  # new objects count as old now, so that the collector does not scan them at once
             gc.enable()

@@ -4,11 +4,13 @@ from typing import Any
 
 from harness.backend_names import BackendName
 from harness.play.backend import Backend
-from harness.play.containers._container_backend import Containers
-from harness.play.process._process_backend import Processes
-from harness.play.simulation.virtual_time import VirtualTime
+from harness.play.containers._container_backend import DockerBackend
+from harness.play.process._process_backend import ProcessBackend
+from harness.play.simulation.virtual_time import SimulationBackend
 
-BACKENDS: dict[BackendName, Backend] = {backend.name: backend for backend in (Processes(), Containers(), VirtualTime())}
+BACKENDS: dict[BackendName, Backend] = {
+    backend.name: backend for backend in (ProcessBackend(), DockerBackend(), SimulationBackend())
+}
 
 
 def in_virtual_time(name: Any) -> bool:

@@ -70,7 +70,8 @@ class SoughtRun:
     branch: str | None = None
     agent: int | None = None
 
-    def is_met_by(self, agent_id: int, run: HandlerRun) -> bool:
+    def matches(self, agent_id: int, run: HandlerRun) -> bool:
+        """Return whether the caller waits for this run."""
         return run.handler == self.handler and self.branch in (None, run.branch) and self.agent in (None, agent_id)
 
 

@@ -48,7 +48,7 @@ class Silent:
         pass
 
 
-class Lines:
+class ProgressLines:
     """A display that prints a line at each change of the stage, and every few seconds."""
 
     def __init__(self, console: Console) -> None:
@@ -76,7 +76,7 @@ class Lines:
         pass
 
 
-class Dashboard:
+class ProgressTable:
     """A live table, which disappears at the end of the run."""
 
     def __init__(self, console: Console) -> None:
@@ -91,7 +91,7 @@ class Dashboard:
 
 
 def for_console(console: Console) -> Progress:
-    return Dashboard(console) if console.is_terminal else Lines(console)
+    return ProgressTable(console) if console.is_terminal else ProgressLines(console)
 
 
 def _render(snapshot: Snapshot) -> RenderableType:

@@ -157,7 +157,7 @@ class Commit:
 
 @dataclass(frozen=True)
 class SuspectCommits:
-    """The first bad commit. Several if the commits between them cannot be played."""
+    """The result of a bisection: the first bad commit, or several candidates if commits could not be played."""
 
     first: tuple[str, ...]
 

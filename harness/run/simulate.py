@@ -24,7 +24,7 @@ from harness.play.mission import RunOutcome
 from harness.play.simulation.incarnations import Incarnation
 from harness.play.simulation.run_files import header
 from harness.play.simulation.simulation import Simulation
-from harness.play.simulation.virtual_time import VirtualTime
+from harness.play.simulation.virtual_time import SimulationBackend
 from harness.scenario import Scenario
 from harness.scenario.verdict_names import CHARACTERISTICS
 from netem.radio import Place
@@ -67,7 +67,7 @@ def simulate_in_memory(
     memory: "MemoryRecorder", scenario: Scenario, seed: int, *, again: bool = False, **options: Any
 ) -> Simulated:
     """Simulate as `simulate` does. `memory` stores the run, and `options` go to the simulation."""
-    VirtualTime().refuse(scenario)
+    SimulationBackend().refuse(scenario)
     simulation = Simulation(scenario, seed, memory, **options)
     with closing(simulation):
         run_to_end(mission.play(simulation, scenario))

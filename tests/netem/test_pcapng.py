@@ -52,7 +52,7 @@ def test_truncated_file_has_every_complete_packet(tmp_path: Path) -> None:
 
 @contextmanager
 def full_after(limit: int) -> Iterator[None]:
-    """Files of this process can have no more than `limit` bytes."""
+    """Limit the size of files of this process to `limit` bytes inside the context."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
     try:

@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING, ClassVar
 
 from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
-from harness.play.process._process_backend import Processes
+from harness.play.process._process_backend import ProcessBackend
 from harness.scenario import Scenario
 
 if TYPE_CHECKING:
     from harness.play.process._run_lab import MissionLab
 
 
-class Containers(Processes):
+class DockerBackend(ProcessBackend):
+    """The backend that plays each vehicle and each agent in a container."""
+
     name: ClassVar[BackendName] = "docker"
     not_in_uml = (
         "--backend docker does not work with --kernel uml, because User Mode Linux has no Docker engine: "

@@ -15,7 +15,7 @@ from harness.archive.directory import PUBLIC_KEYS_FILE
 from harness.errors import RunDirectoryError, ScenarioError
 from harness.play._vehicle_keys import FRESH, FRESH_BYTES, MissionKeys, mission_keys
 from harness.play.containers import _images, ownership
-from harness.play.containers._container_backend import Containers
+from harness.play.containers._container_backend import DockerBackend
 from harness.play.containers._container_preflight import check_debuggers
 from harness.play.containers._images import Image
 from harness.play.process.agent_mission import mission_file
@@ -154,7 +154,7 @@ def _services(
             services[name] = _service(scenario, ours, launch.argv, f"vehicles/{vehicle}", folder) | build | network
             services[name] |= {"environment": dict(launch.env)} if launch.env else {}
             network = {"network_mode": f"service:{name}", "depends_on": [name]}
-        argv = [*Containers().agent_command(scenario, vehicle), mission]
+        argv = [*DockerBackend().agent_command(scenario, vehicle), mission]
         image = Image(str(docker), "python3", foreign=True) if vehicle in in_named else ours
         services[f"agent-{vehicle}"] = _service(scenario, image, argv, "agents", folder) | network
         services[f"agent-{vehicle}"] |= {} if vehicle in in_named else build

@@ -3,12 +3,14 @@
 The harness starts this program beside a mission. It writes JSON lines to the file in its first argument, and ends when
 its standard input ends. `harness.archive.lag` describes a line.
 
-A timer of an agent expires late for two reasons. The machine wakes its process late: this program sleeps for short
-times, and measures how late it wakes up itself. Or the process is awake and not finished with something else: the
-kernel counts for each process how long it ran and how long it waited for a processor (/proc/PID/schedstat), and for the
-machine how long programs waited for a disk (/proc/pressure/io). An agent in any language is measured in this way, and
-an agent can influence the figures only by using processor time. The program imports no package, because it starts
-with each run.
+A timer of an agent expires late for two reasons:
+
+- The machine wakes the process of the agent late. This program sleeps for short times, and measures how late it wakes.
+- The process is busy, or waits for a processor. The kernel counts the running and the waiting time of each process
+  (/proc/PID/schedstat), and the time in which programs waited for a disk (/proc/pressure/io).
+
+These figures exist for agents in any language. An agent can influence them only by using processor time. The program
+imports only the standard library, so that it starts fast.
 """
 
 import json
@@ -41,7 +43,7 @@ class Counters:
         self._stalled = self._read_stalled()
 
     def busy(self) -> dict[str, float]:
-        """Return how long the processes of each agent ran, or waited for a processor. An unknown agent is missing."""
+        """Return agent -> time in which its processes ran or waited for a processor."""
         present = [entry.name for entry in os.scandir("/proc") if entry.name.isdigit()]
         self._agent_of = {pid: self._agent_of[pid] if pid in self._agent_of else self._agent(pid) for pid in present}
         before, self._busy = self._busy, {}

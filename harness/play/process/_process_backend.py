@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from harness.play.process._run_lab import MissionLab
 
 
-class Processes(Backend):
+class ProcessBackend(Backend):
+    """The backend that plays each vehicle and each agent as a process."""
+
     name: ClassVar[BackendName] = "process"
 
     def refuse(self, scenario: Scenario) -> None:

@@ -199,7 +199,7 @@ class ProgramRun:
             self._watchers.start(self._rogue.watch(), of="rogue")
 
     async def _start_agent(self, agent: AgentProcess, lab: MissionLab) -> None:
-        """Start the agent. An active mission goes on with it."""
+        """Start the agent. If the mission is active, the agent joins it."""
         with_vehicle = bool(self._fleet)
         keeps_disk = self._keeps_disks or reboots_with_disk(agent.agent_id, self.scenario)
         epoch_us = self.clock.epoch_us
@@ -366,7 +366,7 @@ class ProgramRun:
             over = self.clock.now() >= mission_s
             for agent in self.agents:
                 for run in agent.handler_runs_since(self._waited_until_s, sought.handler):
-                    if sought.is_met_by(agent.agent_id, run):
+                    if sought.matches(agent.agent_id, run):
                         self._waited_until_s = run.t
                         return agent.agent_id
             if over:

@@ -45,7 +45,7 @@ MAX_REMEMBERED = 10_000
 MAX_WAITING = 100_000
 """Maximum number of copies that wait to be sent. Further copies are not made."""
 FLOOD_BATCH = 64
-"""Maximum number of messages of a flood without returning to other work."""
+"""Maximum number of messages of a flood in a row, before the rogue node handles other work."""
 
 
 QUERY_OF_ANSWER = {NAMES[answer]: NAMES[query] for answer, query in REQUEST_OF.items()}

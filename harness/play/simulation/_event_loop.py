@@ -330,7 +330,10 @@ class EventLoop:
         self._air.busy_until[number] = 0.0 if busy_until is None else incarnation.mission_s(busy_until)
 
     def _timer_end(self, number: int, incarnation: Incarnation, soonest: float) -> float:
-        """Return the mission second of the next end of a timer. `soonest` is this time by the agent's clock."""
+        """Return the mission second at which the next timer ends, or the next waiting answer is due.
+
+        `soonest` is this time by the agent's clock, if none of its timers is late.
+        """
         if number not in self._late:
             return incarnation.mission_s(soonest)
         late = self._late[number]
@@ -369,7 +372,7 @@ class EventLoop:
         """Check whether this is the sought run. After a change of the timeline, keep the run for a later search."""
         if self._recent_runs is not None:
             self._recent_runs.append((agent_id, run))
-        elif self._sought is not None and self._found is None and self._sought.is_met_by(agent_id, run):
+        elif self._sought is not None and self._found is None and self._sought.matches(agent_id, run):
             self._found = agent_id
 
     # Incarnations

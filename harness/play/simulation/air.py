@@ -126,7 +126,7 @@ class _Copies:
 
 
 _UNKNOWN = _Copies([])
-"""The copies of a message whose frame has not ended."""
+"""A placeholder for the copies of a message on a shared channel. They are known at the end of its frame."""
 
 ScheduledInput = tuple[float, int, int, MessageInFlight | DueEvent | StrayDatagram | None]
 """(mission seconds, rank, agent number, input). The input is a message, an event, or None for the end of a timer.

@@ -47,9 +47,9 @@ PROGRESS_S = 20.0
 
 
 class _AnyRun(SoughtRun):
-    """A description that every handler run meets."""
+    """A description that matches every handler run."""
 
-    def is_met_by(self, agent_id: int, run: HandlerRun) -> bool:
+    def matches(self, agent_id: int, run: HandlerRun) -> bool:
         return True
 
 
@@ -178,7 +178,7 @@ class Simulation(EventLoop):
         self._air.deliver_everything()
         recent_runs, self._recent_runs = self._recent_runs or [], None
         for index, (agent_id, run) in enumerate(recent_runs):
-            if sought.is_met_by(agent_id, run):
+            if sought.matches(agent_id, run):
                 self._recent_runs = recent_runs[index + 1 :]
                 return agent_id
         self._sought, self._found = sought, None

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from harness.play.simulation.foreign._virtual_program import ProgramPool
 
 
-class VirtualTime(Backend):
+class SimulationBackend(Backend):
+    """The backend that plays a swarm in virtual time, in this process."""
+
     name = "sim"
     virtual_time = True
     plays_in_memory = True
