@@ -111,7 +111,15 @@ def _written(
         write_new(csv_file, [record_outputs.table(record)])
         yield str(csv_file)
     if kml_file is not None or geojson_file is not None:
-        yield from _maps(record_outputs.tracks(record), {kml_file: kml, geojson_file: _geojson})
+        yield from _maps(_tracks(record), {kml_file: kml, geojson_file: _geojson})
+
+
+def _tracks(record: Consolidation) -> list[Track]:
+    """Return the logged tracks, and those in flight logs of vehicles that logged no position."""
+    logged = record_outputs.tracks(record)
+    known = {track.agent_id for track in logged}
+    flown = record_outputs.flown_tracks(record_outputs.flight_logs(record))
+    return [*logged, *(track for track in flown if track.agent_id not in known)]
 
 
 def _maps(tracks: list[Track], forms: dict[Path | None, Callable[[Iterable[Track]], str]]) -> Iterator[str]:

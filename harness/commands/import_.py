@@ -60,6 +60,7 @@ def _told(flight: ImportedFlight, out: Path) -> str:
         f"trace(s) with {runs} handler runs": sum(agent.trace is not None for agent in agents),
         "export(s)": sum(agent.export is not None for agent in agents),
         "capture(s)": sum(agent.capture is not None for agent in agents) + len(flight.more_captures),
+        "flight log(s)": len({log for agent in agents for log in agent.flight_logs}),
         "list(s) of events": sum(agent.events is not None for agent in agents),
     }
     what = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)

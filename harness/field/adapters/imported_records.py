@@ -5,6 +5,7 @@ were recorded gets a capture.
 """
 
 import json
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -68,6 +69,7 @@ class ImportedAgent(BaseModel):
     export: str | None = None
     capture: str | None = None
     events: str | None = None
+    flight_logs: list[str] = []
 
 
 class ImportedFlight(BaseModel):
@@ -111,6 +113,7 @@ class ImportRecord(BaseModel):
 
 
 AGENTS = "agents"
+FLIGHT_LOGS = "flight-logs"
 INCOMPLETE_LINE = '{"lost_lines":'
 """The beginning of a line. A truncated trace ends with it."""
 _COPY_BYTES = 1024 * 1024
@@ -168,6 +171,11 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
         (directory / CAPTURES).mkdir()
     for agent_id, capture in flight.captures.items():
         agents[agent_id].capture = _copy_capture(capture, directory, str(agent_id))
+    for number, log in enumerate(dict.fromkeys(match.log.path for match in flight.flight_logs), 1):
+        copy = _copy_flight_log(log, directory, number)
+        for match in flight.flight_logs:
+            if match.log.path == log and match.agent_id is not None:
+                agents.setdefault(match.agent_id, ImportedAgent()).flight_logs.append(copy)
     if flight.public_keys is not None:
         from ucp.secure.bundle import write_public
 
@@ -213,6 +221,14 @@ def _copy_capture(capture: Path, directory: Path, name: str) -> str:
         with (directory / path).open("wb") as copy:
             while part := file.read(_COPY_BYTES):
                 copy.write(part)
+    return path
+
+
+def _copy_flight_log(log: Path, directory: Path, number: int) -> str:
+    (directory / FLIGHT_LOGS).mkdir(exist_ok=True)
+    path = f"{FLIGHT_LOGS}/{number}-{log.name}"
+    with log.open("rb") as file, (directory / path).open("wb") as copy:
+        shutil.copyfileobj(file, copy, _COPY_BYTES)
     return path
 
 

@@ -34,6 +34,7 @@ from harness.archive.vocabulary import unknown_names
 from harness.errors import ExportError
 from harness.field.depot.mission_comparison import INCEPTION, ROSTER, ComparedFile, UnreadableFileError
 from harness.field.depot.mission_comparison import read as read_compared_file
+from harness.field.flight_logs import FlightLog, flight_log_kind, read_flight_log
 from harness.field.ingest import Omission
 from harness.field.ingest._file_search import files_of
 from harness.gc_pause import gc_paused
@@ -80,6 +81,7 @@ class CollectedExports:
     """Agents that other files name: mission files, traces, a manifest, or the record of the run."""
     traced: dict[int, list[str]] = field(default_factory=dict)
     """Hashes of the blocks that agents without an export completed, according to their traces."""
+    flight_logs: list[FlightLog] = field(default_factory=list)
     telemetry: bool = True
     """True if events come from vehicles, unless a file contradicts that."""
 
@@ -120,9 +122,12 @@ def collect_exports(paths: Iterable[Path]) -> CollectedExports:
     Raises FieldError if a path does not exist, and ExportError if no export is usable.
     """
     reader, read_exports, left_out = _Reader(), list[ReadExport](), list[str]()
-    skipped, context_files = list[Omission](), list[ComparedFile]()
+    skipped, context_files, flight_logs = list[Omission](), list[ComparedFile](), list[FlightLog]()
     paths = list(paths)
     for path in files_of(paths, skipped):
+        if _is_flight_log(path):
+            flight_logs.append(read_flight_log(path))
+            continue
         named_by_user = path in paths or path.name.endswith(SUFFIX)
         try:
             read_exports.append(reader.read(path, named_by_user=named_by_user))
@@ -141,8 +146,18 @@ def collect_exports(paths: Iterable[Path]) -> CollectedExports:
     left_out += _other_missions(read_exports, mission)
     collected = _by_agent([each for each in read_exports if each.export.inception.block_hash == mission], left_out)
     collected.remarks += [each.sentence for each in skipped]
+    collected.flight_logs = flight_logs
+    collected.remarks += [f"{log.path}: {problem}" for log in flight_logs for problem in log.problems]
     _add_context(collected, [each for each in context_files if each.shared[INCEPTION].value == mission])
     return collected
+
+
+def _is_flight_log(path: Path) -> bool:
+    try:
+        with BoundedFile(path) as file:
+            return flight_log_kind(path, file.peek(BEGINNING_BYTES)[:BEGINNING_BYTES]) is not None
+    except OSError:
+        return False  # the reader of exports reports the error
 
 
 def _add_context(collected: CollectedExports, compared_files: Iterable[ComparedFile]) -> None:

@@ -7,12 +7,15 @@ import csv
 import io
 from binascii import b2a_base64
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from harness.field.depot.consolidation import Consolidation, RecordedBlock, events_in
 from harness.field.depot.record_lines import Fork, ForkBranch, MissingItem, ReconcileResult, RecordLine
+from harness.field.flight_logs import Position
+from harness.field.flight_logs._matching import MatchedLog, match_logs
+from harness.field.flight_logs._summary import in_words as flight_log_in_words
 from harness.report.chain_tree import ranges
-from harness.report.logbook.positions import LAST_TIMESTAMP_US, Track, track_of, utc
+from harness.report.logbook.positions import LAST_TIMESTAMP_US, RoundedPosition, Track, track_of, utc
 from ucp.events import LoggableEvent
 from ucp.telemetry import describe, position_of
 
@@ -79,6 +82,27 @@ def table(record: Consolidation) -> str:
     return out.getvalue()
 
 
+def flight_logs(record: Consolidation) -> list[MatchedLog]:
+    """Return the flight logs of vehicles, with their agents."""
+    logged = {track.agent_id: track.fixes for track in tracks(record)}
+    return match_logs(record.collected.flight_logs, {agent: logged.get(agent, []) for agent in record.header.roster})
+
+
+def flown_tracks(matches: Iterable[MatchedLog]) -> list[Track]:
+    """Return the track of each flight log that has an agent, by the clock of the log."""
+    return [
+        Track(match.agent_id, [], [_fix(position) for position in match.vehicle.positions])
+        for match in matches
+        if match.agent_id is not None and match.vehicle.positions
+    ]
+
+
+def _fix(position: Position) -> tuple[int, RoundedPosition]:
+    at_us = position.at_us if position.utc_us is None else position.utc_us
+    place = (round(position.lat_deg * 1e7), round(position.lon_deg * 1e7), round(position.alt_m * 1e3))
+    return at_us, RoundedPosition(*place)
+
+
 def tracks(record: Consolidation) -> list[Track]:
     """Return the track of each agent that logged positions, by agent ID. Empty if events are no telemetry."""
     logged: dict[int, list[tuple[LoggableEvent, str]]] = {}
@@ -133,6 +157,7 @@ def in_words(
     yield from _single_copies(record)
     yield from missing_in_words(record.lost_blocks)
     yield from (missing.why for missing in record.missing)
+    yield from map(flight_log_in_words, flight_logs(record))
     if reconciled is not None:
         yield from reconciled_in_words(reconciled)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
 from harness.errors import FieldError
+from harness.field.flight_logs._matching import MatchedLog
 from ucp.events import LoggableEvent
 
 if TYPE_CHECKING:
@@ -56,6 +57,8 @@ class Flight:
     any case."""
     sources: dict[int, list[Path]] = field(default_factory=dict)
     """The files that the trace of each agent was read from."""
+    flight_logs: list[MatchedLog] = field(default_factory=list)
+    """The flight logs of the vehicles that carried these agents."""
     public_keys: "PublicKeys | None" = None
     """The public keys of a secured mission. None if no file contains them."""
 
@@ -66,7 +69,7 @@ class Flight:
 
     @property
     def files(self) -> int:
-        return len(self.traces) + len(self.exports) + len(self.captures) + len(self.logged)
+        return len(self.traces) + len(self.exports) + len(self.captures) + len(self.logged) + len(self.flight_logs)
 
 
 @dataclass

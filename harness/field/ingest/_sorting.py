@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 from harness.archive.bounded_file import BoundedFile
 from harness.archive.exports import MAX_EXPORT_BYTES, Export, json_error, parse_export
 from harness.archive.packets.pcap import MAGICS
-from harness.errors import CaptureError, ExportError
+from harness.errors import CaptureError, ExportError, FieldError
+from harness.field.flight_logs import FlightLog, flight_log_kind, read_flight_log
 from harness.field.ingest._file_owners import (
     PUBLIC_SCHEMA,
     CaptureSummary,
@@ -17,6 +18,7 @@ from harness.field.ingest._file_owners import (
     summarise_capture,
 )
 from harness.field.ingest._file_search import files_of
+from harness.field.ingest._flight_logs import assign_flight_logs
 from harness.field.ingest._flights import group_by_flight
 from harness.field.ingest._ingest import IngestResult, Omission, Remark
 from harness.field.ingest._logged_events import read_logged
@@ -64,6 +66,7 @@ class Sorter:
         self.exports: list[tuple[Path, Export]] = []
         self.captures: list[CaptureSummary] = []
         self.logged: list[tuple[Path, int, LoggableEvent]] = []
+        self.flight_logs: list[FlightLog] = []
         self._public_keys: list[tuple[Path, PublicKeys]] = []
         self._left_out = left_out
 
@@ -71,6 +74,7 @@ class Sorter:
         """Return the flights of all records so far."""
         remarks: list[Remark] = []
         flights = group_by_flight(self.incarnations, self.exports, self.captures, self.logged, self._left_out, remarks)
+        assign_flight_logs(flights, self.flight_logs, self._left_out, remarks)
         assign_keys(flights, self._public_keys, self._left_out)
         return IngestResult(flights, [*_summarise(self._left_out)], remarks)
 
@@ -81,6 +85,8 @@ class Sorter:
                 beginning = file.peek(4096)[:4096]
             if beginning.startswith(_BAGS):
                 self._omit(path, "a ROS bag, or a compressed recording: read it with `ucp-harness import`")
+            elif flight_log_kind(path, beginning) is not None:
+                self.flight_logs.append(read_flight_log(path))
             elif beginning[:4] in MAGICS:
                 summary = summarise_capture(path, self._left_out, self._opener)
                 self.captures += [summary] if summary else []
@@ -92,7 +98,7 @@ class Sorter:
                 self._add_export_file(path)
         except OSError as error:
             self._omit(path, f"it cannot be read: {error.strerror}")
-        except CaptureError as error:
+        except (CaptureError, FieldError) as error:
             self._omit(path, str(error).removeprefix(f"{path}: "))
 
     def _add_export_file(self, path: Path) -> None:

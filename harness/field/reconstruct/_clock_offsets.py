@@ -11,7 +11,7 @@ No clock is trusted more than another. The reference is the clock of the agent t
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 MIN_RATE, MAX_RATE = 0.55, 1.8
@@ -57,10 +57,15 @@ class Delivery:
     received_s: float
 
 
-def estimate(agents: Iterable[int], deliveries: Iterable[Delivery]) -> dict[int, ClockLine]:
+def estimate(
+    agents: Iterable[int],
+    deliveries: Iterable[Delivery],
+    ahead_s: Mapping[int, float] = {},
+) -> dict[int, ClockLine]:
     """Return each agent's clock relative to the reference.
 
-    Clocks without messages are assumed to equal the reference.
+    `ahead_s` has clocks relative to GPS time. It places the clocks of agents that exchanged no messages with the
+    reference. Without it, these clocks are assumed to equal the reference.
     """
     between: dict[tuple[int, int], tuple[list[Point], list[Point]]] = defaultdict(lambda: ([], []))
     for delivery in deliveries:
@@ -83,8 +88,13 @@ def estimate(agents: Iterable[int], deliveries: Iterable[Delivery]) -> dict[int,
             (pair_weight, pair) for pair, pair_weight in weight.items() if (pair[0] in clocks) != (pair[1] in clocks)
         ]
         if not links:
-            reference = max(unplaced, key=lambda agent: (total[agent], -agent))
-            clocks[reference] = ClockLine()
+            known = next((agent for agent in clocks if agent in ahead_s), None)
+            candidates = [agent for agent in unplaced if known is not None and agent in ahead_s] or unplaced
+            reference = max(candidates, key=lambda agent: (total[agent], -agent))
+            if known is not None and reference in ahead_s:
+                clocks[reference] = ClockLine(ahead_s[reference] - ahead_s[known]).after(clocks[known])
+            else:
+                clocks[reference] = ClockLine()
             continue
         _, (a, b) = max(links)
         line = fit_line(*between[a, b])

@@ -92,10 +92,10 @@ class Timetable:
         return incarnations
 
 
-def timetable(rehearsals: Mapping[int, Rehearsal]) -> Timetable:
-    """Return the timetable of the rehearsed inputs."""
+def timetable(rehearsals: Mapping[int, Rehearsal], ahead_s: Mapping[int, float] = {}) -> Timetable:
+    """Return the timetable of the rehearsed inputs. `ahead_s` has the clocks of agents relative to GPS time."""
     senders = _Senders(rehearsals)
-    clocks = estimate(rehearsals, senders.deliveries())
+    clocks = estimate(rehearsals, senders.deliveries(), ahead_s)
     clocks = _from_zero(clocks, rehearsals)
     return _Planner(rehearsals, senders, clocks).plan()
 

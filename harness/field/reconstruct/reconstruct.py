@@ -147,7 +147,12 @@ def reconstruct(
         first = next((f"agent {agent_id} {words}; " for agent_id, words in why.items()), "")
         raise FieldError(first + NO_INPUTS)
     report_progress("ordering the inputs")
-    table = timetable(rehearsals)
+    ahead_s = {
+        match.agent_id: match.clock_ahead_s
+        for match in flight.flight_logs
+        if match.agent_id is not None and match.clock_ahead_s is not None
+    }
+    table = timetable(rehearsals, ahead_s)
     lost = {agent_id for agent_id in rehearsals if flight.exports and agent_id not in flight.exports}
     if lost:
         remarks.append(f"no export of {agents(lost)}: the vehicle counts as lost at the end of its trace")

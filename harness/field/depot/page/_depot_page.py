@@ -1,7 +1,7 @@
 """The layout of the page. The template escapes all data from vehicles."""
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,17 @@ from harness.field.depot.consolidation import Consolidation
 from harness.field.depot.depot_reconcile import Reconciliation
 from harness.field.depot.page import _holdings, _position_map, _time_chart
 from harness.field.depot.record_lines import Block
-from harness.field.depot.record_outputs import agents, fork_in_words, in_words, reconciled_in_words, tracks
+from harness.field.depot.record_outputs import (
+    agents,
+    flight_logs,
+    flown_tracks,
+    fork_in_words,
+    in_words,
+    reconciled_in_words,
+    tracks,
+)
+from harness.field.flight_logs._matching import MatchedLog
+from harness.field.flight_logs._summary import changes
 from harness.present import text as text_module
 from harness.present.colours import Ink, inks
 from harness.report import html
@@ -33,6 +43,8 @@ def draw(record: Consolidation, reconciliation: Reconciliation | None = None) ->
     ink = inks(header.roster)
     when = _time_chart.time_span_of(record)
     agent_tracks = tracks(record)
+    matches = flight_logs(record)
+    flown = flown_tracks(matches)
     single_copies = [block.line.name for block in record.blocks if len(block.line.holders) < 2]
     lost: dict[int, list[int]] = {}
     for missing_block in record.lost_blocks:
@@ -51,7 +63,8 @@ def draw(record: Consolidation, reconciliation: Reconciliation | None = None) ->
         ],
         remarks=header.remarks,
         figures=_figures(record, single_copies),
-        map=_position_map.draw(agent_tracks, single_copies, lost, ink) if agent_tracks else None,
+        map=_position_map.draw(agent_tracks, single_copies, lost, ink, flown) if agent_tracks or flown else None,
+        changes=_changes(matches, ink),
         when=when,
         began=text_module.moment(when.first_us) if when else "",
         ended=text_module.moment(when.last_us) if when else "",
@@ -152,6 +165,21 @@ def _vehicles(record: Consolidation, ink: Mapping[int, Ink]) -> list[dict[str, A
         for missing_block in record.missing
     ]
     return sorted(rows + absent, key=lambda row: row["agent_id"])
+
+
+def _changes(matches: Sequence[MatchedLog], ink: Mapping[int, Ink]) -> list[dict[str, Any]]:
+    """Return the changes of all vehicles with a flight log and an agent, in time order."""
+    found = [change for match in matches if match.agent_id is not None for change in changes(match)]
+    return [
+        {
+            "at": text_module.moment(change.at_us),
+            "agent_id": change.agent_id,
+            "ink": ink[change.agent_id],
+            "words": change.words,
+        }
+        for change in sorted(found, key=lambda change: change.at_us)
+        if change.agent_id is not None
+    ]
 
 
 def _row(block: Block, ink: Mapping[int, Ink]) -> dict[str, Any]:

@@ -40,19 +40,25 @@ class Map:
 
 
 def draw(
-    tracks: Sequence[Track], rare: Iterable[str], lost: Mapping[int, Sequence[int]], ink: Mapping[int, Ink]
+    tracks: Sequence[Track],
+    rare: Iterable[str],
+    lost: Mapping[int, Sequence[int]],
+    ink: Mapping[int, Ink],
+    flown: Sequence[Track] = (),
 ) -> Map:
     """Draw the map. `rare` has the names of blocks that only one vehicle holds, and `lost` the ordinals of an agent's
-    lost blocks.
+    lost blocks. `flown` has the tracks in flight logs, which are thin lines.
 
     There is at least one position.
     """
-    field = _Field(tracks)
+    field = _Field([*tracks, *flown])
     paths = {track.agent_id: [field.fix(at_us, position) for at_us, position in track.fixes] for track in tracks}
+    flown_paths = [[field.fix(at_us, position) for at_us, position in track.fixes] for track in flown]
     far_positions = field.far_positions
-    extent_of_map = extent([fix for path in paths.values() for fix in path])
+    extent_of_map = extent([fix for path in (*paths.values(), *flown_paths) for fix in path])
     projection = Projection(extent_of_map, _LEFT, _TOP, _WIDTH, _HEIGHT)
     single_copies = set(rare)
+    vehicles = {track.agent_id for track in (*tracks, *flown)}
     logged = [event for track in tracks for event in _logged(track, single_copies)]
     # single copies are drawn last, on top
     shown = sorted(logged[:: -(-len(logged) // MAX_EVENTS) or 1], key=lambda event: event[0])
@@ -60,13 +66,14 @@ def draw(
         '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
         ' aria-labelledby="map-title map-desc" font-family="{font}" font-size="12">'
         '<title id="map-title">Map of logged events</title><desc id="map-desc">{desc}</desc>\n'
-        "{frame}\n{paths}\n{marks}\n{ends}</svg>\n"
+        "{frame}\n{flown}\n{paths}\n{marks}\n{ends}</svg>\n"
     ).format(
         w=n(_LEFT + projection.width + _RIGHT),
         h=n(_TOP + projection.height + _BOTTOM),
         font=FONT,
-        desc=f"Positions of {len(tracks)} vehicles, {extent_of_map.width_m:.0f} m from west to east.",
+        desc=f"Positions of {len(vehicles)} vehicles, {extent_of_map.width_m:.0f} m from west to east.",
         frame=frame(projection),
+        flown=_flown(flown, flown_paths, projection, ink),
         paths=_paths(tracks, paths, lost, projection, ink),
         marks=Markup("").join(
             _mark(projection(field.fix(entry.event.timestamp_us, entry.position)), entry, rare, ink[agent_id])
@@ -98,6 +105,19 @@ class _Field:
         self.far_positions += max(abs(north_m), abs(east_m)) > FARTHEST_M
         at_s = (at_us - self._first_us) / 1e6
         return Fix(at_s, *(max(-FARTHEST_M, min(FARTHEST_M, metres)) for metres in (north_m, east_m)))
+
+
+def _flown(
+    tracks: Sequence[Track], paths: Sequence[Sequence[Fix]], projection: Projection, ink: Mapping[int, Ink]
+) -> Markup:
+    stride = sum(map(len, paths)) // MAX_FIXES + 1
+    lines = thin([[projection(fix) for fix in (*path[:-1:stride], path[-1])] for path in paths], MAX_POINTS)
+    return Markup("\n").join(
+        Markup('<g class="track flown"><title>flight log of vehicle {}</title><path d="{}" stroke="{}"/></g>').format(
+            track.agent_id, "M" + "L".join(f"{n(x)} {n(y)}" for x, y in line), ink[track.agent_id].fill
+        )
+        for track, line in zip(tracks, lines, strict=True)
+    )
 
 
 def _paths(

@@ -1,0 +1,202 @@
+"""Match the flight logs of vehicles with the agents that flew on them, by time and position.
+
+An agent logs positions of its vehicle as events, and the flight log has the same positions more densely. Both come from
+the same messages of the autopilot. So a moving vehicle passes each place at a known time on the clock of the agent, and
+at a known time of the log. The difference of these times is the same for all places if the log belongs to the agent.
+It is also the error of the agent's clock if the log has GPS time. The vote of all places for a difference needs no
+clock to be right, and ignores places at which a vehicle stays.
+
+The system ID of a vehicle decides only if the positions of the agent do not: without positions, for a vehicle that did
+not move, and never for a log of another place or day.
+"""
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Protocol
+
+from harness.field.flight_logs._records import FlightLog, Position, VehicleLog
+
+MAX_PLACES = 500
+"""Maximum number of positions of an agent that vote."""
+_CELL_DEG = 1e-4
+"""Size of a cell in degrees of latitude, about eleven metres."""
+_PAUSE_US = 5_000_000
+"""Time between two positions near a place from which they belong to two visits."""
+_MAX_VISIT_US = 20_000_000
+"""A vehicle that is near a place for a longer time stays there. The visit then does not vote."""
+_BIN_US = 1_000_000
+_MIN_VOTES = 3
+_MIN_SHARE = 0.5
+"""Share of the moving positions that must agree."""
+_SAME_FLIGHT_S = 60.0
+_NEAR_M = 1_000.0
+_DAY_US = 86_400_000_000
+_FIRST_UTC_US = 1_000_000_000_000_000
+"""An earlier timestamp comes from a clock that was never set. From here on, a clock is at most a day off. Otherwise the
+flight of another day along the same path would match."""
+_METRES_PER_DEGREE = 111_195.0
+
+
+class LoggedPosition(Protocol):
+    """A position in 1e-7 degrees that an agent logged."""
+
+    @property
+    def lat_e7(self) -> int: ...
+    @property
+    def lon_e7(self) -> int: ...
+
+
+Fixes = Sequence[tuple[int, LoggedPosition]]
+"""The positions of an agent with their timestamps in microseconds."""
+
+
+@dataclass(frozen=True)
+class MatchedLog:
+    """A vehicle in a flight log, and its agent. `agent_id` is None if the vehicle carried none of the agents.
+
+    `evidence` completes "is of agent 10 by ...", or "matches no agent: ...". `clock_ahead_s` is the time on the agent's
+    clock minus GPS time, None if unknown.
+    """
+
+    log: FlightLog
+    vehicle: VehicleLog
+    agent_id: int | None
+    evidence: str
+    clock_ahead_s: float | None = None
+
+
+def match_logs(logs: Iterable[FlightLog], agents: Mapping[int, Fixes]) -> list[MatchedLog]:
+    """Return a match for each vehicle in the logs. `agents` has the logged positions of every agent.
+
+    Of several flights along the same path, an agent keeps the one whose time is nearest to its own clock.
+    """
+    matches = [_match(log, vehicle, agents) for log in logs for vehicle in log.vehicles]
+    nearest: dict[int, float] = {}
+    for match in matches:
+        if match.agent_id is not None and match.clock_ahead_s is not None:
+            nearest[match.agent_id] = min(nearest.get(match.agent_id, math.inf), match.clock_ahead_s, key=abs)
+    return [_other_flight(match, nearest) for match in matches]
+
+
+def _other_flight(match: MatchedLog, nearest: Mapping[int, float]) -> MatchedLog:
+    """Return the match without its agent if another log fits the clock of the agent better."""
+    if match.agent_id is None or match.clock_ahead_s is None:
+        return match
+    later_s = nearest[match.agent_id] - match.clock_ahead_s
+    if abs(later_s) <= _SAME_FLIGHT_S:
+        return match
+    why = f"it flew the path of agent {match.agent_id} {abs(later_s):.0f} s {'later' if later_s > 0 else 'earlier'}"
+    return MatchedLog(match.log, match.vehicle, None, why)
+
+
+def _match(log: FlightLog, vehicle: VehicleLog, agents: Mapping[int, Fixes]) -> MatchedLog:
+    votes = {agent_id: _vote(vehicle.positions, fixes) for agent_id, fixes in agents.items()}
+    agreed = [(vote.share, agent_id) for agent_id, vote in votes.items() if vote is not None and vote.agrees]
+    if agreed:
+        _, agent_id = max(agreed)
+        vote = votes[agent_id]
+        assert vote is not None
+        ahead_s = vote.ahead_us / 1e6 if vote.of_utc else None
+        return MatchedLog(log, vehicle, agent_id, f"{vote.agreeing} positions", ahead_s)
+    named = vehicle.vehicle
+    if named is None:
+        return MatchedLog(log, vehicle, None, "its positions are not those of an agent, and it has no system ID")
+    if named not in agents:
+        return MatchedLog(log, vehicle, None, f"no agent has its system ID {named} or its positions")
+    if (contradiction := _contradiction(vehicle, agents[named])) is not None:
+        return MatchedLog(log, vehicle, None, f"agent {named} has its system ID, but {contradiction}")
+    return MatchedLog(log, vehicle, named, "its system ID")
+
+
+@dataclass(frozen=True)
+class _Vote:
+    """The difference of times with the most votes. `of_utc` means that the times of the log are UTC by GPS."""
+
+    ahead_us: float
+    agreeing: int
+    voters: int
+    of_utc: bool
+
+    @property
+    def share(self) -> float:
+        return self.agreeing / self.voters
+
+    @property
+    def agrees(self) -> bool:
+        return self.agreeing >= _MIN_VOTES and self.share >= _MIN_SHARE
+
+
+def _vote(positions: Sequence[Position], fixes: Fixes) -> _Vote | None:
+    of_utc = any(position.utc_us is not None for position in positions)
+    cells: dict[tuple[int, int], list[tuple[int, Position]]] = defaultdict(list)
+    for position in positions:
+        at_us = position.utc_us if of_utc else position.at_us
+        if at_us is not None:
+            cells[_cell(position.lat_deg, position.lon_deg)].append((at_us, position))
+    step = len(fixes) // MAX_PLACES + 1
+    differences = []
+    for timestamp_us, fix in fixes[::step]:
+        row, column = _cell(fix.lat_e7 / 1e7, fix.lon_e7 / 1e7)
+        near = [at for down in (-1, 0, 1) for right in (-1, 0, 1) for at in cells.get((row + down, column + right), ())]
+        if passed := [timestamp_us - at_us for at_us in _visits(near, fix)]:
+            differences.append(passed)
+    if not differences:
+        return None
+    clock_is_set = of_utc and fixes[0][0] >= _FIRST_UTC_US
+    possible = _DAY_US if clock_is_set else math.inf
+    bins = Counter(
+        number
+        for each in differences
+        for number in {round(value / _BIN_US) for value in each if abs(value) <= possible}
+    )
+    if not bins:
+        return None
+    best = max(bins, key=lambda number: (bins[number - 1] + bins[number] + bins[number + 1], bins[number]))
+    agreeing = [
+        min(close, key=lambda value: abs(value - best * _BIN_US))
+        for each in differences
+        if (close := [value for value in each if abs(round(value / _BIN_US) - best) <= 1])
+    ]
+    return _Vote(median(agreeing), len(agreeing), len(differences), of_utc)
+
+
+def _visits(near: list[tuple[int, Position]], fix: LoggedPosition) -> Iterator[int]:
+    """Yield the time at which each short visit came nearest to a place."""
+    near.sort(key=lambda timed: timed[0])
+    visit: list[tuple[int, Position]] = []
+    for index, timed in enumerate(near):
+        visit.append(timed)
+        if index + 1 == len(near) or near[index + 1][0] - timed[0] > _PAUSE_US:
+            if visit[-1][0] - visit[0][0] <= _MAX_VISIT_US:
+                yield min(visit, key=lambda passed: _degrees(passed[1], fix))[0]
+            visit = []
+
+
+def _degrees(position: Position, fix: LoggedPosition) -> float:
+    """Return a distance that grows with the true one."""
+    east = (position.lon_deg - fix.lon_e7 / 1e7) * math.cos(math.radians(position.lat_deg))
+    return math.hypot(position.lat_deg - fix.lat_e7 / 1e7, east)
+
+
+def _cell(lat_deg: float, lon_deg: float) -> tuple[int, int]:
+    return math.floor(lat_deg / _CELL_DEG), math.floor(lon_deg / _CELL_DEG)
+
+
+def _contradiction(vehicle: VehicleLog, fixes: Fixes) -> str | None:
+    """Return the reason why a log cannot be of the agent with these positions. None if it can."""
+    if not vehicle.positions or not fixes:
+        return None
+    lat_deg = median(position.lat_deg for position in vehicle.positions)
+    lon_deg = median(position.lon_deg for position in vehicle.positions)
+    north_m = (median(fix.lat_e7 for _, fix in fixes) / 1e7 - lat_deg) * _METRES_PER_DEGREE
+    east_m = (median(fix.lon_e7 for _, fix in fixes) / 1e7 - lon_deg) * _METRES_PER_DEGREE
+    if (distance_m := math.hypot(north_m, east_m * math.cos(math.radians(lat_deg)))) > _NEAR_M:
+        return f"flew {distance_m / 1000:.1f} km away"
+    times = [position.utc_us for position in vehicle.positions if position.utc_us is not None]
+    logged = [timestamp_us for timestamp_us, _ in fixes if timestamp_us >= _FIRST_UTC_US]
+    if times and logged and (min(logged) - max(times) > _DAY_US or min(times) - max(logged) > _DAY_US):
+        return "flew on another day"
+    return None
