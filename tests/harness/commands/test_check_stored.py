@@ -1,16 +1,19 @@
 """`check` compares stored verdicts and versions with its own. Unfinished swarms have a status of their own."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from harness.commands import report
 from harness.play.progress import Silent
 from harness.run import provenance
+from harness.run.code_state import ROOT
 from harness.run.run import run
 from tests.harness.command import harness
 from tests.harness.virtual import scenario
@@ -50,12 +53,34 @@ def test_check_reports_another_stored_verdict(
     assert expected in harness("check", directory).stderr
 
 
-def test_edited_verdict_of_same_checker_is_status_1(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    edit(directory, EDITS[0][0])
-    monkeypatch.setattr(report, "same_judge", lambda recorded: True)
-    with pytest.raises(report.typer.Exit) as ended:
-        report.check_command([directory])
-    assert ended.value.exit_code == 1
+def test_run_edited_after_its_end_is_status_1(tmp_path: Path) -> None:
+    """Without a clone the commit is unknown, so the version of the package and the reference identify the checker."""
+    installed = tmp_path / "installed"
+    installed.mkdir()
+    for package in ("harness", "netem", "sitl", "ucp"):
+        (installed / package).symlink_to(ROOT / package, target_is_directory=True)
+
+    def command(*arguments: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-P", "-m", "harness.cli", *map(str, arguments)],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(installed)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    asked = tmp_path / "short.yaml"
+    asked.write_text("{name: short, agents: 2, duration_s: 60, events: {source: random, mean_s: 10}}")
+    played = command("run", asked, "--backend", "sim", "--seed", 1, "--out", tmp_path / "run")
+    assert played.returncode == 0, played.stdout + played.stderr
+    assert command("check", tmp_path / "run").returncode == 0
+
+    edit(tmp_path / "run", EDITS[0][0])
+    checked = command("check", tmp_path / "run")
+    assert checked.returncode == 1
+    assert "run.json has 'violated' for characteristic 3, but its files give 'holds'" in checked.stderr
+    assert "the same checker wrote run.json, so a file was edited after the run" in checked.stderr
 
 
 def test_unaltered_run_has_its_stored_verdict(directory: Path) -> None:
