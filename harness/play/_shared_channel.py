@@ -111,7 +111,7 @@ class ChannelTotals:
         self.airtime_s = 0.0
         self._roster = roster
         self._all = (1 << len(roster)) - 1
-        self._receivers: dict[Fate, list[int]] = {}
+        self._receivers: dict[Fate, BitCounter] = {}
         self._drops: dict[Fate, Counter[int]] = {}
         self._load: list[float] = []
         self._busy_until = 0.0
@@ -121,11 +121,10 @@ class ChannelTotals:
         self.frames += 1
         self.airtime_s += ended_at - began_at
         for fate, receivers in frame.lost().items() if frame.received | 1 << frame.sender != self._all else ():
-            counts = self._receivers.get(fate)
-            if counts is None:
-                counts = self._receivers[fate] = [0] * len(self._roster)
-            for receiver in numbers(receivers):
-                counts[receiver] += 1
+            counter = self._receivers.get(fate)
+            if counter is None:
+                counter = self._receivers[fate] = BitCounter()
+            counter.add(receivers)
         began_at = max(began_at, self._busy_until)
         if ended_at > began_at:
             self._busy_until = ended_at
@@ -146,7 +145,7 @@ class ChannelTotals:
 
     def to_json(self) -> dict[str, Any]:
         """Return the counts as run.json has them."""
-        lost = {fate.value: self._by_id(dict(enumerate(counts))) for fate, counts in sorted(self._receivers.items())}
+        lost = {fate.value: self._by_id(counter.counts()) for fate, counter in sorted(self._receivers.items())}
         return {
             "frames": self.frames,
             "airtime_s": round(self.airtime_s, 6),
@@ -158,3 +157,32 @@ class ChannelTotals:
 
     def _by_id(self, counts: "dict[int, int] | Counter[int]") -> dict[str, int]:
         return {str(self._roster[number]): count for number, count in sorted(counts.items()) if count}
+
+
+class BitCounter:
+    """A count for each bit of the sets that were added.
+
+    The counts are kept in binary, each digit of all counts as one integer. To add a set is then a ripple-carry addition
+    of all bits at once, which takes two steps on average, for any number of bits.
+    """
+
+    def __init__(self) -> None:
+        self._digits: list[int] = []
+        """The lowest digit first."""
+
+    def add(self, bits: int) -> None:
+        for place, digit in enumerate(self._digits):
+            self._digits[place] = digit ^ bits
+            bits &= digit
+            if not bits:
+                return
+        if bits:
+            self._digits.append(bits)
+
+    def counts(self) -> dict[int, int]:
+        """Return the count of each bit that is not 0, by the number of the bit."""
+        counts: Counter[int] = Counter()
+        for place, digit in enumerate(self._digits):
+            for number in numbers(digit):
+                counts[number] += 1 << place
+        return dict(counts)

@@ -39,8 +39,8 @@ class CarrierSense:
         """Slots to count down, as of `_from`."""
         self._from = [0] * len(draws)
         """When the station begins to count, or began."""
-        self._resting: set[int] = set()
-        """Stations that count down after their last frame, without a further one."""
+        self._resting: dict[int, int] = {}
+        """Station that counts down after its last frame, without a further one -> when it has counted."""
         self._over: deque[Frame] = deque()
         """Frames that ended less than EIFS ago."""
 
@@ -52,7 +52,7 @@ class CarrierSense:
 
     def wait(self, frame: Frame, now: int, active: Collection[Frame]) -> None:
         station = frame.sender
-        self._resting.discard(station)
+        self._resting.pop(station, None)
         left = self._counted(station, now)
         if active and (busy_until := self._busy_until(station, now, active)):
             if left == 0:
@@ -69,7 +69,9 @@ class CarrierSense:
         This runs for each frame and each waiting station, so it counts the slots itself.
         """
         all_due, all_from, all_left, slot, notices = self._due, self._from, self._left, self._slot, now + self._sense
-        resting = self._resting = {station for station in self._resting if self._counted(station, now)}
+        resting = self._resting
+        for station in [station for station, counted in resting.items() if counted <= now]:
+            del resting[station]
         if not all_due and not resting:
             self.next_due = NEVER
             return
@@ -95,21 +97,27 @@ class CarrierSense:
         for station in resting:
             for idle_from, sensed in busy:
                 if sensed >> station & 1:
-                    all_from[station] = max(all_from[station], idle_from)
+                    since = all_from[station]
+                    if since < now:
+                        all_left[station] -= (now - since) // slot
+                    if since < idle_from:
+                        since = all_from[station] = idle_from
+                    resting[station] = since + all_left[station] * slot
                     break
 
     def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Collection[Frame]) -> None:
         if failed := frame.receiving & frame.disturbed:
             self._wait_for_longer(failed, now)
         station = frame.sender
-        self._left[station] = self._drawn(station)
+        left = self._left[station] = self._drawn(station)
         busy_until = self._busy_until(station, now, active) if active else now
         self._from[station] = max(now, busy_until) + self._difs
-        if waiting is None:
-            self._resting.add(station)
-        else:
-            due = self._due[station] = self._from[station] + self._left[station] * self._slot
-            self.next_due = min(self.next_due, due)
+        counted = self._from[station] + left * self._slot
+        if waiting is not None:
+            self._due[station] = counted
+            self.next_due = min(self.next_due, counted)
+        elif left:
+            self._resting[station] = counted
         self._over.append(frame)
         while self._over[0].ends_ns + self._eifs < now:
             self._over.popleft()
@@ -123,8 +131,11 @@ class CarrierSense:
         for station in (*self._due, *self._resting):
             if stations >> station & 1 and self._from[station] == early:
                 self._from[station] = late
+                counted = late + self._left[station] * self._slot
                 if station in self._due:
-                    self._due[station] = late + self._left[station] * self._slot
+                    self._due[station] = counted
+                else:
+                    self._resting[station] = counted
         self.next_due = min(self._due.values(), default=NEVER)
 
     def _counted(self, station: int, now: int) -> int:
