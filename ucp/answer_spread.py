@@ -8,9 +8,9 @@ can check the wait. A hash of the datagram is as good as a random number here: n
 has its sender and its sequence number.
 """
 
-from hashlib import sha256
 from heapq import heappop, heappush
 
+from ucp.block import hash_digest
 from ucp.messages import (
     BlockAddResponse,
     BlockResponse,
@@ -33,7 +33,7 @@ def answer_wait_s(datagram: bytes, spread_s: float) -> float:
 
     `datagram` is the encoded message. In a secured mission, it is the message before encryption.
     """
-    return spread_s * (int.from_bytes(sha256(datagram).digest()[:8], "big") / 2**64)
+    return spread_s * (int.from_bytes(hash_digest(datagram)[:8], "big") / 2**64)
 
 
 class WaitingAnswers:

@@ -131,6 +131,7 @@ class VirtualAgent:
         entries = [*self._agent.trace(), *self._traced_commands]
         self._traced_commands = []
         self._handled += sum(isinstance(entry, HandlerRun) for entry in entries)
+        self._agent.release_answers(self._now)
         datagrams = self._agent.datagrams_to_send()
         self._bytes_sent += sum(map(len, datagrams))
         parts = [

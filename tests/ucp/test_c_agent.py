@@ -38,6 +38,7 @@ FEATURES = (
     "top_needs_majority",
     "phase1_tie=pop",
     "phase2_tie=block",
+    "answer_spread_s",
 )
 WARNINGS = ["-std=c11", "-Wall", "-Wextra", "-Werror"]
 HARD_RUN: dict[str, Any] = {

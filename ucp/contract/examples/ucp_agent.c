@@ -476,6 +476,7 @@ typedef struct {
     double vote_timeout, phase1_timeout, phase2_timeout, phase3_timeout, finalize_gap;
     uint64_t max_block_bytes, max_event_bytes;
     bool vote_names_chain, changed_before_tally, asks_after_commit, top_needs_majority, phase1_tie_pop, phase2_tie_block;
+    double answer_spread;                               /* 0: answers do not wait */
 } Settings;
 
 typedef struct {
@@ -516,6 +517,7 @@ static bool is_sealed(const Buf *data) {                /* a depot's key of 32 b
 static bool mission_features(Json *j, uint32_t root, bool sealed, Fault *fault) {
     static const char *const has[] = {"store", "vote_names_chain", "changed_before_tally", "asks_after_commit",
                                       "top_needs_majority", "phase1_tie=pop", "phase2_tie=block",
+                                      "answer_spread_s",
 #ifdef SECURED
                                       "secured", "sealed",
 #endif
@@ -556,12 +558,13 @@ static bool mission_features(Json *j, uint32_t root, bool sealed, Fault *fault) 
 }
 
 static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault) {
-    *s = (Settings){10.0, 5.0, 5.0, 5.0, 0.1, 1024, 267, false, false, false, false, false, false};
+    *s = (Settings){10.0, 5.0, 5.0, 5.0, 0.1, 1024, 267, false, false, false, false, false, false,
+                      0.0};
     if (object != 0 && kind(j, object) != '{') return fail(fault, STATUS_WRONG, "settings is no object.");
     struct { const char *key; double *value; bool zero; } numbers[] = {
         {"vote_timeout_s", &s->vote_timeout, false}, {"phase1_timeout_s", &s->phase1_timeout, false},
         {"phase2_timeout_s", &s->phase2_timeout, false}, {"phase3_timeout_s", &s->phase3_timeout, false},
-        {"finalize_gap_s", &s->finalize_gap, true}};
+        {"finalize_gap_s", &s->finalize_gap, true}, {"answer_spread_s", &s->answer_spread, true}};
     struct { const char *key; uint64_t *value; } sizes[] = {
         {"max_block_bytes", &s->max_block_bytes}, {"max_event_bytes", &s->max_event_bytes}};
     struct { const char *key; bool *value; } switches[] = {
@@ -569,7 +572,7 @@ static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault
         {"asks_after_commit", &s->asks_after_commit}, {"top_needs_majority", &s->top_needs_majority}};
     struct { const char *key, *usual, *other; bool *value; } choices[] = {
         {"phase1_tie", "phase2", "pop", &s->phase1_tie_pop}, {"phase2_tie", "oldest", "block", &s->phase2_tie_block}};
-    for (uint32_t i = 0, at; object != 0 && i < 5; i++)
+    for (uint32_t i = 0, at; object != 0 && i < 6; i++)
         if ((at = member(j, object, numbers[i].key)) != 0
             && (!json_double(j, at, numbers[i].value) || *numbers[i].value < 0 || *numbers[i].value > 1e9
                 || (*numbers[i].value == 0 && !numbers[i].zero)))
@@ -592,6 +595,9 @@ static bool mission_settings(Json *j, uint32_t object, Settings *s, Fault *fault
     }
     if (s->max_event_bytes > s->max_block_bytes)
         return fail(fault, STATUS_WRONG, "The setting max_event_bytes is larger than max_block_bytes.");
+    if (s->answer_spread > 0 && s->answer_spread >= fmin(fmin(s->vote_timeout, s->phase1_timeout),
+                                                         fmin(s->phase2_timeout, s->phase3_timeout)))
+        return fail(fault, STATUS_WRONG, "The setting answer_spread_s is not less than each of the four timers.");
     return true;
 }
 
@@ -678,6 +684,8 @@ static bool mission_read(Mission *m, Json *j, uint32_t root, Fault *fault) {
         return fail(fault, STATUS_WRONG, "security is neither null nor an object with a bundle.");
     if (is_sealed(&m->initial_data) && (at == 0 || kind(j, at) == 'n'))
         return fail(fault, STATUS_WRONG, "A depot's key ends initial_data, and there is no security.");
+    if (at != 0 && kind(j, at) != 'n' && m->settings.answer_spread > 0)
+        return fail(fault, STATUS_LACKS, "This agent does not have 'answer_spread_s' in a secured mission.");
     return mission_path(j, member(j, root, "store"), "store", &m->store, fault)
         && mission_path(j, member(j, at, "bundle"), "bundle", &m->bundle, fault);
 }
@@ -843,6 +851,7 @@ typedef struct {
     struct { int algorithm, by; } local[8];
     size_t local_len;
     Buf out;                                            /* datagrams to send, each after its length (u16) */
+    Buf waiting;                                        /* answers: when to send (double), and as in `out` */
     bool tracing, keeping;
     Buf lines;                                          /* for the trace */
     Buf journal;                                        /* for the store */
@@ -973,6 +982,53 @@ static void send_message(Agent *a, enum message_type type, const Hash *block) {
         put_text(&a->sent, "\"}");
     }
     a->sequence++;
+}
+
+static bool is_answer(uint8_t type) {
+    return type == BLOCK_ADD_RESPONSE || type == CHAIN_CONTAIN_RESPONSE || type == NEXT_IN_SEQUENCE_RESPONSE
+        || type == BLOCK_RESPONSE;
+}
+
+/* The setting answer_spread_s. Returns when the next waiting answer is due, and its place; infinity without one. */
+static double next_answer(const Agent *a, size_t *place) {
+    double first = INFINITY, due;
+    for (size_t at = 0; at < a->waiting.len; at += sizeof due + 2 + (size_t)read_be(a->waiting.data + at + sizeof due, 2)) {
+        memcpy(&due, a->waiting.data + at, sizeof due);
+        if (due < first) {
+            first = due;
+            *place = at;
+        }
+    }
+    return first;
+}
+
+/* Leaves in `out` what is to be sent now: the answers that have waited, then all new messages that are no answers. */
+static void hold_answers(Agent *a) {
+    Buf others = {0};
+    size_t place;
+    if (a->m.settings.answer_spread == 0) return;
+    for (size_t at = 0, n; at < a->out.len; at += 2 + n) {
+        const uint8_t *datagram = a->out.data + at + 2;
+        n = (size_t)read_be(a->out.data + at, 2);
+        if (!is_answer(datagram[3])) {
+            put(&others, datagram - 2, 2 + n);
+            continue;
+        }
+        Hash hash = H(datagram, n);
+        double wait = a->m.settings.answer_spread * ((double)read_be(hash.b, 8) * 0x1p-64), due = a->now + wait;
+        put(&a->waiting, (const uint8_t *)&due, sizeof due);
+        put(&a->waiting, datagram - 2, 2 + n);
+    }
+    a->out.len = 0;
+    while (next_answer(a, &place) <= a->now) {
+        uint8_t *due = a->waiting.data + place;
+        size_t n = 2 + (size_t)read_be(due + sizeof(double), 2), whole = sizeof(double) + n;
+        put(&a->out, due + sizeof(double), n);
+        memmove(due, due + whole, a->waiting.len - place - whole);
+        a->waiting.len -= whole;
+    }
+    put(&a->out, others.data, others.len);
+    free(others.data);
 }
 
 static void send_commit(Agent *a, const Block *block) {
@@ -1625,8 +1681,9 @@ static void take_timers(Agent *a, double now) {
     seal_all(a);
 }
 
-static double next_deadline(const Agent *a) {           /* infinity if no timer runs */
-    double first = INFINITY;
+static double next_deadline(const Agent *a) {           /* infinity if no timer runs and no answer waits */
+    size_t place;
+    double first = next_answer(a, &place);
     for (int i = 0; i < TIMERS; i++)
         if (a->timer[i].runs && a->timer[i].deadline < first)
             first = a->timer[i].deadline;
@@ -1665,7 +1722,7 @@ static void agent_new(Agent *a) {
     memset(a->timer, 0, sizeof a->timer);
     memset(a->dropped, 0, sizeof a->dropped);
     a->sequence = 0;
-    a->out.len = a->lines.len = a->journal.len = a->changes.len = a->sent.len = 0;
+    a->out.len = a->waiting.len = a->lines.len = a->journal.len = a->changes.len = a->sent.len = 0;
     set_clear(&a->voters);
     set_clear(&a->responders);
     keys_free(a);
@@ -1720,12 +1777,14 @@ static void put_header(Buf *b, const Agent *a) {
                "\"phase3_timeout_s\":%.17g,\"finalize_gap_s\":%.17g,", s->vote_timeout, s->phase1_timeout,
                s->phase2_timeout, s->phase3_timeout, s->finalize_gap);
     put_format(b, "\"max_block_bytes\":%" PRIu64 ",\"max_event_bytes\":%" PRIu64 ",\"vote_names_chain\":%s,"
-               "\"changed_before_tally\":%s,%s%s\"phase1_tie\":\"%s\",\"phase2_tie\":\"%s\"}", s->max_block_bytes,
+               "\"changed_before_tally\":%s,%s%s\"phase1_tie\":\"%s\",\"phase2_tie\":\"%s\"", s->max_block_bytes,
                s->max_event_bytes, truth(s->vote_names_chain), truth(s->changed_before_tally),
                s->asks_after_commit ? "\"asks_after_commit\":true," : "",
                s->top_needs_majority ? "\"top_needs_majority\":true," : "", s->phase1_tie_pop ? "pop" : "phase2",
                s->phase2_tie_block ? "block" : "oldest");
-    put_format(b, ",\"clock\":{\"epoch_us\":%" PRIu64 ",\"speedup\":%.17g}%s}\n", a->m.epoch_us, a->m.speedup,
+    if (s->answer_spread > 0)
+        put_format(b, ",\"answer_spread_s\":%.17g", s->answer_spread);
+    put_format(b, "},\"clock\":{\"epoch_us\":%" PRIu64 ",\"speedup\":%.17g}%s}\n", a->m.epoch_us, a->m.speedup,
                a->keys != NULL ? ",\"secured\":true" : "");
 }
 
@@ -2089,6 +2148,7 @@ static void settle(Station *s) {
         bundle_write(s);
     store_write(s);
     trace_write(s);
+    hold_answers(a);
     for (size_t at = 0; at < a->out.len;) {
         size_t n = (size_t)read_be(a->out.data + at, 2);
         if (sendto(s->udp, a->out.data + at + 2, n, 0, (struct sockaddr *)&to, sizeof to) == (ssize_t)n)
@@ -2551,6 +2611,7 @@ static bool virtual_input(Virtual *v, const char *line, size_t n) {
 static void virtual_output(Virtual *v) {                /* what the input did, and the answer if it was a command */
     Agent *a = v->a;
     Buf *out = &v->out;
+    hold_answers(a);
     double timer = next_deadline(a);
     put_text(out, "{\"sent\":[");
     for (size_t at = 0; at < a->out.len;) {
@@ -2627,6 +2688,7 @@ static void agent_free(Agent *a) {
     list_clear(&a->deque);
     list_clear(&a->stack);
     void *const all[] = {a->chain.at, a->deque.at, a->stack.at, a->completed.data, a->candidates, a->out.data,
+                         a->waiting.data,
                          a->lines.data, a->journal.data, a->body.data, a->changes.data, a->sent.data, a->m.roster,
                          a->m.initial_data.data, a->m.store, a->m.bundle, a->sealed.data};
     keys_free(a);
