@@ -23,7 +23,7 @@ from harness.report.logbook.positions import LAST_TIMESTAMP_US, Track, tracks
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.mission import CONNECTED, edit, edit_lines, fly, write_exports, write_run
 from tests.ucp.air import Air
-from tests.ucp.test_telemetry import frames, good_estimate, heartbeat, place, text
+from tests.ucp.test_telemetry import frames, good_estimate, heartbeat, position_msg, text
 from ucp.events import LoggableEvent, decode_events
 from ucp.telemetry import EVENT_KINDS, POSITION, STATUS_TEXT, WAYPOINT, Position, TelemetryEvents
 
@@ -45,7 +45,7 @@ def fly_vehicles(agents: int = 3, seconds: int = 240) -> Air:
             said = [
                 good_estimate(),
                 heartbeat(4, armed=second > 2),
-                place(1000 * second, 500_000_000 + agent_id, 80_000_000 + second),
+                position_msg(1000 * second, 500_000_000 + agent_id, 80_000_000 + second),
             ]
             if second % 60 == 30:
                 said.append(mavlink.MAVLink_mission_item_reached_message(second // 60))
