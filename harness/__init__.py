@@ -1,1 +1,1 @@
-"""The harness: scenarios, the orchestrator, the checker, the report and the command line."""
+"""The test harness for UCP agents. `harness.cli` is the command line, and `harness.api` is the Python API."""

@@ -3,14 +3,14 @@
 Exit statuses, of which `docs/reference/commands.md` has a table:
 
 - 0: the command completed, and its result is good.
-- 1: the result is bad. A check of the run has a bad verdict (a characteristic, the steps, the records or the liveness).
-  Or an agent under test crashed, hung, refused a command, or gave an invalid or irreproducible answer. Or a command
+- 1: the result is bad. A check of the run has a bad verdict other than `not finished`. Or an agent under test crashed,
+  hung, refused a command, or gave an invalid or irreproducible answer. Or a command
   that compares, searches or proves has a negative result: see the help of `bisect`, `conformance`, `consolidate`,
   `diff`, `doctor`, `explore`, `keys inspect`, `matrix`, `mission verify`, `prove`, `reconstruct`, `replay` and
   `validate`.
 - 2: the scenario, an argument or an input file is wrong, or no input is usable.
 - 3: this machine cannot do it, or an agent does not support it.
-- 4: `prove` reached a limit.
+- 4: more time is needed for a result. `prove` reached a limit, or the only bad verdict of a run is `not finished`.
 - 125 and 128: `bisect --once` cannot try the code, or its request is wrong. 128 also stands for an old command name.
 - 130: interrupted.
 """
@@ -34,107 +34,113 @@ MAX_NAME = 200
 """Maximum number of characters of a file name in an error."""
 
 
-class Command(NamedTuple):
-    """A command: its panel in the help, the place of its function, and its summary."""
+class CommandEntry(NamedTuple):
+    """An entry of the list of commands."""
 
     panel: str
-    where: str
+    """Heading of the command in the help."""
+    location: str
+    """MODULE:NAME of the function, or of the group of commands."""
     summary: str
     """The first paragraph of the command's own help. At most 62 characters, which fill a line of a terminal."""
 
 
 COMMANDS = {
-    "run": Command("run", "harness.commands.run:run_command", "Play a scenario, judge it, and write a report."),
-    "scenarios": Command(
+    "run": CommandEntry("run", "harness.commands.run:run_command", "Play a scenario, judge it, and write a report."),
+    "scenarios": CommandEntry(
         "run", "harness.commands.runs:scenarios_command", "List the scenarios that come with the harness."
     ),
-    "tell": Command(
+    "tell": CommandEntry(
         "run", "harness.commands.tell:tell_command", "Cause an event in an active run, or control virtual time."
     ),
-    "shell": Command(
+    "shell": CommandEntry(
         "run", "harness.commands.tell:shell_command", "Open a shell in the network of a vehicle of an active run."
     ),
-    "runs": Command(
+    "runs": CommandEntry(
         "look", "harness.commands.runs:runs_command", "List past runs with their verdicts, or open a report."
     ),
-    "check": Command(
+    "check": CommandEntry(
         "look", "harness.commands.report:check_command", "Judge chain exports and traces by the six characteristics."
     ),
-    "report": Command("look", "harness.commands.report:report_command", "Write the report files of a run again."),
-    "watch": Command("look", "harness.commands.report:watch_command", "Show a recorded run as a film in the browser."),
-    "chain": Command(
+    "report": CommandEntry("look", "harness.commands.report:report_command", "Write the report files of a run again."),
+    "watch": CommandEntry(
+        "look", "harness.commands.report:watch_command", "Show a recorded run as a film in the browser."
+    ),
+    "chain": CommandEntry(
         "look", "harness.commands.chain:chain_command", "Print each agent's chain, or write its positions as a map."
     ),
-    "packets": Command(
+    "packets": CommandEntry(
         "look",
         "harness.commands.packets:packets_command",
         "Print each captured datagram, its receivers and its answers.",
     ),
-    "diff": Command("look", "harness.commands.diff:diff_command", "Find where two runs first differ."),
-    "export": Command(
+    "diff": CommandEntry("look", "harness.commands.diff:diff_command", "Find where two runs first differ."),
+    "export": CommandEntry(
         "look", "harness.commands.export:export_command", "Write a run for Foxglove, PlotJuggler, Perfetto or ROS 2."
     ),
-    "mission": Command("field", "harness.commands.mission:app", "Make the mission files of a swarm, and compare them."),
-    "keys": Command(
+    "mission": CommandEntry(
+        "field", "harness.commands.mission:app", "Make the mission files of a swarm, and compare them."
+    ),
+    "keys": CommandEntry(
         "field", "harness.commands.keys:app", "Make, distribute, inspect and revoke keys of a secure mission."
     ),
-    "import": Command(
+    "import": CommandEntry(
         "field", "harness.commands.import_:import_command", "Convert records of any kind into one directory."
     ),
-    "consolidate": Command(
+    "consolidate": CommandEntry(
         "field", "harness.commands.consolidate:consolidate_command", "Merge the chains of all vehicles into one record."
     ),
-    "replay": Command(
+    "replay": CommandEntry(
         "field", "harness.commands.replay:replay_command", "Feed an agent's trace to the reference, and compare."
     ),
-    "reconstruct": Command(
+    "reconstruct": CommandEntry(
         "field",
         "harness.commands.reconstruct:reconstruct_command",
         "Make a scenario that reproduces a recorded flight.",
     ),
-    "matrix": Command(
+    "matrix": CommandEntry(
         "many", "harness.commands.matrix:matrix_command", "Play a scenario over loss rates, swarm sizes and many seeds."
     ),
-    "explore": Command(
+    "explore": CommandEntry(
         "many",
         "harness.commands.explore:explore_command",
         "Play seeds until one violates a characteristic, and shrink it.",
     ),
-    "bisect": Command(
+    "bisect": CommandEntry(
         "many", "harness.commands.bisect:app", "Find the commit that changes how a scenario or record plays."
     ),
-    "prove": Command(
+    "prove": CommandEntry(
         "prove",
         "harness.commands.prove:prove_command",
         "Explore all states that a small swarm can reach within bounds.",
     ),
-    "conformance": Command(
+    "conformance": CommandEntry(
         "prove",
         "harness.commands.conformance:conformance_command",
         "Test one agent alone with thousands of generated cases.",
     ),
-    "validate": Command(
+    "validate": CommandEntry(
         "prove", "harness.commands.coverage:validate_command", "Compare recorded runs with the TLA+ specification."
     ),
-    "coverage": Command(
+    "coverage": CommandEntry(
         "prove",
         "harness.commands.coverage:coverage_command",
         "Report the share of all local states that runs reached.",
     ),
-    "doctor": Command(
+    "doctor": CommandEntry(
         "this machine",
         "harness.commands.doctor:doctor_command",
         "Report what this machine can do, and how to enable the rest.",
     ),
-    "sitl": Command("this machine", "harness.commands.sitl:app", "Install and list ArduPilot's SITL binaries."),
-    "clean": Command(
+    "sitl": CommandEntry("this machine", "harness.commands.sitl:app", "Install and list ArduPilot's SITL binaries."),
+    "clean": CommandEntry(
         "this machine", "harness.commands.doctor:clean_command", "Remove the Docker containers of runs that have ended."
     ),
 }
-"""All commands in the order of the help. A command's module is imported when the command is called."""
+"""Name of each command -> its entry, in the order of the help."""
 
 WITH_VARIANT = ("run", "check", "replay", "coverage", "explore", "prove", "conformance")
-"""Commands with the option --variant: they play agents or judge them. `matrix` has one of its own."""
+"""Commands with the option --variant: they play agents or judge them. `matrix` has its own."""
 
 OLD_NAMES = {
     "again": "`ucp-harness bisect --once`",
@@ -143,8 +149,8 @@ OLD_NAMES = {
 """Old name of a command -> the call that replaces it."""
 
 
-class OldNameError(HarnessError):
-    """The command has another name now.
+class OldCommandNameError(HarnessError):
+    """The user called a command by its old name.
 
     `git bisect run` stops at status 128. It would take status 2 for a bad commit.
     """
@@ -152,37 +158,37 @@ class OldNameError(HarnessError):
     exit_status = 128
 
 
-class Commands(TyperGroup):
-    """All commands. Only the called command is loaded."""
+class LazyCommandGroup(TyperGroup):
+    """All commands. The module of a command is imported when the command is called."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] in COMMANDS:
-            self.add_command(loaded(args[0]), args[0])
+            self.add_command(load_command(args[0]), args[0])
         elif args and args[0] in OLD_NAMES and not ctx.resilient_parsing:
-            raise OldNameError(f"`{args[0]}` is now {OLD_NAMES[args[0]]}: run that")
+            raise OldCommandNameError(f"`{args[0]}` is now {OLD_NAMES[args[0]]}: run that")
         return super().resolve_command(ctx, args)
 
 
-def loaded(name: str) -> Any:
-    """Return the command, or the group of commands, with its arguments and options."""
-    module, _, attribute = COMMANDS[name].where.partition(":")
+def load_command(name: str) -> Any:
+    """Import the module of a command. Return the command, or the group of commands, with its options."""
+    module, _, attribute = COMMANDS[name].location.partition(":")
     with gc_paused():
         command = getattr(import_module(module), attribute)
     if isinstance(command, TyperCommand):
         return command
     if isinstance(command, typer.Typer):
         return typer.main.get_group(command)
-    alone = typer.Typer(add_completion=False)
-    alone.command(name)(command)
-    made = typer.main.get_command(alone)
+    single = typer.Typer(add_completion=False)
+    single.command(name)(command)
+    built = typer.main.get_command(single)
     if name in WITH_VARIANT:
         from harness.commands.variant_option import variant_option
 
-        made.params.append(variant_option())
-    return made
+        built.params.append(variant_option())
+    return built
 
 
-app = typer.Typer(cls=Commands, no_args_is_help=True, pretty_exceptions_enable=False)
+app = typer.Typer(cls=LazyCommandGroup, no_args_is_help=True, pretty_exceptions_enable=False)
 for _name, _command in COMMANDS.items():
     app.command(_name, help=_command.summary, rich_help_panel=_command.panel)(lambda: None)
 
@@ -195,14 +201,14 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def _harness(
-    of_itself: Annotated[
+    show_version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Test harness for the Uniform Chain Protocol."""
 
 
-class _Output(io.FileIO):
+class _OutputWithoutBrokenPipe(io.FileIO):
     """Standard output. When its reader ends early (`| head`), the command continues without output."""
 
     def write(self, data: Any, /) -> int:
@@ -217,12 +223,12 @@ def main() -> NoReturn:
     """Run the console script. A mistake of the user ends in one sentence and an exit status, never in a traceback."""
     if sys.stdout is None:  # the caller closed it
         sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
-    elif sys.stdout is (own := sys.__stdout__):
+    elif sys.stdout is (original := sys.__stdout__):
         sys.stdout = io.TextIOWrapper(
-            io.BufferedWriter(_Output(own.fileno(), "w", closefd=False)),
-            own.encoding,
-            own.errors,
-            line_buffering=own.line_buffering,
+            io.BufferedWriter(_OutputWithoutBrokenPipe(original.fileno(), "w", closefd=False)),
+            original.encoding,
+            original.errors,
+            line_buffering=original.line_buffering,
         )
     try:
         try:

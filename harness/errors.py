@@ -26,11 +26,11 @@ class ScenarioError(HarnessError):
 
 
 class ExportError(HarnessError):
-    """A chain export that cannot be used."""
+    """A chain export is missing, or cannot be read, written or used for the request."""
 
 
 class CaptureError(HarnessError):
-    """A capture of packets that cannot be used."""
+    """A capture of packets cannot be read."""
 
 
 class RunDirectoryError(HarnessError):
@@ -38,11 +38,11 @@ class RunDirectoryError(HarnessError):
 
 
 class FieldError(HarnessError):
-    """No file from the field can be used."""
+    """Records of a flight cannot be used, or the request does not fit them."""
 
 
 class MachineError(HarnessError):
-    """This machine cannot do what the user asked for, for example because a package is missing."""
+    """This machine cannot fulfil the request, for example because a package is missing."""
 
     exit_status = CANNOT_HERE
 

@@ -1,4 +1,4 @@
-"""Captures as others read them: the packets by scapy, what scapy leaves out block by block."""
+"""Independent readers of captures, for comparison. Scapy reads the packets, and this module reads the other blocks."""
 
 import json
 import struct
@@ -13,30 +13,30 @@ COMMENT, RECEIVED, DROPPED = 1, 4, 5
 PAYLOAD_AT = 42  # Ethernet, IPv4, UDP
 
 
-class Frame(NamedTuple):
+class CapturedFrame(NamedTuple):
     at_ns: int
     outbound: bool
     data: bytes
 
     @property
     def payload(self) -> bytes:
-        """Of UDP."""
+        """The payload of UDP."""
         return self.data[PAYLOAD_AT:]
 
 
-def frames(path: Path) -> list[Frame]:
+def frames(path: Path) -> list[CapturedFrame]:
     found = []
     with RawPcapNgReader(str(path)) as reader:
         for data, about in reader:
             assert about.tsresol == 1_000_000_000
             assert about.direction in (1, 2)
             assert about.ifname == f"vehicle {path.stem}".encode()
-            found.append(Frame(about.tshigh << 32 | about.tslow, about.direction == 2, data))
+            found.append(CapturedFrame(about.tshigh << 32 | about.tslow, about.direction == 2, data))
     return found
 
 
 def comment(path: Path) -> dict[str, Any]:
-    """That of the section header."""
+    """Return the comment of the section header."""
     found: dict[str, Any] = json.loads(_options(path, SECTION, 16)[COMMENT])
     return found
 
@@ -48,7 +48,7 @@ def statistics(path: Path) -> dict[str, int]:
 
 
 def _options(path: Path, kind: int, fixed: int) -> dict[int, bytes]:
-    """Those of the only block of this kind, behind `fixed` bytes of its own."""
+    """Return the options of the only block of this kind. They follow `fixed` bytes."""
     (body,) = (body[fixed:] for found, body in _blocks(path.read_bytes()) if found == kind)
     options = {}
     while len(body) >= 4:

@@ -1,6 +1,7 @@
-"""Tests marked `lab` need private network namespaces, `docker` an engine, `uml` User Mode Linux.
+"""Settings of all tests, and the markers `lab`, `docker` and `uml`.
 
-They are skipped where there is none, and say why.
+A test with one of these markers needs private network namespaces, a Docker engine or User Mode Linux. It is skipped
+with a reason on a machine without it.
 """
 
 import os
@@ -11,16 +12,16 @@ from hypothesis import HealthCheck, settings
 
 from tests.machine import require, require_docker, require_uml
 
-# How fast a machine is, is no property of the code.
+# Hypothesis must not fail a test because the machine is slow.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
 
-# Where a build server says that it is one, pytest tells failures at greater length; tests of pytest read what it tells.
+# On a build server, pytest prints longer reports of failures. Tests of the pytest plugin compare the short reports.
 for _build_server in ("CI", "BUILD_NUMBER"):
     os.environ.pop(_build_server, None)
 
-# Where Ctrl-C is ignored (`make test &` in a script, some build servers) children would ignore it too, and tests press
-# it. What is handled here, if only by doing nothing, is at its default in them.
+# If this process ignores SIGINT (`make test &` in a script, some build servers), its children inherit this, and tests
+# that interrupt them fail. A handler that does nothing gives the children the default behaviour.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, lambda *_: None)
 

@@ -1,7 +1,7 @@
-"""What this machine can do, for tests that need more than Python.
+"""Requirements of tests that need more than Python. A test is skipped if this machine lacks a requirement.
 
-`UCP_REQUIRE` is a list of "lab", "netem", "nftables", "uml", "cc", "browser", "tshark", "docker", "tlc" and "ros"
-(comma between): what it names may not be missing, a test that would be skipped for the lack of it fails instead.
+The environment variable `UCP_REQUIRE` lists requirements that must not be missing, separated by commas: "lab", "netem",
+"nftables", "uml", "cc", "browser", "tshark", "docker", "tlc" and "ros". If one of these is missing, the test fails.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from netem.lab import Lab, LabUnavailable
 
 @functools.cache
 def unavailable(engine: str | None) -> LabUnavailable | None:
-    """Why there is no lab with this engine (None: any) here, if there is none."""
+    """Return the reason why this machine cannot open a lab with this engine. `engine` None stands for any engine."""
 
     async def attempt() -> None:
         lab = await Lab.open([1, 2], engine=engine, log=Path(folder, "lab.log"))  # type: ignore[arg-type]
@@ -41,7 +41,7 @@ def unavailable(engine: str | None) -> LabUnavailable | None:
 
 
 def require(engine: str | None) -> None:
-    """Skip, or fail if UCP_REQUIRE says that it has to be there."""
+    """Skip the test without a lab with this engine, or fail it if UCP_REQUIRE names the lab."""
     if (error := unavailable(engine)) is None:
         return
     elsewhere = "; `make test-netem` runs it in User Mode Linux" if engine == "netem" else ""
@@ -49,7 +49,7 @@ def require(engine: str | None) -> None:
 
 
 def require_uml() -> None:
-    """The same of User Mode Linux."""
+    """Skip or fail the test without User Mode Linux."""
     try:
         uml.find()
     except UmlError as error:
@@ -57,7 +57,7 @@ def require_uml() -> None:
 
 
 def require_docker() -> None:
-    """The same of a Docker engine that we may use."""
+    """Skip or fail the test without a Docker engine that this user may use."""
     try:
         Engine.connect().close()
         require_root()
@@ -66,7 +66,7 @@ def require_docker() -> None:
 
 
 def require_tlc() -> None:
-    """The same of TLC, and of the Java that it needs."""
+    """Skip or fail the test without TLC and Java."""
     try:
         _tlc.command()
     except _tlc.NoCheckerError as error:
@@ -74,12 +74,12 @@ def require_tlc() -> None:
 
 
 def require_tshark() -> str:
-    """The same of Wireshark's program for terminals; its path."""
+    """Skip or fail the test without Wireshark's program for terminals. Return its path."""
     return shutil.which("tshark") or do_without("tshark", "no tshark on PATH (Debian package `tshark`)")
 
 
 def do_without(what: str, reason: str) -> NoReturn:
-    """Skip the test, for `what` is missing; or fail it if UCP_REQUIRE names that."""
+    """Skip the test because `what` is missing, or fail it if UCP_REQUIRE names `what`."""
     if what in os.environ.get("UCP_REQUIRE", "").split(","):
         pytest.fail(f"UCP_REQUIRE={os.environ['UCP_REQUIRE']}, but: {reason}")
     pytest.skip(reason)

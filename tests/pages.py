@@ -1,7 +1,7 @@
-"""Pages of the documentation whose commands run, one after another, and print what the page shows.
+"""Run the commands of a documentation page, and compare their output with the page.
 
-A block of `console` has commands after `$ `, each with what it prints: `…` is anything in its line, and alone in a line
-any lines. A block with a `title` is a file of that name.
+A block of language `console` has commands after `$ `, each followed by its output. `…` stands for any text in its line,
+and a line with only `…` stands for any lines. A block with a `title` is the content of a file with that name.
 """
 
 import os
@@ -16,25 +16,28 @@ from tests.harness.command import harness
 REPOSITORY = Path(__file__).parents[1]
 LEFT_OUT = "…"
 DEADLINE_S = 120
-OF_THE_COMMAND_ALONE = re.compile(r"ucp-harness( [\w./=:,+-]+)+")
-"""What a shell would change nothing of."""
+SIMPLE_COMMAND = re.compile(r"ucp-harness( [\w./=:,+-]+)+")
+"""A call of `ucp-harness` without special characters of the shell. It needs no shell."""
 
 
 def play(page: Path, directory: Path, columns: int = 120) -> int:
-    """Do what the page says in `directory`, on a terminal of so many columns, and compare; how many commands it has."""
+    """Run the commands of the page in `directory`, and compare their output. Return the number of commands.
+
+    `columns` is the width of the terminal.
+    """
     tried = 0
     for language, title, body in _blocks(page):
         if title:
             (directory / title).write_text(body)
         elif language == "console":
-            for typed, shown in _commands(body):
-                _compare(typed, shown, directory, columns)
+            for command, shown in _commands(body):
+                _compare(command, shown, directory, columns)
                 tried += 1
     return tried
 
 
 def _blocks(page: Path) -> Iterator[tuple[str, str, str]]:
-    """Language, title or nothing, and content."""
+    """Yield language, title and content of each block. The title may be empty."""
     yield from re.findall(
         r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```', page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
     )
@@ -42,18 +45,18 @@ def _blocks(page: Path) -> Iterator[tuple[str, str, str]]:
 
 def _commands(body: str) -> Iterator[tuple[str, list[str]]]:
     for command in re.split(r"^\$ ", body, flags=re.MULTILINE)[1:]:
-        typed, *shown = command.splitlines()
-        yield typed, shown
+        command, *shown = command.splitlines()
+        yield command, shown
 
 
-def _compare(typed: str, shown: list[str], directory: Path, columns: int) -> None:
+def _compare(command: str, shown: list[str], directory: Path, columns: int) -> None:
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     environment = {**os.environ, "PATH": path, "COLUMNS": str(columns), "NO_COLOR": "1"}
-    if OF_THE_COMMAND_ALONE.fullmatch(typed):
-        ended = harness(*typed.split()[1:], env=environment, cwd=directory, deadline_s=DEADLINE_S)
+    if SIMPLE_COMMAND.fullmatch(command):
+        ended = harness(*command.split()[1:], env=environment, cwd=directory, deadline_s=DEADLINE_S)
     else:
         ended = subprocess.run(
-            ["bash", "-c", typed],
+            ["bash", "-c", command],
             cwd=directory,
             env={**environment, "LC_ALL": "C.UTF-8"},
             stdin=subprocess.DEVNULL,
@@ -64,7 +67,7 @@ def _compare(typed: str, shown: list[str], directory: Path, columns: int) -> Non
         )
     printed = f"{ended.stdout}{ended.stderr}".replace(f"{directory}/", "").replace(f"{REPOSITORY}/", "")
     printed = printed.replace("\u00a0", " ")
-    assert re.fullmatch(_pattern(shown), printed), f"{typed}\n{printed}"
+    assert re.fullmatch(_pattern(shown), printed), f"{command}\n{printed}"
 
 
 def _pattern(shown: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""The documentation: a site without warnings that loads nothing from elsewhere, and examples that do what they say."""
+"""The documentation: the site builds without warnings and loads nothing from other hosts, and all examples work."""
 
 import importlib
 import os
@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from harness.cli import COMMANDS, loaded
+from harness.cli import COMMANDS, load_command
 from harness.json_schemas import texts
 from harness.scenario.load import parse
 from tests.harness.report.browser import open_browser
@@ -38,7 +38,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def test_every_page_and_what_it_links_to_is_on_the_site(site: Path) -> None:
+def test_site_has_every_page_and_every_link_target(site: Path) -> None:
     for page in PAGES[1:]:
         assert (site / page.relative_to(REPOSITORY / "docs").with_suffix(".html")).exists(), page
     assert (site / "index.html").exists()
@@ -56,7 +56,7 @@ def test_site_has_every_schema_and_a_page_that_links_to_it(site: Path) -> None:
         assert f'href="../{path}"' in page
 
 
-def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
+def test_site_loads_nothing_from_other_hosts(site: Path) -> None:
     for page in site.rglob("*.html"):
         loads = re.findall(
             r'<(?:script|img|iframe|link rel="(?:stylesheet|icon|preconnect)")[^>]*?(?:src|href)="([^"]+)',
@@ -85,7 +85,7 @@ TYPE = """(field => {
 FOUND = "[...document.querySelectorAll('.md-search-result__item > .md-search-result__link')].map(link => link.href)"
 
 
-def test_every_page_has_the_search_index_as_a_script_and_the_worker_for_files(site: Path) -> None:
+def test_page_of_the_site_searches_without_a_server(site: Path) -> None:
     assert (site / "search/search_index.js").read_text().startswith("var __index = {")
     for page in site.rglob("*.html"):
         assert "vendor/iframe-worker/shim.js" in page.read_text(), page
@@ -104,7 +104,7 @@ def test_search_of_the_site_opened_as_files_finds_the_page(site: Path, tmp_path:
         assert browser.complaints == []
 
 
-def test_the_reference_has_every_key_of_a_scenario(site: Path) -> None:
+def test_reference_page_has_keys_of_a_scenario(site: Path) -> None:
     text = (site / "reference/scenario-keys.html").read_text()
     for key in ("final_reconcile", "vote_timeout_s", "hold_until_s", "takeoff_altitude_m", "reboot"):
         assert f"<code>{key}</code>" in text
@@ -135,7 +135,7 @@ def test_commands_page_has_the_exit_statuses_of_each_command(site: Path) -> None
 def all_commands() -> Iterator[tuple[str, Any]]:
     """Yield each command with its name, those inside of groups too."""
     for name in COMMANDS:
-        command = loaded(name)
+        command = load_command(name)
         if hasattr(command, "commands"):
             yield from ((f"ucp-harness {name} {inner}", part) for inner, part in command.commands.items())
         else:
@@ -150,10 +150,10 @@ def test_every_key_of_a_scenario_has_a_description() -> None:
     assert [row for row in rows if row.endswith("|  |")] == []
 
 
-def test_the_picture_of_the_rooms_is_drawn_from_the_imports(site: Path) -> None:
+def test_picture_of_the_rooms_shows_the_imports(site: Path) -> None:
     text = (site / "explanation/architecture.html").read_text()
     assert re.search(r"<title>\d+ of the files in report/ use archive/</title>", text)
-    assert "use commands/</title>" not in text  # nobody does
+    assert "use commands/</title>" not in text  # no room imports the commands
 
 
 @pytest.mark.parametrize(
@@ -161,14 +161,14 @@ def test_the_picture_of_the_rooms_is_drawn_from_the_imports(site: Path) -> None:
     [page for page in PAGES if page.stem not in ("run-a-matrix-every-night", "try-a-protocol-change")],
     ids=lambda page: page.name,
 )
-def test_a_scenario_that_a_page_shows_is_one(page: Path) -> None:
+def test_scenario_on_a_page_is_valid(page: Path) -> None:
     for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
         document = yaml.safe_load(block)
         parse({"name": "shown", **document})
 
 
 @pytest.mark.lab
-def test_every_command_of_the_tutorial_prints_what_it_shows(tmp_path: Path) -> None:
+def test_commands_of_the_tutorial_print_their_results(tmp_path: Path) -> None:
     assert play(REPOSITORY / "docs" / "tutorial.md", tmp_path) > 10
 
 
@@ -180,7 +180,7 @@ def test_commands_of_the_page_on_protocol_changes_print_their_results(tmp_path: 
     assert play(REPOSITORY / "docs" / "how-to" / "try-a-protocol-change.md", tmp_path) == 6
 
 
-def test_the_public_names_are_on_their_page(site: Path) -> None:
+def test_api_page_has_every_public_name(site: Path) -> None:
     page = (site / "reference/api.html").read_text()
     for module in ("harness.api", "ucp", "netem", "sitl"):
         for name in importlib.import_module(module).__all__:

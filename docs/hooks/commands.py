@@ -11,7 +11,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 
-from harness.cli import COMMANDS, loaded
+from harness.cli import COMMANDS, load_command
 
 MARK = "<!-- commands -->"
 PROGRAM = "ucp-harness"
@@ -43,7 +43,7 @@ def reference() -> str:
 
 def _section(name: str, summary: str) -> Iterator[str]:
     """Yield the paragraphs on one command, or on a group of commands."""
-    command = loaded(name)
+    command = load_command(name)
     yield f"### {PROGRAM} {name}"
     if not hasattr(command, "commands"):
         yield from _command(f"{PROGRAM} {name}", command)

@@ -24,7 +24,7 @@ BundleOption = Annotated[
 
 
 def opener_of(bundle: Path | None) -> "Opener | None":
-    """What opens the datagrams of that vehicle's mission; None without a bundle. Raises KeysError, MachineError."""
+    """Return the opener of a secured mission's datagrams. None without a bundle. Raises KeysError, MachineError."""
     if bundle is None:
         return None
     try:
@@ -47,7 +47,7 @@ DepotKey = Annotated[
 
 
 def depot_of(path: Path | None) -> "Depot | None":
-    """Whose key is in the file; None without a file. Raises KeysError, MachineError."""
+    """Return the depot whose key is in the file. None without a file. Raises KeysError, MachineError."""
     if path is None:
         return None
     try:
@@ -60,7 +60,7 @@ def depot_of(path: Path | None) -> "Depot | None":
 
 
 def roster_of(text: str) -> int | list[int]:
-    """As a scenario has it: a number of agents, or their IDs. Raises ScenarioError."""
+    """Return the value of the key `agents` of a scenario: a number, or a list of IDs. Raises ScenarioError."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isascii() and part.isdecimal() and len(part) < 10 for part in parts):
         raise ScenarioError(f"`--agents` is {text!r}: use a number of agents, or IDs such as 10,28,32")
@@ -68,14 +68,17 @@ def roster_of(text: str) -> int | list[int]:
 
 
 def refuse_existing(paths: Iterable[Path]) -> None:
-    """Raises RunDirectoryError if one of them is there already: before work begins that would be for nothing."""
+    """Raise RunDirectoryError if an output file exists. Call it before the work, whose results could not be written."""
     for path in paths:
         if path.exists():
             raise RunDirectoryError(f"{path} exists: choose another file; existing files are not overwritten")
 
 
 def write_new(path: Path, parts: Iterable[str]) -> None:
-    """Raises RunDirectoryError if the file is there already or cannot be made, MachineError if the disk refuses."""
+    """Write a new file.
+
+    Raises RunDirectoryError if the file exists or cannot be created, and MachineError if writing fails.
+    """
     try:
         file = path.open("x", encoding="utf-8", newline="")
     except FileExistsError:
@@ -92,10 +95,10 @@ def write_new(path: Path, parts: Iterable[str]) -> None:
 
 
 @contextlib.contextmanager
-def newly(path: Path) -> Iterator[None]:
-    """Whatever makes the file or directory makes it whole: of half of it nothing is left.
+def write_whole(path: Path) -> Iterator[None]:
+    """Run a block that writes a new file or directory, and remove it if the block fails.
 
-    Raises RunDirectoryError if it is there already or cannot be made, MachineError if the disk refuses.
+    Raises RunDirectoryError if `path` exists or cannot be created, and MachineError if writing fails.
     """
     refuse_existing([path])
     if not path.absolute().parent.is_dir():

@@ -29,21 +29,21 @@ from harness.run.code_state import ROOT, interrupted_by_sigterm
 from ucp.agent_files import write_atomically
 
 NOT_FOUND = 1
-CHANGED, CANNOT_BE_TRIED, STOP = 1, 125, 128
+CHANGED, UNTESTABLE, WRONG_ONCE_REQUEST = 1, 125, 128
 """Exit statuses of --once, as `git bisect run` defines them. It stops at 128 and above."""
 FILES_SHOWN = 12
 CHANGES_SHOWN = 8
 ONCE = "With --once"
 
 
-class MistakenError(typer.BadParameter):
+class OnceUsageError(typer.BadParameter):
     """A mistake in the arguments of --once."""
 
-    exit_code = STOP
+    exit_code = WRONG_ONCE_REQUEST
 
 
 class BisectCommand(TyperCommand):
-    """With --once, a mistake in the arguments ends with STOP, because it is no statement about a commit."""
+    """The command `bisect`. With --once, wrong arguments give status 128, at which `git bisect run` stops."""
 
     def make_context(self, info_name: str | None, args: list[str], *rest: Any, **options: Any) -> Any:
         once = "--once" in args
@@ -54,7 +54,7 @@ class BisectCommand(TyperCommand):
         except TyperException as error:
             if not once:
                 raise
-            raise MistakenError(str(error), getattr(error, "ctx", None)) from None
+            raise OnceUsageError(str(error), getattr(error, "ctx", None)) from None
 
 
 _app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -107,29 +107,29 @@ def bisect_command(
     With --once, the command tries the code in --repository. Exit status 0: the outcome is as expected (of records: as
     recorded). 1: it changed. 125: this code cannot be tried. 128: the request is wrong.
     """
-    asked = _Asked(subject, seed, agent, agent_command or [None], speedup, limit_s)
+    request = _PlayRequest(subject, seed, agent, agent_command or [None], speedup, limit_s)
     console = Console(stderr=as_json, highlight=False)
     if once:
         if good is not None:
-            raise MistakenError(
+            raise OnceUsageError(
                 "--good and --once exclude each other: --good starts a search, --once tries one state of the code"
             )
-        _try_once(console, asked, repository.resolve(), expect, out, as_json)
+        _try_once(console, request, repository.resolve(), expect, out, as_json)
     elif good is None:
         raise typer.BadParameter(
             "bisect needs a commit with the expected outcome (--good), or --once to try one state of the code"
         )
-    elif expect is not None or out is not None or len(asked.commands) > 1:
+    elif expect is not None or out is not None or len(request.commands) > 1:
         raise typer.BadParameter(
             "--expect, --out and several --agent-command need --once: add --once, or leave them out"
         )
     else:
-        _search(console, asked, repository.resolve(), good, bad, as_json)
+        _search(console, request, repository.resolve(), good, bad, as_json)
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """The subject to play, and the way to play it."""
+class _PlayRequest:
+    """The scenario or record to play, with the options that decide how to play it."""
 
     subject: Path
     seed: int | None
@@ -140,24 +140,24 @@ class _Asked:
 
     def workshops(self, directory: Path) -> list[Workshop]:
         """Return one workshop for each agent command. Raises HarnessError."""
-        asked = subject_of(self.subject, self.seed, self.agent)
+        subject = subject_of(self.subject, self.seed, self.agent)
         workshops = []
         for number, command in enumerate(self.commands):
             plays = directory / f"plays-{number}"
             plays.mkdir()
-            workshops.append(Workshop(asked, plays, limit_s=self.limit_s, command=command, speedup=self.speedup))
+            workshops.append(Workshop(subject, plays, limit_s=self.limit_s, command=command, speedup=self.speedup))
         return workshops
 
 
-def _search(console: Console, asked: _Asked, repository: Path, good: str, bad: str, as_json: bool) -> None:
+def _search(console: Console, request: _PlayRequest, repository: Path, good: str, bad: str, as_json: bool) -> None:
     with interrupted_by_sigterm(), TemporaryDirectory(prefix="ucp-harness-bisect-") as directory:
-        (workshop,) = asked.workshops(Path(directory))
+        (workshop,) = request.workshops(Path(directory))
 
-        def tell(line: str) -> None:
+        def print_progress(line: str) -> None:
             console.print(Text(line), style="dim", soft_wrap=True)
 
-        tell(f"{workshop.subject.in_words}, between {good} and {bad}")
-        found = bisect(workshop, repository, good, bad, Path(directory), tell)
+        print_progress(f"{workshop.subject.in_words}, between {good} and {bad}")
+        found = bisect(workshop, repository, good, bad, Path(directory), print_progress)
     if as_json:
         print_json(found.to_json())
     else:
@@ -167,15 +167,15 @@ def _search(console: Console, asked: _Asked, repository: Path, good: str, bad: s
 
 
 def _try_once(
-    console: Console, asked: _Asked, code: Path, expect: Path | None, out: Path | None, as_json: bool
+    console: Console, request: _PlayRequest, code: Path, expect: Path | None, out: Path | None, as_json: bool
 ) -> None:
     outcomes: list[Outcome] = []
     try:
         with interrupted_by_sigterm(), TemporaryDirectory(prefix="ucp-harness-bisect-") as directory:
-            workshops = asked.workshops(Path(directory))
+            workshops = request.workshops(Path(directory))
             of_records = workshops[0].subject.scenario is None
             before = read(expect) if expect is not None else None
-            for command, workshop in zip(asked.commands, workshops, strict=True):
+            for command, workshop in zip(request.commands, workshops, strict=True):
                 outcome, _ = workshop.play(code)
                 console.print(Text(f"{command or code}: {outcome.sentence}"), soft_wrap=True)
                 outcomes.append(outcome)
@@ -183,12 +183,12 @@ def _try_once(
         complain(
             f"{code} cannot be tried: {error}; name the repository with --repository (the installed code is in {ROOT})"
         )
-        raise typer.Exit(CANNOT_BE_TRIED) from None
+        raise typer.Exit(UNTESTABLE) from None
     except InterruptedRunError:
         raise
     except HarnessError as error:
         complain(str(error))
-        raise typer.Exit(STOP) from None
+        raise typer.Exit(WRONG_ONCE_REQUEST) from None
     if out is not None:
         _keep(out, outcomes[0])
     if as_json:

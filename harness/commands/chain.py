@@ -1,4 +1,4 @@
-"""`ucp-harness chain`: what the chains say, for people, programs and maps."""
+"""`ucp-harness chain`: print the chains of a run as text or JSON, or write their positions as a map."""
 
 import json
 from pathlib import Path
@@ -36,8 +36,8 @@ def chain_command(
     if geojson_file is not None or kml_file is not None:
         record = archive.origin
         recorded = recorded_tracks(record, archive.tracks(record.known_agents))
-        made = tracks(shown) or [track for track in recorded if agent in (None, track.agent_id)]
-        _write_maps(made, shown, geojson_file, kml_file)
+        map_tracks = tracks(shown) or [track for track in recorded if agent in (None, track.agent_id)]
+        _write_maps(map_tracks, shown, geojson_file, kml_file)
     elif as_json:
         print_lines([json.dumps(document(shown, decode), indent=1)])
     else:
@@ -48,8 +48,11 @@ def chain_command(
         raise typer.Exit(WRONG_REQUEST)
 
 
-def _write_maps(made: list[Track], shown: logbook.Logbook, geojson_file: Path | None, kml_file: Path | None) -> None:
-    if not made:
+def _write_maps(
+    map_tracks: list[Track], shown: logbook.Logbook, geojson_file: Path | None, kml_file: Path | None
+) -> None:
+    """Write the tracks into the requested files. Raises ExportError without tracks."""
+    if not map_tracks:
         why = "the events are not of vehicles, and the run has no recorded tracks"
         if shown.telemetry:
             why = (
@@ -59,9 +62,9 @@ def _write_maps(made: list[Track], shown: logbook.Logbook, geojson_file: Path | 
             )
         raise ExportError(f"these chains hold no positions, so there is no map: {why}")
     if geojson_file is not None:
-        write_new(geojson_file, [json.dumps(geojson(made), ensure_ascii=False) + "\n"])
+        write_new(geojson_file, [json.dumps(geojson(map_tracks), ensure_ascii=False) + "\n"])
     if kml_file is not None:
-        write_new(kml_file, [kml(made)])
+        write_new(kml_file, [kml(map_tracks)])
     written = " and ".join(str(path) for path in (geojson_file, kml_file) if path is not None)
-    positions = sum(len(track.fixes) for track in made)
-    print_lines([f"{positions} positions of {len(made)} vehicles: {written}"])
+    positions = sum(len(track.fixes) for track in map_tracks)
+    print_lines([f"{positions} positions of {len(map_tracks)} vehicles: {written}"])

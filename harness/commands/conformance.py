@@ -1,4 +1,4 @@
-"""`ucp-harness conformance`: does an agent do what Algorithms 1-20 say, alone, with its peers played?"""
+"""`ucp-harness conformance`: test whether one agent follows Algorithms 1 to 20. The harness plays its peers."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ from ucp.agent import HANDLERS
 
 
 class ConformanceRequestError(HarnessError):
-    """What was asked for is not there."""
+    """The options of `ucp-harness conformance` contradict each other, or name no Algorithm."""
 
 
 def conformance_command(
@@ -73,7 +73,7 @@ def conformance_command(
         if command:
             raise ConformanceRequestError("--matrix and the command of one agent exclude each other: give one of them")
         refuse_existing([page])
-        raise typer.Exit(_all_of(read_agents(matrix), only, page, virtual=virtual))
+        raise typer.Exit(_test_all(read_agents(matrix), only, page, virtual=virtual))
     if not command:
         raise ConformanceRequestError(
             "the command of the agent is missing: for example, `ucp-harness conformance -- "
@@ -81,9 +81,9 @@ def conformance_command(
         )
     console = Console(stderr=as_json, highlight=False)
     place = keep or Path("conformance-failures")
-    with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as told:
-        asked = Asked(tuple(resolve_command(command, "the agent")), only, _fresh(place), virtual)
-        results = conform(asked, Path(scratch), told)
+    with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as show:
+        asked = Asked(tuple(resolve_command(command, "the agent")), only, _unused_path(place), virtual)
+        results = conform(asked, Path(scratch), show)
     if junit is not None:
         write_new(junit, [to_junit(results)])
     if as_json:
@@ -95,15 +95,15 @@ def conformance_command(
     raise typer.Exit(results.exit_status)
 
 
-def _all_of(agents: Mapping[str, Sequence[str]], only: str | None, page: Path, *, virtual: bool) -> int:
-    """One agent after the other; their page; the exit status."""
+def _test_all(agents: Mapping[str, Sequence[str]], only: str | None, page: Path, *, virtual: bool) -> int:
+    """Test each agent, write the page with all results, and return the highest exit status."""
     console = Console(highlight=False)
     outcomes: dict[str, Results | str] = {}
     for name, command in agents.items():
-        with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as told:
+        with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as show:
             try:
                 asked = Asked(tuple(resolve_command(list(command), "the agent")), only, None, virtual)
-                outcomes[name] = conform(asked, Path(scratch), told)
+                outcomes[name] = conform(asked, Path(scratch), show)
             except MachineError:
                 raise
             except HarnessError as error:
@@ -118,8 +118,8 @@ def _all_of(agents: Mapping[str, Sequence[str]], only: str | None, page: Path, *
     return max(statuses, default=0)
 
 
-def _fresh(place: Path) -> Path:
-    """Beside what an earlier run has left."""
+def _unused_path(place: Path) -> Path:
+    """Return `place`, or a path next to it with the first free number, so that earlier results stay."""
     number, fresh = 1, place
     while fresh.exists():
         number += 1

@@ -1,4 +1,4 @@
-"""`ucp-harness consolidate`: what the vehicles brought home as one ordered record."""
+"""`ucp-harness consolidate`: merge the exports of all vehicles into one record in time order."""
 
 import json
 from collections.abc import Callable, Iterable, Iterator
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from harness.field.depot.depot_reconcile import Reconciliation
 
 FINDING = 1
-MOST_TOLD = 20
-RECORD = ".jsonl"
+MAX_FINDINGS_SHOWN = 20
+RECORD_SUFFIX = ".jsonl"
 
 
 def consolidate_command(
@@ -58,9 +58,10 @@ def consolidate_command(
     reconciled did not become one. 2: nothing was usable.
     """
     refuse_existing(path for path in (out, html_file, kml_file, geojson_file, csv_file) if path is not None)
-    if out is not None and out.suffix != RECORD:
+    if out is not None and out.suffix != RECORD_SUFFIX:
         raise ExportError(
-            f"{out}: the name of the record must end in {RECORD}; other formats have their own options, such as --kml"
+            f"{out}: the name of the record must end in {RECORD_SUFFIX}; other formats have their own options, such as "
+            "--kml"
         )
     if final_reconcile and out is None:
         raise ExportError("--reconcile writes the exports next to the record: name the record with -o NAME.jsonl")
@@ -68,23 +69,23 @@ def consolidate_command(
     reconciliation = _reconcile(record, out.with_suffix(".reconciled")) if final_reconcile and out is not None else None
     reconciled = reconciliation.line if reconciliation else None
     print_lines(in_words(record, reconciled, opened=depot_key is not None))
-    print_lines(_written(record, reconciled, out, kml_file, geojson_file, csv_file))
+    print_lines(_write_outputs(record, reconciled, out, kml_file, geojson_file, csv_file))
     if html_file is not None:
         from harness.field.depot.page import draw
 
         write_new(html_file, [draw(record, reconciliation)])
         print_lines([str(html_file)])
     findings = [*record.collected.problems, *record.collected.left_out]
-    for sentence in findings[:MOST_TOLD]:
+    for sentence in findings[:MAX_FINDINGS_SHOWN]:
         complain(sentence)
-    if len(findings) > MOST_TOLD:
-        complain(f"and {len(findings) - MOST_TOLD} more findings; the header of the record lists all of them")
+    if len(findings) > MAX_FINDINGS_SHOWN:
+        complain(f"and {len(findings) - MAX_FINDINGS_SHOWN} more findings; the header of the record lists all of them")
     if findings or (reconciled is not None and not reconciled.uniform):
         raise typer.Exit(FINDING)
 
 
 def _reconcile(record: Consolidation, directory: Path) -> "Reconciliation":
-    from harness.field.depot.depot_reconcile import reconcile, write  # what plays a swarm takes its time to import
+    from harness.field.depot.depot_reconcile import reconcile, write  # slow: it imports the simulation
 
     claim(directory)
     with Console(stderr=True).status("reconciling", spinner="line") as status:
@@ -93,7 +94,7 @@ def _reconcile(record: Consolidation, directory: Path) -> "Reconciliation":
     return reconciliation
 
 
-def _written(
+def _write_outputs(
     record: Consolidation,
     reconciled: ReconcileResult | None,
     out: Path | None,
@@ -101,7 +102,7 @@ def _written(
     geojson_file: Path | None,
     csv_file: Path | None,
 ) -> Iterator[str]:
-    """Write what is asked for; the name of each file."""
+    """Write the requested files. Yield a line with the path of each file."""
     if out is not None:
         write_new(out, record_outputs.lines(record, reconciled))
         yield str(out)

@@ -1,4 +1,4 @@
-"""`ucp-harness coverage` and `ucp-harness validate`: recorded runs against all states, and against TLA+."""
+"""`ucp-harness coverage` and `validate`: compare recorded runs with all states, and with the TLA+ specification."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from rich.console import Console
 
 from harness import checker
 from harness.archive.archive import RunArchive
-from harness.commands.terminal import Watcher, complain, print_json, print_lines
+from harness.commands.terminal import StatusLine, complain, print_json, print_lines
 from harness.errors import WRONG_REQUEST, RunDirectoryError
 from harness.proof import Bounds, coverage, specification
 from harness.proof.bounds import EVENT_FILLS_BLOCK
@@ -19,8 +19,8 @@ from harness.proof.coverage import Reached
 from harness.scenario import load_scenario
 from ucp.settings import Settings
 
-OF_BLOCKS = {*EVENT_FILLS_BLOCK, "max_event_bytes"}
-"""Settings that only say how large blocks are, of which bounds know nothing."""
+BLOCK_SIZE_SETTINGS = {*EVENT_FILLS_BLOCK, "max_event_bytes"}
+"""Settings that only affect the size of blocks. In the state space of `prove`, blocks have no size."""
 
 
 def coverage_command(
@@ -44,35 +44,35 @@ def coverage_command(
                 f"{path} has no traces, and the coverage is computed from traces: name a run directory with traces"
             )
         for trace in evidence.traces.values():
-            its = _that_matter(trace.header.settings)
-            if settings is not None and its != settings:
+            relevant = _relevant_settings(trace.header.settings)
+            if settings is not None and relevant != settings:
                 raise RunDirectoryError(
                     f"{path} was played with other settings than the runs before it: measure the "
                     "coverage of runs with equal settings"
                 )
-            settings = its
+            settings = relevant
         reached.add(coverage.reached_in(evidence))
     chosen = tuple(name for name in faults.split(",") if name)
     bounds = Bounds(agents, blocks, network, chosen, settings=settings or {})  # type: ignore[arg-type]  # it is checked
-    there = coverage.existing(bounds)
+    state_space = coverage.existing(bounds)
     if as_json:
-        print_json({"runs": len(runs), **coverage.to_json(reached, there)})
+        print_json({"runs": len(runs), **coverage.to_json(reached, state_space)})
     else:
         console = Console()
-        for line in coverage.in_words(reached, there):
+        for line in coverage.in_words(reached, state_space):
             console.print(line, highlight=False, soft_wrap=True, markup=False)
     if not reached.steps:
         complain("no trace has a step that could be followed, so nothing was measured")
         raise typer.Exit(WRONG_REQUEST)
 
 
-def _that_matter(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings that are not as by default, and that an agent's steps depend on."""
+def _relevant_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that differ from the default and affect the steps of an agent."""
     default = dataclasses.asdict(Settings())
     return {
         name: value
         for name, value in settings.items()
-        if name in default and name not in OF_BLOCKS and value != default[name]
+        if name in default and name not in BLOCK_SIZE_SETTINGS and value != default[name]
     }
 
 
@@ -94,15 +94,17 @@ def validate_command(
     """
     if not runs and scenario is None:
         raise typer.BadParameter("validate needs recorded runs, or a --scenario to play")
-    those = specification.recorded(runs or ())
+    sources = specification.recorded(runs or ())
     count = len(runs or ())
     if scenario is not None:
-        those = chain(those, specification.simulated(load_scenario(scenario), range(seeds)))
+        sources = chain(sources, specification.simulated(load_scenario(scenario), range(seeds)))
         count += seeds
-    with Watcher() as watcher:
+    with StatusLine() as status_line:
         validation = specification.validate(
-            those,
-            watch=lambda done: watcher.show(f"{done.runs:,} of {count:,} runs, {done.steps:,} handler runs looked at"),
+            sources,
+            watch=lambda done: status_line.show(
+                f"{done.runs:,} of {count:,} runs, {done.steps:,} handler runs checked"
+            ),
         )
     if as_json:
         print_json(validation.to_json())

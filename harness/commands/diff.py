@@ -1,4 +1,4 @@
-"""`ucp-harness diff`: where two runs part."""
+"""`ucp-harness diff`: find the first difference between two runs."""
 
 import json
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ from ucp.trigger import MessageTrigger, Trigger
 
 DIFFERENT = 1
 VALUE_CHARACTERS = 60
-OURS = "all agents ran the harness's own program"
+ONLY_REFERENCE_AGENTS = "all agents ran the harness's own program"
 
 
 def diff_command(
@@ -49,7 +49,7 @@ def diff_command(
 
 
 def _lines(difference: Difference) -> Iterator[str]:
-    """All that there is to say, A being the first run and B the second."""
+    """Yield the lines of the result. A is the first run, and B is the second."""
     for differing in difference.keys:
         yield f"{differing.key}: {_value(differing.a)} in A, {_value(differing.b)} in B"
     yield from _programs(difference)
@@ -65,32 +65,34 @@ def _lines(difference: Difference) -> Iterator[str]:
 
 
 def _programs(difference: Difference) -> Iterator[str]:
-    """Who ran what, unless all agents of both runs were the harness's own."""
+    """Yield the programs of the agents. Yield nothing if all agents of both runs were reference agents."""
     a, b = difference.programs["a"], difference.programs["b"]
     if a == b:
         yield from [f"in both runs {in_sentence(a)}"] if a else []
     else:
-        yield from (f"in {run} {in_sentence(ran) or OURS}" for run, ran in (("A", a), ("B", b)))
+        yield from (f"in {run} {in_sentence(ran) or ONLY_REFERENCE_AGENTS}" for run, ran in (("A", a), ("B", b)))
 
 
 def _differences(difference: Difference) -> Iterator[str]:
     first = difference.first
     if first is not None:
         first_difference = difference.agents[first].run
-        assert first_difference is not None, "it is what makes it the first"
+        assert first_difference is not None, "the first differing agent has a differing handler run"
         yield f"the runs differ first at {first_difference.at_s:.3f} s, at agent {first}"
     for agent_id, agent_difference in difference.agents.items():
         yield f"agent {agent_id}: {'the same' if agent_difference == AgentDifference(None, None) else ''}".rstrip()
         if agent_difference.run is not None:
             yield f"  differs from handler run {agent_difference.run.number} on"
-            yield from (f"    {where}  {words}" for where, words in zip("AB", _both(agent_difference.run), strict=True))
+            yield from (
+                f"    {where}  {words}" for where, words in zip("AB", _step_texts(agent_difference.run), strict=True)
+            )
         if agent_difference.chain is not None:
             a, b = (block or "not there" for block in (agent_difference.chain.a, agent_difference.chain.b))
             yield f"  block {agent_difference.chain.place} of its chain: {a} in A, {b} in B"
 
 
-def _both(first_difference: FirstDifference) -> tuple[str, str]:
-    """What the agent does in either run; changes and messages only if they differ."""
+def _step_texts(first_difference: FirstDifference) -> tuple[str, str]:
+    """Return the handler run in A and in B as text. Changes and messages are included only if they differ."""
     a, b = first_difference.a, first_difference.b
     changes = a is None or b is None or a.changes != b.changes
     sent = a is None or b is None or a.sent != b.sent
@@ -100,8 +102,8 @@ def _both(first_difference: FirstDifference) -> tuple[str, str]:
 def _step(step: ComparedStep | None, changes: bool, sent: bool) -> str:
     if step is None:
         return "nothing more"
-    life = f"life {step.life}, " if step.life > 1 else ""
-    words = f"{step.t:.3f} s (line {step.line}): {life}{step.handler}, {step.branch}; {_trigger(step.trigger)}"
+    incarnation = f"life {step.life}, " if step.life > 1 else ""
+    words = f"{step.t:.3f} s (line {step.line}): {incarnation}{step.handler}, {step.branch}; {_trigger(step.trigger)}"
     if changes and step.changes:
         words += f"; {', '.join(' '.join(change) for change in step.changes)}"
     if sent and step.sent:
@@ -110,7 +112,7 @@ def _step(step: ComparedStep | None, changes: bool, sent: bool) -> str:
 
 
 def _trigger(trigger: Trigger) -> str:
-    """What made the handler run, such as: Commit Block, number 17 of agent 4."""
+    """Return the trigger of a handler run as text, such as "Commit Block, number 17 of agent 4"."""
     if isinstance(trigger, MessageTrigger):
         return f"{trigger.message}, number {trigger.sequence} of agent {trigger.sender}"
     return ", ".join(f"{kind} {what}" for kind, what in trigger.to_json().items())

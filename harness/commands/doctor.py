@@ -1,4 +1,4 @@
-"""`ucp-harness doctor` and `ucp-harness clean`: this machine's abilities, and leftover containers."""
+"""`ucp-harness doctor` and `clean`: report the abilities of this machine, and remove leftover containers."""
 
 from typing import Annotated
 
@@ -46,8 +46,8 @@ def doctor_command(
         Console().print(table)
     engines = []
     if measure and able:
-        with capabilities.progress_line(Console(stderr=True)) as say:
-            engines = capabilities.measure_engines(requirements, say)
+        with capabilities.progress_line(Console(stderr=True)) as show_progress:
+            engines = capabilities.measure_engines(requirements, show_progress)
     records = [requirement.to_json() for requirement in requirements]
     if as_json:
         print_json({"findings": records, "measured": [engine.to_json() for engine in engines]} if measure else records)

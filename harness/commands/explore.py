@@ -1,4 +1,4 @@
-"""`ucp-harness explore`: look for a violation, and shrink it; or hunt through the night."""
+"""`ucp-harness explore`: search for a violation and shrink it, or hunt for new states for some time."""
 
 import re
 from pathlib import Path
@@ -17,7 +17,7 @@ from harness.sweep import explore
 HUNT = "Hunt for new states"
 _DURATION = re.compile(r"(\d{1,9}(?:\.\d{1,6})?)(s|m|h|)")
 _UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
-LONGEST_S = 31 * 86400.0
+MAX_HUNT_S = 31 * 86400.0
 
 
 def explore_command(
@@ -80,12 +80,12 @@ def explore_command(
     if corpus is not None or as_json:
         raise typer.BadParameter("--corpus and --json need a hunt: add --for TIME or --runs NUMBER")
     console = Console()
-    request, own_seed = _asked(scenario, secured)
+    request, recorded_seed = _load_request(scenario, secured)
     if first_seed is None:
-        first_seed = own_seed or 0
+        first_seed = recorded_seed or 0
     with explore.watching(console) as watcher:
-        seeds_asked = range(first_seed, first_seed + (seeds or explore.SEEDS))
-        explored = explore.explore(request, seeds_asked, out, source=str(scenario), jobs=jobs, watcher=watcher)
+        requested_seeds = range(first_seed, first_seed + (seeds or explore.SEEDS))
+        explored = explore.explore(request, requested_seeds, out, source=str(scenario), jobs=jobs, watcher=watcher)
     for line in explore.in_words(explored):
         console.print(line, highlight=False, soft_wrap=True, markup=False)
     for seed, reason in explored.searched.failed.items():
@@ -95,10 +95,10 @@ def explore_command(
     raise typer.Exit(explored.exit_status)
 
 
-def _asked(scenario: Path, secured: bool) -> tuple[Scenario, int | None]:
-    """The scenario, and the seed of the run that it was."""
-    request, own_seed = load_recorded_scenario(scenario)
-    return request.secured() if secured else request, own_seed
+def _load_request(scenario: Path, secured: bool) -> tuple[Scenario, int | None]:
+    """Return the scenario. If `scenario` is a run directory, also return the seed of the run."""
+    request, recorded_seed = load_recorded_scenario(scenario)
+    return request.secured() if secured else request, recorded_seed
 
 
 def _hunt(
@@ -111,15 +111,15 @@ def _hunt(
     jobs: int | None,
     as_json: bool,
 ) -> None:
-    from harness.sweep.explore import guided  # pages take long to import
+    from harness.sweep.explore import guided  # slow: it imports the pages
 
-    request, own_seed = _asked(scenario, secured)
+    request, recorded_seed = _load_request(scenario, secured)
     directory = corpus or RUNS / _directory_name(request.name)
     with guided.watching(Console(stderr=True)) as watcher:
         night = guided.spend(
             request,
             directory,
-            first_seed=own_seed or 0 if first_seed is None else first_seed,
+            first_seed=recorded_seed or 0 if first_seed is None else first_seed,
             for_s=float("inf") if for_time is None else _seconds(for_time),
             most_runs=float("inf") if runs is None else runs,
             jobs=jobs or cores(),
@@ -147,6 +147,6 @@ def _directory_name(name: str) -> str:
 def _seconds(text: str) -> float:
     duration = _DURATION.fullmatch(text.strip())
     seconds = float(duration[1]) * _UNITS[duration[2]] if duration else 0.0
-    if not 0 < seconds <= LONGEST_S:
+    if not 0 < seconds <= MAX_HUNT_S:
         raise typer.BadParameter(f"--for {text!r} is no time: 90s, 30m or 8h are, up to 31 days")
     return seconds

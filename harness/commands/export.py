@@ -1,4 +1,4 @@
-"""`ucp-harness export`: a run as files for the tools that people use."""
+"""`ucp-harness export`: write a run as files for Foxglove, PlotJuggler, Perfetto and ROS 2."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from harness.commands._shared_options import DepotKey, depot_of, newly, refuse_existing
+from harness.commands._shared_options import DepotKey, depot_of, refuse_existing, write_whole
 from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
 from harness.report.export import ExportedRun
@@ -46,14 +46,14 @@ def export_command(
             def progress(mission_s: float, path: Path = path) -> None:
                 status.update(f"{path}: {mission_s:.0f} s of {recording.end_s:.0f} s")
 
-            with newly(path):
+            with write_whole(path):
                 written = write(recording, path, progress)
             print_lines([f"{written} {counted}: {path}"])
     for sentence in recording.problems:
         complain(sentence)
 
 
-# A format's packages are loaded, or missed, before anything is written
+# The command imports the packages of all formats before it writes. A missing package leaves no file behind.
 
 
 def _mcap() -> Write:

@@ -1,4 +1,4 @@
-"""`ucp-harness import`: records of other implementations, of recorders and of ours, as the house has them."""
+"""`ucp-harness import`: convert records of any implementation or recorder into the format of the harness."""
 
 from enum import Enum
 from pathlib import Path
@@ -16,14 +16,14 @@ from harness.field.adapters.imported_records import ImportedFlight
 from harness.field.adapters.rosbag_adapter import RosBag
 
 
-class Format(Enum):
-    """What comes along."""
+class RecordFormat(Enum):
+    """The formats with an adapter in the harness."""
 
     CSV = "csv"
     ROSBAG = "rosbag"
 
 
-ADAPTERS: dict[Format, type[Adapter]] = {Format.CSV: CsvAdapter, Format.ROSBAG: RosBag}
+ADAPTERS: dict[RecordFormat, type[Adapter]] = {RecordFormat.CSV: CsvAdapter, RecordFormat.ROSBAG: RosBag}
 
 
 def import_command(
@@ -34,7 +34,7 @@ def import_command(
         typer.Option(metavar="MODULE:CLASS", help="Adapter for a format of your own: my_logs:MyAdapter."),
     ] = None,
     format_: Annotated[
-        Format | None, typer.Option("--format", help="Format of all sources; detected from each if not given.")
+        RecordFormat | None, typer.Option("--format", help="Format of all sources; detected from each if not given.")
     ] = None,
 ) -> None:
     """Convert records of any kind into one directory.
@@ -50,10 +50,10 @@ def import_command(
         record = import_records(sources, adapters, out, status.update, by_content=format_ is None)
     for remark in (*record.left_out, *record.remarks):
         complain(remark.sentence)
-    print_lines(_told(flight, out) for flight in record.flights)
+    print_lines(_summary(flight, out) for flight in record.flights)
 
 
-def _told(flight: ImportedFlight, out: Path) -> str:
+def _summary(flight: ImportedFlight, out: Path) -> str:
     agents = flight.agents.values()
     runs = sum(agent.handler_runs for agent in agents)
     kinds = {

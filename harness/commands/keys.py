@@ -1,4 +1,7 @@
-"""`ucp-harness keys`: the keys of a mission, made and kept at home, and what each vehicle is given of them."""
+"""`ucp-harness keys`: make the keys of a mission, write the bundle of each vehicle, and revoke keys.
+
+All secret keys stay in the key directory at the ground. A vehicle gets only its bundle.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -68,12 +71,12 @@ def inspect_command(
 
     Exit status 0: all files are valid and belong to one mission. 1: they belong to several. 2: one is not usable.
     """
-    told = [facts for path in paths for facts in inspect(path)]
+    all_facts = [facts for path in paths for facts in inspect(path)]
     if as_json:
-        print_json(told)
+        print_json(all_facts)
     else:
-        print_lines(map(in_words, told))
-    missions = {facts["mission"] for facts in told}
+        print_lines(map(in_words, all_facts))
+    missions = {facts["mission"] for facts in all_facts}
     if len(missions) > 1:
         complain(f"these keys belong to {len(missions)} missions: vehicles of one mission drop the messages of another")
         raise typer.Exit(SEVERAL_MISSIONS)
@@ -95,11 +98,11 @@ def revoke_command(
     """
     if out is not None:
         refuse_existing([out])
-    kept = Home(home)
-    revocation = kept.revoke(agents)
+    key_directory = Home(home)
+    revocation = key_directory.revoke(agents)
     if out is not None:
         try:
-            write_revocation(out, revocation, kept.public())
+            write_revocation(out, revocation, key_directory.public())
         except OSError as error:
             raise KeysError(f"{out} cannot be written: {error.strerror}; choose another file") from None
-    print_lines([in_words(facts) for facts in inspect(kept.directory / "revocation.json")])
+    print_lines([in_words(facts) for facts in inspect(key_directory.directory / "revocation.json")])

@@ -1,4 +1,4 @@
-"""`ucp-harness matrix`: a scenario over loss rates, numbers of agents, mission lengths, backends and seeds."""
+"""`ucp-harness matrix`: play a scenario for all loss rates, swarm sizes, mission lengths, backends and seeds."""
 
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -64,7 +64,7 @@ def matrix_command(
     if secured:
         request = request.model_copy(update={"scenario": request.scenario.secured()})
     baseline = load_baseline(against, request) if against else None
-    kept = nights_of_matrix.opened(nights) if nights else None
+    nights_directory = nights_of_matrix.opened(nights) if nights else None
     directory = (out or default_path(request.name)).absolute()
     if variant is not None and (against, nights, scheduler, coverage) != (None, None, None, False):
         raise typer.BadParameter("--variant excludes --against, --nights, --scheduler and --coverage: leave them out")
@@ -73,14 +73,14 @@ def matrix_command(
     else:
         spread = on_cluster(request, scheduler, shown=True)
     if variant is not None:
-        _beside_the_original(request, load_variant(variant), directory, spread, as_json)
+        _compare_with_variant(request, load_variant(variant), directory, spread, as_json)
     finished = matrix.run_matrix(request, directory, spread, covers=coverage)
     if baseline is not None:
         finished = compare_with(finished, baseline, str(against))
     earlier = None
-    if kept is not None:
-        nights_of_matrix.keep(finished.record, kept)
-        earlier = nights_of_matrix.read(kept, request)
+    if nights_directory is not None:
+        nights_of_matrix.keep(finished.record, nights_directory)
+        earlier = nights_of_matrix.read(nights_directory, request)
         if earlier.left_out:
             complain(f"{earlier.said_left_out}; {earlier.left_out[0]}")
     matrix_outputs.write(finished, directory, earlier)
@@ -91,19 +91,19 @@ def matrix_command(
     end_sweep(finished.record, None if as_json else matrix_table.render(finished.record), directory / "report.html")
 
 
-def _beside_the_original(
+def _compare_with_variant(
     request: matrix.Matrix, variant: Variant, directory: Path, spread: Spread, as_json: bool
 ) -> NoReturn:
-    """Play the matrix with the original and with the variant, in directories of their own, and compare."""
+    """Play the matrix with the original and with the variant, each into its own directory, and compare the results."""
     original = matrix.run_matrix(request, directory / "original", spread)
     matrix_outputs.write(original, directory / "original")
     if original.record.outcome == "interrupted":
         complain(f"to continue, repeat the command with --out {directory}")
         raise typer.Exit(INTERRUPTED)
-    beside = directory / f"{variant.name}-{variant.digest}"
+    variant_directory = directory / f"{variant.name}-{variant.digest}"
     with in_force(variant):
-        changed = matrix.run_matrix(request, beside, spread)
-    matrix_outputs.write(changed, beside)
+        changed = matrix.run_matrix(request, variant_directory, spread)
+    matrix_outputs.write(changed, variant_directory)
     comparison = compare_runs(variant, request, original, changed)
     page = directory / "comparison.md"
     write_atomically(page, comparison.to_markdown())

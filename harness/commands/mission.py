@@ -1,4 +1,4 @@
-"""`ucp-harness mission`: what every vehicle is given before it takes off, and whether all of them have it."""
+"""`ucp-harness mission`: write the mission file of each vehicle, and check that all files belong to one mission."""
 
 import base64
 import ipaddress
@@ -74,19 +74,19 @@ def new_command(
 
     All files have the same inception block. The manifest holds the parts that all files share.
     """
-    asked = _scenario(scenario, agents, name)
-    home, data = None if keys is None else _home(keys), _initial_data(initial_data, asked)
+    requested = _scenario(scenario, agents, name)
+    home, data = None if keys is None else _home(keys), _initial_data(initial_data, requested)
     if home is not None:
-        home.bundles(asked.roster)  # before anything is written that would need them
+        home.bundles(requested.roster)  # a missing key must be an error before the first file is written
         depot = home.public().depot
         data = data if depot is None else seal_to(data, depot)
-    if asked.has_wrong_agents:
+    if requested.has_wrong_agents:
         complain(
-            f"{scenario}: its quirks ({', '.join(quirks_in_words(asked.quirks))}) are left out, because mission files "
-            "have no quirks"
+            f"{scenario}: its quirks ({', '.join(quirks_in_words(requested.quirks))}) are left out, because mission "
+            "files have no quirks"
         )
     plan = Plan(
-        asked,
+        requested,
         data,
         settings=_pairs("--setting", settings),
         events=_events(_pairs("--event", events)),
@@ -98,7 +98,7 @@ def new_command(
     )
     *files, manifest = write(plan, out, overwrite=overwrite)
     if home is not None:
-        print_lines(map(str, home.write_bundles(out, asked.roster, overwrite=overwrite)))
+        print_lines(map(str, home.write_bundles(out, requested.roster, overwrite=overwrite)))
     print_lines([*map(str, files), str(manifest), compare([*files, manifest]).in_words()])
 
 
@@ -128,19 +128,22 @@ def verify_command(
 
 
 def _scenario(path: Path | None, agents: str | None, name: str | None) -> Scenario:
-    """What is asked for, as a scenario. Raises ScenarioError, MissionFileError."""
+    """Return a scenario with the name, roster, settings and events of the mission.
+
+    Raises ScenarioError, MissionFileError.
+    """
     if path is None and agents is None:
         raise MissionFileError("the roster is missing: give it with --agents 10,28,32, or name a --scenario")
     if path is None:
         return parse({"name": name or "mission", "agents": roster_of(agents or "")})
-    asked = load_scenario(path)
+    requested = load_scenario(path)
     roster = {} if agents is None else {"agents": roster_of(agents)}
-    chosen = {"name": name or asked.name, "agents": list(asked.roster), **roster}
+    chosen = {"name": name or requested.name, "agents": list(requested.roster), **roster}
     kept = {
-        "settings": asked.settings,
-        "events": asked.events,
-        "quirks": asked.quirks,
-        "initial_data": asked.initial_data,
+        "settings": requested.settings,
+        "events": requested.events,
+        "quirks": requested.quirks,
+        "initial_data": requested.initial_data,
     }
     return parse({**chosen, **kept})
 
@@ -153,11 +156,11 @@ def _home(directory: Path) -> "Home":
     return Home(directory)
 
 
-def _initial_data(text: str | None, asked: Scenario) -> bytes:
-    if text is None and asked.initial_data is not None:
-        return base64.b64decode(asked.initial_data)
+def _initial_data(text: str | None, requested: Scenario) -> bytes:
+    if text is None and requested.initial_data is not None:
+        return base64.b64decode(requested.initial_data)
     if text is None:
-        return f"{asked.name}, made {datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%fZ}".encode()
+        return f"{requested.name}, made {datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%fZ}".encode()
     if not text.startswith("@"):
         return text.encode(errors="surrogateescape")
     try:
@@ -190,7 +193,7 @@ def _texts(option: str, pairs: list[str] | None) -> dict[str, str]:
 
 
 def _pairs(option: str, pairs: list[str] | None) -> dict[str, Any]:
-    """Values as JSON has them; whatever is no JSON is text."""
+    """Return the value of each key. A value that is no JSON is text."""
     values: dict[str, Any] = {}
     for key, text in _texts(option, pairs).items():
         try:
@@ -201,6 +204,6 @@ def _pairs(option: str, pairs: list[str] | None) -> dict[str, Any]:
 
 
 def _events(values: dict[str, Any]) -> dict[str, Any]:
-    """Kinds of events need no brackets."""
+    """Split the value of `log` at its commas, so that `--event log=mode,position` needs no brackets."""
     log = values.get("log")
     return {**values, "log": log.split(",")} if isinstance(log, str) else values

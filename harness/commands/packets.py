@@ -1,4 +1,4 @@
-"""`ucp-harness packets`: what crossed the air, from captures of the vehicles."""
+"""`ucp-harness packets`: list the datagrams in the captures of the vehicles."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -71,18 +71,18 @@ def _output_lines(
         listed = shown if chapters is None else in_order(chapters)
         yield from document(captures, count_losses(selected), listed, exchanges, names, losses)
         return
-    wording = TransmissionText(names, _paint(), losses)
+    texts = TransmissionText(names, _paint(), losses)
     yield packets_text.header(captures)
     if chapters is not None:
-        yield from packets_text.exchange_lines(chapters, exchanges, wording)
+        yield from packets_text.exchange_lines(chapters, exchanges, texts)
         return
-    yield from packets_text.transmission_lines(shown, exchanges, wording, selection.receiver)
+    yield from packets_text.transmission_lines(shown, exchanges, texts, selection.receiver)
     if lost:
         yield from loss_matrix(count_losses(selected))
     yield from packets_text.totals(captures, selected)
 
 
 def _paint() -> Paint:
-    """Colours only on a terminal."""
+    """Return a function that paints text red on a terminal, and leaves it unchanged elsewhere."""
     console = Console()
     return partial(typer.style, fg="red") if console.is_terminal and not console.no_color else str

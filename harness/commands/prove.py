@@ -1,4 +1,4 @@
-"""`ucp-harness prove`: look at everything that can happen within bounds."""
+"""`ucp-harness prove`: explore all states that a swarm can reach within bounds."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -11,7 +11,7 @@ from rich.console import Console
 
 from harness import proof as prove
 from harness.commands._shared_options import RARE
-from harness.commands.terminal import Watcher, complain, print_json
+from harness.commands.terminal import StatusLine, complain, print_json
 from harness.errors import INTERRUPTED
 from harness.play.core_version import edited_files
 from harness.play.variant import variant_in_use
@@ -155,35 +155,35 @@ def prove_command(
     )
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s, cores() if cores_ is None else cores_)
     if second_opinion:
-        with Watcher() as watcher, sigterm_as_ctrl_c():
+        with StatusLine() as status_line, sigterm_as_ctrl_c():
             opinion = specification.second_opinion(
-                bounds, limits, watch=lambda progress: watcher.show(_how_far(progress))
+                bounds, limits, watch=lambda progress: status_line.show(_progress_text(progress))
             )
-        _say(opinion.to_json(), opinion.in_words(), as_json)
+        _print_result(opinion.to_json(), opinion.in_words(), as_json)
         raise typer.Exit(opinion.exit_status)
     if against is not None:
         _compare(against, bounds, limits, out, as_json)
-    with Watcher() as watcher, sigterm_as_ctrl_c():
-        proof = prove.prove(bounds, limits, out, watch=lambda progress: watcher.show(_how_far(progress)))
-    _say(proof.to_json(), prove.in_words(proof), as_json)
+    with StatusLine() as status_line, sigterm_as_ctrl_c():
+        proof = prove.prove(bounds, limits, out, watch=lambda progress: status_line.show(_progress_text(progress)))
+    _print_result(proof.to_json(), prove.in_words(proof), as_json)
     if proof.exit_status == INTERRUPTED:
         complain("interrupted")
     raise typer.Exit(proof.exit_status)
 
 
 def _compare(against: str, bounds: Bounds, limits: Limits, out: Path | None, as_json: bool) -> NoReturn:
-    """Prove the same for the original. Both proofs reduce states, or neither: their livelocks are then comparable."""
-    with original.code_of(against) as code, Watcher() as watcher, sigterm_as_ctrl_c():
+    """Prove the original too, and compare. Both proofs reduce states, or neither does: else livelocks would differ."""
+    with original.code_of(against) as code, StatusLine() as status_line, sigterm_as_ctrl_c():
         if bounds.reduced and original.is_edited(code):
             complain(f"state reduction is disabled: it assumes the released core, and {against} has another one")
             bounds = replace(bounds, reduced=False)
-        proof = prove.prove(bounds, limits, out, watch=lambda progress: watcher.show(_how_far(progress)))
+        proof = prove.prove(bounds, limits, out, watch=lambda progress: status_line.show(_progress_text(progress)))
         comparison = original.Comparison(proof, original.prove_original(against, code, bounds, limits))
-    _say(comparison.to_json(), comparison.in_words(), as_json)
+    _print_result(comparison.to_json(), comparison.in_words(), as_json)
     raise typer.Exit(comparison.exit_status)
 
 
-def _say(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:
+def _print_result(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:
     if as_json:
         print_json(document)
         return
@@ -205,7 +205,7 @@ def _pairs(option: str, texts: list[str] | None) -> dict[str, Any]:
     return pairs
 
 
-def _how_far(progress: Progress) -> str:
+def _progress_text(progress: Progress) -> str:
     if progress.asked is not None:
         return f"{progress.states:,} states, all explored; now checking: {progress.asked}"
     frontier = progress.states - progress.looked_at

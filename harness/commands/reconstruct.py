@@ -1,4 +1,4 @@
-"""`ucp-harness reconstruct`: from what came home to a scenario that flies it again."""
+"""`ucp-harness reconstruct`: make a scenario that reproduces a recorded flight."""
 
 from pathlib import Path
 from typing import Annotated

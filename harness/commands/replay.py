@@ -1,4 +1,4 @@
-"""`ucp-harness replay`: what one agent saw, played again."""
+"""`ucp-harness replay`: give the recorded inputs of an agent to the reference, and compare each step."""
 
 from bdb import BdbQuit
 from collections.abc import Iterable, Sequence
@@ -52,7 +52,7 @@ def replay_command(
     console = Console(highlight=False)
     try:
         if step or breaks:
-            _ask(console, open_record(record, agent), until, step, breaks or [], debug)
+            _step_through(console, open_record(record, agent), until, step, breaks or [], debug)
         else:
             _play(console, open_records(record, agent), until, as_json)
     except (KeyboardInterrupt, BdbQuit):
@@ -60,29 +60,29 @@ def replay_command(
 
 
 def _play(console: Console, records: Sequence[Record], until: float | None, as_json: bool) -> NoReturn:
-    """Play whole records, and say what differs."""
-    told, differ, judged = list[ReplayedRecord](), False, False
+    """Replay whole records, and print the differences."""
+    replayed_records, differ, judged = list[ReplayedRecord](), False, False
     for record in records:
-        _complain_of(record)
+        _print_problems(record)
         names = ReplayNames(record)
         result = Player(record, until).to_end()
-        in_use = Player(record, until, IN_USE).to_end()  # so that a debugger stops in the handlers of `ucp`
+        in_use = Player(record, until, IN_USE).to_end()  # a debugger then stops in the handlers of `ucp`
         differ |= bool(result.deviations)
         judged |= bool(result.steps)
         if as_json:
-            told.append(replayed(record, result, names))
+            replayed_records.append(replayed(record, result, names))
         else:
             _show(console, [header_text(record), *summary(record, result, names), *_in_use(in_use, result)])
     if as_json:
-        print_json(document(told))
+        print_json(document(replayed_records))
     raise typer.Exit(VIOLATED if differ else 0 if judged else WRONG_REQUEST)
 
 
-def _ask(
+def _step_through(
     console: Console, record: Record, until: float | None, at_start: bool, breaks: Sequence[str], debug: bool
 ) -> NoReturn:
-    """Step through a record as the user says; when no more is said, play the rest."""
-    _complain_of(record)
+    """Step through a record by the user's commands. At the end of the commands, replay the rest."""
+    _print_problems(record)
     names = ReplayNames(record)
     player = Player(record, until, IN_USE if debug else REFERENCE)
     if debug:
@@ -114,7 +114,7 @@ def _in_use(in_use: ReplayResult, result: ReplayResult) -> list[Text]:
     return [Text(f"The core of this installation{edited} first differs from the record in {where}.")]
 
 
-def _complain_of(record: Record) -> None:
+def _print_problems(record: Record) -> None:
     for sentence in record.problems:
         complain(sentence)
 

@@ -1,4 +1,4 @@
-"""`ucp-harness check`, `report` and `watch`: judge a run again, write its report again, show it as a film."""
+"""`ucp-harness check`, `report` and `watch`: judge a run again, write its report again, or show it as a film."""
 
 import asyncio
 import os
@@ -32,24 +32,24 @@ def report_command(run: Annotated[Path, typer.Argument(help="Run directory.")]) 
 
     The files are report.html, report.md, junit.xml and chains.svg. The run may have been killed.
     """
-    left = report.read_source(RunArchive(run, skim=True))
+    source = report.read_source(RunArchive(run, skim=True))
     try:
-        page = report.write(left)
+        page = report.write(source)
     except RunDirectoryError as error:
         raise MachineError(f"{error}: free some disk space, or make the directory writable") from None
-    for sentence in _missing(left):
+    for sentence in _missing(source):
         complain(sentence)
     sys.stdout.write(f"{page}\n")
 
 
-def _missing(left: report.ReportSource) -> Iterator[str]:
-    """A sentence for everything that a whole run would have left and this one has not."""
-    if left.archive.recorded and left.record.outcome == "running":
+def _missing(source: report.ReportSource) -> Iterator[str]:
+    """Yield a sentence for each part that a complete run has and this run lacks."""
+    if source.archive.recorded and source.record.outcome == "running":
         yield "the end of the run is not recorded: the run is still active, or it was killed"
-    if not left.record.characteristics:
-        yield f"the run has no verdict: `ucp-harness check {left.run_dir}` judges the files that exist"
-    yield from left.chains_missing
-    yield from left.files_missing
+    if not source.record.characteristics:
+        yield f"the run has no verdict: `ucp-harness check {source.run_dir}` judges the files that exist"
+    yield from source.chains_missing
+    yield from source.files_missing
 
 
 def check_command(
@@ -68,9 +68,9 @@ def check_command(
     stored = [*stored_verdict.differences(archive.record, result, survived)]
     differing = differing_versions(archive.record.versions, versions()) if archive.record.versions else []
     if as_json:
-        ran = [program.to_json() for program in programs(archive.record)]
-        beside = {"differs_from_stored": stored, "differing_versions": differing}
-        print_json({**result.to_json(), "survival": survived.model_dump(), "programs": ran, **beside})
+        used_programs = [program.to_json() for program in programs(archive.record)]
+        differences = {"differs_from_stored": stored, "differing_versions": differing}
+        print_json({**result.to_json(), "survival": survived.model_dump(), "programs": used_programs, **differences})
     else:
         show_result(Console(), result)
         show_programs(Console(), archive.record)
@@ -129,7 +129,7 @@ async def _show(feed: "Feed", run: Path, port: int) -> None:
 
 
 def show_address(console: Console, address: str) -> None:
-    """Print the page's address as a link; and open it, for somebody who sits at a desktop."""
+    """Print the address of the page as a link. On a desktop, also open it in the browser."""
     console.print(Text("watch it at "), Text(address, style=f"link {address}"), sep="", soft_wrap=True)
     has_desktop = sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if console.is_terminal and has_desktop:

@@ -31,7 +31,7 @@ from harness.scenario.agent_programs import Programs, command_keys, programs_of
 from harness.scenario.load import explain
 
 
-class Vehicles(StrEnum):
+class VehicleKind(StrEnum):
     ardupilot = "ardupilot"
     embedded = "embedded"
     none = "none"
@@ -55,7 +55,7 @@ def run_command(
             help="Other agent for all vehicles or, with ID=, for one; repeatable.",
         ),
     ] = None,
-    vehicles: Annotated[Vehicles | None, typer.Option(help="Kind of vehicles, instead of the scenario's.")] = None,
+    vehicles: Annotated[VehicleKind | None, typer.Option(help="Kind of vehicles, instead of the scenario's.")] = None,
     backend: Annotated[
         BackendName, typer.Option(help="Processes in private networks, containers, or virtual time.")
     ] = "process",
@@ -104,12 +104,12 @@ def run_command(
     `not finished`. 130: interrupted.
     """
     console = Console()
-    asked, own_seed = load_recorded_scenario(scenario)
-    request = _with_options(asked, speedup, vehicles, gcs, capture, image_from_host, programs_of(agents or ()))
+    loaded, recorded_seed = load_recorded_scenario(scenario)
+    request = _with_options(loaded, speedup, vehicles, gcs, capture, image_from_host, programs_of(agents or ()))
     if secured:
         request = request.secured()
     directory = (out or default_path(request.name)).absolute()
-    seed = own_seed if seed is None else seed
+    seed = recorded_seed if seed is None else seed
     chosen_seed = secrets.randbelow(2**32) if seed is None else seed
     if emit_compose is not None:
         _emit_compose(console, request, chosen_seed, emit_compose)
@@ -146,24 +146,38 @@ def run_command(
     if remark := BACKENDS[backend].remark(request):
         console.print(remark, style="dim")
     virtual = BACKENDS[backend].virtual_time
-    told = watch or by_hand
-    hand = Interventions(request, virtual_time=virtual, factor=request.speedup, paused=by_hand) if told else None
-    with live_page(directory, watch_port, hand) if watch and hand is not None else nullcontext() as page:
+    takes_events = watch or by_hand
+    interventions = None
+    if takes_events:
+        interventions = Interventions(request, virtual_time=virtual, factor=request.speedup, paused=by_hand)
+    with (
+        live_page(directory, watch_port, interventions)
+        if watch and interventions is not None
+        else nullcontext() as page
+    ):
         if page is not None:
             show_address(console, page.address)
         shown = progress.for_console(console)
-        heard = shown if page is None else page.tee(shown)
+        watched = shown if page is None else page.tee(shown)
         try:
-            all_heard = watch and virtual  # the page shows who heard what
-            finished = run(request, chosen_seed, directory, heard, backend, delivers_all=all_heard, interventions=hand)
+            delivers_all = watch and virtual  # the page shows the receivers of each message
+            finished = run(
+                request,
+                chosen_seed,
+                directory,
+                watched,
+                backend,
+                delivers_all=delivers_all,
+                interventions=interventions,
+            )
         finally:
             shown.close()
         _show(console, finished)
         if page is not None:
-            is_looked_at = page.run_is_over()
+            is_watched = page.run_is_over()
             if page.problem is not None:
                 complain(page.problem)
-            if is_looked_at and finished.played.outcome != "interrupted":
+            if is_watched and finished.played.outcome != "interrupted":
                 console.print("The page stays open until you close it or press Ctrl-C.", style="dim")
                 page.wait()
     raise typer.Exit(finished.exit_status)
@@ -190,13 +204,13 @@ def _emit_compose(console: Console, scenario: Scenario, seed: int, file: Path) -
 def _with_options(
     scenario: Scenario,
     speedup: float | None,
-    vehicles: Vehicles | None,
+    vehicles: VehicleKind | None,
     gcs: str | None,
     capture: bool,
     image_from_host: bool,
     programs: Programs,
 ) -> Scenario:
-    """The scenario as resolved: the command line's word comes before the file's."""
+    """Return the scenario with the options of the command line, which override the keys of the file."""
     document: dict[str, Any] = scenario.model_dump() | command_keys(scenario, programs)
     if speedup is not None:
         if not 0 < speedup <= 1000:

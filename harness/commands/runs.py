@@ -1,4 +1,4 @@
-"""`ucp-harness runs` and `ucp-harness scenarios`: recorded runs, and the library."""
+"""`ucp-harness runs` and `scenarios`: list recorded runs, and the scenarios that come with the harness."""
 
 import webbrowser
 from datetime import datetime
@@ -62,16 +62,16 @@ def _table(runs: list[PastRun]) -> Table:
 
 
 def _verdict(record: RunRecord) -> tuple[Kind, str]:
-    """What it amounts to, in a few words."""
+    """Return a summary of all verdicts in a few words, and whether it is good, bad or unknown."""
     kinds = {key: kind_of(judgement.verdict) for key, judgement in record.judgements.items()}
     bad = [BAD_IN_WORDS[key] for key, kind in kinds.items() if kind == "bad" and key in BAD_IN_WORDS]
     if bad:
         return "bad", ", ".join(bad)
     if record.outcome != "completed":
         return "unknown", record.outcome
-    open_ones = [key for key, kind in kinds.items() if kind == "unknown"]
-    if open_ones or not kinds:
-        return "unknown", f"not judged: {', '.join(open_ones)}" if open_ones else "not judged"
+    unjudged = [key for key, kind in kinds.items() if kind == "unknown"]
+    if unjudged or not kinds:
+        return "unknown", f"not judged: {', '.join(unjudged)}" if unjudged else "not judged"
     return "good", "all good"
 
 

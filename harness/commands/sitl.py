@@ -1,4 +1,4 @@
-"""`ucp-harness sitl install`, `list` and `path`: ArduPilot's SITL binaries, from its server into the user's cache."""
+"""`ucp-harness sitl install`, `list` and `path`: ArduPilot's SITL binaries in the user's cache."""
 
 import json
 import os
@@ -45,7 +45,7 @@ def install_into_cache(
     """
     console = Console()
     try:
-        with _Bar(console, BINARIES[vehicle]) as bar:
+        with _DownloadBar(console, BINARIES[vehicle]) as bar:
             outcome = install(vehicle, version, os.environ, bar, url)
     except KeyboardInterrupt:
         raise InterruptedRunError("interrupted; repeat the command to continue") from None
@@ -78,24 +78,24 @@ def list_binaries(
 
     A run searches ARDUPILOT_SITL, then PATH, then the cache.
     """
-    offers = [offer for vehicle in VEHICLE_TYPES for offer in _offers(vehicle)]
+    binaries = [binary for vehicle in VEHICLE_TYPES for binary in _available_binaries(vehicle)]
     if as_json:
-        sys.stdout.write(json.dumps([asdict(offer) for offer in offers], indent=1) + "\n")
+        sys.stdout.write(json.dumps([asdict(binary) for binary in binaries], indent=1) + "\n")
         return
     console = Console()
-    for offer in offers:
-        build = f"{offer.version or '-'}{f' ({offer.commit})' if offer.commit else ''}"
-        what = f"{offer.vehicle:<7} {build:<21} {megabytes(offer.size_bytes):>8}"
-        date, source = (offer.fetched_at or "-")[:10], f"{offer.source}{', current' if offer.current else ''}"
-        state = Text(offer.problem, style="red") if offer.problem else Text("ok", style="green")
-        console.print(Text.assemble(f"{what}  {date:<10}  {source}: {offer.path}  ", state), soft_wrap=True)
-    if not offers:
+    for binary in binaries:
+        build = f"{binary.version or '-'}{f' ({binary.commit})' if binary.commit else ''}"
+        what = f"{binary.vehicle:<7} {build:<21} {megabytes(binary.size_bytes):>8}"
+        date, source = (binary.fetched_at or "-")[:10], f"{binary.source}{', current' if binary.current else ''}"
+        state = Text(binary.problem, style="red") if binary.problem else Text("ok", style="green")
+        console.print(Text.assemble(f"{what}  {date:<10}  {source}: {binary.path}  ", state), soft_wrap=True)
+    if not binaries:
         console.print(f"no ArduPilot binaries: run {install_command('copter')}", highlight=False, soft_wrap=True)
 
 
 @dataclass(frozen=True)
-class _Offer:
-    """A binary that is here; `fetched_at` is known of installed ones, `commit` by its first digits."""
+class _AvailableBinary:
+    """A SITL binary on this machine, as `list --json` prints it."""
 
     vehicle: VehicleType
     source: str
@@ -103,38 +103,40 @@ class _Offer:
     size_bytes: int
     version: str | None = None
     commit: str | None = None
+    """First digits of the commit hash."""
     sha256: str | None = None
     defaults: str | None = None
-    """Its default parameters."""
+    """Path of the default parameters."""
     fetched_at: str | None = None
+    """Time of the download. Only for a binary in the cache."""
     current: bool = False
     problem: str | None = None
 
 
-def _offers(vehicle: VehicleType) -> Iterator[_Offer]:
+def _available_binaries(vehicle: VehicleType) -> Iterator[_AvailableBinary]:
     name = BINARIES[vehicle]
     named = Path(os.environ[ENVIRONMENT]) / name if os.environ.get(ENVIRONMENT) else None
     on_path = shutil.which(name)
     for source, binary in ((ENVIRONMENT, named), ("PATH", on_path and Path(on_path))):
         if binary and binary.is_file():
             problem = None if os.access(binary, os.X_OK) else f"{name} is not executable"
-            yield _Offer(
-                vehicle, source, str(binary), binary.stat().st_size, **_built(vehicle, binary), problem=problem
+            yield _AvailableBinary(
+                vehicle, source, str(binary), binary.stat().st_size, **_build_details(vehicle, binary), problem=problem
             )
     for installed in all_installed(vehicle, os.environ):
-        yield _Offer(
+        yield _AvailableBinary(
             vehicle,
             "cache",
             str(installed.directory),
             sum(path.stat().st_size for path in installed.directory.iterdir()),
-            **{**_built(vehicle, installed.binary), "version": installed.directory.name},
+            **{**_build_details(vehicle, installed.binary), "version": installed.directory.name},
             fetched_at=installed.manifest.fetched_at if installed.manifest else None,
             current=installed.is_current,
             problem=installed.damage,
         )
 
 
-def _built(vehicle: VehicleType, binary: Path) -> dict[str, Any]:
+def _build_details(vehicle: VehicleType, binary: Path) -> dict[str, Any]:
     build, defaults = build_of(binary), default_parameters(binary, DEFAULTS[vehicle])
     return {
         "version": build.number if build else None,
@@ -144,8 +146,8 @@ def _built(vehicle: VehicleType, binary: Path) -> dict[str, Any]:
     }
 
 
-class _Bar:
-    """A progress bar on a terminal; elsewhere nothing but that another install has to end first."""
+class _DownloadBar:
+    """A progress bar on a terminal. Elsewhere it only reports that the command waits for another install."""
 
     def __init__(self, console: Console, what: str) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn())

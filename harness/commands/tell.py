@@ -17,7 +17,7 @@ from harness.play.request_socket import ask_run
 from harness.report.stories.sentences import VERBS, StoryEntries
 from harness.scenario.scenario_file import in_one_line
 
-_TIME: list[tuple[re.Pattern[str], str, str | None]] = [
+_TIME_COMMANDS: list[tuple[re.Pattern[str], str, str | None]] = [
     (re.compile("pause"), "pause", None),
     (re.compile("go on"), "go_on", None),
     (re.compile("full speed"), "pace", None),
@@ -25,8 +25,8 @@ _TIME: list[tuple[re.Pattern[str], str, str | None]] = [
     (re.compile("step"), "step", None),
     (re.compile(r"step (\d{1,9}(?:\.\d{1,9})?)(?: s)?"), "step", "seconds"),
 ]
-"""What is said of time, the command that it is, and what its number stands for."""
-_WHAT_THERE_IS = (
+"""Pattern of a sentence about virtual time, the command for the run, and the key of the number in the sentence."""
+_COMMAND_EXAMPLES = (
     "`partition 1 2 | 3`, `heal`, `1 does not reach 2 3`, `1 reaches 2 3 again`, "
     f"{', '.join(f'`{verb} 1`' for verb in VERBS)}, an entry of a timeline such as `{{loss: 0.5}}`; in virtual time "
     "`pause`, `go on`, `step`, `step 10`, `speed 20` and `full speed`"
@@ -49,7 +49,7 @@ def tell_command(
         if not sentence:
             _show(asyncio.run(ask_run(run, command="state")))
             return
-        for request in _requests(" ".join(sentence)):
+        for request in _parse_requests(" ".join(sentence)):
             answer = asyncio.run(ask_run(run, **request))
             typer.echo(f"{answer['at_s']:.3f} s")
     except OSError:
@@ -58,18 +58,18 @@ def tell_command(
         ) from None
 
 
-def _requests(sentence: str) -> list[dict[str, Any]]:
-    """What is to be asked of the run. Raises ScenarioError if nothing of the kind can be."""
-    for pattern, command, key in _TIME:
-        if said := pattern.fullmatch(sentence):
-            return [{"command": command, **({key: float(said[1])} if key else {})}]
+def _parse_requests(sentence: str) -> list[dict[str, Any]]:
+    """Return the requests that a sentence stands for. Raises ScenarioError for an unknown sentence."""
+    for pattern, command, key in _TIME_COMMANDS:
+        if match := pattern.fullmatch(sentence):
+            return [{"command": command, **({key: float(match[1])} if key else {})}]
     parsed = StoryEntries()
     try:
         parsed.add(0, sentence)
     except ScenarioError:
         parsed.timeline.clear()
     if not parsed.timeline:
-        raise ScenarioError(f"{sentence[:80]!r} is not a command: use {_WHAT_THERE_IS}")
+        raise ScenarioError(f"{sentence[:80]!r} is not a command: use {_COMMAND_EXAMPLES}")
     return [
         {"command": "happen", "entry": {key: value for key, value in entry.items() if key != "at_s"}}
         for entry in parsed.timeline
@@ -109,11 +109,11 @@ def shell_command(
         return
     directory = run.resolve()
     if directory in inside:
-        asked = ["shell", str(directory), *([] if vehicle is None else [str(vehicle)])]
-        raise typer.Exit(enter(inside[directory], [*asked, *(["--", *command] if command else [])]))
+        arguments = ["shell", str(directory), *([] if vehicle is None else [str(vehicle)])]
+        raise typer.Exit(enter(inside[directory], [*arguments, *(["--", *command] if command else [])]))
     if directory not in runs:
         raise RunDirectoryError(
-            f"{run} has no running vehicles: the run has ended, or has not begun; {_what_runs([*runs, *inside])}"
+            f"{run} has no running vehicles: the run has ended, or has not begun; {_active_runs_text([*runs, *inside])}"
         )
     vehicles = runs[directory]
     if vehicle is None:
@@ -126,13 +126,13 @@ def shell_command(
     argv = command or [os.environ.get("SHELL", "/bin/sh")]
     if not command:
         complain(f"in the network of vehicle {vehicle}; `exit` leaves it, and the run continues")
-    way = enter_command(vehicles[vehicle])
-    os.execvp(way[0], [*way, *argv])  # noqa: S606 (Ctrl-C is the shell's, and so is the exit status)
+    entering = enter_command(vehicles[vehicle])
+    os.execvp(entering[0], [*entering, *argv])  # noqa: S606 (Ctrl-C is the shell's, and so is the exit status)
 
 
 def _listed(vehicles: dict[int, int]) -> str:
     return ", ".join(map(str, vehicles))
 
 
-def _what_runs(runs: list[Path]) -> str:
+def _active_runs_text(runs: list[Path]) -> str:
     return "no other run is active" if not runs else f"active runs: {', '.join(map(str, runs))}"

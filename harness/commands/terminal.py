@@ -1,4 +1,4 @@
-"""What several commands print, and how: results for people, JSON for programs, complaints on standard error."""
+"""Output that several commands share: results as text or JSON on standard output, problems on standard error."""
 
 import io
 import json
@@ -63,7 +63,7 @@ def show_rogue(console: Console, injected: list[RogueInjection]) -> None:
 
 
 def end_sweep(record: "MatrixRecord", table: RenderableType | None, picture: Path) -> NoReturn:
-    """Show what came out, as JSON if there is no table, and exit."""
+    """Print the result of a sweep and exit. Without a table, print JSON."""
     if table is None:
         print_json(record.to_json())
     else:
@@ -77,9 +77,9 @@ def end_sweep(record: "MatrixRecord", table: RenderableType | None, picture: Pat
 
 
 def print_lines(texts: Iterable[str]) -> None:
-    """Plain lines."""
+    """Print lines without markup. A character that the terminal lacks becomes a question mark."""
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # a terminal that lacks a vehicle's characters
+        sys.stdout.reconfigure(errors="replace")
     for text in texts:
         sys.stdout.write(text + "\n")
 
@@ -92,8 +92,8 @@ def complain(sentence: str) -> None:
     Console(stderr=True).print(Text(f"ucp-harness: {sentence}", style="red"), soft_wrap=True)
 
 
-class Watcher:
-    """Says on standard error how far it is: in place on a terminal, and now and then a line elsewhere."""
+class StatusLine:
+    """The progress of a command on standard error: one line that changes on a terminal, elsewhere a line every 10 s."""
 
     def __init__(self) -> None:
         self._console = Console(stderr=True)

@@ -29,8 +29,8 @@ def variant_option() -> Any:
         ] = None,
     ) -> None: ...
 
-    alone = typer.Typer(add_completion=False)
-    alone.command()(command)
-    (option,) = typer.main.get_command(alone).params
+    single = typer.Typer(add_completion=False)
+    single.command()(command)
+    (option,) = typer.main.get_command(single).params
     option.expose_value = False
     return option

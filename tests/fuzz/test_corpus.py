@@ -14,7 +14,7 @@ MUTATED = 25
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_input_breaks_its_reader(name: str) -> None:
+def test_reader_survives_every_input_of_the_corpus(name: str) -> None:
     target, kept = named(name), {path: path.read_bytes() for path in files_of(name)}
     assert kept
     for path, data in kept.items():
@@ -26,7 +26,7 @@ def test_no_input_breaks_its_reader(name: str) -> None:
         executed(target, data)
 
 
-def test_the_corpus_is_small_and_each_of_its_folders_is_that_of_a_target() -> None:
+def test_corpus_is_small_and_has_one_folder_for_each_target() -> None:
     kept = [path for path in FOLDER.rglob("*") if path.is_file()]
     assert len(kept) <= MOST_FILES
     assert sum(path.stat().st_size for path in kept) <= MOST_BYTES
@@ -39,7 +39,7 @@ def _some_mutation_fails(name: str, tries: int = 300) -> None:
         executed(target, data)
 
 
-def test_a_decoder_that_takes_what_follows_a_message_for_a_part_of_it_is_found(
+def test_fuzz_finds_a_decoder_that_accepts_trailing_bytes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     decode = named("datagram").decode  # type: ignore[attr-defined]
@@ -48,31 +48,31 @@ def test_a_decoder_that_takes_what_follows_a_message_for_a_part_of_it_is_found(
         executed(named("datagram"), encode(2, 0, RequestForBlock(bytes(31) + b"\1")) + b"\0")
 
 
-def test_an_agent_whose_handler_does_something_else_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fuzz_finds_an_agent_with_a_wrong_handler(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ucp.core.Core.pop_to_stack", lambda core: core.chain.pop())
     with pytest.raises(FailedError):
         _some_mutation_fails("agent")
 
 
-def test_a_reader_that_drops_lines_without_a_word_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fuzz_finds_a_reader_that_drops_lines_silently(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.field.ingest._trace_incarnations.TraceReader._left_out", lambda reader: iter(()))
     with pytest.raises(FailedError, match="nobody says"):
         _some_mutation_fails("trace")
 
 
-def test_a_reader_that_raises_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fuzz_finds_a_reader_that_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.field.ingest._trace_incarnations._entry", lambda line: 1 // (b"NaN" not in line))
     with pytest.raises((ZeroDivisionError, FailedError)):
         _some_mutation_fails("trace")
 
 
-def test_a_command_that_is_answered_by_nothing_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fuzz_finds_a_command_without_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ucp.control.ControlServer.answer", lambda server, line: {}[line])
     with pytest.raises(FailedError, match="KeyError"):
         _some_mutation_fails("control", 0)
 
 
-def test_an_input_that_takes_long_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fuzz_finds_an_input_that_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tests.fuzz.finding.MOST_S", 0.05)
 
     class Endless:

@@ -1,4 +1,4 @@
-"""Captures as vehicles leave them: pcapng and pcap files made by hand, and those of agents on a simulated air."""
+"""Capture files for tests: pcapng and pcap files with given packets, and captures of agents in a simulated network."""
 
 import json
 import struct
@@ -17,7 +17,7 @@ INBOUND, OUTBOUND = 1, 2
 
 
 def frame(sender: int, datagram: bytes, port: int = PORT) -> bytes:
-    """What a vehicle's network card broadcasts, with sound checksums."""
+    """Return the Ethernet frame in which a vehicle broadcasts the datagram, with valid checksums."""
     addresses = bytes(int(part) for part in f"{address(sender)}.{BROADCAST}".split("."))
     udp = struct.pack("!4H", PORT, port, 8 + len(datagram), 0)
     udp_sum = checksum(addresses + struct.pack("!2H", 17, 8 + len(datagram)) + udp + datagram)
@@ -28,7 +28,7 @@ def frame(sender: int, datagram: bytes, port: int = PORT) -> bytes:
 
 
 def checksum(data: bytes) -> int:
-    """RFC 1071, folded word by word."""
+    """Return the Internet checksum of RFC 1071."""
     total = sum(struct.unpack(f"!{(len(data) + 1) // 2}H", data + bytes(len(data) % 2)))
     while total > 0xFFFF:
         total = (total & 0xFFFF) + (total >> 16)
@@ -40,7 +40,7 @@ def wall_ns(at_s: float) -> int:
 
 
 class PcapNg:
-    """A pcapng file in the making."""
+    """A pcapng file under construction."""
 
     def __init__(self, vehicle: int | None = None, order: str = "<", resolution: int = 9) -> None:
         self.order = order
@@ -69,15 +69,15 @@ class PcapNg:
 
 
 def pcap(packets: Iterable[tuple[int, bytes]], link_type: int = 1) -> bytes:
-    """A file of the older format, of (microseconds, frame)."""
+    """Return a file in the older pcap format. A packet is a pair of microseconds and frame."""
     data = struct.pack("<I2H2i2I", 0xA1B2C3D4, 2, 4, 0, 0, 65535, link_type)
     for time_us, packet in packets:
         data += struct.pack("<4I", *divmod(time_us, 1_000_000), len(packet), len(packet)) + packet
     return data
 
 
-class Scene:
-    """A story told by hand: who sends what at which mission second, and whom it reaches how much later."""
+class CaptureScript:
+    """Captures of scripted messages: sender, mission second, and the delay of each receiver."""
 
     def __init__(self, *vehicles: int) -> None:
         self.files = {vehicle: PcapNg(vehicle) for vehicle in vehicles}
@@ -86,34 +86,37 @@ class Scene:
     def send(
         self, at_s: float, sender: int, message: Message, reaches: Mapping[int, float | Sequence[float]] | None = None
     ) -> bytes:
-        """`reaches` are delays in mission seconds, several for several copies; all within 10 ms if not said."""
+        """Send a message. `reaches` maps a receiver to its delay in mission seconds, or to the delays of its copies.
+
+        By default the message reaches all other vehicles after 10 ms.
+        """
         sequence = self.sequences[sender]
         self.sequences[sender] += 1
         datagram = encode(sender, sequence, message)
-        self.crosses(at_s, sender, datagram, reaches)
+        self.broadcast(at_s, sender, datagram, reaches)
         return datagram
 
-    def crosses(
+    def broadcast(
         self,
         at_s: float,
         sender: int,
         datagram: bytes,
         reaches: Mapping[int, float | Sequence[float]] | None = None,
     ) -> None:
-        """Bytes of any kind go the way of a message."""
-        self.sees(sender, at_s, OUTBOUND, datagram)
-        everybody = {vehicle: 0.01 for vehicle in self.files if vehicle != sender}
-        for receiver, delays in (everybody if reaches is None else reaches).items():
+        """Send any bytes as a datagram. `reaches` is that of `send`."""
+        self.record(sender, at_s, OUTBOUND, datagram)
+        all_others = {vehicle: 0.01 for vehicle in self.files if vehicle != sender}
+        for receiver, delays in (all_others if reaches is None else reaches).items():
             for delay in [delays] if isinstance(delays, float) else delays:
-                self.sees(receiver, at_s + delay, INBOUND, datagram)
+                self.record(receiver, at_s + delay, INBOUND, datagram)
 
-    def sees(self, vehicle: int, at_s: float, direction: int, datagram: bytes) -> None:
-        """From whomever it comes."""
+    def record(self, vehicle: int, at_s: float, direction: int, datagram: bytes) -> None:
+        """Add a datagram to the capture of a vehicle. Its bytes 4 to 7 name the sender."""
         data = frame(int.from_bytes(datagram[4:8], "big"), datagram)
         self.files[vehicle].packet(wall_ns(at_s), direction, data)
 
-    def ends(self, at_s: float, *vehicles: int) -> None:
-        """The captures end in good order: those of `vehicles`, or all."""
+    def finish(self, at_s: float, *vehicles: int) -> None:
+        """Complete the captures of `vehicles`, or of all vehicles, with statistics."""
         for vehicle in vehicles or self.files:
             self.files[vehicle].statistics(wall_ns(at_s))
 
@@ -122,7 +125,7 @@ class Scene:
 
 
 class Captures:
-    """What each vehicle sends and hears on an air, from now on; and which deliveries there were, to compare with."""
+    """Captures of all vehicles in a simulated network, from now on. `sent` and `heard` are the expected deliveries."""
 
     def __init__(self, air: Air) -> None:
         self.air = air
@@ -155,7 +158,7 @@ class Captures:
         self.files[vehicle].packet(wall_ns(self.air.now), direction, data)
 
     def lost(self) -> set[tuple[bytes, int]]:
-        """(datagram, who did not hear it)."""
+        """Return a pair for each lost datagram: the datagram, and the vehicle that did not receive it."""
         return {
             (datagram, listener)
             for datagram in self.sent
@@ -164,7 +167,7 @@ class Captures:
         }
 
     def write(self, run: Path, *without: int) -> Path:
-        """The run directory's captures, complete to the end, except those of vehicles `without` one."""
+        """Write complete captures into a run directory, except for the vehicles in `without`."""
         for file in self.files.values():
             file.statistics(wall_ns(self.air.now))
         return write_files(run, self.files, without)

@@ -1,4 +1,4 @@
-"""Running `ucp-harness` as a user does, and looking at the processes that it started."""
+"""Run `ucp-harness` as a user does, and list the processes that it started."""
 
 import json
 import os
@@ -25,7 +25,7 @@ def harness(
 ) -> subprocess.CompletedProcess[str]:
     """Run the command to its end."""
     words = [str(argument) for argument in arguments]
-    if forks.suits(env):
+    if forks.same_interpreter(env):
         return forks.call(words, env, cwd or Path.cwd(), input, deadline_s)
     return subprocess.run(
         [*COMMAND, *words], capture_output=True, text=True, timeout=deadline_s, env=env, cwd=cwd, input=input
@@ -33,13 +33,13 @@ def harness(
 
 
 def sentences(stderr: str) -> list[str]:
-    """What was said on standard error, which is never a traceback."""
+    """Return the lines of standard error without their prefix. Fail if they contain a traceback."""
     assert "Traceback" not in stderr, stderr
     return [line.removeprefix("ucp-harness: ") for line in stderr.splitlines()]
 
 
 def write_scenario(directory: Path, **keys: Any) -> Path:
-    """A short mission, two seconds of wall time unless told otherwise."""
+    """Write a scenario with a short mission. By default it takes two seconds of wall time."""
     scenario = {"name": "test", "agents": 3, "duration_s": 200, "speedup": 100, **keys}
     path = directory / "scenario.yaml"
     path.write_text(json.dumps(scenario))  # JSON is YAML
@@ -47,7 +47,7 @@ def write_scenario(directory: Path, **keys: Any) -> Path:
 
 
 class Running:
-    """A run that goes on while the test looks at it or hurts it."""
+    """An active run, which a test can observe and disturb."""
 
     def __init__(
         self, scenario: Path, out: Path, *options: object, command: Sequence[str] = COMMAND, **settings: Any
@@ -69,7 +69,7 @@ class Running:
             time.sleep(0.02)
 
     def wait_for_mission(self, *agents: int) -> None:
-        """Until these agents have traced something."""
+        """Wait until each of these agents has traced a handler run."""
 
         def traced() -> bool:
             paths = [self.out / "agents" / f"{agent}.trace.jsonl" for agent in agents]
@@ -82,7 +82,7 @@ class Running:
         os.kill(pid, number)
 
     def end(self) -> tuple[int, str, str]:
-        """Exit status, standard output and error."""
+        """Wait for the end. Return exit status, standard output and standard error."""
         out, err = self.process.communicate(timeout=DEADLINE_S)
         return self.process.returncode, out, err
 
@@ -92,7 +92,7 @@ class Running:
 
 
 def processes(directory: Path) -> dict[int, str]:
-    """PID -> command line of every process that has to do with a run directory: by its words or where it works."""
+    """Return PID -> command line of every process whose arguments or working directory are in a run directory."""
     found = {}
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit() or int(entry.name) == os.getpid():

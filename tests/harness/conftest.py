@@ -1,4 +1,4 @@
-"""What tests of pages share."""
+"""Fixtures of tests that show a page in a browser."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""A Docker engine as tests see it: which containers there are, and a way to it that can be cut."""
+"""Access to the Docker engine for tests: the containers of a run, and a connection that a test can break."""
 
 import os
 import socket
@@ -13,7 +13,7 @@ from harness.play.containers.docker_engine import DEFAULT_HOST, Engine
 
 
 def containers(run: Path) -> list[str]:
-    """Names of all containers of the run in this directory, whether they run or not."""
+    """Return the names of all containers of the run in this directory, also of stopped ones."""
     engine = Engine.connect()
     found = engine.api.containers(all=True, filters={"label": f"{ownership.RUN}={ownership.run_name(run)}"})
     engine.close()
@@ -21,8 +21,8 @@ def containers(run: Path) -> list[str]:
 
 
 @contextmanager
-def stranger(name: str) -> Iterator[Engine]:
-    """A container that is nobody's of ours."""
+def foreign_container(name: str) -> Iterator[Engine]:
+    """Start a container that does not belong to any run."""
     engine = Engine.connect()
     image = from_host(engine)
     settings = engine.api.create_host_config(network_mode="none", binds=[f"{it}:{it}:ro" for it in image.mounted])
@@ -35,8 +35,8 @@ def stranger(name: str) -> Iterator[Engine]:
         engine.close()
 
 
-class Way:
-    """A socket that leads to the engine, until it falls `silent` or is `cut`."""
+class BreakableConnection:
+    """A socket that forwards to the engine, until a test calls `silent` or `cut`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -50,7 +50,7 @@ class Way:
         threading.Thread(target=self._serve, daemon=True).start()
 
     def silent(self) -> None:
-        """From here on connections are taken, and nothing is answered."""
+        """Accept connections from now on, but forward nothing."""
         self._open.clear()
 
     def cut(self) -> None:

@@ -1,8 +1,8 @@
-"""`ucp-harness` called hundreds of times: forks of one process in which all commands are imported.
+"""Fast calls of `ucp-harness`: forks of a server process that has imported all commands.
 
-Each call is a process of its own, with arguments, working directory, environment and standard streams of its own; what
-is not done anew each time is the import of the same modules, 0.4 s of processor time.
-`python -m tests.harness.forks FD` is the process that forks, until nobody holds the other end of that socket.
+Each call is a process with its own arguments, working directory, environment and standard streams. A fork saves the
+import of the modules, 0.4 s of processor time. `python -m tests.harness.forks FD` is the server process. It ends when
+the other end of its socket is closed.
 """
 
 import atexit
@@ -24,11 +24,11 @@ from pathlib import Path
 REPOSITORY = Path(__file__).parents[2]
 MAX_REQUEST_BYTES = 1 << 17
 READ_AT_START = ("PYTHON", "LANG", "LC_")
-"""So begin the names of what an interpreter reads from its environment when it starts: a fork does not."""
+"""First letters of environment variables that an interpreter reads only at its start. A fork would ignore changes."""
 
 
-def suits(environ: Mapping[str, str]) -> bool:
-    """Whether an interpreter that starts with this environment is as ours."""
+def same_interpreter(environ: Mapping[str, str]) -> bool:
+    """Return whether an interpreter that starts with this environment behaves as this one."""
     names = {name for name in (*environ, *os.environ) if name.startswith(READ_AT_START)}
     return all(environ.get(name) == os.environ.get(name) for name in names)
 
@@ -36,7 +36,7 @@ def suits(environ: Mapping[str, str]) -> bool:
 def call(
     arguments: list[str], environ: Mapping[str, str], cwd: Path, typed: str, deadline_s: float
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end, and until nobody holds its standard output and error any more."""
+    """Run the command until it ends and until all its children have closed standard output and error."""
     (stdin, keyboard), (out, stdout), (err, stderr) = os.pipe(), os.pipe(), os.pipe()
     with os.fdopen(keyboard, "w") as stream:
         stream.write(typed)
@@ -47,9 +47,9 @@ def call(
     for end in (stdin, stdout, stderr):
         os.close(end)
     pid = int(server.recv(32))
-    said, complained = _Text(out), _Text(err)
+    output, errors = _PipeReader(out), _PipeReader(err)
     try:
-        for text in (said, complained):
+        for text in (output, errors):
             text.join(deadline_s)
             if text.is_alive():
                 raise TimeoutError
@@ -57,13 +57,13 @@ def call(
     except TimeoutError:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-        _server.cache_clear()  # what it has to say of this one is for nobody
+        _server.cache_clear()  # the next call starts a new server, because this one would first report the killed fork
         raise subprocess.TimeoutExpired(arguments, deadline_s) from None
-    return subprocess.CompletedProcess(arguments, status, said.text, complained.text)
+    return subprocess.CompletedProcess(arguments, status, output.text, errors.text)
 
 
-class _Text(threading.Thread):
-    """All that comes out of a pipe."""
+class _PipeReader(threading.Thread):
+    """A thread that reads a pipe to its end."""
 
     def __init__(self, end: int) -> None:
         super().__init__(daemon=True)
@@ -77,24 +77,24 @@ class _Text(threading.Thread):
 
 @functools.cache
 def _server() -> socket.socket:
-    ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    own_end, server_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     process = subprocess.Popen(
-        [sys.executable, "-m", __name__, str(its.fileno())],
+        [sys.executable, "-m", __name__, str(server_end.fileno())],
         cwd=REPOSITORY,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
-        pass_fds=[its.fileno()],
+        pass_fds=[server_end.fileno()],
     )
-    its.close()
+    server_end.close()
     atexit.register(process.wait)
-    atexit.register(ours.close)
-    return ours
+    atexit.register(own_end.close)
+    return own_end
 
 
-class _Ending:
-    """What a fork does last: to tidy up memory that was never its own takes longer than most commands."""
+class _FastExit:
+    """The last exit handler of a fork. It skips the release of memory, which would take longer than most commands."""
 
-    status = 1  # an exception's
+    status = 1  # the status after an exception
 
     def __call__(self) -> None:
         sys.stdout.flush()
@@ -103,13 +103,13 @@ class _Ending:
 
 
 def _serve(channel: socket.socket) -> None:
-    ending = _Ending()
-    atexit.register(ending)  # before all others, so it is called after them
+    fast_exit = _FastExit()
+    atexit.register(fast_exit)  # before all others, so it is called after them
     from harness.cli import COMMANDS
 
     for command in COMMANDS.values():
-        import_module(command.where.partition(":")[0])
-    del sys.modules["harness.cli"]  # it runs as __main__, as with `python -m`
+        import_module(command.location.partition(":")[0])
+    del sys.modules["harness.cli"]  # a fork runs it as __main__, as `python -m` does
     gc.freeze()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
@@ -129,14 +129,14 @@ def _serve(channel: socket.socket) -> None:
         os.dup2(end, standard)
         os.close(end)
     try:
-        _become(**json.loads(request))
+        _run_command(**json.loads(request))
     except SystemExit as end:
         assert isinstance(end.code, int), end.code
-        ending.status = end.code
+        fast_exit.status = end.code
         raise
 
 
-def _become(arguments: list[str], environ: dict[str, str], cwd: str) -> None:
+def _run_command(arguments: list[str], environ: dict[str, str], cwd: str) -> None:
     for number, (name, mode) in enumerate({"stdin": "r", "stdout": "w", "stderr": "w"}.items()):
         was = getattr(sys, name)
         buffering = 1 if was.line_buffering else -1

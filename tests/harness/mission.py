@@ -1,4 +1,4 @@
-"""Missions for tests of what judges them: real agents on a simulated air, exported as a run would."""
+"""Missions for tests of the checker: real agents in a simulated network, exported as a run exports them."""
 
 import json
 from pathlib import Path
@@ -42,7 +42,7 @@ def write_exports(air: Air, directory: Path, traces: bool = True) -> list[Path]:
 
 
 def write_run(air: Air, directory: Path, network: list[dict[str, Any]], **record: Any) -> Path:
-    """A run directory with exports, traces, and a record of the network."""
+    """Write a run directory with exports, traces, and a record of the network."""
     write_exports(air, directory / "agents")
     ended = {"schema": "ucp-run/1", "outcome": "completed", "agents": {}}
     record = {**ended, "roster": list(air.agents), "network": network, **record}

@@ -135,7 +135,7 @@ def test_public_module_has_a_user_outside_its_room() -> None:
     assert unused == []
 
 
-def test_every_listed_door_exists_and_needs_its_place_in_the_list() -> None:
+def test_every_listed_door_exists_and_needs_its_entry() -> None:
     used = {name for module in modules() for name in imports(module) if room_of(name) != room_of(module)}
     assert [door for door in DOORS if door not in modules()] == []
     assert [door for door in DOORS if door in used] == []

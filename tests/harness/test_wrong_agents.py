@@ -1,4 +1,4 @@
-"""The table of wrong agents is true: each is found, and a part of it made again is the same."""
+"""The table of wrong agents: every quirk is found, and repeated trials give the same results."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ ROWS = rows_of(PAGE.read_text(encoding="utf-8"))
 
 @cache
 def right(seed: int) -> Trial:
-    """The same mission with the right agent; most quirks are found by one of the first seeds."""
+    """Play the same mission with the right agent. The cache helps, because quirks share their first seeds."""
     return play(None, seed)
 
 
@@ -23,26 +23,26 @@ def cells(quirk: str) -> list[str]:
     return [cell.strip() for cell in ROWS[quirk].strip().strip("|").split(" | ")]
 
 
-def test_every_quirk_has_a_row_and_every_row_a_quirk() -> None:
+def test_table_has_one_row_for_each_quirk() -> None:
     assert list(ROWS) == list(QUIRKS), "write it again: python -m docs.generate.wrong_agents.trials_page"
 
 
-def test_nothing_goes_unnoticed() -> None:
+def test_every_quirk_is_found() -> None:
     assert not [quirk for quirk, line in ROWS.items() if NOTHING in line], "a hole: mend the hole"
 
 
 @pytest.mark.parametrize("quirk", QUIRKS)
-def test_what_found_a_quirk_first_finds_it_again(quirk: str) -> None:
+def test_first_finding_of_a_quirk_repeats(quirk: str) -> None:
     first = cells(quirk)[-1]
     seed = int(first.removeprefix("seed ").split(":")[0])
     assert first_found(seed, findings_of(play(quirk, seed), right(seed))) == first
 
 
-def test_what_the_right_agent_is_charged_with_is_no_finding() -> None:
+def test_verdict_against_the_right_agent_is_no_finding() -> None:
     assert findings_of(Trial({"5": 60.0, "2": 9.0}, None), Trial({"5": 70.0}, None)) == {"2": 9.0}
 
 
-def test_a_row_says_what_found_it_how_often_how_soon_and_whether_the_right_handler_was_named() -> None:
+def test_row_lists_the_checks_that_found_the_quirk() -> None:
     good, other = "vote_timer_expiration", "receive_commit_block"
     unharmed = {seed: Trial({}, None) for seed in (1, 2, 3, 4)}
     wrong = {
@@ -59,7 +59,7 @@ def test_a_row_says_what_found_it_how_often_how_soon_and_whether_the_right_handl
     assert NOTHING in row("hide_commits", unharmed, unharmed)
 
 
-def test_a_trial_has_the_time_of_the_earliest_evidence_and_the_handler_that_it_names() -> None:
+def test_trial_has_time_and_handler_of_the_earliest_evidence() -> None:
     early = Finding(2, "trace line 7, t=12.5 s: it sent nothing", handler="build_data_block")
     late = Finding(1, "trace line 9, t=90 s: it sent nothing", handler="reconcile_finalize")
     steps = Judgement("every step", "deviates", "2 times", [early, late])
@@ -68,6 +68,6 @@ def test_a_trial_has_the_time_of_the_earliest_evidence_and_the_handler_that_it_n
     assert judged(result) == Trial({"2": None, "steps": 12.5}, "build_data_block")
 
 
-def test_the_missions_are_those_that_the_page_names() -> None:
+def test_page_names_every_mission() -> None:
     page = PAGE.read_text(encoding="utf-8")
     assert [mission for mission in MISSIONS if f"[{mission.stem}](" not in page] == []

@@ -1,4 +1,4 @@
-"""Agents that say that something is not supported, at their start or half way."""
+"""Agents that do not support a feature. They report it at their start, or at a command during the run."""
 
 import shlex
 import sys
@@ -22,13 +22,13 @@ sys.exit(ucp.node.main(sys.argv[1:]))
 
 
 def refusing_to_start(path: Path, words: str = "mine has no telemetry") -> Path:
-    """A program that ends with 127, with these words on standard error."""
+    """Write a program that prints `words` on standard error and ends with status 127."""
     path.write_text(f"#!/bin/sh\necho {shlex.quote(words)} >&2\nexit 127\n")
     path.chmod(0o755)
     return path
 
 
 def lacking(path: Path, command: str) -> list[str]:
-    """What starts an agent that has all commands of the control socket but this one."""
+    """Return the command of an agent that supports all commands of the control socket except this one."""
     path.write_text(LACKING.format(command=command))
     return [sys.executable, str(path)]

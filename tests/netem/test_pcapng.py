@@ -11,12 +11,12 @@ from scapy.utils import rdpcap
 
 from netem.capture import begin_file
 from netem.pcapng import PcapngFile
-from tests.captured import Frame, comment, frames, statistics
+from tests.captured import CapturedFrame, comment, frames, statistics
 from tests.machine import require_tshark
 
 EPOCH_US = 1_790_000_000_000_000
 AT_NS = EPOCH_US * 1000 + 123_456_789
-FRAMES = [Frame(AT_NS + number, number % 3 == 0, bytes([number]) * (14 + number)) for number in range(60)]
+FRAMES = [CapturedFrame(AT_NS + number, number % 3 == 0, bytes([number]) * (14 + number)) for number in range(60)]
 
 
 def written(folder: Path) -> Path:

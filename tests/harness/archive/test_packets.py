@@ -14,7 +14,7 @@ from harness.archive.packets.packets_text import TransmissionText
 from harness.archive.packets.selection import Selection, block_arrivals, exchanges_about
 from harness.archive.packets.transmissions import Transmission, join
 from harness.errors import CaptureError
-from tests.harness.captures import INBOUND, OUTBOUND, Captures, PcapNg, Scene, frame, pcap, wall_ns
+from tests.harness.captures import INBOUND, OUTBOUND, Captures, CaptureScript, PcapNg, frame, pcap, wall_ns
 from tests.harness.mission import write_exports
 from tests.ucp.air import Air, uniform_latency
 from ucp.block import Block
@@ -42,7 +42,7 @@ def read(*paths: Path) -> Read:
     return read_captures(capture_files(paths))
 
 
-def transmissions_of(scene: Scene, path: Path, *without: int) -> list[Transmission]:
+def transmissions_of(scene: CaptureScript, path: Path, *without: int) -> list[Transmission]:
     return join(read(scene.write(path / "run", *without)))
 
 
@@ -112,11 +112,11 @@ def test_each_response_matches_the_request_in_the_trace(finished_flight: tuple[A
 
 
 def test_request_has_an_outcome_for_each_vehicle(tmp_path: Path) -> None:
-    scene = Scene(1, 2, 3, 4, 5)
+    scene = CaptureScript(1, 2, 3, 4, 5)
     scene.send(10, 1, PROPOSAL, {2: 0.01, 3: 0.01, 4: 0.01})
     scene.send(10.02, 2, APPROVE)
     scene.send(10.03, 3, DISAPPROVE, {2: 0.01})
-    scene.ends(20)
+    scene.finish(20)
     request, *responses = transmissions_of(scene, tmp_path)
     answers = Exchanges([request, *responses]).answers(request)
     assert [(answer.by, answer.outcome) for answer in answers] == [
@@ -134,7 +134,7 @@ def test_request_has_an_outcome_for_each_vehicle(tmp_path: Path) -> None:
 
 
 def test_each_type_of_request_matches_its_response(tmp_path: Path) -> None:
-    scene = Scene(1, 2)
+    scene = CaptureScript(1, 2)
     pairs = [
         (PROPOSAL, APPROVE),
         (QUERY, ChainContainResponse(CHAIN, False)),
@@ -145,7 +145,7 @@ def test_each_type_of_request_matches_its_response(tmp_path: Path) -> None:
     for number, (request, response) in enumerate(pairs):
         scene.send(number, 1, request)
         scene.send(number + 0.02, 2, response)
-    scene.ends(10)
+    scene.finish(10)
     found = transmissions_of(scene, tmp_path)
     exchanges = Exchanges(found)
     assert [exchanges.responses(one) for one in found[::2]] == [[one] for one in found[1::2]]
@@ -156,12 +156,12 @@ def test_response_answers_the_last_received_request(tmp_path: Path) -> None:
 
     Agent 2 does not answer the first one, and only receives the second one of 3.
     """
-    scene = Scene(1, 2, 3)
+    scene = CaptureScript(1, 2, 3)
     scene.send(1, 3, QUERY)
     scene.send(2, 1, QUERY, {3: 0.01})
     scene.send(3, 3, QUERY)
     scene.send(3.02, 2, ChainContainResponse(CHAIN, True))
-    scene.ends(10)
+    scene.finish(10)
     found = transmissions_of(scene, tmp_path)
     exchanges = Exchanges(found)
     assert [len(exchanges.responses(one)) for one in found] == [0, 0, 1, 0]
@@ -169,26 +169,26 @@ def test_response_answers_the_last_received_request(tmp_path: Path) -> None:
 
 
 def test_simultaneous_requests_are_answered_in_order(tmp_path: Path) -> None:
-    scene = Scene(1, 2, 3)
+    scene = CaptureScript(1, 2, 3)
     scene.send(1, 1, QUERY)
     scene.send(1.001, 3, QUERY, {2: 0.01})
     scene.send(1.02, 2, ChainContainResponse(CHAIN, True))
     scene.send(1.021, 2, ChainContainResponse(CHAIN, True))
-    scene.ends(10)
+    scene.finish(10)
     found = transmissions_of(scene, tmp_path)
     exchanges = Exchanges(found)
     assert [exchanges.responses(one) for one in found[:2]] == [[found[2]], [found[3]]]
 
 
 def test_duplicated_request_is_answered_twice(tmp_path: Path) -> None:
-    scene = Scene(1, 2)
+    scene = CaptureScript(1, 2)
     scene.send(0, 1, QUERY)
     scene.send(1, 1, QUERY, {2: [0.01, 0.5]})
     scene.send(1.02, 2, ChainContainResponse(CHAIN, True))
     scene.send(1.2, 1, QUERY)
     scene.send(1.22, 2, ChainContainResponse(CHAIN, True))
     scene.send(1.52, 2, ChainContainResponse(CHAIN, True))
-    scene.ends(10)
+    scene.finish(10)
     found = transmissions_of(scene, tmp_path)
     _, twice, first, again, second, third = found
     assert received(twice) == {2: (1.01, 2)}
@@ -197,20 +197,20 @@ def test_duplicated_request_is_answered_twice(tmp_path: Path) -> None:
 
 
 def test_uncaptured_agent_answers_the_last_request_of_another(tmp_path: Path) -> None:
-    scene = Scene(1, 2, 3)
+    scene = CaptureScript(1, 2, 3)
     scene.send(1, 1, QUERY)
     scene.send(2, 3, QUERY)
     scene.send(3, 3, ChainContainResponse(CHAIN, True))
-    scene.ends(10)
+    scene.finish(10)
     found = transmissions_of(scene, tmp_path, 3)
     assert [len(Exchanges(found).responses(one)) for one in found] == [1, 0, 0]
 
 
 def test_answered_request_arrived_although_the_capture_lacks_it(tmp_path: Path) -> None:
-    scene = Scene(1, 2)
+    scene = CaptureScript(1, 2)
     scene.send(1, 1, QUERY, {})
     scene.send(2, 2, ChainContainResponse(CHAIN, True))
-    scene.ends(10)
+    scene.finish(10)
     found = transmissions_of(scene, tmp_path)
     assert [(answer.by, answer.outcome) for answer in Exchanges(found).answers(found[0])] == [(2, "answered")]
 
@@ -224,7 +224,7 @@ def test_outcomes_are_listed_from_answers_to_losses() -> None:
 
 
 def test_overtaking_packets_are_listed_in_order_of_sending(tmp_path: Path) -> None:
-    scene = Scene(1, 2)
+    scene = CaptureScript(1, 2)
     scene.send(2, 1, APPROVE, {2: 0.1})
     scene.send(1, 1, PROPOSAL, {2: 9.0})
     found = transmissions_of(scene, tmp_path)
@@ -232,11 +232,11 @@ def test_overtaking_packets_are_listed_in_order_of_sending(tmp_path: Path) -> No
 
 
 def test_restarted_agent_may_send_the_same_bytes_again(tmp_path: Path) -> None:
-    scene = Scene(1, 2, 3)
+    scene = CaptureScript(1, 2, 3)
     scene.send(60, 1, QUERY, {3: 0.01})
     scene.sequences[1] = 0
     scene.send(5, 1, QUERY, {2: 0.01})
-    scene.ends(100)
+    scene.finish(100)
     found = transmissions_of(scene, tmp_path)
     assert [(one.at_s, one.sequence, one.reached, one.lost_by) for one in found] == [
         (5, 0, [2], (3,)),
@@ -245,34 +245,34 @@ def test_restarted_agent_may_send_the_same_bytes_again(tmp_path: Path) -> None:
 
 
 def test_loss_is_inferred_without_the_capture_of_the_sender(tmp_path: Path) -> None:
-    scene = Scene(1, 2, 3)
+    scene = CaptureScript(1, 2, 3)
     scene.send(5, 1, QUERY, {2: 0.01})
     scene.send(6, 1, QUERY, {})
-    scene.ends(10)
+    scene.finish(10)
     (seen,) = transmissions_of(scene, tmp_path, 1)
     assert (seen.origin, seen.at_s, seen.reached, seen.lost_by) == ("inferred", pytest.approx(5.01), [2], (3,))
 
 
 def test_vehicle_without_running_capture_loses_nothing(tmp_path: Path) -> None:
-    scene = Scene(1, 2, 3)
+    scene = CaptureScript(1, 2, 3)
     scene.files[3] = PcapNg()  # A capture from the field does not contain the time at which it began.
     scene.send(1, 1, QUERY, {})
-    scene.sees(3, 2, OUTBOUND, encode(3, 0, QUERY))
+    scene.record(3, 2, OUTBOUND, encode(3, 0, QUERY))
     scene.send(3, 1, QUERY, {})
-    scene.ends(4, 2)
+    scene.finish(4, 2)
     scene.send(5, 1, QUERY, {})
-    scene.ends(10, 1, 3)
+    scene.finish(10, 1, 3)
     found = [one for one in transmissions_of(scene, tmp_path) if one.sender == 1]
     assert [(one.lost_by, one.absent) for one in found] == [((2,), (3,)), ((2, 3), ()), ((3,), (2,))]
 
 
 def test_datagram_missing_in_the_capture_of_its_sender_is_forged(tmp_path: Path) -> None:
-    scene = Scene(1, 2, 3)
+    scene = CaptureScript(1, 2, 3)
     scene.send(1, 1, QUERY)
     forged = encode(1, 77, PROPOSAL)
-    scene.sees(2, 5, INBOUND, forged)
-    scene.sees(1, 5, INBOUND, encode(3, 77, ChainContainResponse(CHAIN, True)))
-    scene.ends(10)
+    scene.record(2, 5, INBOUND, forged)
+    scene.record(1, 5, INBOUND, encode(3, 77, ChainContainResponse(CHAIN, True)))
+    scene.finish(10)
     rogue = PcapNg()
     rogue.packet(wall_ns(6), OUTBOUND, frame(1, encode(1, 78, PROPOSAL)))
     run = scene.write(tmp_path / "run")
@@ -288,9 +288,9 @@ def test_datagram_missing_in_the_capture_of_its_sender_is_forged(tmp_path: Path)
 
 
 def test_incomplete_capture_proves_no_forgery(tmp_path: Path) -> None:
-    scene = Scene(1, 2)
+    scene = CaptureScript(1, 2)
     scene.send(1, 1, QUERY)
-    scene.sees(2, 5, INBOUND, encode(1, 77, PROPOSAL))
+    scene.record(2, 5, INBOUND, encode(1, 77, PROPOSAL))
     scene.files[1].statistics(wall_ns(10), dropped=1)
     captures = read(scene.write(tmp_path / "run"))
     assert [one.origin for one in join(captures)] == ["captured", "inferred"]
@@ -315,7 +315,7 @@ def test_field_captures_count_time_from_the_first_packet(tmp_path: Path) -> None
 
 
 def test_capture_of_another_run_is_left_out(tmp_path: Path) -> None:
-    scene = Scene(1, 2)
+    scene = CaptureScript(1, 2)
     scene.send(1, 1, QUERY)
     run = scene.write(tmp_path / "run")
     other = tmp_path / "2.pcapng"
@@ -356,7 +356,7 @@ def test_block_names_follow_proposals_without_exports(run_dir: Path) -> None:
 
 
 def test_late_capture_gives_no_block_names(tmp_path: Path) -> None:
-    scene = Scene(1, 2)
+    scene = CaptureScript(1, 2)
     scene.sequences[1] = 40
     scene.send(1, 1, PROPOSAL)
     scene.send(2, 1, CommitBlock(BLOCK, CHAIN))

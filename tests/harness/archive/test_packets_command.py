@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from harness.archive.packets.packets_document import PacketsRecord
-from tests.harness.captures import INBOUND, OUTBOUND, PcapNg, Scene, frame, pcap, wall_ns
+from tests.harness.captures import INBOUND, OUTBOUND, CaptureScript, PcapNg, frame, pcap, wall_ns
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.ucp.secure.swarm import KEYS, session
 from ucp.block import Block
@@ -23,24 +23,24 @@ BEFORE, AFTER = bytes(32), bytes(range(32))
 @pytest.fixture
 def run_dir(tmp_path: Path) -> Path:
     """Write captures in which vehicle 1 proposes and commits a block, 3 loses the commit, and 1 loses the vote of 3."""
-    scene = Scene(1, 2, 3)
+    scene = CaptureScript(1, 2, 3)
     scene.send(10, 1, BlockAddRequest(BLOCK.block_hash, BEFORE))
     scene.send(10.02, 2, BlockAddResponse(BLOCK.block_hash, True))
     scene.send(10.03, 3, BlockAddResponse(BLOCK.block_hash, False), {2: 0.01})
     scene.send(20, 1, CommitBlock(BLOCK, AFTER), {2: [0.01, 0.02]})
     scene.files[2].packet(wall_ns(21), INBOUND, frame(3, b"UC is no message"))
     scene.files[3].packet(wall_ns(21), INBOUND, frame(3, b"anybody", port=53))
-    scene.ends(30)
+    scene.finish(30)
     return scene.write(tmp_path / "run")
 
 
 def test_bundle_decrypts_sealed_datagrams(tmp_path: Path) -> None:
     asks, answers = session(1), session(2)
-    scene = Scene(1, 2, 3)
+    scene = CaptureScript(1, 2, 3)
     request, vote = BlockAddRequest(BLOCK.block_hash, BEFORE), BlockAddResponse(BLOCK.block_hash, True)
-    scene.crosses(10, 1, asks.seal(0, request, None, None, 0))
-    scene.crosses(10.02, 2, answers.seal(0, vote, Request(1, asks.boot, 0), None, 0))
-    scene.ends(30)
+    scene.broadcast(10, 1, asks.seal(0, request, None, None, 0))
+    scene.broadcast(10.02, 2, answers.seal(0, vote, Request(1, asks.boot, 0), None, 0))
+    scene.finish(30)
     run_dir = scene.write(tmp_path / "run")
     write_bundle(tmp_path / "3.bundle.json", KEYS.bundle(3))
     sealed, opened = harness("packets", run_dir), harness("packets", run_dir, "--bundle", tmp_path / "3.bundle.json")

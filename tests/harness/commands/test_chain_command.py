@@ -36,22 +36,22 @@ FLOWN = {
 
 
 def fly_vehicles(agents: int = 3, seconds: int = 240) -> Air:
-    """Agents that log what vehicles say: they fly east side by side, and reach a waypoint each minute."""
+    """Play agents that log telemetry. Their vehicles fly east side by side, and reach a waypoint each minute."""
     air = Air(range(1, agents + 1))
     sources = {agent_id: TelemetryEvents(10.0, random.Random(agent_id), EVENT_KINDS) for agent_id in air.agents}
     for second in range(seconds):
         air.run_until(float(second))
         for agent_id, source in sources.items():
-            said = [
+            messages = [
                 good_estimate(),
                 heartbeat(4, armed=second > 2),
                 position_msg(1000 * second, 500_000_000 + agent_id, 80_000_000 + second),
             ]
             if second % 60 == 30:
-                said.append(mavlink.MAVLink_mission_item_reached_message(second // 60))
+                messages.append(mavlink.MAVLink_mission_item_reached_message(second // 60))
             if second == 100:
-                said.append(text("<EKF> & \x1b[31mGPS"))
-            for event_id, data in source.receive(frames(*said), float(second)):
+                messages.append(text("<EKF> & \x1b[31mGPS"))
+            for event_id, data in source.receive(frames(*messages), float(second)):
                 event = LoggableEvent(EPOCH_US + 1_000_000 * second, event_id, data)
                 air.agents[agent_id].add_event(event, air.now)
             air.flush(agent_id)
@@ -77,7 +77,7 @@ def first_position(air: Air, agent_id: int) -> Position:
 # As text
 
 
-def test_each_agent_s_chain_is_printed_block_by_block(flown: Air, run_dir: Path) -> None:
+def test_chain_prints_each_block_of_each_agent(flown: Air, run_dir: Path) -> None:
     done = harness("chain", run_dir)
     assert (done.returncode, done.stderr) == (0, "")
     printed = done.stdout.splitlines()
@@ -97,7 +97,7 @@ def test_each_agent_s_chain_is_printed_block_by_block(flown: Air, run_dir: Path)
     ]
 
 
-def test_decoded_each_event_is_a_line_in_words(flown: Air, run_dir: Path) -> None:
+def test_decode_prints_a_line_for_each_event(flown: Air, run_dir: Path) -> None:
     done = harness("chain", run_dir, "--decode", "--agent", "2")
     assert done.returncode == 0
     assert "agent 1:" not in done.stdout
@@ -126,8 +126,8 @@ def test_exports_without_a_run_are_decoded_as_telemetry(flown: Air, tmp_path: Pa
     assert "reached mission item" in harness("chain", paths[0], "--decode").stdout
 
 
-def test_events_that_no_vehicle_made_are_shown_as_bytes(tmp_path: Path) -> None:
-    """Even those whose random ID and length would pass for telemetry."""
+def test_events_of_no_vehicle_are_printed_as_bytes(tmp_path: Path) -> None:
+    """Random events stay bytes, even if their ID and length match telemetry."""
     air = Air([1])
     for _ in range(40):
         air.agents[1].add_event(LoggableEvent(5_000_000, WAYPOINT, bytes(6)), air.now)
@@ -151,13 +151,13 @@ def test_events_that_no_vehicle_made_are_shown_as_bytes(tmp_path: Path) -> None:
         {"scenario": {"name": "flown", "events": {"source": "mavlink"}, "vehicles": {"kind": "none"}}},
     ],
 )
-def test_a_run_s_record_says_whether_vehicles_logged(flown: Air, tmp_path: Path, change: dict[str, Any]) -> None:
+def test_record_decides_whether_events_are_telemetry(flown: Air, tmp_path: Path, change: dict[str, Any]) -> None:
     assert logbook.read(RunArchive(write_run(flown, tmp_path / "flown", CONNECTED, **FLOWN))).telemetry
     assert not logbook.read(RunArchive(write_run(flown, tmp_path / "not", CONNECTED, **{**FLOWN, **change}))).telemetry
     assert not logbook.read(RunArchive(tmp_path / "not" / "agents" / "2.chain.json")).telemetry
 
 
-def test_a_simulated_run_is_shown_from_end_to_end(tmp_path: Path) -> None:
+def test_chains_of_a_simulated_run_are_printed(tmp_path: Path) -> None:
     scenario = tmp_path / "scenario.yaml"
     scenario.write_text(json.dumps({"name": "x", "agents": 2, "duration_s": 400}))
     assert harness("run", scenario, "--backend", "sim", "--seed", "1", "--out", tmp_path / "run").returncode == 0
@@ -168,7 +168,7 @@ def test_a_simulated_run_is_shown_from_end_to_end(tmp_path: Path) -> None:
     assert "unreadable" not in done.stdout
 
 
-def test_blocks_beside_the_chain_are_counted(run_dir: Path) -> None:
+def test_blocks_outside_the_chain_are_counted(run_dir: Path) -> None:
     def move(export: dict[str, Any]) -> None:
         export["blocks_to_be_committed"] = [{**export["chain"].pop(), "chain_hash": None}]
 
@@ -176,7 +176,7 @@ def test_blocks_beside_the_chain_are_counted(run_dir: Path) -> None:
     assert "  beside the chain: 1 block to be committed\n" in harness("chain", run_dir).stdout
 
 
-def test_a_block_whose_events_cannot_be_read_says_where(run_dir: Path) -> None:
+def test_unreadable_events_of_a_block_are_reported_with_their_place(run_dir: Path) -> None:
     def cut(export: dict[str, Any]) -> None:
         export["chain"][0]["event_data"] = base64.b64encode(bytes(5)).decode()
 
@@ -192,25 +192,27 @@ def test_a_block_whose_events_cannot_be_read_says_where(run_dir: Path) -> None:
 # As JSON
 
 
-def test_as_json_the_chains_are_whole(flown: Air, run_dir: Path) -> None:
+def test_json_holds_every_block_and_event(flown: Air, run_dir: Path) -> None:
     plain = json.loads(harness("chain", run_dir, "--json").stdout)
     assert list(plain["agents"]) == ["1", "2", "3"]
     assert plain["source"] == "mavlink"
     assert plain["errors"] == []
-    told = plain["agents"]["3"]["chain"]
-    assert [block["block_hash"] for block in told] == [block.block_hash.hex() for block in flown.agents[3].state.chain]
-    for block, ours in zip(told, flown.agents[3].state.chain, strict=True):
+    printed = plain["agents"]["3"]["chain"]
+    assert [block["block_hash"] for block in printed] == [
+        block.block_hash.hex() for block in flown.agents[3].state.chain
+    ]
+    for block, ours in zip(printed, flown.agents[3].state.chain, strict=True):
         events = [LoggableEvent(e["timestamp_us"], e["event_id"], bytes.fromhex(e["data"])) for e in block["events"]]
         assert events == decode_events(ours.event_data)
-    assert "words" not in told[0]["events"][0]
+    assert "words" not in printed[0]["events"][0]
     in_words = json.loads(harness("chain", run_dir, "--json", "--decode").stdout)
     assert in_words["agents"]["3"]["chain"][0]["events"][0]["words"] == "[0.0 s] mode GUIDED"
 
 
-# What is missing, damaged or hostile
+# Missing, damaged or hostile input
 
 
-def test_an_agent_without_an_export_is_one_sentence(run_dir: Path) -> None:
+def test_missing_export_of_an_agent_is_one_sentence(run_dir: Path) -> None:
     (run_dir / "agents" / "2.chain.json").unlink()
     edit(run_dir / "run.json", lambda run: run["agents"].update({"2": {"outcome": "killed"}}))
     done = harness("chain", run_dir)
@@ -225,7 +227,7 @@ def test_an_agent_without_an_export_is_one_sentence(run_dir: Path) -> None:
     assert sentences(stranger.stderr) == ["the export of agent 9 is missing; exports here are of agents 1, 3"]
 
 
-def test_a_damaged_export_is_told_with_status_2_and_the_rest_are_shown(run_dir: Path) -> None:
+def test_damaged_export_has_status_2_and_the_rest_are_printed(run_dir: Path) -> None:
     path = run_dir / "agents" / "2.chain.json"
     path.write_text(path.read_text()[:500])
     done = harness("chain", run_dir)
@@ -234,7 +236,7 @@ def test_a_damaged_export_is_told_with_status_2_and_the_rest_are_shown(run_dir: 
     assert "agent 1: " in done.stdout
 
 
-def test_nothing_to_show_is_status_2(tmp_path: Path) -> None:
+def test_chain_of_nothing_has_status_2(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "nowhere"):
         done = harness("chain", path)
         assert done.returncode == 2
@@ -242,14 +244,14 @@ def test_nothing_to_show_is_status_2(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("record", ["", "[]", '{"roster": 7}', "[" * 100_000])
-def test_a_damaged_record_is_no_hindrance(run_dir: Path, record: str) -> None:
+def test_chains_are_read_without_a_valid_record(run_dir: Path, record: str) -> None:
     (run_dir / "run.json").write_text(record)
     assert list(logbook.read(RunArchive(run_dir)).exports) == [1, 2, 3]
 
 
 @pytest.mark.parametrize("option", ["--decode", "--json"])
-def test_a_reader_that_has_seen_enough_ends_it_quietly(tmp_path: Path, option: str) -> None:
-    """More than a pipe holds."""
+def test_closed_standard_output_ends_the_command_quietly(tmp_path: Path, option: str) -> None:
+    """The output is longer than the buffer of a pipe."""
     run = write_run(fly(agents=5, duration_s=12_000), tmp_path / "run", CONNECTED)
     with subprocess.Popen(
         [*COMMAND, "chain", str(run), option], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -262,7 +264,7 @@ def test_a_reader_that_has_seen_enough_ends_it_quietly(tmp_path: Path, option: s
         assert process.wait(DEADLINE_S) == 0
 
 
-def test_a_terminal_without_a_character_shows_a_question_mark(flown: Air, tmp_path: Path) -> None:
+def test_character_that_the_terminal_lacks_is_a_question_mark(flown: Air, tmp_path: Path) -> None:
     air = Air([1])
     for _ in range(20):
         data = b"\0\0\0\0\6" + "Höhe →".encode()
@@ -311,7 +313,7 @@ def test_any_block_is_printed_and_mapped(flown: Air, blocks: list[tuple[int, int
 
 
 def fixes(book: Logbook) -> list[list[tuple[int, bytes]]]:
-    """Of each track; as bytes, since unknown angles are NaN and no NaN is another's equal."""
+    """Return the fixes of each track. Positions are bytes, because unknown angles are NaN, and NaN equals nothing."""
     return [[(timestamp_us, position.pack()) for timestamp_us, position in track.fixes] for track in tracks(book)]
 
 
@@ -325,7 +327,7 @@ def logbook_of(air: Air) -> Logbook:
 
 
 def check_geojson(collection: dict[str, Any]) -> None:
-    """What RFC 7946 asks of these features."""
+    """Assert the rules of RFC 7946 for these features."""
     assert collection["type"] == "FeatureCollection"
     for feature in collection["features"]:
         assert feature["type"] == "Feature"
@@ -365,7 +367,7 @@ def test_geojson_has_a_line_for_each_vehicle_and_a_point_for_each_event(
     assert len(features) - 3 == sum(len(decode_events(block.event_data)) for block in blocks)
 
 
-def test_an_event_is_where_its_vehicle_last_was(flown: Air) -> None:
+def test_event_has_the_last_position_of_its_vehicle(flown: Air) -> None:
     features = [one for one in geojson(tracks(logbook_of(flown)))["features"] if "event_id" in one["properties"]]
     first, *_ = features
     assert first["properties"] == {
@@ -383,7 +385,7 @@ def test_an_event_is_where_its_vehicle_last_was(flown: Air) -> None:
     assert 0 < reached["properties"]["position_age_s"] < 16
 
 
-def test_a_lost_vehicle_is_on_the_map_as_far_as_others_hold_its_blocks(flown: Air) -> None:
+def test_map_shows_a_lost_vehicle_by_the_blocks_that_others_hold(flown: Air) -> None:
     book = logbook_of(flown)
     whole = fixes(book)
     del book.exports[3]
@@ -391,7 +393,7 @@ def test_a_lost_vehicle_is_on_the_map_as_far_as_others_hold_its_blocks(flown: Ai
     assert fixes(book) == whole
 
 
-def test_blocks_in_any_order_and_in_many_copies_make_one_track_in_time(flown: Air) -> None:
+def test_blocks_in_any_order_and_number_of_copies_give_one_track(flown: Air) -> None:
     book = logbook_of(flown)
     export = book.exports[1]
     outside = [block.model_copy(update={"chain_hash": None}) for block in export.chain]
@@ -400,7 +402,7 @@ def test_blocks_in_any_order_and_in_many_copies_make_one_track_in_time(flown: Ai
     assert fixes(Logbook({1: stacked, 2: waiting}, {})) == fixes(book)
 
 
-def test_a_place_that_is_not_on_earth_and_a_time_that_never_comes_are_left_out(flown: Air) -> None:
+def test_impossible_positions_and_times_are_left_out(flown: Air) -> None:
     good = first_position(flown, 1)
     made = [
         LoggableEvent(1, POSITION, good.pack()),
@@ -421,7 +423,7 @@ def test_a_place_that_is_not_on_earth_and_a_time_that_never_comes_are_left_out(f
     ]
 
 
-def test_a_single_position_is_a_point_and_no_line(flown: Air) -> None:
+def test_single_position_is_a_point_and_no_line(flown: Air) -> None:
     (track, *_) = tracks(logbook_of(flown))
     entry = next(entry for entry in track.entries if entry.is_position)
     alone = Track(1, [entry], track.fixes[:1])
@@ -453,7 +455,7 @@ def test_kml_has_a_track_and_placemarks_with_times(flown: Air, run_dir: Path, tm
     assert len((marks[0].findtext("kml:Point/kml:coordinates", "", KML)).split(",")) == 3
 
 
-def test_nothing_is_overwritten(run_dir: Path, tmp_path: Path) -> None:
+def test_map_files_are_not_overwritten(run_dir: Path, tmp_path: Path) -> None:
     file = tmp_path / "map"
     file.write_text("mine")
     for option in ("--geojson", "--kml"):
@@ -466,7 +468,7 @@ def test_nothing_is_overwritten(run_dir: Path, tmp_path: Path) -> None:
     assert "cannot be created: No such file or directory" in sentences(done.stderr)[0]
 
 
-def test_without_positions_there_is_no_map(tmp_path: Path) -> None:
+def test_chains_without_positions_give_no_map(tmp_path: Path) -> None:
     run = write_run(fly(agents=2), tmp_path / "run", CONNECTED, **{**FLOWN, "backend": "sim"})
     done = harness("chain", run, "--geojson", tmp_path / "map")
     assert done.returncode == 2
@@ -474,7 +476,7 @@ def test_without_positions_there_is_no_map(tmp_path: Path) -> None:
     assert not (tmp_path / "map").exists()
 
 
-def test_a_flight_in_virtual_time_is_on_the_map_by_the_runs_own_record(tmp_path: Path) -> None:
+def test_map_of_a_run_in_virtual_time_shows_its_recorded_tracks(tmp_path: Path) -> None:
     run = write_run(fly(agents=2), tmp_path / "run", CONNECTED, **{**FLOWN, "backend": "sim"})
     places = ({"1": [0.0, 0.0, 0.0], "2": [0.0, 111.3195, 0.0]}, {"1": [1113.195, 0.0, 30.0]})
     lines = (json.dumps({"at_s": float(at_s), "places": place}) for at_s, place in enumerate(places))

@@ -1,4 +1,4 @@
-"""`check` compares stored verdicts and versions with its own. Unfinished swarms have a status of their own."""
+"""`check` compares stored verdicts and versions with its own. A swarm that needs more time has status 4."""
 
 import json
 import os

@@ -31,7 +31,7 @@ def test_check_gives_characteristics_and_figures_as_json(run_dir: Path) -> None:
     assert verdict["figures"]["agents"] == 3
 
 
-def test_a_violation_is_status_1_with_its_evidence(run_dir: Path) -> None:
+def test_violation_has_status_1_and_evidence(run_dir: Path) -> None:
     edit(run_dir / "agents" / "2.chain.json", lambda export: export["chain"][0].update(timestamp_us=5))
     done = harness("check", run_dir)
     assert done.returncode == 1
@@ -39,7 +39,7 @@ def test_a_violation_is_status_1_with_its_evidence(run_dir: Path) -> None:
     assert "does not match its block" in " ".join(done.stdout.split())
 
 
-def test_an_unreadable_export_is_status_2_and_the_rest_are_checked(tmp_path: Path) -> None:
+def test_unreadable_export_has_status_2_and_the_rest_are_checked(tmp_path: Path) -> None:
     paths = write_exports(fly(agents=3, duration_s=400), tmp_path, traces=False)
     paths[1].write_text(paths[1].read_text()[:100])
     done = harness("check", *paths, "--json")
@@ -48,36 +48,36 @@ def test_an_unreadable_export_is_status_2_and_the_rest_are_checked(tmp_path: Pat
     assert "truncated or damaged" in sentences(done.stderr)[0]
 
 
-def test_a_violation_among_unreadable_exports_is_status_1(tmp_path: Path) -> None:
+def test_violation_among_unreadable_exports_has_status_1(tmp_path: Path) -> None:
     paths = write_exports(fly(agents=3, duration_s=400), tmp_path, traces=False)
     paths[1].write_text("")
     edit(paths[0], lambda export: export["chain"][0].update(timestamp_us=5))
     assert harness("check", *paths).returncode == 1
 
 
-def test_nothing_to_check_is_status_2(tmp_path: Path) -> None:
+def test_check_of_nothing_has_status_2(tmp_path: Path) -> None:
     for arguments in ([tmp_path], [tmp_path / "nowhere"]):
         done = harness("check", *arguments)
         assert done.returncode == 2
         assert str(tmp_path) in sentences(done.stderr)[0]
 
 
-def test_a_wrong_scenario_is_one_sentence_and_status_2(tmp_path: Path) -> None:
+def test_wrong_scenario_is_refused_in_one_sentence_with_status_2(tmp_path: Path) -> None:
     scenario = tmp_path / "scenario.yaml"
     scenario.write_text("name: x\nnetwork: {loss: 1.5}")
     done = harness("run", scenario, "--out", tmp_path / "run")
     assert done.returncode == 2
-    (said,) = sentences(done.stderr)
-    assert said == f"{scenario}: `network.loss` is 1.5: it should be less than or equal to 1"
+    (sentence,) = sentences(done.stderr)
+    assert sentence == f"{scenario}: `network.loss` is 1.5: it should be less than or equal to 1"
     assert not (tmp_path / "run").exists()
 
 
-def test_an_unknown_option_is_status_2(tmp_path: Path) -> None:
+def test_unknown_option_has_status_2(tmp_path: Path) -> None:
     assert harness("run", "x.yaml", "--lossy").returncode == 2
 
 
 @pytest.mark.parametrize("speedup", ["0", "-1", "nan", "1e9"])
-def test_an_impossible_speedup_is_refused(tmp_path: Path, speedup: str) -> None:
+def test_impossible_speedup_is_refused(tmp_path: Path, speedup: str) -> None:
     scenario = tmp_path / "scenario.yaml"
     scenario.write_text("name: x")
     done = harness("run", scenario, "--speedup", speedup, "--out", tmp_path / "run")
@@ -86,7 +86,7 @@ def test_an_impossible_speedup_is_refused(tmp_path: Path, speedup: str) -> None:
     assert not (tmp_path / "run").exists()
 
 
-def test_doctor_says_what_this_machine_can_do_as_text_and_json() -> None:
+def test_doctor_reports_requirements_as_text_and_json() -> None:
     as_json = harness("doctor", "--json")
     findings = json.loads(as_json.stdout)
     assert {"name", "ok", "needed", "detail", "way_out"} <= findings[0].keys()
@@ -98,14 +98,14 @@ def test_doctor_says_what_this_machine_can_do_as_text_and_json() -> None:
         assert finding["name"] in as_text.stdout
 
 
-def test_a_scenario_runs_in_virtual_time_and_says_that_no_vehicles_fly(tmp_path: Path) -> None:
+def test_run_in_virtual_time_reports_that_no_vehicles_fly(tmp_path: Path) -> None:
     done = harness("run", PERFECT, "--backend", "sim", "--seed", "1", "--out", tmp_path / "run")
     assert done.returncode == 0
     assert "Virtual time has no telemetry" in done.stdout
     assert (tmp_path / "run" / "report.html").exists()
 
 
-def test_virtual_time_has_no_ardupilot(tmp_path: Path) -> None:
+def test_virtual_time_refuses_ardupilot(tmp_path: Path) -> None:
     asked = ("run", PERFECT, "--backend", "sim", "--vehicles", "ardupilot", "--out", tmp_path / "run")
     done = harness(*asked)
     assert done.returncode == 2
@@ -131,7 +131,9 @@ def test_option_ucp_agent_replaces_the_agents_of_a_scenario(tmp_path: Path) -> N
         (["2="], "--ucp-agent is empty: name a program"),
     ],
 )
-def test_impossible_option_ucp_agent_is_one_sentence(agents: list[str], sentence: str, tmp_path: Path) -> None:
+def test_impossible_option_ucp_agent_is_refused_in_one_sentence(
+    agents: list[str], sentence: str, tmp_path: Path
+) -> None:
     options = [word for agent in agents for word in ("--ucp-agent", agent)]
     done = harness("run", write_scenario(tmp_path), *options, "--out", tmp_path / "run")
     assert done.returncode == 2

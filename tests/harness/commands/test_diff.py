@@ -1,4 +1,4 @@
-"""`ucp-harness diff`: says where two runs part, and that two of the same seed do not."""
+"""`ucp-harness diff`: the first difference of two runs. Two runs with the same seed do not differ."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ SAME = AgentDifference(None, None)
 
 
 def fly(out: Path, seed: int = 1, **keys: Any) -> Path:
-    """A run in virtual time; three agents for five minutes, unless told otherwise."""
+    """Play a run in virtual time. By default, three agents fly for five minutes."""
     run(scenario(**{"agents": 3, "duration_s": 300, **keys}), seed, out, Silent(), "sim")
     return out
 
@@ -37,7 +37,7 @@ def a(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def b(a: Path) -> Path:
-    """A copy, to be changed."""
+    """A copy of the run `a` that a test may change."""
     return Path(shutil.copytree(a, a.with_name("b")))
 
 
@@ -45,7 +45,7 @@ def trace(run_dir: Path, agent: int = 2) -> Path:
     return run_dir / "agents" / f"{agent}.trace.jsonl"
 
 
-def test_the_same_seed_is_the_same_run(a: Path, tmp_path: Path) -> None:
+def test_runs_of_the_same_seed_are_identical(a: Path, tmp_path: Path) -> None:
     again = fly(tmp_path / "again", network={"loss": 0.2})
     done = harness("diff", a, again)
     assert (done.returncode, done.stderr) == (0, "")
@@ -53,7 +53,7 @@ def test_the_same_seed_is_the_same_run(a: Path, tmp_path: Path) -> None:
     assert done.stdout == f"identical to the last byte: {lines} handler runs of 3 agents, and their chains\n"
 
 
-def test_one_lost_commit_is_where_the_runs_part(tmp_path: Path) -> None:
+def test_diff_finds_the_one_lost_commit(tmp_path: Path) -> None:
     lossy = load_scenario(LOST_LAST_COMMIT)
     without, with_it = tmp_path / "a", tmp_path / "b"
     run(lossy, 1, without, Silent(), "sim")
@@ -61,17 +61,17 @@ def test_one_lost_commit_is_where_the_runs_part(tmp_path: Path) -> None:
     found = compare(without, with_it)
     assert (found.verdict, found.first) == ("differ", 2)
     assert [(one.key, one.b) for one in found.keys] == [("fates", [])]
-    parted = found.agents.pop(2)
+    difference = found.agents.pop(2)
     assert set(found.agents.values()) == {SAME}
-    assert parted.chain == ChainDifference(4, None, "4.2")
-    assert parted.run is not None and parted.run.a is None and parted.run.b is not None
-    assert (parted.run.b.handler, parted.run.b.branch) == ("receive_commit_block", "committed")
-    assert parted.run.b.trigger.to_json()["from"] == 4
-    assert ("chain+", "4.2") in parted.run.b.changes
-    assert 117 < parted.run.at_s < 130
+    assert difference.chain == ChainDifference(4, None, "4.2")
+    assert difference.run is not None and difference.run.a is None and difference.run.b is not None
+    assert (difference.run.b.handler, difference.run.b.branch) == ("receive_commit_block", "committed")
+    assert difference.run.b.trigger.to_json()["from"] == 4
+    assert ("chain+", "4.2") in difference.run.b.changes
+    assert 117 < difference.run.at_s < 130
 
 
-def test_runs_that_differ_are_status_1_with_keys_first_then_agents(a: Path, tmp_path: Path) -> None:
+def test_differing_runs_have_status_1_with_keys_before_agents(a: Path, tmp_path: Path) -> None:
     other = fly(tmp_path / "other", seed=2, network={"loss": 0.3})
     done = harness("diff", a, other)
     assert done.returncode == 1
@@ -82,7 +82,7 @@ def test_runs_that_differ_are_status_1_with_keys_first_then_agents(a: Path, tmp_
     assert re.search(r"^    A  [\d.]+ s \(line \d+\): \w+, .+; .+$", done.stdout, re.MULTILINE)
 
 
-def test_as_json_it_says_the_same(a: Path, b: Path) -> None:
+def test_json_holds_the_first_difference(a: Path, b: Path) -> None:
     edit_lines(trace(b), lambda lines: lines[5].update(branch="another"))
     done = harness("diff", a, b, "--json")
     assert done.returncode == 1
@@ -93,8 +93,8 @@ def test_as_json_it_says_the_same(a: Path, b: Path) -> None:
     assert (first["number"], first["a"]["line"], first["b"]["branch"]) == (5, 6, "another")
 
 
-def test_other_times_and_other_hashes_of_the_same_blocks_are_no_difference(a: Path, b: Path) -> None:
-    """As between two runs of processes."""
+def test_times_and_hashes_of_the_same_blocks_are_not_compared(a: Path, b: Path) -> None:
+    """Two runs of processes differ in this way."""
     for path in (b / "agents").glob("*.json*"):
         text = re.sub(
             r"\b[0-9a-f]{64}\b", lambda found: hashlib.sha256(found[0].encode()).hexdigest(), path.read_text()
@@ -109,7 +109,7 @@ def test_other_times_and_other_hashes_of_the_same_blocks_are_no_difference(a: Pa
     )
 
 
-def test_a_state_that_was_edited_is_not_called_a_time(a: Path, b: Path) -> None:
+def test_edited_state_is_reported_as_a_difference_in_states(a: Path, b: Path) -> None:
     trace(b).write_text(trace(b).read_text().replace('"deque":0', '"deque":7', 1))
     done = harness("diff", a, b)
     assert done.returncode == 0
@@ -128,7 +128,7 @@ def test_a_state_that_was_edited_is_not_called_a_time(a: Path, b: Path) -> None:
     ],
     ids=["handler", "branch", "trigger", "sent", "changes"],
 )
-def test_what_an_agent_does_is_compared(a: Path, b: Path, change: Any) -> None:
+def test_each_action_of_an_agent_is_compared(a: Path, b: Path, change: Any) -> None:
     edit_lines(trace(b), lambda lines: change(lines[3]))
     found = compare(a, b)
     assert found.first == 2
@@ -136,7 +136,7 @@ def test_what_an_agent_does_is_compared(a: Path, b: Path, change: Any) -> None:
     assert found.agents[1] == found.agents[3] == SAME
 
 
-def test_the_first_to_part_is_the_first_in_mission_time_in_either_run(a: Path, b: Path) -> None:
+def test_first_differing_agent_is_the_earliest_in_mission_time(a: Path, b: Path) -> None:
     edit_lines(trace(b, 1), lambda lines: lines[9].update(branch="another"))
     edit_lines(trace(b, 3), lambda lines: lines[9].update(branch="another", t=1.5))
     found = compare(a, b)
@@ -144,7 +144,7 @@ def test_the_first_to_part_is_the_first_in_mission_time_in_either_run(a: Path, b
     assert found.agents[3].run is not None and found.agents[3].run.at_s == 1.5
 
 
-def test_another_life_of_an_agent_is_a_difference_even_if_it_does_the_same(a: Path, b: Path) -> None:
+def test_additional_incarnation_of_an_agent_is_a_difference(a: Path, b: Path) -> None:
     lines = trace(b).read_text().splitlines(keepends=True)
     trace(b).write_text("".join([*lines[:4], lines[0], *lines[4:]]))
     found = compare(a, b)
@@ -154,14 +154,14 @@ def test_another_life_of_an_agent_is_a_difference_even_if_it_does_the_same(a: Pa
     assert (first.number, first.a.life, first.b.life, first.b.line) == (4, 1, 2, 6)
 
 
-def test_half_a_last_line_is_what_a_killed_agent_leaves(a: Path, b: Path) -> None:
+def test_incomplete_last_line_of_a_killed_agent_is_ignored(a: Path, b: Path) -> None:
     for run_dir in (a, b):
         with trace(run_dir).open("a") as file:
             file.write('{"t":' if run_dir is a else '{"t":12,"handler":"x')
     assert compare(a, b).verdict == "identical"
 
 
-def test_keys_are_told_innermost_and_lists_of_another_length_whole() -> None:
+def test_innermost_keys_differ_and_lists_of_other_lengths_as_a_whole() -> None:
     one = {"network": {"loss": 0.1, "delay": 1}, "timeline": [{"at_s": 1}], "fates": [1], "name": "x"}
     other = {"network": {"loss": 0.2, "delay": 1}, "timeline": [{"at_s": 2}], "fates": [], "name": "x", "more": True}
     assert [*differing_keys(one, other)] == [
@@ -191,18 +191,18 @@ def test_keys_are_told_innermost_and_lists_of_another_length_whole() -> None:
         (lambda b: (b / "run.json").unlink(), "is this a run directory?"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(a: Path, b: Path, spoil: Any, sentence: str) -> None:
-    spoil(b)
+def test_runs_that_cannot_be_compared_are_refused(a: Path, b: Path, damage: Any, sentence: str) -> None:
+    damage(b)
     with pytest.raises(RunDirectoryError, match=re.escape(sentence)):
         compare(a, b)
 
 
-def test_a_refusal_is_status_2_with_one_sentence(a: Path, tmp_path: Path) -> None:
+def test_refused_comparison_has_status_2_and_one_sentence(a: Path, tmp_path: Path) -> None:
     done = harness("diff", a, tmp_path / "nowhere")
     assert (done.returncode, done.stdout, len(sentences(done.stderr))) == (2, "", 1)
 
 
-def test_an_export_that_cannot_be_read_is_told_and_counts_as_no_chain(a: Path, b: Path) -> None:
+def test_unreadable_export_is_reported_and_counts_as_no_chain(a: Path, b: Path) -> None:
     (b / "agents" / "2.chain.json").write_text("{")
     done = harness("diff", a, b)
     assert done.returncode == 1
@@ -210,7 +210,7 @@ def test_an_export_that_cannot_be_read_is_told_and_counts_as_no_chain(a: Path, b
     assert "2.chain.json: truncated or damaged" in sentences(done.stderr)[0]
 
 
-def test_a_run_that_has_not_recorded_its_end_is_compared_and_that_is_said(a: Path, b: Path) -> None:
+def test_run_without_a_recorded_end_is_compared_with_a_remark(a: Path, b: Path) -> None:
     edit(b / "run.json", lambda record: record.update(outcome="running"))
     done = harness("diff", a, b)
     assert done.returncode == 0
@@ -219,7 +219,7 @@ def test_a_run_that_has_not_recorded_its_end_is_compared_and_that_is_said(a: Pat
     ]
 
 
-def test_long_traces_are_never_in_memory_as_a_whole(a: Path, b: Path) -> None:
+def test_diff_does_not_hold_a_whole_trace_in_memory(a: Path, b: Path) -> None:
     for run_dir in (a, b):
         header, *steps = trace(run_dir).read_text().splitlines(keepends=True)
         trace(run_dir).write_text(header + "".join(step for step in steps if '"complete"' not in step) * 200)

@@ -1,4 +1,4 @@
-"""The command line opens at once: it lists its commands without importing them, and completes what is typed."""
+"""The command line: its help imports no command, and the shell completes names and options."""
 
 import os
 import re
@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 import typer
 
-from harness.cli import COMMANDS, OLD_NAMES, loaded
+from harness.cli import COMMANDS, OLD_NAMES, load_command
 from tests.harness.command import COMMAND, harness, sentences, write_scenario
 from tests.harness.mission import CONNECTED, fly, write_run
 
-ITS_OWN = {"harness", "harness.cli", "harness.errors", "harness.gc_pause"}
+IMPORTED_BY_HELP = {"harness", "harness.cli", "harness.errors", "harness.gc_pause"}
 
 
 def test_help_imports_no_command() -> None:
@@ -31,10 +31,10 @@ assert CliRunner().invoke(app, ["--help"]).exit_code == 0
 print(*(name for name in sys.modules if name.split(".")[0] in ("harness", "ucp", "netem", "sitl", "pydantic", "scapy")))
 """
     listed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert set(listed.stdout.split()) == ITS_OWN
+    assert set(listed.stdout.split()) == IMPORTED_BY_HELP
 
 
-def test_whoever_flies_no_vehicle_imports_no_mavlink() -> None:
+def test_commands_run_and_report_do_not_import_mavlink() -> None:
     script = """
 import sys
 import harness.commands.report, harness.commands.run
@@ -45,9 +45,9 @@ print(*(name for name in sys.modules if name.startswith("pymavlink")))
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_list_says_what_a_commands_own_help_says(name: str) -> None:
-    _, where, summary = COMMANDS[name]
-    module, _, attribute = where.partition(":")
+def test_summary_of_a_command_is_the_start_of_its_help(name: str) -> None:
+    _, location, summary = COMMANDS[name]
+    module, _, attribute = location.partition(":")
     command = getattr(import_module(module), attribute)
     own = command.info.help if isinstance(command, typer.Typer) else getattr(command, "help", None) or getdoc(command)
     assert own is not None
@@ -60,7 +60,7 @@ def panels(*command: str) -> dict[str, str]:
     return dict(re.findall(r"╭─ ([^─]+) ─+╮\n(.*?)╰─", shown, re.DOTALL))
 
 
-def test_each_command_is_one_line_of_its_panel_and_of_no_other() -> None:
+def test_each_command_has_one_line_in_one_panel() -> None:
     shown = panels()
     assert [*shown] == ["Options", "run", "look", "field", "many", "prove", "this machine"]
     listed = {title: re.findall(r"^│ (\S.*?) +│$", text, re.MULTILINE) for title, text in shown.items()}
@@ -83,7 +83,7 @@ OPTIONS_IN_A_PANEL = 11
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_each_option_has_one_line_of_help_and_no_panel_is_long(name: str) -> None:
-    for command_name, command in commands_of(loaded(name), name):
+    for command_name, command in commands_of(load_command(name), name):
         in_panel = Counter[str | None]()
         for parameter in command.params:
             help_text = parameter.help or ""
@@ -100,7 +100,7 @@ def test_prove_shows_rare_options_below_common_ones() -> None:
 
 
 @pytest.mark.parametrize("name", OLD_NAMES)
-def test_an_old_name_answers_with_the_new_one(name: str) -> None:
+def test_old_name_of_a_command_is_refused_with_the_new_one(name: str) -> None:
     refused = harness(name, "my.yaml", "--seed", "3")
     assert refused.returncode == 128
     assert sentences(refused.stderr) == [f"`{name}` is now {OLD_NAMES[name]}: run that"]
@@ -108,7 +108,7 @@ def test_an_old_name_answers_with_the_new_one(name: str) -> None:
     assert new is not None and new[1] in COMMANDS and name not in COMMANDS
 
 
-def test_version() -> None:
+def test_option_version_prints_the_version() -> None:
     assert harness("--version").stdout == f"ucp-harness {version('ucp-harness')}\n"
 
 
@@ -120,7 +120,7 @@ def test_version() -> None:
         ("ucp-harness sitl pa", {"path"}),
     ],
 )
-def test_what_is_typed_is_completed(typed: str, completed: set[str]) -> None:
+def test_shell_completes_commands_and_options(typed: str, completed: set[str]) -> None:
     word = str(len(typed.split()) - 1)
     asked = {"_UCP_HARNESS_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": word}
     script = "from harness.cli import app; app(prog_name='ucp-harness')"
@@ -130,13 +130,13 @@ def test_what_is_typed_is_completed(typed: str, completed: set[str]) -> None:
     assert set(answer.stdout.split()) == completed
 
 
-def test_a_command_that_there_is_not_is_told_from_those_that_there_are() -> None:
+def test_unknown_command_gets_a_suggestion() -> None:
     refused = harness("chek")
     assert refused.returncode == 2
     assert "Did you mean 'check'?" in refused.stderr
 
 
-def test_a_full_standard_output_is_no_verdict(tmp_path: Path) -> None:
+def test_full_standard_output_has_status_3(tmp_path: Path) -> None:
     run_dir = write_run(fly(agents=3, duration_s=400), tmp_path / "run", CONNECTED)
     for arguments in (["--help"], ["sitl", "--help"], ["check", run_dir], ["check", run_dir, "--json"]):
         with Path("/dev/full").open("w") as full:
@@ -149,7 +149,7 @@ def test_a_full_standard_output_is_no_verdict(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("options", [[], ["--json"]])
 @pytest.mark.parametrize(("blocks", "status"), [(3, 0), (4, 1)])
-def test_a_reader_that_has_seen_enough_changes_no_verdict(
+def test_closed_standard_output_does_not_change_the_status(
     tmp_path: Path, options: list[str], blocks: int, status: int
 ) -> None:
     reads, writes = os.pipe()
@@ -162,7 +162,7 @@ def test_a_reader_that_has_seen_enough_changes_no_verdict(
     assert (ended.returncode, ended.stderr) == (status, "")
 
 
-def test_what_is_no_file_is_no_scenario(tmp_path: Path) -> None:
+def test_run_refuses_a_scenario_that_is_no_regular_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "scenario.yaml")
     for path in (tmp_path / "scenario.yaml", "/dev/zero", tmp_path):
         refused = harness("run", path)
@@ -170,14 +170,14 @@ def test_what_is_no_file_is_no_scenario(tmp_path: Path) -> None:
         assert sentences(refused.stderr) == [f"{path}: not a file with a scenario"]
 
 
-def test_a_mission_beyond_reason_is_refused(tmp_path: Path) -> None:
+def test_mission_above_the_maximum_duration_is_refused(tmp_path: Path) -> None:
     refused = harness("run", write_scenario(tmp_path, duration_s=10**9))
     assert refused.returncode == 2
     assert "`duration_s` is 1000000000: it should be less than or equal to 2678400" in refused.stderr
 
 
 @pytest.mark.parametrize("command", ["check", "run", "replay"])
-def test_a_file_that_cannot_even_be_looked_at_is_one_sentence(command: str) -> None:
+def test_too_long_file_name_is_refused_in_one_sentence(command: str) -> None:
     ended = harness(command, "x" * 5000)
     assert ended.returncode == 2
     (sentence,) = sentences(ended.stderr)

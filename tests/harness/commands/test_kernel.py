@@ -1,4 +1,4 @@
-"""`--kernel uml`: the command line in User Mode Linux, as a user sees it from outside."""
+"""The option `--kernel uml`: commands in User Mode Linux, called from outside."""
 
 import json
 import os
@@ -33,7 +33,7 @@ uml._COMMAND = uml._COMMAND.replace(beats, "while sleep {beat_s}; do echo; done"
 
 
 @pytest.mark.uml
-def test_a_run_leaves_verdict_report_and_status_as_on_the_host(tmp_path: Path) -> None:
+def test_run_in_uml_leaves_verdict_report_and_status(tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path, **QUICK, network={"delay": 0.1})
     done = harness("run", scenario, "--kernel", "uml", "--vehicles", "none", "--seed", "7", "--out", tmp_path / "run")
     assert done.returncode == 0, done.stderr
@@ -41,18 +41,18 @@ def test_a_run_leaves_verdict_report_and_status_as_on_the_host(tmp_path: Path) -
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (record["outcome"], record["engine"], record["seed"]) == ("completed", "netem", 7)
     assert "User Mode Linux" in record["versions"]["kernel"]
-    left = {path.name for path in tmp_path.glob("run/**/*")}
-    assert {"report.html", "network.jsonl", "1.chain.json", "2.trace.jsonl"} <= left
+    written = {path.name for path in tmp_path.glob("run/**/*")}
+    assert {"report.html", "network.jsonl", "1.chain.json", "2.trace.jsonl"} <= written
     assert all(path.stat().st_uid == os.geteuid() for path in tmp_path.glob("run/**/*"))
     assert harness("check", tmp_path / "run").returncode == 0
 
 
 @pytest.mark.uml
-def test_a_shell_reaches_inside_and_an_interrupted_run_is_exported_and_judged(tmp_path: Path) -> None:
+def test_shell_enters_a_run_in_uml_that_is_judged_when_interrupted(tmp_path: Path) -> None:
     run = tmp_path / "run"
     scenario = write_scenario(tmp_path, **{**QUICK, "duration_s": 100_000})
     asked = ("run", str(scenario), "--kernel", "uml", "--vehicles", "none", "--out", str(run))
-    with _Started(tmp_path, *COMMAND, *asked) as started:
+    with _UmlProgram(tmp_path, *COMMAND, *asked) as started:
         started.wait_for("mission;")
         assert f"{run}: inside User Mode Linux\n" in harness("shell").stdout
         inside = harness("shell", run, 2, "--", "sh", "-c", "ip -brief address; exit 7", deadline_s=DEADLINE_S)
@@ -64,35 +64,35 @@ def test_a_shell_reaches_inside_and_an_interrupted_run_is_exported_and_judged(tm
     assert "holds" in rest
     assert {path.name for path in run.glob("agents/*.chain.json")} == {"1.chain.json", "2.chain.json"}
     assert (run / "report.html").exists()
-    started.wait_until_nothing_is_left()
+    started.wait_for_clean_end()
 
 
 @pytest.mark.uml
 @pytest.mark.any_user
 @pytest.mark.parametrize("before", ["", LATE_BEAT], ids=["beating", "output-before-first-beat"])
 def test_sigterm_reaches_the_command_as_ctrl_c(tmp_path: Path, before: str) -> None:
-    with _Started(tmp_path, sys.executable, "-c", before + WAITING) as started:
+    with _UmlProgram(tmp_path, sys.executable, "-c", before + WAITING) as started:
         started.wait_for("here")
         started.process.terminate()
         rest, _ = started.process.communicate(timeout=DEADLINE_S)
     assert (started.process.returncode, rest) == (130, "Ctrl-C\n")
-    started.wait_until_nothing_is_left()
+    started.wait_for_clean_end()
 
 
 @pytest.mark.uml
 @pytest.mark.any_user
-def test_whoever_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
-    with _Started(tmp_path, sys.executable, "-c", WAITING) as started:
+def test_killed_program_leaves_no_uml_processes_or_files(tmp_path: Path) -> None:
+    with _UmlProgram(tmp_path, sys.executable, "-c", WAITING) as started:
         started.wait_for("here")
-        assert started.left()
+        assert started.remaining_processes()
         started.process.kill()
         started.process.wait()
-        started.wait_until_nothing_is_left()
+        started.wait_for_clean_end()
 
 
 @pytest.mark.uml
 @pytest.mark.any_user
-def test_the_exit_status_and_both_outputs_come_out_whole(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_uml_passes_exit_status_and_both_outputs_on(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     lines = 20000
     assert _run(f"seq {lines}; echo complaint >&2; exit 7") == 7
     out, err = capfd.readouterr()
@@ -102,14 +102,14 @@ def test_the_exit_status_and_both_outputs_come_out_whole(tmp_path: Path, capfd: 
 
 @pytest.mark.uml
 @pytest.mark.any_user
-def test_a_kernel_that_panics_is_an_error_not_a_status(tmp_path: Path) -> None:
+def test_kernel_panic_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UmlError, match="panic"):
         _run("echo c >/proc/sysrq-trigger; sleep 60")
 
 
 @pytest.mark.uml
 @pytest.mark.any_user
-def test_a_kernel_that_falls_silent_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_kernel_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uml, "SILENCE_LIMIT_S", 3.0)
     monkeypatch.setattr(uml, "BEAT_S", 60)
     with pytest.raises(UmlError, match="nothing came from it for 3 s"):
@@ -118,22 +118,22 @@ def test_a_kernel_that_falls_silent_is_an_error(tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.uml
 @pytest.mark.any_user
-def test_a_kernel_that_does_not_boot_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernel_that_does_not_boot_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uml, "MEMORY", "nonsense")
     with pytest.raises(UmlError, match="it did not boot"):
         _run("true")
 
 
-def test_without_user_mode_linux_the_way_out_is_named(tmp_path: Path) -> None:
+def test_missing_user_mode_linux_is_refused_with_a_solution(tmp_path: Path) -> None:
     asked = ("run", write_scenario(tmp_path), "--kernel", "uml", "--out", tmp_path / "run")
     done = harness(*asked, env={**os.environ, "PATH": str(tmp_path)})
     assert done.returncode == 3
-    (said,) = sentences(done.stderr)
-    assert "apt install user-mode-linux" in said
+    (sentence,) = sentences(done.stderr)
+    assert "apt install user-mode-linux" in sentence
     assert not (tmp_path / "run").exists()
 
 
-def test_virtual_time_has_no_kernel(tmp_path: Path) -> None:
+def test_virtual_time_refuses_a_kernel(tmp_path: Path) -> None:
     asked = ("run", write_scenario(tmp_path), "--kernel", "uml", "--backend", "sim", "--out", tmp_path / "run")
     done = harness(*asked)
     assert done.returncode == 2
@@ -145,8 +145,8 @@ def _run(script: str) -> int:
     return uml.run(["sh", "-c", script], cwd=Path("/"), env={"PATH": uml.SYSTEM_PATH})
 
 
-class _Started:
-    """A program that starts User Mode Linux; `temporary` is where it keeps what should be gone in the end."""
+class _UmlProgram:
+    """A program that starts User Mode Linux. It must remove all files in `temporary` at its end."""
 
     def __init__(self, folder: Path, *command: str) -> None:
         self.temporary = folder / "tmp"
@@ -166,8 +166,8 @@ class _Started:
                 return
         pytest.fail(f"it ended before it said {word}: {self.process.communicate()}")
 
-    def left(self) -> list[str]:
-        """The processes of its User Mode Linux: their command lines name its directory."""
+    def remaining_processes(self) -> list[str]:
+        """Return the command lines of the processes of its User Mode Linux. They contain the name of its directory."""
         found = []
         for entry in Path("/proc").iterdir():
             try:
@@ -178,13 +178,13 @@ class _Started:
                 found.append(command)
         return found
 
-    def wait_until_nothing_is_left(self) -> None:
+    def wait_for_clean_end(self) -> None:
         deadline = time.monotonic() + DEADLINE_S
-        while left := [*self.left(), *self.temporary.iterdir()]:
-            assert time.monotonic() < deadline, f"still there: {left}"
+        while remaining := [*self.remaining_processes(), *self.temporary.iterdir()]:
+            assert time.monotonic() < deadline, f"still there: {remaining}"
             time.sleep(0.05)
 
-    def __enter__(self) -> "_Started":
+    def __enter__(self) -> "_UmlProgram":
         return self
 
     def __exit__(self, *_: Any) -> None:

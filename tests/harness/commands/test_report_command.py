@@ -1,4 +1,4 @@
-"""`ucp-harness report`: the report of a run, drawn again, whatever is left of the run."""
+"""`ucp-harness report`: write the report of a run again, also of an incomplete or damaged run."""
 
 import shutil
 import signal
@@ -23,7 +23,7 @@ def run_dir(tmp_path: Path) -> Path:
     return out
 
 
-def test_a_report_is_drawn_again_as_it_was(run_dir: Path) -> None:
+def test_report_writes_the_same_files_again(run_dir: Path) -> None:
     before = [(run_dir / name).read_bytes() for name in WRITTEN]
     for name in WRITTEN:
         (run_dir / name).unlink()
@@ -32,7 +32,7 @@ def test_a_report_is_drawn_again_as_it_was(run_dir: Path) -> None:
     assert [(run_dir / name).read_bytes() for name in WRITTEN] == before
 
 
-def test_of_a_run_that_was_killed_there_is_what_is_left(tmp_path: Path) -> None:
+def test_report_of_a_killed_run_shows_the_remaining_files(tmp_path: Path) -> None:
     keys = {"duration_s": 1_000_000, "events": {"source": "random"}}
     running = Running(write_scenario(tmp_path, **keys), tmp_path / "run", "--backend", "sim")
     running.wait_for_mission(1)
@@ -49,7 +49,7 @@ def test_of_a_run_that_was_killed_there_is_what_is_left(tmp_path: Path) -> None:
     assert all((running.out / name).stat().st_size for name in WRITTEN)
 
 
-def test_a_damaged_export_is_told_and_the_rest_is_drawn(run_dir: Path) -> None:
+def test_damaged_export_is_reported_and_the_rest_is_drawn(run_dir: Path) -> None:
     (run_dir / "agents" / "2.chain.json").write_text("{")
     done = harness("report", run_dir)
     assert done.returncode == 0
@@ -60,7 +60,7 @@ def test_a_damaged_export_is_told_and_the_rest_is_drawn(run_dir: Path) -> None:
 
 
 def cut(path: Path) -> None:
-    """As if the writer had been stopped in mid-line."""
+    """Remove the end of a file, as if its writer had been stopped within a line."""
     path.write_bytes(path.read_bytes()[:-40])
 
 
@@ -108,10 +108,10 @@ NO_VERDICT = "the run has no verdict: `ucp-harness check {run}` judges the files
         ),
     ],
 )
-def test_what_is_missing_or_cut_off_is_told_and_the_rest_is_drawn(
-    run_dir: Path, spoil: Callable[[Path], object], said: list[str]
+def test_missing_or_truncated_file_is_reported_and_the_rest_is_drawn(
+    run_dir: Path, damage: Callable[[Path], object], said: list[str]
 ) -> None:
-    spoil(run_dir)
+    damage(run_dir)
     done = harness("report", run_dir)
     assert (done.returncode, done.stdout) == (0, f"{run_dir / 'report.html'}\n")
     assert sentences(done.stderr) == [sentence.format(run=run_dir) for sentence in said]
@@ -122,7 +122,7 @@ def test_what_is_missing_or_cut_off_is_told_and_the_rest_is_drawn(
 
 
 @pytest.mark.parametrize("what", ["nowhere", "no run", "another record"])
-def test_what_is_no_run_directory_is_status_2(run_dir: Path, what: str) -> None:
+def test_directory_without_a_run_has_status_2(run_dir: Path, what: str) -> None:
     if what != "another record":
         shutil.rmtree(run_dir)
     if what == "no run":
@@ -140,7 +140,7 @@ def test_what_is_no_run_directory_is_status_2(run_dir: Path, what: str) -> None:
     assert expected[what] in said
 
 
-def test_a_report_that_cannot_be_written_is_status_3(run_dir: Path) -> None:
+def test_unwritable_report_has_status_3(run_dir: Path) -> None:
     (run_dir / "report.html").unlink()
     (run_dir / "report.html").mkdir()
     done = harness("report", run_dir)

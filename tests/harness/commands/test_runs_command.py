@@ -1,4 +1,4 @@
-"""`ucp-harness runs` lists what was run, and opens its reports."""
+"""`ucp-harness runs`: list past runs, and open a report."""
 
 import json
 import os
@@ -22,7 +22,7 @@ def runs(tmp_path: Path) -> Path:
     return folder
 
 
-def test_the_newest_is_first(runs: Path) -> None:
+def test_newest_run_is_listed_first(runs: Path) -> None:
     listed = harness("runs", cwd=runs.parent)
     assert listed.returncode == 0
     newer, older = (next(line for line in listed.stdout.splitlines() if name in line) for name in ("newer", "older"))
@@ -32,14 +32,14 @@ def test_the_newest_is_first(runs: Path) -> None:
     assert only["directory"] == str(runs / "newer")
 
 
-def test_a_damaged_record_is_named_and_the_others_are_listed(runs: Path) -> None:
+def test_damaged_record_is_reported_and_the_others_are_listed(runs: Path) -> None:
     (runs / "older" / "run.json").write_text("{")
     listed = harness("runs", runs)
     assert "newer" in listed.stdout
     assert sentences(listed.stderr) == [f"{runs / 'older' / 'run.json'}: truncated or damaged: not a JSON document"]
 
 
-def test_a_report_is_opened_or_it_is_said_how_it_comes_about(runs: Path, tmp_path: Path) -> None:
+def test_runs_opens_a_report_or_names_the_command_that_writes_it(runs: Path, tmp_path: Path) -> None:
     missing = harness("runs", runs, "--open", "2")
     assert missing.returncode == 2
     assert sentences(missing.stderr) == [
@@ -54,7 +54,7 @@ def test_a_report_is_opened_or_it_is_said_how_it_comes_about(runs: Path, tmp_pat
     assert "has 2 runs, and no run 3" in harness("runs", runs, "--open", "3").stderr
 
 
-def test_no_folder_is_one_sentence(tmp_path: Path) -> None:
+def test_missing_folder_of_runs_is_one_sentence(tmp_path: Path) -> None:
     refused = harness("runs", tmp_path / "none")
     assert refused.returncode == 2
     assert "`ucp-harness run` creates it" in refused.stderr

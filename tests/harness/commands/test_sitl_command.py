@@ -1,4 +1,4 @@
-"""`ucp-harness sitl` as a user runs it, against a firmware server on loopback."""
+"""`ucp-harness sitl` with a firmware server on loopback."""
 
 import json
 import os
@@ -26,14 +26,14 @@ def server() -> Iterator[FirmwareServer]:
 
 @pytest.fixture
 def environ(server: FirmwareServer, tmp_path: Path) -> dict[str, str]:
-    """An environment with a cache of its own and nothing but this server, for an interpreter like ours."""
-    ours = {name: value for name, value in os.environ.items() if name.startswith(forks.READ_AT_START)}
+    """Return an environment with an empty cache and this server as the mirror, for the same interpreter."""
+    python_environment = {name: value for name, value in os.environ.items() if name.startswith(forks.READ_AT_START)}
     cache = str(tmp_path / "cache")
     place = {"XDG_CACHE_HOME": cache, "PATH": "/usr/bin:/bin", "UCP_SITL_URL": server.url, "no_proxy": "127.0.0.1"}
-    return {**ours, **place}
+    return {**python_environment, **place}
 
 
-def test_install_path_list_and_install_again(environ: dict[str, str], tmp_path: Path) -> None:
+def test_installed_binary_is_printed_by_path_and_list(environ: dict[str, str], tmp_path: Path) -> None:
     directory = tmp_path / "cache" / "ucp-harness" / "sitl" / "copter" / "4.6.3"
     done = harness("sitl", "install", env=environ)
     assert (done.returncode, done.stderr) == (0, "")
@@ -42,11 +42,11 @@ def test_install_path_list_and_install_again(environ: dict[str, str], tmp_path: 
     assert (again.returncode, again.stdout) == (0, f"copter 4.6.3 is installed already: {directory}\n")
     path = harness("sitl", "path", env=environ)
     assert (path.returncode, path.stdout) == (0, f"{directory}\n")
-    (offer,) = json.loads(harness("sitl", "list", "--json", env=environ).stdout)
-    assert offer.pop("fetched_at").endswith("Z")
-    assert offer.pop("size_bytes") > len(BINARY)
-    assert len(offer.pop("sha256")) == 64
-    assert offer == {
+    (binary,) = json.loads(harness("sitl", "list", "--json", env=environ).stdout)
+    assert binary.pop("fetched_at").endswith("Z")
+    assert binary.pop("size_bytes") > len(BINARY)
+    assert len(binary.pop("sha256")) == 64
+    assert binary == {
         "commit": None,
         "defaults": f"{directory}/copter.parm",
         "vehicle": "copter",
@@ -58,7 +58,7 @@ def test_install_path_list_and_install_again(environ: dict[str, str], tmp_path: 
     }
 
 
-def test_list_has_what_the_environment_offers_and_what_is_damaged(environ: dict[str, str], tmp_path: Path) -> None:
+def test_list_shows_all_sources_and_damaged_binaries(environ: dict[str, str], tmp_path: Path) -> None:
     harness("sitl", "install", env=environ)
     installed = tmp_path / "cache" / "ucp-harness" / "sitl" / "copter" / "4.6.3"
     (installed / "arducopter").write_bytes(b"x")
@@ -68,8 +68,8 @@ def test_list_has_what_the_environment_offers_and_what_is_damaged(environ: dict[
         (directory / "arducopter").write_bytes(BINARY)
         (directory / "arducopter").chmod(mode)
     environ |= {"ARDUPILOT_SITL": str(named), "PATH": f"{on_path}:{environ['PATH']}"}
-    offers = json.loads(harness("sitl", "list", "--json", env=environ).stdout)
-    assert [(offer["source"], offer["path"], offer["problem"]) for offer in offers] == [
+    binaries = json.loads(harness("sitl", "list", "--json", env=environ).stdout)
+    assert [(binary["source"], binary["path"], binary["problem"]) for binary in binaries] == [
         ("ARDUPILOT_SITL", f"{named}/arducopter", "arducopter is not executable"),
         ("PATH", f"{on_path}/arducopter", None),
         ("cache", str(installed), "arducopter is not the file that was fetched (SHA-256)"),
@@ -79,7 +79,7 @@ def test_list_has_what_the_environment_offers_and_what_is_damaged(environ: dict[
     assert "4.6.3" in shown
 
 
-def test_a_damaged_binary_has_no_path(environ: dict[str, str], tmp_path: Path) -> None:
+def test_damaged_binary_has_no_path(environ: dict[str, str], tmp_path: Path) -> None:
     harness("sitl", "install", env=environ)
     (tmp_path / "cache" / "ucp-harness" / "sitl" / "copter" / "4.6.3" / "copter.parm").unlink()
     done = harness("sitl", "path", env=environ)
@@ -87,7 +87,7 @@ def test_a_damaged_binary_has_no_path(environ: dict[str, str], tmp_path: Path) -
     assert "is damaged, copter.parm cannot be read" in sentences(done.stderr)[0]
 
 
-def test_nothing_installed_is_status_3_with_the_command_that_installs(environ: dict[str, str]) -> None:
+def test_missing_binary_has_status_3_and_names_the_command(environ: dict[str, str]) -> None:
     done = harness("sitl", "path", "--vehicle", "plane", env=environ)
     assert (done.returncode, done.stdout) == (3, "")
     assert sentences(done.stderr) == ["no plane is installed: run `ucp-harness sitl install --vehicle plane`"]
@@ -96,29 +96,29 @@ def test_nothing_installed_is_status_3_with_the_command_that_installs(environ: d
 
 
 @pytest.mark.parametrize("options", [("--version", "9.9.9"), ("--vehicle", "boat"), ("--url", "ftp://x")])
-def test_a_wrong_request_is_status_2(options: tuple[str, str], environ: dict[str, str]) -> None:
+def test_wrong_request_has_status_2(options: tuple[str, str], environ: dict[str, str]) -> None:
     done = harness("sitl", "install", *options, env=environ)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
 
 
-def test_no_server_is_status_3_in_one_sentence(environ: dict[str, str]) -> None:
-    environ["UCP_SITL_URL"] = "http://127.0.0.1:1"  # tcpmux, which nobody runs
+def test_unreachable_server_has_status_3_and_one_sentence(environ: dict[str, str]) -> None:
+    environ["UCP_SITL_URL"] = "http://127.0.0.1:1"  # the port of tcpmux, on which no server runs
     done = harness("sitl", "install", env=environ)
     assert done.returncode == 3
-    (said,) = sentences(done.stderr)
-    assert said.startswith("127.0.0.1:1 cannot be reached (Connection refused): if there is a mirror")
+    (sentence,) = sentences(done.stderr)
+    assert sentence.startswith("127.0.0.1:1 cannot be reached (Connection refused): if there is a mirror")
 
 
-def test_a_cache_that_cannot_be_written_is_status_3(environ: dict[str, str], tmp_path: Path) -> None:
+def test_unwritable_cache_has_status_3(environ: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "cache").write_text("a file")
     done = harness("sitl", "install", env=environ)
     assert done.returncode == 3
-    (said,) = sentences(done.stderr)
-    assert "set XDG_CACHE_HOME" in said
+    (sentence,) = sentences(done.stderr)
+    assert "set XDG_CACHE_HOME" in sentence
 
 
-def test_ctrl_c_is_status_130_and_what_came_is_kept(
+def test_interrupted_download_has_status_130_and_continues_later(
     server: FirmwareServer, environ: dict[str, str], tmp_path: Path
 ) -> None:
     server.change(f"{RELEASE}arducopter", silent_after=len(BINARY) // 2)

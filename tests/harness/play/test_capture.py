@@ -14,7 +14,7 @@ from harness.play.progress import Silent
 from harness.report.facts import gaps
 from harness.run.run import run
 from netem.frames import udp_broadcast
-from tests.captured import Frame, comment, frames, statistics
+from tests.captured import CapturedFrame, comment, frames, statistics
 from tests.harness.command import Running, harness, processes, sentences, write_scenario
 from tests.harness.virtual import scenario
 from ucp.messages import BlockAddRequest, CommitBlock, decode
@@ -40,7 +40,7 @@ RUN: dict[str, Any] = {
 }
 
 
-def captured(out: Path) -> dict[int, list[Frame]]:
+def captured(out: Path) -> dict[int, list[CapturedFrame]]:
     return {int(path.stem): frames(path) for path in sorted((out / "capture").glob("*.pcapng"))}
 
 

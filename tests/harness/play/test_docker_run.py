@@ -13,7 +13,7 @@ import pytest
 from harness.play.containers import ownership
 from harness.play.keyring.key_directory import Home
 from tests.harness.command import Running, harness, processes, sentences, write_scenario
-from tests.harness.docker import Way, containers, stranger
+from tests.harness.docker import BreakableConnection, containers, foreign_container
 from tests.harness.secure.secrets import left_in, secrets, told
 
 pytestmark = pytest.mark.docker
@@ -113,7 +113,7 @@ def test_clean_after_sigkill_removes_only_own_containers(tmp_path: Path) -> None
     run = long_run(tmp_path)
     held = [f"{ownership.run_name(run.out)}-{role}-{number}" for role in ("agent", "network") for number in (1, 2, 3)]
     assert containers(run.out) == held
-    with stranger(f"stranger-{os.getpid()}") as engine:
+    with foreign_container(f"stranger-{os.getpid()}") as engine:
         assert harness("clean").returncode == 0
         assert containers(run.out) == held, "it goes on"
         run.process.kill()
@@ -149,10 +149,11 @@ def test_ctrl_c_while_containers_start_leaves_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("hurt", "sentence"), [(Way.silent, "stopped answering"), (Way.cut, "the Docker engine has stopped")]
+    ("hurt", "sentence"),
+    [(BreakableConnection.silent, "stopped answering"), (BreakableConnection.cut, "the Docker engine has stopped")],
 )
 def test_stopped_engine_ends_the_run(hurt: Any, sentence: str, tmp_path: Path) -> None:
-    way = Way(tmp_path / "way.sock")
+    way = BreakableConnection(tmp_path / "way.sock")
     scenario = write_scenario(tmp_path, duration_s=100_000, **NO_VEHICLES)
     out = tmp_path / "run"
     command = [sys.executable, "-c", IMPATIENT]
@@ -173,7 +174,7 @@ def test_stopped_engine_ends_the_run(hurt: Any, sentence: str, tmp_path: Path) -
 
 def test_used_container_name_is_one_sentence(tmp_path: Path) -> None:
     name = f"{ownership.run_name(tmp_path / 'run')}-network-2"
-    with stranger(name):
+    with foreign_container(name):
         done = on_docker(tmp_path, **NO_VEHICLES)
     assert done.returncode == 3
     assert sentences(done.stderr) == [
