@@ -12,7 +12,7 @@ from rich.text import Text
 from harness.commands._shared_options import refuse_existing, write_new
 from harness.commands.terminal import complain, print_json
 from harness.conformance.conformance_page import read_agents, to_html
-from harness.conformance.conformance_run import Asked, conform
+from harness.conformance.conformance_run import ConformanceRequest, conform
 from harness.conformance.results import TITLES, Results
 from harness.conformance.results_table import progress, render, summary, to_junit
 from harness.conformance.vectors import generate, to_lines
@@ -82,8 +82,8 @@ def conformance_command(
     console = Console(stderr=as_json, highlight=False)
     place = keep or Path("conformance-failures")
     with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as show:
-        asked = Asked(tuple(resolve_command(command, "the agent")), only, _unused_path(place), virtual)
-        results = conform(asked, Path(scratch), show)
+        request = ConformanceRequest(tuple(resolve_command(command, "the agent")), only, _unused_path(place), virtual)
+        results = conform(request, Path(scratch), show)
     if junit is not None:
         write_new(junit, [to_junit(results)])
     if as_json:
@@ -102,8 +102,8 @@ def _test_all(agents: Mapping[str, Sequence[str]], only: str | None, page: Path,
     for name, command in agents.items():
         with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as show:
             try:
-                asked = Asked(tuple(resolve_command(list(command), "the agent")), only, None, virtual)
-                outcomes[name] = conform(asked, Path(scratch), show)
+                request = ConformanceRequest(tuple(resolve_command(list(command), "the agent")), only, None, virtual)
+                outcomes[name] = conform(request, Path(scratch), show)
             except MachineError:
                 raise
             except HarnessError as error:

@@ -8,63 +8,71 @@ from types import MappingProxyType
 from typing import Any
 
 from harness.conformance._alphabet import INPUTS, TIMER, Input
-from harness.conformance._observation import Exchange, Seen
-from harness.conformance._reference_model import AGENT, INITIAL_DATA, ROSTER, Model
-from harness.conformance._state_space import Variant, pair_of, state_of
+from harness.conformance._observation import Observation, RecordedDatagram
+from harness.conformance._reference_model import AGENT, INITIAL_DATA, ROSTER, ReferenceModel
+from harness.conformance._state_space import SettingsVariant, key_of, state_of
 from harness.play.process.agent_mission import NO_QUIRKS
 from ucp.features import CONTRACT
 from ucp.mission import SCHEMA
 
 
-class Subject(ABC):
-    """One life of an agent."""
+class AgentUnderTest(ABC):
+    """One incarnation of the agent under test, with the reference that gets the same inputs."""
 
-    def __init__(self, variant: Variant) -> None:
-        self.model = Model(variant.settings)
-        self.in_step = True
-        """Whether the reference still is where the agent is, after the machine was late."""
+    def __init__(self, variant: SettingsVariant) -> None:
+        self.model = ReferenceModel(variant.settings)
+        self.reference_follows = True
+        """False if the machine was late, and the reference could not follow the agent to its state."""
 
-    async def step(self, given: Input) -> Seen | None:
-        """Both are given an input, and compared; None if there is no such input now."""
-        if given.first is None:
+    async def step(self, given: Input) -> Observation | None:
+        """Give the input to the agent and to the reference, and compare them.
+
+        Return None if the input is impossible in the current state.
+        """
+        if given.preceding is None:
             return await self._step(given)
-        pair = pair_of(state_of(self.model), given)
-        before = await self._step(INPUTS[given.first])
+        key = key_of(state_of(self.model), given)
+        before = await self._step(INPUTS[given.preceding])
         if before is None or before.wrong:
             return before
         then = await self._step(INPUTS[TIMER])
-        return then if then is None else replace(then, pair=pair, hidden=before.outcome.runs[0])
+        return then if then is None else replace(then, key=key, hidden_run=before.outcome.runs[0])
 
     @abstractmethod
-    async def _step(self, given: Input) -> Seen | None: ...
+    async def _step(self, given: Input) -> Observation | None: ...
 
     @property
     @abstractmethod
-    def hurried(self) -> bool:
-        """Whether the next timer ends so soon that no input should be given before."""
+    def timer_is_near(self) -> bool:
+        """True if the next timer expires so soon that it must be the next input."""
 
     @abstractmethod
-    def exchanges(self) -> tuple[Exchange, ...]:
-        """All that has crossed the air."""
+    def exchanges(self) -> tuple[RecordedDatagram, ...]:
+        """Return all datagrams since the start of the agent."""
 
     @abstractmethod
     async def close(self) -> None:
-        """End it."""
+        """End the agent, or make its process available for the next incarnation."""
 
 
-Start = Callable[[Variant, bool], Awaitable[Subject]]
-"""Starts an agent in a mission with such settings, alone or beside others.
-
-Raises NoAgentError, UnsupportedError, AgentEndedError."""
+Start = Callable[[SettingsVariant, bool], Awaitable[AgentUnderTest]]
+"""Function that starts an agent with a variant of the settings. The second argument is true for a replay, in which few
+agents run in parallel. Raises NoAgentError, UnsupportedError, AgentEndedError."""
 
 
 NO_KEYS: Mapping[str, Any] = MappingProxyType({})
 
 
 def mission(
-    variant: Variant, *, address: str, broadcast: str, port: int, speedup: float, keys: Mapping[str, Any] = NO_KEYS
+    variant: SettingsVariant,
+    *,
+    address: str,
+    broadcast: str,
+    port: int,
+    speedup: float,
+    keys: Mapping[str, Any] = NO_KEYS,
 ) -> dict[str, Any]:
-    """`keys` take the place of those that are here."""
+    """Return a mission file. `keys` replace keys of it."""
     return {
         "schema": SCHEMA,
         "contract": CONTRACT,

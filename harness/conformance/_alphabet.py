@@ -1,7 +1,8 @@
-"""The inputs that there are: each of the nine messages in the variants that matter, events, timers and commands.
+"""The input alphabet: all relevant variants of the nine messages, events, timers and commands.
 
-An input is a function of the reference's state, as in "a second no of somebody who has voted already". It gives what to
-do, or None where there is no such thing. Peers are alike, so whoever answers first is agent 2, then 3, then 4.
+An input is a function of the reference's state. For example, "vote no of an agent that has voted" needs an agent that
+has voted. The function returns an action, or None if the input is impossible in this state. All peers behave alike, so
+agent 2 answers first, then agent 3, then agent 4.
 """
 
 from collections.abc import Callable
@@ -9,7 +10,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 from harness.checker.reference.algorithms import IS_TOP_OF_CHAIN
-from harness.conformance._reference_model import AGENT, OLD_US, PEERS, YOUNG_US, Action, Command, Expire, Model
+from harness.conformance._reference_model import (
+    AGENT,
+    OLD_US,
+    PEERS,
+    YOUNG_US,
+    Action,
+    ControlCommand,
+    ReferenceModel,
+    TimerExpiry,
+)
 from ucp.block import Block, next_chain_hash
 from ucp.messages import (
     BlockAddRequest,
@@ -25,24 +35,24 @@ from ucp.messages import (
 )
 
 UNKNOWN = bytes.fromhex("de" * 32)
-"""A hash of nothing."""
+"""A hash of no block and no chain."""
 
 Tally = Literal["voting", "phase one", "phase two", "timer"]
 
 
 @dataclass(frozen=True)
 class Input:
-    """`name` says what it is. `tally` is what its effect depends on besides what the agent holds.
-
-    `as_if`: the input that counts, of one that must not. `first`: the input that comes before the end of a timer, so
-    that it is seen whether it was counted.
-    """
+    """One input of the alphabet. Its name describes it."""
 
     name: str
-    make: Callable[[Model], Action | None]
+    make: Callable[[ReferenceModel], Action | None]
     tally: Tally | None = None
-    as_if: str | None = None
-    first: str | None = None
+    """Activity whose counted answers the effect depends on. "timer": the counted answers of any activity."""
+    counted_twin: str | None = None
+    """Only of an answer that the agent must ignore: the name of a similar answer that it must count."""
+    preceding: str | None = None
+    """Only of the expiry of a timer after an ignored answer: the name of the answer. The expiry shows whether the agent
+    counted it."""
 
 
 INPUTS: dict[str, Input] = {}
@@ -50,111 +60,111 @@ TIMER, LOG = "the next timer ends", "an event fills a block"
 
 
 def _input(
-    name: str, tally: Tally | None = None, as_if: str | None = None
-) -> Callable[[Callable[[Model], Action | None]], None]:
-    def declare(make: Callable[[Model], Action | None]) -> None:
+    name: str, tally: Tally | None = None, counted_twin: str | None = None
+) -> Callable[[Callable[[ReferenceModel], Action | None]], None]:
+    def declare(make: Callable[[ReferenceModel], Action | None]) -> None:
         assert name not in INPUTS
-        INPUTS[name] = Input(name, make, tally, as_if)
+        INPUTS[name] = Input(name, make, tally, counted_twin)
 
     return declare
 
 
 def _message(
     name: str,
-    message: Callable[[Model], Message | None],
-    sender: Callable[[Model], int | None] = lambda _: PEERS[0],
+    message: Callable[[ReferenceModel], Message | None],
+    sender: Callable[[ReferenceModel], int | None] = lambda _: PEERS[0],
     tally: Tally | None = None,
-    as_if: str | None = None,
+    counted_twin: str | None = None,
 ) -> None:
-    def make(model: Model) -> Action | None:
-        by = sender(model)
-        if by is None:
+    def make(model: ReferenceModel) -> Action | None:
+        peer = sender(model)
+        if peer is None:
             return None
-        says = message(model)
-        return None if says is None else model.datagram(by, says)
+        content = message(model)
+        return None if content is None else model.datagram(peer, content)
 
-    _input(name, tally, as_if)(make)
-
-
-# Whose
+    _input(name, tally, counted_twin)(make)
 
 
-def _nobody_yet(responders: Callable[[Model], set[int]]) -> Callable[[Model], int | None]:
+# The sender of a message: a peer that has not answered yet, or one that has
+
+
+def _first_silent_peer(responders: Callable[[ReferenceModel], set[int]]) -> Callable[[ReferenceModel], int | None]:
     return lambda model: next((peer for peer in PEERS if peer not in responders(model)), None)
 
 
-def _again(responders: Callable[[Model], set[int]]) -> Callable[[Model], int | None]:
+def _last_responder(responders: Callable[[ReferenceModel], set[int]]) -> Callable[[ReferenceModel], int | None]:
     return lambda model: max(responders(model), default=None)
 
 
-def _voters(model: Model) -> set[int]:
-    """Of the vote that matters now."""
+def _voters(model: ReferenceModel) -> set[int]:
+    """Return the agents that have voted in the current vote. During a reconcile, votes do not count."""
     state = model.state
     return state.voters if state.voting_timer.active and not state.reconcile_in_progress else set()
 
 
-def _of_phase_1(model: Model) -> set[int]:
+def _responders_of_phase_1(model: ReferenceModel) -> set[int]:
     return model.state.reconcile_responders if model.state.phase_one_timer.active else set()
 
 
-def _of_phase_2(model: Model) -> set[int]:
+def _responders_of_phase_2(model: ReferenceModel) -> set[int]:
     return model.state.reconcile_responders if model.state.phase_two_timer.active else set()
 
 
-# Of what
+# The chain or the block that a message is about
 
 
-def _top(model: Model) -> bytes:
+def _top(model: ReferenceModel) -> bytes:
     return model.state.chain.top_chain_hash
 
 
-def _chain_hashes(model: Model) -> list[bytes]:
+def _chain_hashes(model: ReferenceModel) -> list[bytes]:
     hashes = [model.state.chain.inception.chain_hash]
     for block in model.state.chain:
         hashes.append(next_chain_hash(hashes[-1], block.block_hash))
     return hashes
 
 
-def _below(model: Model) -> bytes | None:
-    """The chain without its top block."""
+def _chain_below_top(model: ReferenceModel) -> bytes | None:
+    """Return the hash of the chain without its top block."""
     hashes = _chain_hashes(model)
     return hashes[-2] if len(hashes) > 1 else None
 
 
-def _top_block(model: Model) -> Block | None:
+def _top_block(model: ReferenceModel) -> Block | None:
     *_, top = (None, *model.state.chain)
     return top
 
 
-def _popped(model: Model) -> bytes | None:
-    """The chain with the block that was popped last."""
+def _chain_with_popped_block(model: ReferenceModel) -> bytes | None:
+    """Return the hash of the chain with the block that was popped last."""
     stack = model.state.reconcile_stack
     return next_chain_hash(_top(model), stack[-1].block_hash) if stack else None
 
 
-def _candidate(model: Model) -> Block | None:
+def _candidate(model: ReferenceModel) -> Block | None:
     state = model.state
     return state.candidate_block if state.voting_timer.active else None
 
 
-def _chain_of_vote(model: Model) -> bytes | None:
+def _chain_hash_of_vote(model: ReferenceModel) -> bytes | None:
     state = model.state
     return state.top_chain_hash_at_initiation if state.settings.vote_names_chain else None
 
 
 @_input(LOG)
-def _log(model: Model) -> Action | None:
+def _log(model: ReferenceModel) -> Action | None:
     return model.event()
 
 
 @_input(TIMER, "timer")
-def _expire(model: Model) -> Action | None:
-    return None if model.agent.next_timer() is None else Expire()
+def _expire(model: ReferenceModel) -> Action | None:
+    return None if model.agent.next_timer() is None else TimerExpiry()
 
 
 @_input("operator reconciles")
-def _reconcile(model: Model) -> Action | None:
-    return Command("reconcile")
+def _reconcile(model: ReferenceModel) -> Action | None:
+    return ControlCommand("reconcile")
 
 
 # Block Add Request
@@ -163,7 +173,7 @@ _message("Block Add Request on the agent's chain", lambda model: BlockAddRequest
 _message("Block Add Request on an unknown chain", lambda model: BlockAddRequest(UNKNOWN, UNKNOWN))
 _message(
     "Block Add Request on the chain below the top",
-    lambda model: BlockAddRequest(UNKNOWN, below) if (below := _below(model)) else None,
+    lambda model: BlockAddRequest(UNKNOWN, below) if (below := _chain_below_top(model)) else None,
 )
 _message(
     "Block Add Request for the agent's own candidate",
@@ -171,56 +181,66 @@ _message(
 )
 _message(
     "Block Add Request on the chain with the popped block",
-    lambda model: BlockAddRequest(UNKNOWN, popped) if (popped := _popped(model)) else None,
+    lambda model: BlockAddRequest(UNKNOWN, popped) if (popped := _chain_with_popped_block(model)) else None,
 )
 
 # Block Add Response
 
 
-def _vote(approve: bool) -> Callable[[Model], Message | None]:
+def _vote(approve: bool) -> Callable[[ReferenceModel], Message | None]:
     return lambda model: (
-        BlockAddResponse(block.block_hash, approve, _chain_of_vote(model)) if (block := _candidate(model)) else None
+        BlockAddResponse(block.block_hash, approve, _chain_hash_of_vote(model))
+        if (block := _candidate(model))
+        else None
     )
 
 
-for _approve, _word in ((True, "yes"), (False, "no")):
-    _message(f"vote {_word}", _vote(_approve), _nobody_yet(_voters), "voting")
-    _message(f"vote {_word} of an agent that has voted", _vote(_approve), _again(_voters), "voting", f"vote {_word}")
+for _approve, _answer in ((True, "yes"), (False, "no")):
+    _message(f"vote {_answer}", _vote(_approve), _first_silent_peer(_voters), "voting")
     _message(
-        f"vote {_word} for an unknown block",
-        lambda model, approve=_approve: BlockAddResponse(UNKNOWN, approve, _chain_of_vote(model)),  # type: ignore[misc]
-        _nobody_yet(_voters),
+        f"vote {_answer} of an agent that has voted",
+        _vote(_approve),
+        _last_responder(_voters),
         "voting",
-        f"vote {_word}",
+        f"vote {_answer}",
     )
     _message(
-        f"vote {_word} for the block on top of the chain",
+        f"vote {_answer} for an unknown block",
+        lambda model, approve=_approve: BlockAddResponse(UNKNOWN, approve, _chain_hash_of_vote(model)),  # type: ignore[misc]
+        _first_silent_peer(_voters),
+        "voting",
+        f"vote {_answer}",
+    )
+    _message(
+        f"vote {_answer} for the block on top of the chain",
         lambda model, approve=_approve: (  # type: ignore[misc]
-            BlockAddResponse(top.block_hash, approve, _chain_of_vote(model)) if (top := _top_block(model)) else None
+            BlockAddResponse(top.block_hash, approve, _chain_hash_of_vote(model))
+            if (top := _top_block(model))
+            else None
         ),
-        _nobody_yet(_voters),
+        _first_silent_peer(_voters),
         "voting",
-        f"vote {_word}",
+        f"vote {_answer}",
     )
     _message(
-        f"vote {_word} for the block that waits behind",
+        f"vote {_answer} for the block that waits behind",
         lambda model, approve=_approve: (  # type: ignore[misc]
-            BlockAddResponse(model.state.blocks_to_be_committed[1].block_hash, approve, _chain_of_vote(model))
+            BlockAddResponse(model.state.blocks_to_be_committed[1].block_hash, approve, _chain_hash_of_vote(model))
             if len(model.state.blocks_to_be_committed) > 1
             else None
         ),
-        _nobody_yet(_voters),
+        _first_silent_peer(_voters),
         "voting",
-        f"vote {_word}",
+        f"vote {_answer}",
     )
     _message(
-        f"vote {_word} that names another chain",
+        f"vote {_answer} that names another chain",
         lambda model, approve=_approve: (  # type: ignore[misc]
             BlockAddResponse(block.block_hash, approve, UNKNOWN) if (block := _candidate(model)) else None
         ),
-        _nobody_yet(_voters),
+        _first_silent_peer(_voters),
         "voting",
-        f"vote {_word}",
+        f"vote {_answer}",
     )
 _message(
     "vote no that names no chain",
@@ -229,7 +249,7 @@ _message(
         if model.state.settings.vote_names_chain and (block := _candidate(model))
         else None
     ),
-    _nobody_yet(_voters),
+    _first_silent_peer(_voters),
     "voting",
     "vote no",
 )
@@ -237,13 +257,13 @@ _message(
 # Commit Block
 
 
-def _succeeding(model: Model, block: Block) -> CommitBlock:
+def _succeeding(model: ReferenceModel, block: Block) -> CommitBlock:
     return CommitBlock(block, next_chain_hash(_top(model), block.block_hash))
 
 
-for _young, _word in ((False, "old"), (True, "young")):
+for _young, _age in ((False, "old"), (True, "young")):
     _message(
-        f"Commit Block of a new {_word} block that succeeds the top",
+        f"Commit Block of a new {_age} block that succeeds the top",
         lambda model, young=_young: _succeeding(model, model.new_block(PEERS[0], young=young)),  # type: ignore[misc]
     )
 _message(
@@ -269,7 +289,7 @@ _message(
     "Commit Block that succeeds the chain below the top",
     lambda model: (
         CommitBlock(block := model.new_block(PEERS[0], young=False), next_chain_hash(below, block.block_hash))
-        if (below := _below(model))
+        if (below := _chain_below_top(model))
         else None
     ),
 )
@@ -303,13 +323,13 @@ for _query in (ChainContainQuery, ChainHashSuccessorQuery):
     _message(
         f"{_query.NAME} about the chain below the top",
         lambda model, query=_query: (  # type: ignore[misc]
-            query(below) if len(model.state.chain) > 1 and (below := _below(model)) else None
+            query(below) if len(model.state.chain) > 1 and (below := _chain_below_top(model)) else None
         ),
     )
     _message(f"{_query.NAME} about an unknown chain", lambda model, query=_query: query(UNKNOWN))  # type: ignore[misc]
     _message(
         f"{_query.NAME} about the chain with the popped block",
-        lambda model, query=_query: query(popped) if (popped := _popped(model)) else None,  # type: ignore[misc]
+        lambda model, query=_query: query(popped) if (popped := _chain_with_popped_block(model)) else None,  # type: ignore[misc]
     )
 _message(
     "Chain Contain Query that names a block's hash",
@@ -318,112 +338,117 @@ _message(
 
 # Chain Contain Response
 
-for _contained, _word in ((True, "yes"), (False, "no")):
-    for _who, _sender in (("", _nobody_yet(_of_phase_1)), (" of an agent that has answered", _again(_of_phase_1))):
+for _contained, _answer in ((True, "yes"), (False, "no")):
+    for _suffix, _sender in (
+        ("", _first_silent_peer(_responders_of_phase_1)),
+        (" of an agent that has answered", _last_responder(_responders_of_phase_1)),
+    ):
         _message(
-            f"Chain Contain Response {_word}{_who}",
+            f"Chain Contain Response {_answer}{_suffix}",
             lambda model, contained=_contained: ChainContainResponse(_top(model), contained),  # type: ignore[misc]
             _sender,
             "phase one",
-            f"Chain Contain Response {_word}" if _who else None,
+            f"Chain Contain Response {_answer}" if _suffix else None,
         )
     _message(
-        f"Chain Contain Response {_word} about an unknown chain",
+        f"Chain Contain Response {_answer} about an unknown chain",
         lambda model, contained=_contained: ChainContainResponse(UNKNOWN, contained),  # type: ignore[misc]
-        _nobody_yet(_of_phase_1),
+        _first_silent_peer(_responders_of_phase_1),
         "phase one",
-        f"Chain Contain Response {_word}",
+        f"Chain Contain Response {_answer}",
     )
     _message(
-        f"Chain Contain Response {_word} about the chain with the popped block",
+        f"Chain Contain Response {_answer} about the chain with the popped block",
         lambda model, contained=_contained: (  # type: ignore[misc]
-            ChainContainResponse(popped, contained) if (popped := _popped(model)) else None
+            ChainContainResponse(popped, contained) if (popped := _chain_with_popped_block(model)) else None
         ),
-        _nobody_yet(_of_phase_1),
+        _first_silent_peer(_responders_of_phase_1),
         "phase one",
-        f"Chain Contain Response {_word}",
+        f"Chain Contain Response {_answer}",
     )
 
 # Next in Sequence Response
 
 
-def _phase_two(model: Model) -> bool:
+def _phase_two(model: ReferenceModel) -> bool:
     return model.state.phase_two_timer.active
 
 
-def _next_new(*, young: bool) -> Callable[[Model], Message | None]:
-    def make(model: Model) -> Message:
+def _next_new(*, young: bool) -> Callable[[ReferenceModel], Message | None]:
+    def make(model: ReferenceModel) -> Message:
         block = model.new_block(PEERS[1], young=young)
         return NextInSequenceResponse(_top(model), block.block_hash, block.timestamp_us)
 
     return make
 
 
-def _next(candidate: Callable[[Model], Block | None]) -> Callable[[Model], Message | None]:
-    def make(model: Model) -> Message | None:
+def _next(candidate: Callable[[ReferenceModel], Block | None]) -> Callable[[ReferenceModel], Message | None]:
+    def make(model: ReferenceModel) -> Message | None:
         block = candidate(model)
         return None if block is None else NextInSequenceResponse(_top(model), block.block_hash, block.timestamp_us)
 
     return make
 
 
-def _named_block(model: Model) -> Block | None:
-    """The block that was named first in this phase 2."""
+def _named_block(model: ReferenceModel) -> Block | None:
+    """Return the block that was named first in the current phase 2."""
     named = [candidate for candidate in model.state.reconcile_response_dictionary if candidate != IS_TOP_OF_CHAIN]
     return model.blocks.get(named[0]) if _phase_two(model) and named else None
 
 
-def _of_stack(place: int) -> Callable[[Model], Block | None]:
-    """From the top of the stack: 1, 2."""
+def _block_of_stack(place: int) -> Callable[[ReferenceModel], Block | None]:
+    """Return a function that returns the block at this place from the top of the stack. 1 is the top."""
     return lambda model: model.state.reconcile_stack[-place] if len(model.state.reconcile_stack) >= place else None
 
 
-def _waiting(model: Model) -> Block | None:
+def _first_of_deque(model: ReferenceModel) -> Block | None:
     return model.state.blocks_to_be_committed[0] if model.state.blocks_to_be_committed else None
 
 
-for _name, _says in {
+for _name, _make_message in {
     "Is Top Of Chain, old": lambda model: NextInSequenceResponse(_top(model), None, OLD_US),
     "Is Top Of Chain, young": lambda model: NextInSequenceResponse(_top(model), None, YOUNG_US),
     "an old new block": _next_new(young=False),
     "a young new block": _next_new(young=True),
     "the block that was named first": _next(_named_block),
-    "the block on top of the stack": _next(_of_stack(1)),
-    "the second block of the stack": _next(_of_stack(2)),
+    "the block on top of the stack": _next(_block_of_stack(1)),
+    "the second block of the stack": _next(_block_of_stack(2)),
     "the top block itself": _next(_top_block),
-    "a block of the agent's deque": _next(_waiting),
+    "a block of the agent's deque": _next(_first_of_deque),
 }.items():
-    _message(f"Next in Sequence Response: {_name}", _says, _nobody_yet(_of_phase_2), "phase two")
-_COUNTED = {
+    _message(
+        f"Next in Sequence Response: {_name}", _make_message, _first_silent_peer(_responders_of_phase_2), "phase two"
+    )
+_COUNTED_TWINS = {
     "Is Top Of Chain": "Next in Sequence Response: Is Top Of Chain, old",
     "an old new block": "Next in Sequence Response: an old new block",
     "the block that was named first": "Next in Sequence Response: the block that was named first",
 }
-for _name, _says in {
+for _name, _make_message in {
     "Is Top Of Chain": lambda model: NextInSequenceResponse(_top(model), None, OLD_US),
     "an old new block": _next_new(young=False),
     "the block that was named first": _next(_named_block),
 }.items():
     _message(
         f"Next in Sequence Response of an agent that has answered: {_name}",
-        _says,
-        _again(_of_phase_2),
+        _make_message,
+        _last_responder(_responders_of_phase_2),
         "phase two",
-        _COUNTED[_name],
+        _COUNTED_TWINS[_name],
     )
 _message(
     "Next in Sequence Response about an unknown chain",
     lambda model: NextInSequenceResponse(
         UNKNOWN, (block := model.new_block(PEERS[1], young=False)).block_hash, block.timestamp_us
     ),
-    _nobody_yet(_of_phase_2),
+    _first_silent_peer(_responders_of_phase_2),
     "phase two",
     "Next in Sequence Response: an old new block",
 )
 _message(
     "Next in Sequence Response about the chain with the popped block",
-    lambda model: NextInSequenceResponse(popped, None, OLD_US) if (popped := _popped(model)) else None,
-    _nobody_yet(_of_phase_2),
+    lambda model: NextInSequenceResponse(popped, None, OLD_US) if (popped := _chain_with_popped_block(model)) else None,
+    _first_silent_peer(_responders_of_phase_2),
     "phase two",
     "Next in Sequence Response: Is Top Of Chain, old",
 )
@@ -441,7 +466,7 @@ _message(
 _message("Request for Block: an unknown block", lambda model: RequestForBlock(UNKNOWN))
 _message(
     "Request for Block: a block of the agent's deque",
-    lambda model: RequestForBlock(block.block_hash) if (block := _waiting(model)) else None,
+    lambda model: RequestForBlock(block.block_hash) if (block := _first_of_deque(model)) else None,
 )
 _message(
     "Request for Block: the inception block",
@@ -449,12 +474,12 @@ _message(
 )
 
 
-def _asked_for(model: Model) -> Message | None:
+def _requested_block(model: ReferenceModel) -> Message | None:
     wanted = model.state.majority_response_block_hash
     return BlockResponse(model.blocks[wanted]) if model.state.phase_three_timer.active and wanted else None
 
 
-_message("Block Response: the block asked for", _asked_for)
+_message("Block Response: the block asked for", _requested_block)
 _message("Block Response: another block", lambda model: BlockResponse(model.new_block(PEERS[1], young=False)))
 _message(
     "Block Response: the top block",
@@ -462,8 +487,10 @@ _message(
 )
 
 
-def _then_timer(given: Input) -> Input:
-    return Input(f"{given.name}, and the timer ends", given.make, "timer", given.as_if, given.name)
+def _with_timer(given: Input) -> Input:
+    return Input(f"{given.name}, and the timer ends", given.make, "timer", given.counted_twin, given.name)
 
 
-INPUTS |= {then.name: then for then in [_then_timer(given) for given in INPUTS.values() if given.as_if is not None]}
+INPUTS |= {
+    then.name: then for then in [_with_timer(given) for given in INPUTS.values() if given.counted_twin is not None]
+}

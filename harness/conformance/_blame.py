@@ -1,7 +1,8 @@
-"""Which handler is wrong, as far as that can be told from outside.
+"""Find the handler that most likely caused a failure, from outside the agent.
 
-A failure shows at an input, of which several handlers come to run, one after the other, and the wrong one may have run
-before. What is missing or too much, which branches pass elsewhere, and when it fails tell them apart.
+One input can trigger several handlers, one after another, and the wrong handler may even have run before this input.
+The evidence is: missing and unexpected messages, wrong values in the status, and the branches that passed or failed in
+other vectors.
 """
 
 from collections import Counter
@@ -10,40 +11,40 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from harness.conformance._alphabet import INPUTS, TIMER
-from harness.conformance._observation import Seen
-from harness.conformance._reference_model import Run
-from harness.conformance._state_space import Pair
-from harness.conformance._suite import Failure, Tally
+from harness.conformance._observation import Observation
+from harness.conformance._reference_model import ExpectedRun
+from harness.conformance._state_space import VectorKey
+from harness.conformance._suite import ConfirmedFailure, VariantResult
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT
 from ucp.handler import LocalEvent
 from ucp.messages import Message
 
-HELD = {"chain", "deque", "stack", "completed", "top_chain_hash"}
-"""Keys of the status: what the agent has."""
+BLOCK_KEYS = {"chain", "deque", "stack", "completed", "top_chain_hash"}
+"""Keys of the status about the blocks of the agent."""
 
 Branch = tuple[str, str, bool]
-"""Handler, branch, and whether it changes there what is held: one branch of Algorithm 20 does so, or does not."""
+"""Handler, branch, and whether the run changes blocks. One branch of Algorithm 20 changes blocks in some runs only."""
 
-STARTS = {timer: handler.name for handler in HANDLERS.values() for timer in handler.starts}
-ENDS = {
+STARTED_BY = {timer: handler.name for handler in HANDLERS.values() for timer in handler.starts}
+"""Timer -> the handler that starts it."""
+BEGINNING_OF_COUNT = {
     "vote_timer_expiration": "process_next_deque_block",
     "reconcile_phase_1_timer_expiration": "reconcile_phase_1",
     "reconcile_phase_2_timer_expiration": "reconcile_phase_2",
     "reconcile_phase_3_timer_expiration": "reconcile_phase_3",
 }
-"""What runs when a timer has ended -> what began the count that it decides by."""
-
+"""Handler of a timer's expiry -> the handler that began the count on which it decides."""
 
 _EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
-_BEGINS = {"Reconcile Begin", "Reconcile Phase 1"}
-"""What only leads on."""
-STARTING = {"proposed", "asked", "recommitted, more to come"}
+_LEADING_EVENTS = {"Reconcile Begin", "Reconcile Phase 1"}
+"""Local events whose handlers only trigger a further handler."""
+STARTING_BRANCHES = {"proposed", "asked", "recommitted, more to come"}
 """Branches in which a handler starts its timer."""
 
 
 @dataclass(frozen=True)
-class Blamed:
-    """`branch` is that which the reference takes there."""
+class BlamedBranch:
+    """The handler to blame, and the branch that the reference took in it."""
 
     handler: str
     branch: str
@@ -57,122 +58,141 @@ class Blamed:
         return HANDLERS[self.handler].title
 
 
-class Evidence:
-    """How often each branch was in a vector that passed, and in one that failed; and which led on to which."""
+class BlameEvidence:
+    """The number of passed and failed vectors with each branch, and the pairs of successive branches that passed."""
 
-    def __init__(self, tallies: Iterable[Tally]) -> None:
+    def __init__(self, variant_results: Iterable[VariantResult]) -> None:
         self._passed: Counter[Branch] = Counter()
         self._failed: Counter[Branch] = Counter()
-        self._led_on: set[tuple[Branch, Branch]] = set()
-        self._pairs: set[tuple[str, Pair]] = set()
-        for tally in tallies:
-            for failure in tally.failures:
-                self._failed.update({_branch(run) for run in failure.seen.outcome.runs})
-            for pair in tally.passed:
-                self._pairs.add((tally.vectors.variant.name, pair))
-                step = tally.vectors.by_pair.get(pair)
+        self._followed_by: set[tuple[Branch, Branch]] = set()
+        self._pairs: set[tuple[str, VectorKey]] = set()
+        for variant_result in variant_results:
+            for failure in variant_result.failures:
+                self._failed.update({_branch(run) for run in failure.observation.outcome.runs})
+            for key in variant_result.passed:
+                self._pairs.add((variant_result.vectors.variant.name, key))
+                step = variant_result.vectors.by_key.get(key)
                 if step is not None:
                     branches = [_branch(run) for run in step.outcome.runs]
                     self._passed.update(set(branches))
-                    self._led_on.update(pairwise(branches))
+                    self._followed_by.update(pairwise(branches))
 
-    def blame(self, failure: Failure) -> Blamed:
-        seen, runs = failure.seen, failure.seen.outcome.runs
-        if seen.mistimed in STARTS:
-            return self._starter(failure)
-        if seen.hidden is not None and not self._fails_without(failure):
-            return Blamed(seen.hidden.handler, seen.hidden.branch)
+    def blame(self, failure: ConfirmedFailure) -> BlamedBranch:
+        observation, runs = failure.observation, failure.observation.outcome.runs
+        if observation.wrong_timer in STARTED_BY:
+            return self._starter_of_timer(failure)
+        if observation.hidden_run is not None and not self._fails_without_preceding_input(failure):
+            return BlamedBranch(observation.hidden_run.handler, observation.hidden_run.branch)
         if not runs:
-            sends = [handler for handler in HANDLERS.values() if _names(handler.sends) & set(seen.unexpected)]
-            return Blamed(sends[0].name if sends else "build_data_block", "")
-        run = _says_otherwise(seen)
-        if run is None and self._began_wrongly(failure):
-            return Blamed(ENDS[runs[0].handler], "")
-        run = run or _decided_otherwise(seen) or self._holds_otherwise(seen) or self._suspect(runs, failure)
-        return Blamed(run.handler, run.branch)
+            sends = [handler for handler in HANDLERS.values() if _names(handler.sends) & set(observation.unexpected)]
+            return BlamedBranch(sends[0].name if sends else "build_data_block", "")
+        run = _sends_other_content(observation)
+        if run is None and self._counts_wrongly_from_start(failure):
+            return BlamedBranch(BEGINNING_OF_COUNT[runs[0].handler], "")
+        run = (
+            run
+            or _took_another_decision(observation)
+            or self._holds_other_blocks(observation)
+            or self._most_suspicious(runs, failure)
+        )
+        return BlamedBranch(run.handler, run.branch)
 
-    def _fails_without(self, failure: Failure) -> bool:
-        """Whether the end of the timer fails also without the answer before it that must not count."""
-        pair = failure.seen.pair
-        if INPUTS[pair.input].first is None:
+    def _fails_without_preceding_input(self, failure: ConfirmedFailure) -> bool:
+        """Return whether the expiry of the timer also fails without the ignored answer before it."""
+        key = failure.observation.key
+        if INPUTS[key.input].preceding is None:
             return False
-        return (failure.variant, Pair(*failure.seen.before, TIMER)) not in self._pairs
+        return (failure.variant, VectorKey(*failure.observation.before, TIMER)) not in self._pairs
 
-    def _began_wrongly(self, failure: Failure) -> bool:
-        """Whether the count was wrong from its beginning: it decides rightly where anything was counted."""
-        seen, first = failure.seen, failure.seen.outcome.runs[0]
-        if first.handler not in ENDS:
+    def _counts_wrongly_from_start(self, failure: ConfirmedFailure) -> bool:
+        """Return whether the count was wrong from its start, because the agent decides rightly after other counts."""
+        observation, first = failure.observation, failure.observation.outcome.runs[0]
+        if first.handler not in BEGINNING_OF_COUNT:
             return False
-        nothing_counted = seen.before.counted[:2] in ((), (0, 0), (1, 0))
-        return failure.of_an_earlier_round or bool(nothing_counted and seen.unexpected and self._passed[_branch(first)])
+        nothing_counted = observation.before.counted[:2] in ((), (0, 0), (1, 0))
+        return failure.needs_earlier_round or bool(
+            nothing_counted and observation.unexpected and self._passed[_branch(first)]
+        )
 
-    def _holds_otherwise(self, seen: Seen) -> Run | None:
-        """Who changes what is held, if that is not as it should be; or who never led on to that, where others do."""
-        if not HELD & set(seen.misstated):
+    def _holds_other_blocks(self, observation: Observation) -> ExpectedRun | None:
+        """Return the run that should have changed the blocks, if the status has wrong blocks.
+
+        If this branch passes elsewhere, return an earlier run whose branch never passes.
+        """
+        if not BLOCK_KEYS & set(observation.wrong_status_keys):
             return None
-        for place, run in enumerate(seen.outcome.runs):
+        for place, run in enumerate(observation.outcome.runs):
             if run.changes:
-                never = [before for before in seen.outcome.runs[:place] if not self._passed[_branch(before)]]
-                return never[0] if never and self._passed[_branch(run)] else run
+                never_passed = [
+                    before for before in observation.outcome.runs[:place] if not self._passed[_branch(before)]
+                ]
+                return never_passed[0] if never_passed and self._passed[_branch(run)] else run
         return None
 
     @staticmethod
-    def _starter(failure: Failure) -> Blamed:
-        """Who starts the timer that is not as it should be; if that ran now, in the branch that it took."""
-        for run in failure.seen.outcome.runs:
-            if HANDLERS[run.handler].starts and run.branch in STARTING:
-                return Blamed(run.handler, run.branch)
-        return Blamed(STARTS[str(failure.seen.mistimed)], "")
+    def _starter_of_timer(failure: ConfirmedFailure) -> BlamedBranch:
+        """Return the handler that starts the wrong timer, with its branch if it ran in this step."""
+        for run in failure.observation.outcome.runs:
+            if HANDLERS[run.handler].starts and run.branch in STARTING_BRANCHES:
+                return BlamedBranch(run.handler, run.branch)
+        return BlamedBranch(STARTED_BY[str(failure.observation.wrong_timer)], "")
 
-    def _suspect(self, runs: Sequence[Run], failure: Failure) -> Run:
-        """Who sends what is too much, or should have sent what is missing, or should have led on to that."""
-        seen = failure.seen
+    def _most_suspicious(self, runs: Sequence[ExpectedRun], failure: ConfirmedFailure) -> ExpectedRun:
+        """Return the run to blame by its messages, by its successor, and by the vectors that passed."""
+        observation = failure.observation
         if len(runs) == 1:
             return runs[0]
-        never = [run for run in runs if not self._passed[_branch(run)]]
-        if never:  # what is wrong about all of them is wrong first
+        never_passed = [run for run in runs if not self._passed[_branch(run)]]
+        if never_passed:  # a branch that fails everywhere is the most likely cause
             return max(
-                never, key=lambda run: (self._failed[_branch(run)], STARTS.get(str(seen.started)) == run.handler)
+                never_passed,
+                key=lambda run: (
+                    self._failed[_branch(run)],
+                    STARTED_BY.get(str(observation.running_timer)) == run.handler,
+                ),
             )
-        sends = [run for run in runs if _names(HANDLERS[run.handler].sends) & set(seen.unexpected)]
+        sends = [run for run in runs if _names(HANDLERS[run.handler].sends) & set(observation.unexpected)]
         if sends:
             return sends[0]
         for run, then in reversed(list(pairwise(runs))):
-            if (_branch(run), _branch(then)) not in self._led_on:
+            if (_branch(run), _branch(then)) not in self._followed_by:
                 return run
-        if runs[0].handler in ENDS:
+        if runs[0].handler in BEGINNING_OF_COUNT:
             return runs[0]
-        missing = [run for run in runs if {message.NAME for message in run.sent} & set(seen.missing)]
+        missing = [run for run in runs if {message.NAME for message in run.sent} & set(observation.missing)]
         if missing:
             return missing[0]
         return min(runs, key=lambda run: self._passed[_branch(run)])
 
 
-def _decided_otherwise(seen: Seen) -> Run | None:
-    """Who decides at the end of a timer, if what came is what comes of another decision."""
-    first, *then = seen.outcome.runs
-    if first.handler not in ENDS or not seen.unexpected:
+def _took_another_decision(observation: Observation) -> ExpectedRun | None:
+    """Return the run of the expired timer, if all unexpected messages follow from another decision of its handler."""
+    first, *then = observation.outcome.runs
+    if first.handler not in BEGINNING_OF_COUNT or not observation.unexpected:
         return None
     others = set(HANDLERS[first.handler].triggers) - {_EVENT_OF.get(run.handler) for run in then[:1]}
-    sends = _names(HANDLERS[first.handler].sends).union(*[_sends_after(event) for event in others])
-    sends -= {message.NAME for message in seen.outcome.sent}
-    return first if set(seen.unexpected) <= sends else None
+    sends = _names(HANDLERS[first.handler].sends).union(*[_messages_after(event) for event in others])
+    sends -= {message.NAME for message in observation.outcome.sent}
+    return first if set(observation.unexpected) <= sends else None
 
 
-def _sends_after(event: LocalEvent) -> set[str]:
-    """What may be sent when this was triggered."""
+def _messages_after(event: LocalEvent) -> set[str]:
+    """Return the names of the messages that the agent may send after this event."""
     handler = ON_LOCAL_EVENT[event]
-    return _names(handler.sends).union(*[_sends_after(then) for then in handler.triggers if then in _BEGINS])
+    return _names(handler.sends).union(*[_messages_after(then) for then in handler.triggers if then in _LEADING_EVENTS])
 
 
-def _says_otherwise(seen: Seen) -> Run | None:
-    """Who sends the same messages with another content, if all is held that should be."""
-    if HELD & set(seen.misstated) or set(seen.missing) != set(seen.unexpected):
+def _sends_other_content(observation: Observation) -> ExpectedRun | None:
+    """Return the run that sent the right messages with a wrong content. None if a block or a type is wrong, too."""
+    if BLOCK_KEYS & set(observation.wrong_status_keys) or set(observation.missing) != set(observation.unexpected):
         return None
-    return next((run for run in seen.outcome.runs if {message.NAME for message in run.sent} & set(seen.missing)), None)
+    return next(
+        (run for run in observation.outcome.runs if {message.NAME for message in run.sent} & set(observation.missing)),
+        None,
+    )
 
 
-def _branch(run: Run) -> Branch:
+def _branch(run: ExpectedRun) -> Branch:
     return run.handler, run.branch, run.changes
 
 

@@ -1,50 +1,55 @@
-"""The cases by hand: each with agents of its own, a few side by side; what fails is tried again, alone."""
+"""Run the handwritten cases, each with its own agents. A few cases run in parallel. Failed cases run again, alone."""
 
 import asyncio
 from dataclasses import replace
 
-from harness.conformance._udp_lab import AgentEndedError, Air
-from harness.conformance.cases import ALL, Bench, ByHand
-from harness.conformance.cases._bench import CannotTellError, WrongError
-from harness.conformance.results import Case
+from harness.conformance._udp_lab import AgentEndedError, UdpLab
+from harness.conformance.cases import ALL_CASES, Bench, HandwrittenCase
+from harness.conformance.cases._bench import CannotJudgeError, WrongBehaviourError
+from harness.conformance.results import CaseResult
 from harness.errors import UnsupportedError
 from harness.play.agent_control import AgentRefusedError, AgentUnsupportedError
 from ucp.agent import HANDLERS
 
-AT_ONCE = 4
-TIMES = 2
-"""A failure is one only if it comes again so often, alone."""
+PARALLEL_CASES = 4
+RETRIES = 2
+"""Number of further runs in which a case must fail to be a failure."""
 
 _HANDLER = {handler.algorithm: handler.name for handler in HANDLERS.values()}
 
 
-async def by_hand(air: Air, only: str | None) -> list[Case]:
-    """All cases, or those of one Algorithm."""
-    cases = [case for case in ALL if only is None or only in (str(case.algorithm), _HANDLER.get(case.algorithm))]
-    tried: dict[str, Case] = {}
+async def handwritten(lab: UdpLab, only: str | None) -> list[CaseResult]:
+    """Run all handwritten cases, or those of one Algorithm. Return their results."""
+    cases = [case for case in ALL_CASES if only is None or only in (str(case.algorithm), _HANDLER.get(case.algorithm))]
+    results: dict[str, CaseResult] = {}
     waiting = iter(cases)
 
     async def work() -> None:
         for case in waiting:
-            tried[case.name] = await _play(air, case)
+            results[case.name] = await _play(lab, case)
 
-    await asyncio.gather(*(work() for _ in range(AT_ONCE)))
+    await asyncio.gather(*(work() for _ in range(PARALLEL_CASES)))
     for case in cases:
-        for _ in range(TIMES):
-            if tried[case.name].verdict == "failed":
-                tried[case.name] = await _play(air, case)
-    return [tried[case.name] for case in cases]
+        for _ in range(RETRIES):
+            if results[case.name].verdict == "failed":
+                results[case.name] = await _play(lab, case)
+    return [results[case.name] for case in cases]
 
 
-async def _play(air: Air, case: ByHand) -> Case:
-    named = Case(case.name, case.algorithm, "passed", _HANDLER.get(case.algorithm, ""), section=case.section)
+async def _play(lab: UdpLab, case: HandwrittenCase) -> CaseResult:
+    named = CaseResult(case.name, case.algorithm, "passed", _HANDLER.get(case.algorithm, ""), section=case.section)
     try:
-        await case.play(Bench(air))
-    except (UnsupportedError, AgentUnsupportedError, CannotTellError) as error:
+        await case.play(Bench(lab))
+    except (UnsupportedError, AgentUnsupportedError, CannotJudgeError) as error:
         return replace(named, verdict="not applicable", reason=str(error))
-    except WrongError as error:
-        said = {"reason": str(error), "expected": (error.expected,), "came": (error.came,), "wrong": (str(error),)}
-        return replace(named, verdict="failed", **said)  # type: ignore[arg-type]
+    except WrongBehaviourError as error:
+        details = {
+            "reason": str(error),
+            "expected": (error.expected,),
+            "received": (error.received,),
+            "wrong": (str(error),),
+        }
+        return replace(named, verdict="failed", **details)  # type: ignore[arg-type]
     except (AgentEndedError, AgentRefusedError) as error:
         return replace(named, verdict="failed", reason=str(error), wrong=(str(error),))
     except (AssertionError, AttributeError, KeyError, LookupError, TypeError, ValueError, OSError) as error:

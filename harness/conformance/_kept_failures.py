@@ -1,9 +1,9 @@
 """Files kept of each failure, among them a scenario that gives the agent the same inputs.
 
-failure.txt       what was expected and what came
-vector.jsonl      the inputs and answers that lead there, as `COMMAND --virtual` reads and writes them
-scenario.yaml     the same as a scenario, for `ucp-harness run --backend sim`
-air.pcapng        what crossed the air, for Wireshark and `ucp-harness packets`
+failure.txt       the expected and the received messages
+vector.jsonl      the inputs and the expected answers, as `COMMAND --virtual` reads and writes them
+scenario.yaml     the same inputs as a scenario, for `ucp-harness run --backend sim`
+air.pcapng        the datagrams, for Wireshark and `ucp-harness packets`
 
 The scenario can be played in virtual time. The run has a report and a trace, and the checker judges each step. If a
 timer expired late in the test, the inputs may be impossible in virtual time. In that case failure.txt reports this, and
@@ -17,12 +17,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.conformance._observation import Exchange
+from harness.conformance._observation import RecordedDatagram
 from harness.conformance._reference_model import AGENT, INITIAL_DATA, PEERS, ROSTER
-from harness.conformance._state_space import VARIANTS, Variant
-from harness.conformance._udp_lab import AGENTS, PEERS_ON
-from harness.conformance._virtual_lines import NotPlayableError, Writer
-from harness.conformance.results import Case
+from harness.conformance._state_space import VARIANTS, SettingsVariant
+from harness.conformance._udp_lab import AGENTS_VEHICLE, PEERS_VEHICLE
+from harness.conformance._virtual_lines import LineWriter, NotPlayableError
+from harness.conformance.results import CaseResult
 from harness.conformance.results_table import lines_of
 from harness.errors import MachineError
 from harness.scenario.scenario_file import Document, to_yaml
@@ -38,13 +38,13 @@ COMMENT = (
 )
 
 
-def scenario_of(name: str, command: Sequence[str], variant: Variant, way: Sequence[str]) -> str:
-    """The file."""
+def scenario_of(name: str, command: Sequence[str], variant: SettingsVariant, path: Sequence[str]) -> str:
+    """Return a scenario file that gives the inputs of the path to the agent. Raises NotPlayableError."""
     script: list[Document] = []
     datagrams: list[Document] = []
     timeline: list[Document] = [{"at_s": 0, "kill": list(PEERS)}]
-    writer = Writer(variant)
-    for line in writer.lines(way):
+    writer = LineWriter(variant)
+    for line in writer.lines(path):
         match line.given:
             case {"t": at_s, "datagram": datagram}:
                 source = decode(base64.b64decode(datagram)).sender
@@ -60,7 +60,7 @@ def scenario_of(name: str, command: Sequence[str], variant: Variant, way: Sequen
         "agent_command": {AGENT: list(command)},
         "duration_s": math.ceil(writer.now) + 1,
         "initial_data": base64.b64encode(INITIAL_DATA).decode("ascii"),
-        "settings": _unusual(variant.settings.to_json()),
+        "settings": _non_default(variant.settings.to_json()),
         "timeline": timeline,
         "events": {"source": "scripted"} | ({"script": script} if script else {}),
         "datagrams": datagrams,
@@ -68,17 +68,17 @@ def scenario_of(name: str, command: Sequence[str], variant: Variant, way: Sequen
     return to_yaml({key: value for key, value in document.items() if value not in ({}, [])}, COMMENT)
 
 
-def _unusual(settings: dict[str, Any]) -> dict[str, Any]:
-    usual = Settings().to_json()
-    return {name: value for name, value in settings.items() if name not in usual or usual[name] != value}
+def _non_default(settings: dict[str, Any]) -> dict[str, Any]:
+    default = Settings().to_json()
+    return {name: value for name, value in settings.items() if name not in default or default[name] != value}
 
 
 EPOCH_US = 1_700_000_000_000_000
-"""Of the capture: mission second 0."""
+"""Time of mission second 0 in the capture, in microseconds since the Unix epoch."""
 
 
-def keep(case: Case, command: Sequence[str], directory: Path) -> None:
-    """Raises MachineError if the disk refuses."""
+def keep(case: CaseResult, command: Sequence[str], directory: Path) -> None:
+    """Write the files of a failure into a new directory. Raises MachineError if this is impossible."""
     try:
         directory.mkdir(parents=True)
         lines = list(lines_of(case))
@@ -98,20 +98,20 @@ def keep(case: Case, command: Sequence[str], directory: Path) -> None:
         raise MachineError(f"{directory} cannot be written: {error.strerror}") from None
 
 
-def _vector(case: Case) -> str:
-    writer = Writer(VARIANTS[case.settings])
-    steps: list[dict[str, Any]] = [{"in": writer.first(), "out": {"sent": [], "timer": None}}]
+def _vector(case: CaseResult) -> str:
+    writer = LineWriter(VARIANTS[case.settings])
+    steps: list[dict[str, Any]] = [{"in": writer.first_line(), "out": {"sent": [], "timer": None}}]
     for line in writer.lines(case.inputs):
-        steps.append({"in": line.given, "out": line.answer, "says": line.says, "sends": line.sends})
+        steps.append({"in": line.given, "out": line.answer, "says": line.input_text, "sends": line.sent_texts})
     return "".join(json.dumps(step) + "\n" for step in steps)
 
 
-def _write_capture(exchanges: Sequence[Exchange], directory: Path) -> None:
+def _write_capture(exchanges: Sequence[RecordedDatagram], directory: Path) -> None:
     path = directory / "air.pcapng"
-    begin_file(directory, AGENTS, EPOCH_US, 1.0).rename(path)
+    begin_file(directory, AGENTS_VEHICLE, EPOCH_US, 1.0).rename(path)
     capture = PcapngFile(path)
     for exchange in exchanges:
         at_ns = EPOCH_US * 1000 + round(exchange.t * 1e9)
-        frame = udp_broadcast(AGENTS if exchange.sent else PEERS_ON, PORT, exchange.data)
+        frame = udp_broadcast(AGENTS_VEHICLE if exchange.sent else PEERS_VEHICLE, PORT, exchange.data)
         capture.packet(at_ns, frame, outbound=exchange.sent)
     capture.close()

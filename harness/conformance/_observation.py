@@ -1,21 +1,21 @@
-"""What one step of an agent showed, compared with the reference, and its words for people."""
+"""One step of the agent under test, compared with the reference, and its description in words."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from harness.conformance._alphabet import Input
-from harness.conformance._reference_model import AGENT, Expire, Model, Outcome, Run
-from harness.conformance._state_space import Pair, State, ends_next, pair_of
+from harness.conformance._reference_model import AGENT, ExpectedOutcome, ExpectedRun, ReferenceModel, TimerExpiry
+from harness.conformance._state_space import AgentState, VectorKey, key_of, next_timer_name
 from harness.report.stories.story_names import INCEPTION, in_words
 from ucp.block import next_chain_hash
 from ucp.messages import MalformedDatagramError, Message, decode
 
 
-class Names:
-    """What the reference knows by now."""
+class KnownNames:
+    """Names for the blocks and chains that the reference knows, such as "2.1"."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: ReferenceModel) -> None:
         state = model.state
         blocks = [*model.blocks.values(), *state.chain, *state.blocks_to_be_committed, *state.reconcile_stack]
         self._blocks: dict[str, str] = {}
@@ -27,9 +27,9 @@ class Names:
         self._chains = {chain_hash: INCEPTION}
         self._below: dict[bytes, str] = {}
         for block in (*state.chain, *reversed(state.reconcile_stack)):
-            below, chain_hash = self._chains[chain_hash], next_chain_hash(chain_hash, block.block_hash)
+            chain_below, chain_hash = self._chains[chain_hash], next_chain_hash(chain_hash, block.block_hash)
             text = f"{text} {self.block(block.block_hash.hex())}".strip()
-            self._chains[chain_hash], self._below[chain_hash] = text, below
+            self._chains[chain_hash], self._below[chain_hash] = text, chain_below
         for waiting in blocks:
             chain_hash = next_chain_hash(state.chain.top_chain_hash, waiting.block_hash)
             top = self._chains[state.chain.top_chain_hash]
@@ -47,126 +47,132 @@ class Names:
         return self._below.get(chain_hash, "an unknown chain")
 
 
-def told(message: Message, names: Names) -> str:
-    """ "Commit Block (1.1 on inception)"."""
+def message_text(message: Message, names: KnownNames) -> str:
+    """Return a message in words, such as "Commit Block (1.1 on inception)"."""
     return in_words(message, names)
 
 
-def told_datagram(data: bytes, names: Names) -> str:
+def datagram_text(data: bytes, names: KnownNames) -> str:
     try:
-        return told(decode(data).message, names)
+        return message_text(decode(data).message, names)
     except MalformedDatagramError as error:
         return f"{len(data)} bytes that are an invalid message ({error.reason}): {data[:24].hex()}"
 
 
 COMPARED = ("idle", "reconcile_in_progress", "chain", "deque", "stack", "completed", "reconciles", "top_chain_hash")
-"""Keys of the status; what is not there is not compared."""
+"""Keys of the status that are compared. A missing key is not compared."""
 SHOWN = 12
-MOST_ENDED = 3
-"""Timers that may have ended one after the other."""
+MAX_EARLY_TIMERS = 3
+"""Maximum number of successive timers that are tried as an explanation for an early message."""
 
 
 @dataclass(frozen=True)
-class Exchange:
-    """A datagram that crossed the air: mission second, whether the agent sent it, what, and what that says."""
+class RecordedDatagram:
+    """A datagram between the agent and its peers."""
 
     t: float
+    """Mission second."""
     sent: bool
+    """True if the agent sent it, false if a peer sent it."""
     data: bytes
     text: str
+    """The message in words."""
 
 
 @dataclass(frozen=True)
-class Seen:
-    """One step: what came of an input, beside what should have."""
+class Observation:
+    """One step of the agent under test: the input, the expected answer, and the actual answer."""
 
-    pair: Pair
-    outcome: Outcome
+    key: VectorKey
+    outcome: ExpectedOutcome
     given: str
     expected: tuple[str, ...]
-    came: tuple[str, ...]
+    received: tuple[str, ...]
     wrong: tuple[str, ...]
-    """In sentences; none if all is as it should be."""
-    before: State
+    """A sentence for each deviation. Empty if the agent did the same as the reference."""
+    before: AgentState
     late: bool = False
-    """The machine was so late that nothing can be said."""
+    """True if the machine was so late that the step proves nothing."""
     unexpected: tuple[str, ...] = ()
-    """Names of messages that should not have come."""
+    """Names of messages that the agent sent and the reference did not."""
     missing: tuple[str, ...] = ()
-    misstated: tuple[str, ...] = ()
-    """Keys of the status that are wrong."""
-    mistimed: str | None = None
-    """The timer that ended, or would end, at another time than it should."""
-    started: str | None = None
-    """The timer that runs as it should, where that can be seen."""
+    wrong_status_keys: tuple[str, ...] = ()
+    """Keys of the status with wrong values."""
+    wrong_timer: str | None = None
+    """Name of the timer that expired, or will expire, at a wrong time."""
+    running_timer: str | None = None
+    """Name of the next timer, if its time of expiry is right. In virtual time only."""
     ended: str | None = None
-    """How the agent ended by itself, or that it hangs."""
-    hidden: Run | None = None
-    """What should have changed nothing, just before; or should have stopped a timer."""
+    """The end of the agent in words, or a sentence that it hangs. None if it runs."""
+    hidden_run: ExpectedRun | None = None
+    """A handler run that is the cause: of an answer that must not count, or that should have stopped a timer."""
 
 
 def compare(
-    model: Model,
+    model: ReferenceModel,
     given: Input,
-    before: State,
-    outcome: Outcome,
+    before: AgentState,
+    outcome: ExpectedOutcome,
     datagrams: Iterable[bytes],
     status: Mapping[str, Any],
     wrong: Iterable[str],
-) -> Seen:
-    """What the agent sent for an input that the reference has been given, and its status after it.
+) -> Observation:
+    """Compare the agent's datagrams and status after an input with the reference, which has had the same input.
 
-    `wrong` is what is known to be wrong already.
+    `wrong` contains sentences about known deviations.
     """
-    sentences, names, came = list(wrong), Names(model), list[Message]()
+    sentences, names, received = list(wrong), KnownNames(model), list[Message]()
     for data in datagrams:
         try:
             sender, _, message = decode(data)
         except MalformedDatagramError:
-            sentences.append(f"it sent {told_datagram(data, names)}")
+            sentences.append(f"it sent {datagram_text(data, names)}")
             continue
         if sender != AGENT:
             sentences.append(f"it sent a message as agent {sender}")
-        came.append(message)
-    missing = [message for message in outcome.sent if message not in came]
-    unexpected = [message for message in came if message not in outcome.sent]
-    if came != outcome.sent:
-        sentences += [f"it did not send {told(message, names)}" for message in missing]
-        sentences += [f"it sent {told(message, names)}" for message in unexpected[:SHOWN]]
+        received.append(message)
+    missing = [message for message in outcome.sent if message not in received]
+    unexpected = [message for message in received if message not in outcome.sent]
+    if received != outcome.sent:
+        sentences += [f"it did not send {message_text(message, names)}" for message in missing]
+        sentences += [f"it sent {message_text(message, names)}" for message in unexpected[:SHOWN]]
         if not missing and not unexpected:
             sentences.append("it sent its messages in another order, or sent one of them twice")
-    should = model.status()
-    misstated = tuple(key for key in COMPARED if key in status and status[key] != should[key])
-    sentences += [f"its status says {key} {status[key]!r}, not {should[key]!r}" for key in misstated]
-    mistimed = _as_if_ended(model, outcome.sent, came, status) if sentences else None
-    if mistimed is not None:
-        sentences.append(f"its timer {mistimed} seems to have expired already")
-    return Seen(
-        pair_of(before, given),
+    expected_status = model.status()
+    wrong_status_keys = tuple(key for key in COMPARED if key in status and status[key] != expected_status[key])
+    sentences += [f"its status says {key} {status[key]!r}, not {expected_status[key]!r}" for key in wrong_status_keys]
+    wrong_timer = _timer_expired_early(model, outcome.sent, received, status) if sentences else None
+    if wrong_timer is not None:
+        sentences.append(f"its timer {wrong_timer} seems to have expired already")
+    return Observation(
+        key_of(before, given),
         outcome,
         given.name,
-        tuple(told(message, names) for message in outcome.sent),
-        tuple(told(message, names) for message in came[:SHOWN]),
+        tuple(message_text(message, names) for message in outcome.sent),
+        tuple(message_text(message, names) for message in received[:SHOWN]),
         tuple(sentences),
         before,
         unexpected=tuple(message.NAME for message in unexpected),
         missing=tuple(message.NAME for message in missing),
-        misstated=misstated,
-        mistimed=mistimed,
+        wrong_status_keys=wrong_status_keys,
+        wrong_timer=wrong_timer,
     )
 
 
-def _as_if_ended(
-    model: Model, expected: Sequence[Message], came: Sequence[Message], status: Mapping[str, Any]
+def _timer_expired_early(
+    model: ReferenceModel, expected: Sequence[Message], received: Sequence[Message], status: Mapping[str, Any]
 ) -> str | None:
-    """The timer that the agent seems to have let end before its time; the reference is of no use any more then."""
-    sent, first = list(expected), ends_next(model)
-    for _ in range(MOST_ENDED):
+    """Return the timer whose early expiry explains the received messages and the status. None if no timer does.
+
+    This call advances the model, so the model cannot follow the agent any more.
+    """
+    sent, first = list(expected), next_timer_name(model)
+    for _ in range(MAX_EARLY_TIMERS):
         deadline = model.agent.next_timer()
         if deadline is None or not status:
             return None
-        sent += model.feed(Expire(), deadline).sent
-        should = model.status()
-        if came == sent and all(status.get(key, should[key]) == should[key] for key in COMPARED):
+        sent += model.feed(TimerExpiry(), deadline).sent
+        expected_status = model.status()
+        if received == sent and all(status.get(key, expected_status[key]) == expected_status[key] for key in COMPARED):
             return first
     return None

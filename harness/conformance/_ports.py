@@ -1,30 +1,30 @@
-"""Sockets of the lab, for who is outside: `python -m harness.conformance._ports SOCKET PORT...` in a vehicle's network.
+"""Open sockets inside the lab for the harness outside: `python -m harness.conformance._ports SOCKET PORT...`.
 
-It binds a UDP socket to each port, hands all of them over through the Unix socket SOCKET, and ends. A socket stays in
-the network that it was made in.
+The program runs in the network namespace of a vehicle. It binds a UDP socket to each port, passes all of them to the
+harness through the Unix socket SOCKET, and ends. A socket stays in the namespace in which it was opened.
 """
 
 import socket
 import sys
 from collections.abc import Sequence
 
-AT_ONCE = 100
-"""Descriptors in one message; Linux carries 253."""
+MAX_DESCRIPTORS = 100
+"""Maximum number of descriptors in one message. The limit of Linux is 253."""
 
 
 def main(arguments: Sequence[str]) -> None:
     path, *ports = arguments
     sockets = []
     for port in ports:
-        air = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        air.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        air.bind(("", int(port)))
-        sockets.append(air)
+        udp_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        udp_socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        udp_socket.bind(("", int(port)))
+        sockets.append(udp_socket)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as to:
         to.connect(path)
-        for first in range(0, len(sockets), AT_ONCE):
-            some = sockets[first : first + AT_ONCE]
-            socket.send_fds(to, [bytes([len(some)])], [air.fileno() for air in some])
+        for first in range(0, len(sockets), MAX_DESCRIPTORS):
+            some = sockets[first : first + MAX_DESCRIPTORS]
+            socket.send_fds(to, [bytes([len(some)])], [udp_socket.fileno() for udp_socket in some])
 
 
 if __name__ == "__main__":

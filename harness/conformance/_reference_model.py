@@ -1,7 +1,8 @@
-"""The reference beside the agent under test, and saved moments of it.
+"""The reference next to the agent under test, and snapshots of it.
 
-It is the independent reference (`harness.checker.reference`), and gets the inputs of the agent under test at the same
-time. Inputs are chosen by its state, so that they fit the blocks that the agent really made, whatever its clock shows.
+The reference is that of the step judge (`harness.checker.reference`). It receives the same inputs as the agent under
+test. The inputs are made from the reference's state, which contains the agent's real blocks with the timestamps of the
+agent's clock.
 """
 
 from collections import deque
@@ -23,13 +24,13 @@ ROSTER = (AGENT, *PEERS)
 STRANGER = 9
 INITIAL_DATA = b"conformance"
 OLD_US, YOUNG_US = 1_000, 2**62
-"""Timestamps of peers' blocks: before, and after, any that the agent under test can make."""
+"""Timestamps of peers' blocks in microseconds: older and younger than any block of the agent under test."""
 EVENT_ID = 7
 
 
 @dataclass(frozen=True)
-class Datagram:
-    """A peer's message; or bytes that are none."""
+class PeerDatagram:
+    """A datagram of a peer. `message` is None if `data` is no valid message."""
 
     sender: int
     message: Message | None
@@ -37,44 +38,44 @@ class Datagram:
 
 
 @dataclass(frozen=True)
-class Log:
+class LogEvent:
     """The agent logs an event."""
 
     data: bytes
 
 
 @dataclass(frozen=True)
-class Expire:
-    """The next timer ends."""
+class TimerExpiry:
+    """The next timer expires."""
 
 
 @dataclass(frozen=True)
-class Command:
-    """The control socket's command."""
+class ControlCommand:
+    """A command on the control socket."""
 
     name: str
 
 
-Action = Datagram | Log | Expire | Command
+Action = PeerDatagram | LogEvent | TimerExpiry | ControlCommand
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run of a handler: which branch it must take, and what it must send."""
+class ExpectedRun:
+    """A handler run of the reference: its branch and its messages."""
 
     algorithm: int
     handler: str
     branch: str
     sent: tuple[Message, ...]
     changes: bool = False
-    """Whether it changes what the agent holds."""
+    """True if it changes chain, deque, stack or completed blocks."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What must come of an input: handler runs in order, none if it is dropped."""
+class ExpectedOutcome:
+    """The handler runs of the reference after one input, in order. Empty if the input is dropped."""
 
-    runs: tuple[Run, ...]
+    runs: tuple[ExpectedRun, ...]
 
     @property
     def sent(self) -> list[Message]:
@@ -82,19 +83,19 @@ class Outcome:
 
     @property
     def algorithm(self) -> int:
-        """To which the input is given."""
+        """Number of the Algorithm that handles the input."""
         return self.runs[0].algorithm
 
 
-class Model:
-    """The reference agent, the blocks that there are by now, and how many handlers have run."""
+class ReferenceModel:
+    """The reference agent, all blocks of the test so far, and the number of handler runs."""
 
     def __init__(self, settings: Settings) -> None:
         self.agent = ReferenceAgent(AGENT, ROSTER, INITIAL_DATA, ReferenceSettings.of(settings))
         self.blocks: dict[bytes, Block] = {}
-        """Of peers, by hash; what is in the chain, the deque or the stack is there, too."""
+        """Blocks of peers, by hash. Chain, deque and stack contain some of them, too."""
         self.datagrams: list[bytes] = []
-        """What it sent last."""
+        """Datagrams that the reference sent after the last input."""
         self.handled = self.reconciles = 0
         self.logged = 0
         self._fresh = 0
@@ -105,7 +106,7 @@ class Model:
         return self.agent.state
 
     def new_block(self, owner: int, *, young: bool) -> Block:
-        """A block that nobody has seen."""
+        """Return a new block of a peer, unknown to the agent under test."""
         self._fresh += 1
         timestamp_us = (YOUNG_US if young else OLD_US) + self._fresh
         event = LoggableEvent(timestamp_us, EVENT_ID, b"of a peer, %d" % self._fresh)
@@ -113,34 +114,34 @@ class Model:
         self.blocks[block.block_hash] = block
         return block
 
-    def datagram(self, sender: int, message: Message) -> Datagram:
+    def datagram(self, sender: int, message: Message) -> PeerDatagram:
         self._sequence += 1
-        return Datagram(sender, message, encode(sender, self._sequence, message))
+        return PeerDatagram(sender, message, encode(sender, self._sequence, message))
 
-    def event(self) -> Log:
-        """An event; with the settings of all missions here each fills a block."""
+    def event(self) -> LogEvent:
+        """Return a new event. With the settings of `VARIANTS` each event fills a block."""
         self.logged += 1
-        return Log(b"event %d" % self.logged)
+        return LogEvent(b"event %d" % self.logged)
 
-    def feed(self, action: Action, now: float, timestamp_us: int = 0) -> Outcome:
-        """`timestamp_us` is an event's, as the agent under test has it."""
+    def feed(self, action: Action, now: float, timestamp_us: int = 0) -> ExpectedOutcome:
+        """Give the reference an input. `timestamp_us` is the timestamp that the agent under test gave to an event."""
         match action:
-            case Datagram():
+            case PeerDatagram():
                 self.agent.receive_datagram(action.data, now)
-            case Log():
+            case LogEvent():
                 self.agent.add_event(LoggableEvent(timestamp_us, EVENT_ID, action.data), now)
-            case Expire():
+            case TimerExpiry():
                 self.agent.handle_timer(now)
-            case Command("reconcile"):
+            case ControlCommand("reconcile"):
                 self.agent.begin_reconcile(now)
         self.datagrams = self.agent.datagrams_to_send()
         runs = tuple(_run(entry) for entry in self.agent.trace())
         self.handled += len(runs)
         self.reconciles += sum(run.branch == "begun" for run in runs)
-        return Outcome(runs)
+        return ExpectedOutcome(runs)
 
     def status(self) -> dict[str, Any]:
-        """What the agent must say of itself now."""
+        """Return the expected answer of the agent to the command `status`."""
         state = self.state
         return {
             "idle": state.idle,
@@ -155,27 +156,27 @@ class Model:
         }
 
 
-def _run(entry: HandlerRun) -> Run:
+def _run(entry: HandlerRun) -> ExpectedRun:
     sent = tuple(announced.datagram.content.message for announced in entry.sent)  # type: ignore[union-attr]
-    return Run(entry.algorithm, entry.handler, entry.branch, sent, bool(entry.changes))
+    return ExpectedRun(entry.algorithm, entry.handler, entry.branch, sent, bool(entry.changes))
 
 
 CONTAINERS = frozenset((bytearray, set, list, deque, dict))
 
 
-class Moment:
-    """All that matters of a model now, to the last bit.
+class ModelSnapshot:
+    """The state of a model at one moment, to restore it later.
 
-    What is only counted for a report is not; nor is a timer that is paused: between inputs none is.
+    Counters for reports are left out. Paused timers are left out, too, because no timer is paused between inputs.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: ReferenceModel) -> None:
         self._model = model
         self._parts = [(part, *_sorted(part)) for part in (vars(model), vars(model.state), vars(model.state.chain))]
         self._deadlines = [(timer, timer.deadline) for timer in model.state.timers]
 
-    def put_back(self) -> Model:
-        """The model, as it was."""
+    def restore(self) -> ReferenceModel:
+        """Reset the model to the state of the snapshot, and return it."""
         for part, plain, containers in self._parts:
             part.update(plain)
             for name, value in containers:
@@ -186,12 +187,12 @@ class Moment:
 
 
 def _sorted(part: dict[str, Any]) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
-    """What stays as it is, and copies of what changes."""
+    """Return the immutable values of a part, and copies of its containers."""
     containers = [(name, _copied(value)) for name, value in part.items() if type(value) in CONTAINERS]
     return {name: value for name, value in part.items() if type(value) not in CONTAINERS}, containers
 
 
 def _copied(value: Any) -> Any:
-    if type(value) is dict and value and type(next(iter(value.values()))) is list:  # counted, by candidate
+    if type(value) is dict and value and type(next(iter(value.values()))) is list:  # the counts of the candidates
         return {key: item.copy() for key, item in value.items()}
     return value.copy()

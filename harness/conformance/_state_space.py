@@ -1,8 +1,9 @@
-"""States, as far as they differ to an agent; and the walk over all of them, breadth first.
+"""The state space of one agent, and its exploration, breadth first.
 
-What lies deep in the chain, or how many blocks wait behind the second, makes no difference to any handler, and what has
-been counted matters only to what counts on. So a state is told by a few numbers (`state_of`), and a vector stands for
-one input in one of them.
+Two states are the same if no handler can distinguish them. Beyond two blocks, a longer chain, stack or deque does not
+change the branch that a handler takes. Counted answers matter only to the handlers that count in the same activity.
+Therefore a few values describe a state (`state_of`), and the number of states is small enough to visit all of them. A
+vector is one input in one of these states.
 """
 
 from collections import deque
@@ -12,67 +13,75 @@ from typing import NamedTuple
 
 from harness.checker.reference.algorithms import IS_TOP_OF_CHAIN
 from harness.conformance._alphabet import INPUTS, LOG, TIMER, Input
-from harness.conformance._reference_model import AGENT, OLD_US, YOUNG_US, Model, Moment, Outcome
+from harness.conformance._reference_model import AGENT, OLD_US, YOUNG_US, ExpectedOutcome, ModelSnapshot, ReferenceModel
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.settings import ALTERNATIVES, Settings
 
 STEP_S = 0.125
 """Mission seconds between two inputs that are not timers, in virtual time."""
-MOST_CHAIN, MOST_STACK, MOST_WAITING = 2, 2, 2
-MOST_STATES = 4000
-"""So that a mistake in here ends."""
+MAX_CHAIN, MAX_STACK, MAX_WAITING = 2, 2, 2
+MAX_STATES = 4000
+"""Limit of the exploration. It ends the program if an error in this module makes the state space infinite."""
 
 
 @dataclass(frozen=True)
-class Variant:
-    """Settings that make another agent; `features` are what they need of it."""
+class SettingsVariant:
+    """Settings of the agent under test."""
 
     name: str
     settings: Settings
     features: tuple[str, ...] = ()
+    """Features of the agent contract that the settings need."""
 
 
 def _settings(**other: object) -> Settings:
-    """Timers of different lengths; a vote that runs ends before any phase that begins after it. Each event fills a
-    block."""
+    """Return settings with timers of different durations, in which each event fills a block.
+
+    By default a vote ends before any phase that begins after it.
+    """
     timers = {"vote_timeout_s": 10.0, "phase1_timeout_s": 12.0, "phase2_timeout_s": 13.0, "phase3_timeout_s": 14.0}
     room = {"max_block_bytes": MAX_EVENT_DATA_BYTES, "max_event_bytes": MAX_EVENT_DATA_BYTES}
     return Settings(**{**timers, "finalize_gap_s": 4.0, **room, **other})  # type: ignore[arg-type]
 
 
-VARIANTS: dict[str, Variant] = {
+VARIANTS: dict[str, SettingsVariant] = {
     variant.name: variant
     for variant in (
-        Variant("default", _settings()),
-        Variant("long votes", _settings(vote_timeout_s=45.0)),
-        Variant("no finalize gap", _settings(finalize_gap_s=0.0)),
-        *(Variant(feature, _settings(**{name: value}), (feature,)) for feature, (name, value) in ALTERNATIVES.items()),
+        SettingsVariant("default", _settings()),
+        SettingsVariant("long votes", _settings(vote_timeout_s=45.0)),
+        SettingsVariant("no finalize gap", _settings(finalize_gap_s=0.0)),
+        *(
+            SettingsVariant(feature, _settings(**{name: value}), (feature,))
+            for feature, (name, value) in ALTERNATIVES.items()
+        ),
     )
 }
 
 
-class State(NamedTuple):
-    """What makes a difference. `holds` is what the agent has and does, `counted` what it has been told."""
+class AgentState(NamedTuple):
+    """The values that handlers can distinguish."""
 
-    doing: str
-    """Its timer of a reconcile, "voting", "idle", or "stuck"."""
-    holds: tuple[str | int, ...]
+    activity: str
+    """Name of the running timer of a reconcile, "voting", "idle", or "stuck" (a reconcile without a running timer)."""
+    holdings: tuple[str | int, ...]
+    """Length of the chain, owner of its top block, waiting blocks, and length of the stack. Lengths are limited."""
     counted: tuple[object, ...]
+    """Answers that the agent has counted in its current activity."""
 
     @property
     def text(self) -> str:
-        chain, top, waiting, stack = self.holds
-        parts = [f"{chain}{'+' if chain == MOST_CHAIN else ''} in the chain{f', {top} on top' if top else ''}"]
+        chain, top, waiting, stack = self.holdings
+        parts = [f"{chain}{'+' if chain == MAX_CHAIN else ''} in the chain{f', {top} on top' if top else ''}"]
         if waiting:
             parts.append(str(waiting))
         if stack:
             parts.append(f"{stack} on the stack")
         if self.counted:
             parts.append(f"counted {self.counted}")
-        return f"{self.doing}: {', '.join(parts)}"
+        return f"{self.activity}: {', '.join(parts)}"
 
 
-def state_of(model: Model) -> State:
+def state_of(model: ReferenceModel) -> AgentState:
     state = model.state
     chain = len(state.chain)
     top = "" if not chain else "its own block" if [*state.chain][-1].agent_id == AGENT else "another's block"
@@ -82,7 +91,7 @@ def state_of(model: Model) -> State:
         waiting = "a vote runs" if voting else "blocks wait" if deque_words else ""
     else:
         waiting = deque_words
-    holds = (min(chain, MOST_CHAIN), top, waiting, min(len(state.reconcile_stack), MOST_STACK))
+    holdings = (min(chain, MAX_CHAIN), top, waiting, min(len(state.reconcile_stack), MAX_STACK))
     running = next((timer.name for timer in state.reconcile_timers if timer.active), None)
     if running == "phase one":
         counted: tuple[object, ...] = tuple(state.reconcile_vote_count.values())
@@ -93,16 +102,16 @@ def state_of(model: Model) -> State:
         counted = (*state.vote_count.values(), "the chain has changed" if changed else "")
     else:
         counted = ()
-    return State(
-        running or ("stuck" if state.reconcile_in_progress else "voting" if voting else "idle"), holds, counted
+    return AgentState(
+        running or ("stuck" if state.reconcile_in_progress else "voting" if voting else "idle"), holdings, counted
     )
 
 
-def _candidates(model: Model) -> tuple[object, ...]:
-    """What has been named in phase 2: what it is, how old, and how often."""
+def _candidates(model: ReferenceModel) -> tuple[object, ...]:
+    """Return each candidate of phase 2: its kind, its age, and the number of answers that name it."""
     state = model.state
     stack = [block.block_hash for block in reversed(state.reconcile_stack)]
-    told = []
+    candidates = []
     for candidate, (count, timestamp_us) in state.reconcile_response_dictionary.items():
         if candidate == IS_TOP_OF_CHAIN:
             what = "top"
@@ -111,47 +120,51 @@ def _candidates(model: Model) -> tuple[object, ...]:
         else:
             what = "held" if state.holds(candidate) else "new"
         age = "old" if timestamp_us < 2 * OLD_US else "young" if timestamp_us >= YOUNG_US else "own"
-        told.append((what, age, count))
-    return tuple(sorted(told))
+        candidates.append((what, age, count))
+    return tuple(sorted(candidates))
 
 
-class Pair(NamedTuple):
-    """What a vector stands for: an input in a state, of which `counted` is there only if it matters to the input."""
+class VectorKey(NamedTuple):
+    """The identity of a vector: an input in a state. `counted` is empty if the input does not depend on it."""
 
-    doing: str
-    holds: tuple[str | int, ...]
+    activity: str
+    holdings: tuple[str | int, ...]
     counted: tuple[object, ...]
     input: str
 
 
-def pair_of(state: State, given: Input) -> Pair:
-    matters: bool = given.tally == "timer" or given.tally == state.doing
-    return Pair(state.doing, state.holds, state.counted if matters else (), given.name)
+def key_of(state: AgentState, given: Input) -> VectorKey:
+    matters: bool = given.tally == "timer" or given.tally == state.activity
+    return VectorKey(state.activity, state.holdings, state.counted if matters else (), given.name)
 
 
 @dataclass(frozen=True)
-class Step:
-    """An edge of the walk: `given` in `before` leads to `after`. `way` are the inputs that lead to `before`."""
+class Transition:
+    """An edge of the state space: the input in `key` leads from `before` to `after`."""
 
-    pair: Pair
-    way: tuple[str, ...]
-    before: State
-    after: State
-    outcome: Outcome
+    key: VectorKey
+    path: tuple[str, ...]
+    """Inputs that lead from the start to `before`, by the shortest path."""
+    before: AgentState
+    after: AgentState
+    outcome: ExpectedOutcome
     expired: str | None
-    """The timer that ended."""
+    """Name of the timer that expired."""
 
 
-def ends_next(model: Model) -> str | None:
-    """The timer that ends next."""
+def next_timer_name(model: ReferenceModel) -> str | None:
+    """Return the name of the timer that expires next. None if no timer runs."""
     running = [timer for timer in model.state.timers if timer.deadline is not None]
     return min(running, key=lambda timer: timer.deadline or 0.0).name if running else None
 
 
-def advance(model: Model, given: Input, now: float) -> tuple[Outcome, float] | None:
-    """Give the reference the input in virtual time: what comes of it, and when; None if there is no such input."""
-    if given.first is not None:
-        before = advance(model, INPUTS[given.first], now)
+def advance(model: ReferenceModel, given: Input, now: float) -> tuple[ExpectedOutcome, float] | None:
+    """Give the reference an input in virtual time. Return the outcome and its time.
+
+    Return None if the input is impossible in the current state.
+    """
+    if given.preceding is not None:
+        before = advance(model, INPUTS[given.preceding], now)
         return None if before is None else advance(model, INPUTS[TIMER], before[1])
     action = given.make(model)
     if action is None:
@@ -161,50 +174,52 @@ def advance(model: Model, given: Input, now: float) -> tuple[Outcome, float] | N
     return model.feed(action, now, timestamp_us=round(now * 1_000_000)), now
 
 
-def explore(variant: Variant) -> Iterator[Step]:
-    """Each pair of a state and an input, once, by the shortest way to it; the same at each call."""
-    seen: set[Pair] = set()
-    model = Model(variant.settings)
+def explore(variant: SettingsVariant) -> Iterator[Transition]:
+    """Yield each vector once, with the shortest path to it. Each call yields the same transitions."""
+    seen: set[VectorKey] = set()
+    model = ReferenceModel(variant.settings)
     start = state_of(model)
     reached = {start}
-    waiting: deque[tuple[State, tuple[str, ...], Moment, float]] = deque([(start, (), Moment(model), 0.0)])
-    while waiting and len(reached) < MOST_STATES:
-        before, way, moment, now = waiting.popleft()
-        model = moment.put_back()
+    waiting: deque[tuple[AgentState, tuple[str, ...], ModelSnapshot, float]] = deque(
+        [(start, (), ModelSnapshot(model), 0.0)]
+    )
+    while waiting and len(reached) < MAX_STATES:
+        before, path, snapshot, now = waiting.popleft()
+        model = snapshot.restore()
         for given in INPUTS.values():
-            pair = pair_of(before, given)
+            key = key_of(before, given)
             if (
-                pair in seen
-                or _too_much(model, before, given)
-                or (given.first and not _tells(moment, now, before, given))
+                key in seen
+                or _is_redundant(model, before, given)
+                or (given.preceding and not _reveals_counting(snapshot, now, before, given))
             ):
                 continue
-            expired = ends_next(model) if given.tally == "timer" else None
+            expired = next_timer_name(model) if given.tally == "timer" else None
             advanced = advance(model, given, now)
             if advanced is None:
                 continue
             outcome, then = advanced
-            seen.add(pair)
+            seen.add(key)
             after = state_of(model)
-            yield Step(pair, way, before, after, outcome, expired)
+            yield Transition(key, path, before, after, outcome, expired)
             if after not in reached:
                 reached.add(after)
-                waiting.append((after, (*way, given.name), Moment(model), then))
-            if not is_unchanged(outcome):
-                moment.put_back()
+                waiting.append((after, (*path, given.name), ModelSnapshot(model), then))
+            if not changes_nothing(outcome):
+                snapshot.restore()
 
 
-def walk(variant: Variant, way: tuple[str, ...]) -> tuple[Model, float]:
-    """The reference after these inputs, and when."""
-    model, now = Model(variant.settings), 0.0
-    for name in way:
+def walk(variant: SettingsVariant, path: tuple[str, ...]) -> tuple[ReferenceModel, float]:
+    """Return the reference after these inputs, and the time of the last one."""
+    model, now = ReferenceModel(variant.settings), 0.0
+    for name in path:
         advanced = advance(model, INPUTS[name], now)
-        assert advanced is not None, f"{name} was there when the path was found"
+        assert advanced is not None, f"{name} was possible when the path was found"
         now = advanced[1]
     return model, now
 
 
-_CHANGE_NOTHING = {
+_CHANGING_BRANCHES = {
     "receive_request_add_block": None,
     "receive_request_chain_contain": None,
     "receive_request_block_for_hash": None,
@@ -215,70 +230,83 @@ _CHANGE_NOTHING = {
     "receive_response_next_in_sequence": ("new candidate", "counted"),
     "receive_response_block_for_hash": ("committed",),
 }
-"""Handler -> the branches that change the agent; None if none does."""
+"""Handler -> the branches that change the agent. None: no branch does."""
 
 
-def is_unchanged(outcome: Outcome) -> bool:
-    """Whether the agent is as it was."""
+def changes_nothing(outcome: ExpectedOutcome) -> bool:
+    """Return whether the outcome leaves the agent unchanged."""
     if len(outcome.runs) != 1:
         return False
     (run,) = outcome.runs
-    return run.handler in _CHANGE_NOTHING and run.branch not in (_CHANGE_NOTHING[run.handler] or ())
+    return run.handler in _CHANGING_BRANCHES and run.branch not in (_CHANGING_BRANCHES[run.handler] or ())
 
 
-COUNTING = {"receive_vote_add_block", "receive_phase_1_response", "receive_response_next_in_sequence"}
-"""Handlers of which what they should not have done is seen only when a timer ends."""
-COUNTED_IN = {
+COUNTING_HANDLERS = {"receive_vote_add_block", "receive_phase_1_response", "receive_response_next_in_sequence"}
+"""Handlers that only count an answer. A wrong count shows only when the timer expires."""
+COUNTING_STATES = {
     ("voting", (2, "another's block", "one block waits", 0)),
     ("voting", (2, "another's block", "blocks wait", 0)),
     ("phase one", (2, "another's block", "", 0)),
     ("phase two", (2, "another's block", "", 0)),
 }
-"""What the agent does and holds in those states in which more than one answer is explored, and in which it is looked at
-whether it counted what it should not: how it counts and chooses depends on nothing else. The chain is a long one, and
-nothing is on the stack, so that one agent can come there as often as it is led there."""
+"""Activity and holdings of the states in which the exploration goes beyond one answer, and tests ignored answers. An
+agent counts and decides in the same way in all other states. These states have a long chain and an empty stack, so that
+one agent can reach them again and again."""
 
 
-def _tells(moment: Moment, now: float, before: State, given: Input) -> bool:
-    """Whether an agent that counts the input would do otherwise at the end of the timer."""
-    if (before.doing, before.holds) not in COUNTED_IN or given.first is None or given.as_if is None:
+def _reveals_counting(snapshot: ModelSnapshot, now: float, before: AgentState, given: Input) -> bool:
+    """Return whether the expiry of the timer reveals an agent that wrongly counts the input."""
+    if (
+        (before.activity, before.holdings) not in COUNTING_STATES
+        or given.preceding is None
+        or given.counted_twin is None
+    ):
         return False
-    rightly = _then_timer(moment, now, given.first, counts=False)
-    wrongly = _then_timer(moment, now, given.as_if, counts=True)
-    moment.put_back()
-    return rightly is not None and wrongly is not None and in_short(rightly) != in_short(wrongly)
+    ignored = _outcome_of_timer(snapshot, now, given.preceding, counts=False)
+    counted = _outcome_of_timer(snapshot, now, given.counted_twin, counts=True)
+    snapshot.restore()
+    return (
+        ignored is not None and counted is not None and handlers_and_messages(ignored) != handlers_and_messages(counted)
+    )
 
 
-def _then_timer(moment: Moment, now: float, name: str, *, counts: bool) -> Outcome | None:
-    """What comes when the timer ends after this input; None if there is no such, or it is not one that counts so."""
-    model = moment.put_back()
+def _outcome_of_timer(snapshot: ModelSnapshot, now: float, name: str, *, counts: bool) -> ExpectedOutcome | None:
+    """Return the outcome of the timer's expiry after this input.
+
+    Return None if the input is impossible, or unless the agent counts (`counts`) or ignores the input.
+    """
+    model = snapshot.restore()
     advanced = advance(model, INPUTS[name], now)
-    if advanced is None or advanced[0].runs[0].handler not in COUNTING or is_unchanged(advanced[0]) is counts:
+    if (
+        advanced is None
+        or advanced[0].runs[0].handler not in COUNTING_HANDLERS
+        or changes_nothing(advanced[0]) is counts
+    ):
         return None
     ended = advance(model, INPUTS[TIMER], advanced[1])
     return None if ended is None else ended[0]
 
 
-def in_short(outcome: Outcome) -> tuple[object, ...]:
-    """What does not depend on which blocks there are."""
+def handlers_and_messages(outcome: ExpectedOutcome) -> tuple[object, ...]:
+    """Return handlers, branches and names of messages: the part of an outcome that does not depend on block hashes."""
     return tuple((run.handler, run.branch, tuple(message.NAME for message in run.sent)) for run in outcome.runs)
 
 
-def _too_much(model: Model, before: State, given: Input) -> bool:
-    """What would only make more of the same, or is not told apart by the state."""
+def _is_redundant(model: ReferenceModel, before: AgentState, given: Input) -> bool:
+    """Return whether the input leads only to states equivalent to known ones, or depends on more than the state."""
     if given.name == LOG:
-        return len(model.state.blocks_to_be_committed) >= MOST_WAITING
-    if before.doing != "voting" and "waits behind" in given.name:
+        return len(model.state.blocks_to_be_committed) >= MAX_WAITING
+    if before.activity != "voting" and "waits behind" in given.name:
         return True
-    if given.tally != before.doing or "of an agent that has" in given.name:
+    if given.tally != before.activity or "of an agent that has" in given.name:
         return False
-    return _answers(model, before) >= 1 and (before.doing, before.holds) not in COUNTED_IN
+    return _answer_count(model, before) >= 1 and (before.activity, before.holdings) not in COUNTING_STATES
 
 
-def _answers(model: Model, before: State) -> int:
-    """How many have been counted in what the agent does."""
+def _answer_count(model: ReferenceModel, before: AgentState) -> int:
+    """Return the number of answers that the agent has counted in its current activity."""
     state = model.state
-    match before.doing:
+    match before.activity:
         case "voting":
             return len(state.voters)
         case "phase one":

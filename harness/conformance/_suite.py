@@ -1,4 +1,8 @@
-"""All generated vectors, by agents side by side; then what is suspected, alone."""
+"""Play all vectors with many agents in parallel, and then replay the suspected failures, with few agents at a time.
+
+Parallel agents compete for the processor, so a wrong answer may be the fault of the machine. A suspicion becomes a
+failure only if it repeats in each of several replays.
+"""
 
 import asyncio
 import time
@@ -8,319 +12,355 @@ from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import Any
 
+from harness.conformance._agent_under_test import Start
 from harness.conformance._alphabet import INPUTS
-from harness.conformance._observation import Exchange, Seen
-from harness.conformance._reference_model import Model, Run
-from harness.conformance._state_space import COUNTING, Pair, Variant, advance, in_short, is_unchanged, walk
-from harness.conformance._subject import Start
-from harness.conformance._tours import Map, Suspicion, Tour
+from harness.conformance._observation import Observation, RecordedDatagram
+from harness.conformance._reference_model import ExpectedRun, ReferenceModel
+from harness.conformance._state_space import (
+    COUNTING_HANDLERS,
+    SettingsVariant,
+    VectorKey,
+    advance,
+    changes_nothing,
+    handlers_and_messages,
+    walk,
+)
+from harness.conformance._tours import Suspicion, Tour, VectorMap
 from harness.conformance._udp_lab import AgentEndedError, NoAgentError
-from harness.conformance.vectors import Vectors
+from harness.conformance.vectors import VectorSet
 from harness.errors import UnsupportedError
 
-SIDE_BY_SIDE = 24
-MORE_ROOM = 0.01
-"""For another agent, with each vector that passes."""
-FEWEST = 6
-"""Side by side, where the machine is late again and again."""
+MAX_WORKERS = 24
+"""Maximum number of agents in parallel."""
+WORKERS_PER_PASS = 0.01
+"""Increase of the number of agents with each vector that passes, after a decrease."""
+MIN_WORKERS = 6
+"""Minimum number of agents in parallel, if the machine is late again and again."""
 STARTS_AT_ONCE = 4
-"""An agent that starts needs the processor, and those that are under test would be late."""
-ALONE_AT_ONCE = 3
-"""What is suspected is tried again by so few agents that none is in another's way."""
-FAILURES_OF_A_KIND = 3
-"""After so many suspicions further vectors in which the same branches are to be taken are set aside."""
-MOST_SUSPICIONS_OF_A_KIND = 2
-MOST_SUSPICIONS = 24
-"""That are tried again."""
-MOST_HIDDEN = 16
-LONGEST_WAY = 80
-TIMES = 2
-"""A failure is one only if it comes so often."""
-MOST_TIMES = 4
-"""That it is tried, where the machine was late."""
-STARTS_IN_VAIN = 3
+"""Maximum number of simultaneous starts. A start needs the processor, and delays the agents under test."""
+RETRY_WORKERS = 3
+"""Number of agents that replay in parallel. They are few, so that they do not disturb each other."""
+MAX_FAILURES_OF_A_KIND = 3
+"""Number of suspicions with the same branches after which further vectors with these branches are set aside."""
+MAX_RETRIES_OF_A_KIND = 2
+MAX_SUSPICIONS = 24
+"""Maximum number of suspicions that are replayed. The suite stops its tours when it has as many."""
+MAX_HIDDEN = 16
+"""Maximum number of ignored answers that are tried as the cause of a failure."""
+MAX_PATH = 80
+"""Maximum number of inputs in a replay of the end of a tour."""
+REPETITIONS = 2
+"""Number of replays in which a suspicion must repeat to be a failure."""
+MAX_ATTEMPTS = 4
+"""Maximum number of replays, if the machine is late in some of them."""
+MAX_FAILED_STARTS = 3
+"""Number of failed starts in a row after which the suite gives up."""
 
 
 @dataclass(frozen=True)
-class Failure:
-    """A vector that failed alone, each time that it was tried; `way` are all inputs, of which the last was wrong."""
+class ConfirmedFailure:
+    """A vector that failed in each replay."""
 
     variant: str
-    way: tuple[str, ...]
-    seen: Seen
-    exchanges: tuple[Exchange, ...]
-    """What crossed the air."""
-    of_an_earlier_round: bool = False
-    """It fails only after what was long over."""
+    path: tuple[str, ...]
+    """All inputs since the start of the agent. The agent answered the last one wrongly."""
+    observation: Observation
+    exchanges: tuple[RecordedDatagram, ...]
+    """All datagrams since the start of the agent."""
+    needs_earlier_round: bool = False
+    """True if the shortest path does not fail, but a path with an earlier vote or reconcile does."""
     unexplained_end: str | None = None
-    """How the agent ended, if no short way to its last input ends it."""
+    """The end of the agent in words, if no short path to the last input causes it."""
 
 
 @dataclass
-class Tally:
-    """What came of a variant's vectors."""
+class VariantResult:
+    """The results of the vectors of one variant."""
 
-    vectors: Vectors
-    passed: set[Pair] = field(default_factory=set)
+    vectors: VectorSet
+    passed: set[VectorKey] = field(default_factory=set)
     suspicions: list[Suspicion] = field(default_factory=list)
-    failures: list[Failure] = field(default_factory=list)
+    failures: list[ConfirmedFailure] = field(default_factory=list)
     unsupported: str | None = None
     set_aside: int = 0
 
 
-class Verdict(Enum):
-    """Of a way on which nothing failed."""
+class ReplayVerdict(Enum):
+    """The verdict of a replay without a failure."""
 
     RIGHT = auto()
     TOO_LATE = auto()
-    """The machine was late: nothing can be said."""
+    """The machine was late, so the replay proves nothing."""
 
 
-RIGHT, TOO_LATE = Verdict.RIGHT, Verdict.TOO_LATE
-Outcome = Failure | Verdict
+RIGHT, TOO_LATE = ReplayVerdict.RIGHT, ReplayVerdict.TOO_LATE
+ReplayOutcome = ConfirmedFailure | ReplayVerdict
 
 
-class Suite:
-    """`told` is called with how many vectors have been seen, whenever that changes."""
+class VectorSuite:
+    """All vectors of a test. It calls `show_progress` with the number of passed vectors after each change."""
 
     def __init__(
         self,
         start: Start,
-        generated: Sequence[Vectors],
-        told: Callable[[int], None],
+        generated: Sequence[VectorSet],
+        show_progress: Callable[[int], None],
         *,
-        side_by_side: int,
-        enough: int = MOST_SUSPICIONS,
+        workers: int,
+        max_suspicions: int = MAX_SUSPICIONS,
     ) -> None:
         self._start = start
-        self._side_by_side = side_by_side
-        self._told = told
-        self.tallies = [Tally(vectors) for vectors in generated if vectors.wanted]
+        self._all_workers = workers
+        self._show_progress = show_progress
+        self.variant_results = [VariantResult(vectors) for vectors in generated if vectors.wanted]
         self._maps = [
-            Map(tally.vectors.variant, list(tally.vectors.steps), set(tally.vectors.wanted)) for tally in self.tallies
+            VectorMap(
+                variant_result.vectors.variant, list(variant_result.vectors.steps), set(variant_result.vectors.wanted)
+            )
+            for variant_result in self.variant_results
         ]
-        self._at_work: Counter[int] = Counter()
+        self._working: Counter[int] = Counter()
         self._on_tour: Counter[int] = Counter()
-        """Of those at work, who may yet see something; the others wait for that."""
+        """Variant -> number of its active tours. The other workers of the variant wait for the end of these tours."""
         self._kinds: Counter[object] = Counter()
-        self._in_vain = 0
-        self._enough = enough
-        self._room = float(side_by_side)
+        self._failed_starts = 0
+        self._max_suspicions = max_suspicions
+        self._max_workers = float(workers)
         self._starting = asyncio.Semaphore(STARTS_AT_ONCE)
         self._unexplained_ends: set[str] = set()
 
     async def run(self, until: float) -> None:
-        """All vectors, until that second of the monotonic clock, the last of them alone; then what is suspected.
+        """Play all vectors, then those for which the machine was late, and then the suspicions.
 
-        Raises NoAgentError if the agent never starts.
+        `until` is the second of the monotonic clock at which no further vectors begin. Raises NoAgentError if the
+        agent never starts.
         """
-        workers = min(self._side_by_side, 1 + sum(atlas.left for atlas in self._maps) // 10)
-        await _together([self._work(place, until) for place in range(workers)])
+        workers = min(self._all_workers, 1 + sum(vector_map.left for vector_map in self._maps) // 10)
+        await _run_all([self._work(place, until) for place in range(workers)])
         if not self._suspicious:
-            missed = iter(
+            late_keys = iter(
                 [
-                    (tally, pair)
-                    for tally, atlas in zip(self.tallies, self._maps, strict=True)
-                    for pair in atlas.given_up
+                    (variant_result, key)
+                    for variant_result, vector_map in zip(self.variant_results, self._maps, strict=True)
+                    for key in vector_map.given_up
                 ]
             )
-            await _together([self._try_with_time(missed, until) for _ in range(ALONE_AT_ONCE)])
-        once_more = [(tally, suspicion) for tally in self.tallies for suspicion in self._worth(tally)]
-        waiting = iter(once_more[: self._enough])
-        await _together([self._try_again(waiting) for _ in range(ALONE_AT_ONCE)])
+            await _run_all([self._retry_late(late_keys, until) for _ in range(RETRY_WORKERS)])
+        to_retry = [
+            (variant_result, suspicion)
+            for variant_result in self.variant_results
+            for suspicion in self._suspicions_to_retry(variant_result)
+        ]
+        waiting = iter(to_retry[: self._max_suspicions])
+        await _run_all([self._retry_suspicions(waiting) for _ in range(RETRY_WORKERS)])
 
     @property
     def _suspicious(self) -> bool:
-        """Whether there are as many suspicions as are tried again."""
-        return sum(len(tally.suspicions) for tally in self.tallies) >= self._enough
+        """Return whether the suite has the maximum number of suspicions."""
+        return sum(len(variant_result.suspicions) for variant_result in self.variant_results) >= self._max_suspicions
 
-    def _tell(self) -> None:
-        self._told(sum(len(each.passed) for each in self.tallies))
+    def _report_progress(self) -> None:
+        self._show_progress(sum(len(each.passed) for each in self.variant_results))
 
     async def _work(self, place: int, until: float) -> None:
-        while time.monotonic() < until and not self._suspicious and (number := self._most_left()) is not None:
-            if place >= self._room:
+        while time.monotonic() < until and not self._suspicious and (number := self._next_variant()) is not None:
+            if place >= self._max_workers:
                 await asyncio.sleep(0.1)
                 continue
-            self._at_work[number] += 1
+            self._working[number] += 1
             try:
                 await self._tour(number, until)
             finally:
-                self._at_work[number] -= 1
+                self._working[number] -= 1
 
-    def _most_left(self) -> int | None:
-        """The variant in which an agent finds most that is yet to be seen."""
+    def _next_variant(self) -> int | None:
+        """Return the variant with the most vectors left for each worker. None if no variant has vectors left."""
         shares = [
-            (atlas.left / (self._at_work[number] + 1), number)
-            for number, atlas in enumerate(self._maps)
-            if atlas.left > len(atlas.claimed)
+            (vector_map.left / (self._working[number] + 1), number)
+            for number, vector_map in enumerate(self._maps)
+            if vector_map.left > len(vector_map.claimed)
         ]
         return max(shares, default=(0, None))[1]
 
     async def _tour(self, number: int, until: float) -> None:
-        tally, atlas = self.tallies[number], self._maps[number]
-        if atlas.way_from(atlas.start) is None:
+        variant_result, vector_map = self.variant_results[number], self._maps[number]
+        if vector_map.path_from(vector_map.start) is None:
             if not self._on_tour[number]:
-                atlas.give_up()
+                vector_map.give_up()
             await asyncio.sleep(0.1)
             return
         self._on_tour[number] += 1
         try:
-            await self._life(tally, atlas, until)
+            await self._run_tour(variant_result, vector_map, until)
         finally:
             self._on_tour[number] -= 1
 
-    async def _life(self, tally: Tally, atlas: Map, until: float) -> None:
-        """Of an agent, as long as its tour lasts."""
+    async def _run_tour(self, variant_result: VariantResult, vector_map: VectorMap, until: float) -> None:
+        """Start an agent, and lead it on a tour until the tour ends."""
         try:
             async with self._starting:
-                subject = await self._start(tally.vectors.variant, False)
+                agent = await self._start(variant_result.vectors.variant, False)
         except UnsupportedError as error:
-            tally.unsupported = str(error)
-            atlas.give_up()
+            variant_result.unsupported = str(error)
+            vector_map.give_up()
             return
         except AgentEndedError as error:
-            self._in_vain += 1
-            if self._in_vain >= STARTS_IN_VAIN:
+            self._failed_starts += 1
+            if self._failed_starts >= MAX_FAILED_STARTS:
                 raise NoAgentError(f"the agent does not start: {error}") from None
             return
-        self._in_vain = 0
+        self._failed_starts = 0
 
-        def passed(pair: Pair) -> None:
-            tally.passed.add(pair)
-            self._room = min(self._side_by_side, self._room + MORE_ROOM)
-            self._tell()
+        def passed(key: VectorKey) -> None:
+            variant_result.passed.add(key)
+            self._max_workers = min(self._all_workers, self._max_workers + WORKERS_PER_PASS)
+            self._report_progress()
 
         try:
-            suspicion = await Tour(atlas, subject, passed).go_on(until)
-            if not subject.in_step:  # an agent was lost because all are late: make room
-                self._room = max(FEWEST, self._room - 1)
+            suspicion = await Tour(vector_map, agent, passed).run(until)
+            if not agent.reference_follows:  # the machine is late, so fewer agents should run in parallel
+                self._max_workers = max(MIN_WORKERS, self._max_workers - 1)
             if suspicion is not None:
-                self._suspect(tally, atlas, suspicion)
+                self._suspect(variant_result, vector_map, suspicion)
         finally:
-            await subject.close()
+            await agent.close()
 
-    def _suspect(self, tally: Tally, atlas: Map, suspicion: Suspicion) -> None:
-        tally.suspicions.append(suspicion)
-        atlas.avoid(suspicion.seen.pair)
-        kind = in_short(suspicion.seen.outcome)
+    def _suspect(self, variant_result: VariantResult, vector_map: VectorMap, suspicion: Suspicion) -> None:
+        variant_result.suspicions.append(suspicion)
+        vector_map.avoid(suspicion.observation.key)
+        kind = handlers_and_messages(suspicion.observation.outcome)
         self._kinds[kind] += 1
-        if self._kinds[kind] >= FAILURES_OF_A_KIND:
-            alike = [pair for pair, step in tally.vectors.wanted.items() if in_short(step.outcome) == kind]
-            tally.set_aside += sum(atlas.take(pair) for pair in alike)
+        if self._kinds[kind] >= MAX_FAILURES_OF_A_KIND:
+            alike = [
+                key
+                for key, step in variant_result.vectors.wanted.items()
+                if handlers_and_messages(step.outcome) == kind
+            ]
+            variant_result.set_aside += sum(vector_map.take(key) for key in alike)
 
     @staticmethod
-    def _worth(tally: Tally) -> Iterator[Suspicion]:
-        """A few of each kind, the shortest ways first."""
+    def _suspicions_to_retry(variant_result: VariantResult) -> Iterator[Suspicion]:
+        """Yield the suspicions with the shortest paths, at most MAX_RETRIES_OF_A_KIND with the same branches."""
         kinds: Counter[object] = Counter()
-        for suspicion in sorted(tally.suspicions, key=lambda suspicion: len(suspicion.way)):
-            kind = in_short(suspicion.seen.outcome)
+        for suspicion in sorted(variant_result.suspicions, key=lambda suspicion: len(suspicion.path)):
+            kind = handlers_and_messages(suspicion.observation.outcome)
             kinds[kind] += 1
-            if kinds[kind] <= MOST_SUSPICIONS_OF_A_KIND:
+            if kinds[kind] <= MAX_RETRIES_OF_A_KIND:
                 yield suspicion
 
-    # Alone
+    # Replays with few agents at a time
 
-    async def _try_with_time(self, missed: Iterator[tuple[Tally, Pair]], until: float) -> None:
-        """What could not be seen beside others, because the machine was late."""
-        for tally, pair in missed:
+    async def _retry_late(self, late_keys: Iterator[tuple[VariantResult, VectorKey]], until: float) -> None:
+        """Play the vectors for which the machine was late in each tour."""
+        for variant_result, key in late_keys:
             if time.monotonic() >= until:
                 return
-            step = tally.vectors.wanted[pair]
-            outcome = await self._repeated(tally.vectors.variant, (*step.way, pair.input))
-            if isinstance(outcome, Failure):
-                tally.failures.append(outcome)
-                tally.passed.discard(outcome.seen.pair)
+            step = variant_result.vectors.wanted[key]
+            outcome = await self._play_repeatedly(variant_result.vectors.variant, (*step.path, key.input))
+            if isinstance(outcome, ConfirmedFailure):
+                variant_result.failures.append(outcome)
+                variant_result.passed.discard(outcome.observation.key)
             elif outcome is RIGHT:
-                tally.passed.add(pair)
-                self._tell()
+                variant_result.passed.add(key)
+                self._report_progress()
 
-    async def _try_again(self, waiting: Iterator[tuple[Tally, Suspicion]]) -> None:
-        for tally, suspicion in waiting:
-            tally.passed.discard(suspicion.seen.pair)
-            if suspicion.seen.ended is not None and _kind_of_end(suspicion.seen.ended) in self._unexplained_ends:
+    async def _retry_suspicions(self, waiting: Iterator[tuple[VariantResult, Suspicion]]) -> None:
+        for variant_result, suspicion in waiting:
+            variant_result.passed.discard(suspicion.observation.key)
+            if (
+                suspicion.observation.ended is not None
+                and _kind_of_end(suspicion.observation.ended) in self._unexplained_ends
+            ):
                 continue
-            outcomes = [outcome async for outcome in self._alone(tally, suspicion)]
-            failures = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
+            outcomes = [outcome async for outcome in self._retry_variants(variant_result, suspicion)]
+            failures = [outcome for outcome in outcomes if isinstance(outcome, ConfirmedFailure)]
             if failures:
-                tally.failures.append(failures[0])
-                tally.passed.discard(failures[0].seen.pair)
-            elif (ended := suspicion.seen.ended) is not None:
+                variant_result.failures.append(failures[0])
+                variant_result.passed.discard(failures[0].observation.key)
+            elif (ended := suspicion.observation.ended) is not None:
                 if _kind_of_end(ended) not in self._unexplained_ends:
                     self._unexplained_ends.add(_kind_of_end(ended))
-                    tally.failures.append(_unexplained(tally.vectors.variant, suspicion, ended))
+                    variant_result.failures.append(
+                        _unexplained_failure(variant_result.vectors.variant, suspicion, ended)
+                    )
             elif all(outcome is RIGHT for outcome in outcomes):
-                tally.passed.add(suspicion.seen.pair)  # it was the machine
+                variant_result.passed.add(suspicion.observation.key)  # the machine was at fault
 
-    async def _alone(self, tally: Tally, suspicion: Suspicion) -> AsyncIterator[Outcome]:
-        """By the shortest way; after each input on the way that should have changed nothing; and at last as it was.
+    async def _retry_variants(
+        self, variant_result: VariantResult, suspicion: Suspicion
+    ) -> AsyncIterator[ReplayOutcome]:
+        """Replay the suspicion by different paths until it fails, and yield the outcomes.
 
-        Until it fails.
+        The first path is the shortest one. The next paths are the shortest one with an additional answer that the agent
+        must ignore. The last paths are the ends of the original path.
         """
-        variant = tally.vectors.variant
-        name = suspicion.way[-1]
-        step = tally.vectors.by_pair.get(suspicion.seen.pair)
+        variant = variant_result.vectors.variant
+        name = suspicion.path[-1]
+        step = variant_result.vectors.by_key.get(suspicion.observation.key)
         if step is not None:
-            yield (outcome := await self._repeated(variant, (*step.way, name)))
-            if isinstance(outcome, Failure):
+            yield (outcome := await self._play_repeatedly(variant, (*step.path, name)))
+            if isinstance(outcome, ConfirmedFailure):
                 return
-            for hidden in list(dict.fromkeys(reversed(suspicion.way[:-1])))[:MOST_HIDDEN]:
-                run = _run_without_effect(variant, step.way, hidden)
-                if run is not None and run.handler in COUNTING:
-                    outcome = await self._repeated(variant, (*step.way, hidden, name))
-                    if isinstance(outcome, Failure):
-                        yield replace(outcome, seen=replace(outcome.seen, hidden=run))
+            for additional in list(dict.fromkeys(reversed(suspicion.path[:-1])))[:MAX_HIDDEN]:
+                run = _single_run(variant, step.path, additional)
+                if run is not None and run.handler in COUNTING_HANDLERS:
+                    outcome = await self._play_repeatedly(variant, (*step.path, additional, name))
+                    if isinstance(outcome, ConfirmedFailure):
+                        yield replace(outcome, observation=replace(outcome.observation, hidden_run=run))
                         return
-        if suspicion.seen.ended is not None:  # all its inputs may have ended it, not the last ones
+        if suspicion.observation.ended is not None:  # the number of all inputs may have ended it, not the last ones
             return
-        for way in _tails(variant, suspicion.way):
-            outcome = await self._repeated(variant, way)
-            if isinstance(outcome, Failure):
-                yield await self._what_counted(variant, way, outcome, of_an_earlier_round=step is not None)
+        for path in _path_tails(variant, suspicion.path):
+            outcome = await self._play_repeatedly(variant, path)
+            if isinstance(outcome, ConfirmedFailure):
+                yield await self._find_miscounted(variant, path, outcome, needs_earlier_round=step is not None)
                 return
             yield outcome
 
-    async def _what_counted(
-        self, variant: Variant, way: Sequence[str], failure: Failure, *, of_an_earlier_round: bool
-    ) -> Failure:
-        """The failure with what should not have counted on its way, without which it does not fail."""
-        counted = _uncounted(variant, way)
+    async def _find_miscounted(
+        self, variant: SettingsVariant, path: Sequence[str], failure: ConfirmedFailure, *, needs_earlier_round: bool
+    ) -> ConfirmedFailure:
+        """Return the failure with its cause, if the path does not fail without the ignored answers of one handler."""
+        counted = _ignored_answers(variant, path)
         for handler in dict.fromkeys(run.handler for run in counted.values()):
             others = [
-                name for place, name in enumerate(way) if place not in counted or counted[place].handler != handler
+                name for place, name in enumerate(path) if place not in counted or counted[place].handler != handler
             ]
-            if await self._repeated(variant, others) is RIGHT:
+            if await self._play_repeatedly(variant, others) is RIGHT:
                 run = next(run for run in reversed(counted.values()) if run.handler == handler)
-                return replace(failure, seen=replace(failure.seen, hidden=run))
-        return replace(failure, of_an_earlier_round=of_an_earlier_round)
+                return replace(failure, observation=replace(failure.observation, hidden_run=run))
+        return replace(failure, needs_earlier_round=needs_earlier_round)
 
-    async def _repeated(self, variant: Variant, way: Sequence[str]) -> Outcome:
-        """Right if it is so once; a failure if it fails each time; too late if nothing else came."""
+    async def _play_repeatedly(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
+        """Replay a path several times. Return RIGHT if one replay is right, or the failure if REPETITIONS replays fail.
+
+        Return TOO_LATE if the machine was late in too many replays.
+        """
         failures = 0
-        for _ in range(MOST_TIMES):
-            outcome = await self.play(variant, way)
+        for _ in range(MAX_ATTEMPTS):
+            outcome = await self.play(variant, path)
             if outcome is RIGHT:
                 return RIGHT
-            if isinstance(outcome, Failure):
+            if isinstance(outcome, ConfirmedFailure):
                 failures += 1
-                if failures >= TIMES:
+                if failures >= REPETITIONS:
                     return outcome
         return TOO_LATE
 
-    async def play(self, variant: Variant, way: Sequence[str]) -> Outcome:
-        """An agent is given all these inputs: where it was wrong first, if it was not the machine that was late."""
+    async def play(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
+        """Give a new agent these inputs. Return the first failure, RIGHT, or TOO_LATE if the machine was late."""
         try:
-            subject = await self._start(variant, True)
+            agent = await self._start(variant, True)
         except (AgentEndedError, UnsupportedError):
             return TOO_LATE
         try:
-            for number, name in enumerate(way, 1):
-                seen = await subject.step(INPUTS[name])
-                if seen is not None and seen.wrong:
-                    failure = Failure(variant.name, tuple(way[:number]), seen, subject.exchanges())
-                    return TOO_LATE if seen.late else failure
+            for number, name in enumerate(path, 1):
+                observation = await agent.step(INPUTS[name])
+                if observation is not None and observation.wrong:
+                    failure = ConfirmedFailure(variant.name, tuple(path[:number]), observation, agent.exchanges())
+                    return TOO_LATE if observation.late else failure
         finally:
-            await subject.close()
+            await agent.close()
         return RIGHT
 
 
@@ -329,47 +369,52 @@ def _kind_of_end(ended: str) -> str:
     return ended.partition(":")[0]
 
 
-def _unexplained(variant: Variant, suspicion: Suspicion, ended: str) -> Failure:
-    return Failure(variant.name, suspicion.way, suspicion.seen, suspicion.exchanges, unexplained_end=ended)
+def _unexplained_failure(variant: SettingsVariant, suspicion: Suspicion, ended: str) -> ConfirmedFailure:
+    return ConfirmedFailure(
+        variant.name, suspicion.path, suspicion.observation, suspicion.exchanges, unexplained_end=ended
+    )
 
 
-def _run_without_effect(variant: Variant, way: tuple[str, ...], name: str) -> Run | None:
-    """What comes of an input after this way, if that is only one handler's run."""
-    model, now = walk(variant, way)
+def _single_run(variant: SettingsVariant, path: tuple[str, ...], name: str) -> ExpectedRun | None:
+    """Return the handler run that an input causes after this path. None unless it causes exactly one."""
+    model, now = walk(variant, path)
     advanced = advance(model, INPUTS[name], now)
     return advanced[0].runs[0] if advanced is not None and len(advanced[0].runs) == 1 else None
 
 
-def _uncounted(variant: Variant, way: Sequence[str]) -> dict[int, Run]:
-    """The runs on a way that look at an answer and must not count it, by their place."""
-    model, now = Model(variant.settings), 0.0
+def _ignored_answers(variant: SettingsVariant, path: Sequence[str]) -> dict[int, ExpectedRun]:
+    """Return place in the path -> handler run, for each answer on the path that the agent must ignore."""
+    model, now = ReferenceModel(variant.settings), 0.0
     uncounted = {}
-    for place, name in enumerate(way[:-1]):
+    for place, name in enumerate(path[:-1]):
         advanced = advance(model, INPUTS[name], now)
         if advanced is not None:
             outcome, now = advanced
-            if outcome.runs and outcome.runs[0].handler in COUNTING and is_unchanged(outcome):
+            if outcome.runs and outcome.runs[0].handler in COUNTING_HANDLERS and changes_nothing(outcome):
                 uncounted[place] = outcome.runs[0]
     return uncounted
 
 
-def _tails(variant: Variant, way: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """The last inputs of a way, since the agent was idle, or since it was so before that; and all, if they are few."""
-    model, now = Model(variant.settings), 0.0
+def _path_tails(variant: SettingsVariant, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    """Yield ends of a path, from the shortest to the whole path. Each begins when the agent was idle.
+
+    Ends with more than MAX_PATH inputs are left out.
+    """
+    model, now = ReferenceModel(variant.settings), 0.0
     idle = [0]
-    for number, name in enumerate(way[:-1], 1):
+    for number, name in enumerate(path[:-1], 1):
         advanced = advance(model, INPUTS[name], now)
         if advanced is not None:
             now = advanced[1]
         if model.state.idle and not model.state.blocks_to_be_committed:
             idle.append(number)
     for place in (*idle[:-4:-1], 0):
-        if len(way) - place <= LONGEST_WAY:
-            yield way[place:]
+        if len(path) - place <= MAX_PATH:
+            yield path[place:]
 
 
-async def _together(work: Sequence[Coroutine[Any, Any, None]]) -> None:
-    """All of it; the first error ends all."""
+async def _run_all(work: Sequence[Coroutine[Any, Any, None]]) -> None:
+    """Run all coroutines. The first error cancels the others, and is raised."""
     try:
         async with asyncio.TaskGroup() as group:
             for each in work:

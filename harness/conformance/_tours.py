@@ -1,8 +1,9 @@
-"""Tours: an agent is led through as many vectors as it takes, by the shortest ways.
+"""Tours: one agent plays many vectors, one after another, along the shortest paths between them.
 
-In a state first come the inputs that change nothing, then one that does; where all is seen, the nearest state in which
-anything is not. Many tours go on side by side and share what is yet to be seen. Where the agent deviates, that is a
-suspicion: the tour ends, and another agent goes on with what is left. What is suspected is tried again, alone.
+In each state the tour first plays the vectors that leave the agent unchanged, and then one that changes it. If no
+vectors are left in a state, the tour goes to the nearest state with vectors that are left. Many tours run in parallel,
+and share the set of vectors that are left. A deviation of the agent ends its tour with a suspicion. Another agent
+continues with the other vectors, and the suite plays the suspicion again, alone.
 """
 
 import heapq
@@ -11,224 +12,236 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 
+from harness.conformance._agent_under_test import AgentUnderTest
 from harness.conformance._alphabet import INPUTS, TIMER
-from harness.conformance._observation import Exchange, Seen
-from harness.conformance._reference_model import Model
-from harness.conformance._state_space import Pair, State, Step, Variant, pair_of, state_of
-from harness.conformance._subject import Subject
+from harness.conformance._observation import Observation, RecordedDatagram
+from harness.conformance._reference_model import ReferenceModel
+from harness.conformance._state_space import AgentState, SettingsVariant, Transition, VectorKey, key_of, state_of
 
 TIMER_COSTS = 10.0
-"""Mission seconds, about."""
+"""Cost of the expiry of a timer on a path. A cost is about one mission second."""
 INPUT_COSTS = 0.3
 START_COSTS = 100.0
-"""An agent takes less than that to start, but processor time, which others lack then."""
+"""Cost of a new agent. It takes less time, but needs processor time, which the other agents then lack."""
 GROWTH_COSTS = 60.0
-"""Of a chain that is as short as some vectors need it: it does not become shorter again."""
-MOST_TRIES = 6
-"""Of one vector, when the machine is late."""
-MOST_WAYS = 3000
-"""States that are looked at for a way."""
-_ANEW = "another agent starts"
+"""Cost of a block on the chain. A chain does not become shorter, and some vectors need a short chain."""
+MAX_TRIES = 6
+"""Maximum number of tries of one vector, if the machine is late each time."""
+MAX_SEARCHED_STATES = 3000
+"""Maximum number of states in the search for a path."""
+_RESTART = "another agent starts"
 
 
 @dataclass(frozen=True)
 class Suspicion:
-    """Where an agent deviated: by these inputs from its start on, of which the last was wrong."""
+    """A deviation of an agent in a tour. It may be the machine's fault."""
 
-    way: tuple[str, ...]
-    seen: Seen
-    exchanges: tuple[Exchange, ...]
+    path: tuple[str, ...]
+    """All inputs since the start of the agent. The agent answered the last one wrongly."""
+    observation: Observation
+    exchanges: tuple[RecordedDatagram, ...]
     """All datagrams since the start of the agent."""
 
 
-class Map:
-    """The vectors of a variant: which are yet to be seen, and which ways lead there."""
+class VectorMap:
+    """The vectors of a variant that are left to play, and the edges of the state space, which lead there."""
 
-    def __init__(self, variant: Variant, steps: list[Step], wanted: set[Pair]) -> None:
+    def __init__(self, variant: SettingsVariant, transitions: list[Transition], wanted: set[VectorKey]) -> None:
         self.variant = variant
-        self.start = state_of(Model(variant.settings))
-        self._unseen: dict[tuple[str, tuple[str | int, ...]], set[Pair]] = defaultdict(set)
-        """By what the state does and holds."""
+        self.start = state_of(ReferenceModel(variant.settings))
+        self._unseen: dict[tuple[str, tuple[str | int, ...]], set[VectorKey]] = defaultdict(set)
+        """Activity and holdings -> the vectors that are left there."""
         self.left = len(wanted)
-        for pair in wanted:
-            self._unseen[pair.doing, pair.holds].add(pair)
-        self._ways: dict[tuple[str, tuple[str | int, ...], tuple[object, ...]], list[tuple[str, State, float]]]
-        self._ways = defaultdict(list)
-        """From the part of a state that matters."""
-        self._quiet: set[Pair] = set()
-        self._growing: set[Pair] = set()
-        self._tries: Counter[Pair] = Counter()
-        self.given_up: list[Pair] = []
-        """What could not be seen however often it was tried: the machine was late each time."""
-        self.claimed: set[Pair] = set()
-        """To which a tour is on its way."""
-        for step in steps:
-            if step.after == step.before:
-                self._quiet.add(step.pair)
+        for key in wanted:
+            self._unseen[key.activity, key.holdings].add(key)
+        self._edges: dict[tuple[str, tuple[str | int, ...], tuple[object, ...]], list[tuple[str, AgentState, float]]]
+        self._edges = defaultdict(list)
+        """Activity, holdings and relevant counts -> edges from there: input, next state, and cost."""
+        self._quiet: set[VectorKey] = set()
+        self._growing: set[VectorKey] = set()
+        self._tries: Counter[VectorKey] = Counter()
+        self.given_up: list[VectorKey] = []
+        """Vectors for which the machine was late MAX_TRIES times."""
+        self.claimed: set[VectorKey] = set()
+        """Vectors to which a tour is on its way."""
+        for transition in transitions:
+            if transition.after == transition.before:
+                self._quiet.add(transition.key)
             else:
-                costs = TIMER_COSTS if step.expired else INPUT_COSTS
-                if step.after.holds[0] > step.before.holds[0]:  # type: ignore[operator]
+                costs = TIMER_COSTS if transition.expired else INPUT_COSTS
+                if transition.after.holdings[0] > transition.before.holdings[0]:  # type: ignore[operator]
                     costs += GROWTH_COSTS
-                    self._growing.add(step.pair)
-                self._ways[step.pair[:3]].append((step.pair.input, step.after, costs))
+                    self._growing.add(transition.key)
+                self._edges[transition.key[:3]].append((transition.key.input, transition.after, costs))
 
-    def unseen_in(self, state: State, misled: Container[Pair] = ()) -> Pair | None:
-        """Of what is yet to be seen, but for what is `misled`: inputs that change nothing come first, then others, the
-        timer, and at last what makes the chain longer."""
-        here = self._unseen.get((state.doing, state.holds))
+    def unseen_in(self, state: AgentState, ruled_out: Container[VectorKey] = ()) -> VectorKey | None:
+        """Return the next vector to play in this state. None if none is left except those in `ruled_out`.
+
+        Inputs that leave the agent unchanged come first, then other inputs, then timers, and last the inputs that make
+        the chain longer.
+        """
+        here = self._unseen.get((state.activity, state.holdings))
         if not here:
             return None
-        pairs = (
-            pair
-            for pair in here
-            if pair not in self.claimed
-            and pair not in misled
-            and pair.counted in ((), state.counted)
-            and pair == pair_of(state, INPUTS[pair.input])
+        keys = (
+            key
+            for key in here
+            if key not in self.claimed
+            and key not in ruled_out
+            and key.counted in ((), state.counted)
+            and key == key_of(state, INPUTS[key.input])
         )
-        return min(pairs, key=self._rank, default=None)
+        return min(keys, key=self._rank, default=None)
 
-    def is_cheap(self, pair: Pair) -> bool:
-        return pair not in self._growing
+    def is_cheap(self, key: VectorKey) -> bool:
+        return key not in self._growing
 
-    def _rank(self, pair: Pair) -> tuple[bool, bool, bool, str]:
-        return pair in self._growing, INPUTS[pair.input].tally == "timer", pair not in self._quiet, pair.input
+    def _rank(self, key: VectorKey) -> tuple[bool, bool, bool, str]:
+        return key in self._growing, INPUTS[key.input].tally == "timer", key not in self._quiet, key.input
 
-    def take(self, pair: Pair) -> bool:
-        """Whether it was yet to be seen; from now on it is not."""
-        here = self._unseen.get((pair.doing, pair.holds))
-        if here is None or pair not in here:
+    def take(self, key: VectorKey) -> bool:
+        """Remove a vector from those that are left. Return whether it was one of them."""
+        here = self._unseen.get((key.activity, key.holdings))
+        if here is None or key not in here:
             return False
-        here.remove(pair)
+        here.remove(key)
         self.left -= 1
         return True
 
-    def put_back(self, pair: Pair) -> bool:
-        """It could not be seen: another time, if there were not too many."""
-        self._tries[pair] += 1
-        if self._tries[pair] >= MOST_TRIES:
-            self.given_up.append(pair)
+    def return_key(self, key: VectorKey) -> bool:
+        """Add a vector to those that are left again, because the machine was late. After MAX_TRIES give it up.
+
+        Return whether it is left.
+        """
+        self._tries[key] += 1
+        if self._tries[key] >= MAX_TRIES:
+            self.given_up.append(key)
             return False
-        self._unseen[pair.doing, pair.holds].add(pair)
+        self._unseen[key.activity, key.holdings].add(key)
         self.left += 1
         return True
 
     def give_up(self) -> None:
-        """Nothing more is to be seen."""
+        """Remove all vectors that are left."""
         self._unseen.clear()
         self.left = 0
 
-    def avoid(self, pair: Pair) -> None:
-        """No way leads over it any more: there the agent deviates."""
-        ways = self._ways[pair[:3]]
-        ways[:] = [way for way in ways if way[0] != pair.input]
+    def avoid(self, key: VectorKey) -> None:
+        """Remove the edge of a vector at which the agent deviates from all paths."""
+        edges = self._edges[key[:3]]
+        edges[:] = [edge for edge in edges if edge[0] != key.input]
 
-    def way_from(self, state: State, misled: Container[Pair] = ()) -> tuple[list[str], Pair | None] | None:
-        """Inputs that lead to something to see, the last of which is that.
+    def path_from(
+        self, state: AgentState, ruled_out: Container[VectorKey] = ()
+    ) -> tuple[list[str], VectorKey | None] | None:
+        """Return the cheapest path to a vector that is left, and this vector. Its input is the last one of the path.
 
-        None are left if it is nearer to begin anew; None if no way leads anywhere. `misled` are steps that have led
-        elsewhere than the map says, or that there were not.
+        An empty path means that a new agent gets there more cheaply. Return None if no path leads to such a vector.
+        `ruled_out` contains vectors that were impossible, or led to another state than the map has.
         """
-        queue: list[tuple[float, int, State | Pair, tuple[str, ...]]] = [(0.0, 0, state, ())]
+        queue: list[tuple[float, int, AgentState | VectorKey, tuple[str, ...]]] = [(0.0, 0, state, ())]
         if state != self.start:
-            queue.append((START_COSTS, 1, self.start, (_ANEW,)))
-        closed: set[State] = set()
+            queue.append((START_COSTS, 1, self.start, (_RESTART,)))
+        closed: set[AgentState] = set()
         number = 1
-        while queue and len(closed) < MOST_WAYS:
-            costs, _, at, way = heapq.heappop(queue)
-            if isinstance(at, Pair):
-                return ([], None) if way[0] == _ANEW else (list(way), at)
+        while queue and len(closed) < MAX_SEARCHED_STATES:
+            costs, _, at, path = heapq.heappop(queue)
+            if isinstance(at, VectorKey):
+                return ([], None) if path[0] == _RESTART else (list(path), at)
             if at in closed:
                 continue
             closed.add(at)
-            pair = self.unseen_in(at, misled)
-            if pair is not None:
+            key = self.unseen_in(at, ruled_out)
+            if key is not None:
                 number += 1
                 heapq.heappush(
-                    queue, (costs + (0.0 if self.is_cheap(pair) else GROWTH_COSTS), number, pair, (*way, pair.input))
+                    queue, (costs + (0.0 if self.is_cheap(key) else GROWTH_COSTS), number, key, (*path, key.input))
                 )
-            for name, after, more in self._ways_out(at):
-                if after not in closed and pair_of(at, INPUTS[name]) not in misled:
+            for name, after, more in self._edges_from(at):
+                if after not in closed and key_of(at, INPUTS[name]) not in ruled_out:
                     number += 1
-                    heapq.heappush(queue, (costs + more, number, after, (*way, name)))
+                    heapq.heappush(queue, (costs + more, number, after, (*path, name)))
         return None
 
-    def leads_to(self, state: State, name: str) -> State | None:
-        """Where the map says that an input leads; None if it does not say."""
-        return next((after for way, after, _ in self._ways_out(state) if way == name), None)
+    def leads_to(self, state: AgentState, name: str) -> AgentState | None:
+        """Return the state to which the input leads by the map. None if the map has no such edge."""
+        return next((after for each, after, _ in self._edges_from(state) if each == name), None)
 
-    def _ways_out(self, state: State) -> Iterator[tuple[str, State, float]]:
-        yield from self._ways.get((state.doing, state.holds, ()), ())
+    def _edges_from(self, state: AgentState) -> Iterator[tuple[str, AgentState, float]]:
+        yield from self._edges.get((state.activity, state.holdings, ()), ())
         if state.counted:
-            yield from self._ways.get(state, ())
+            yield from self._edges.get(state, ())
 
 
 class Tour:
-    """One life of an agent; `passed` is told of each vector that passed."""
+    """A tour of one agent. It calls `passed` for each vector that passes."""
 
-    def __init__(self, atlas: Map, subject: Subject, passed: Callable[[Pair], None]) -> None:
-        self._map = atlas
-        self._subject = subject
+    def __init__(self, vector_map: VectorMap, agent: AgentUnderTest, passed: Callable[[VectorKey], None]) -> None:
+        self._map = vector_map
+        self._agent = agent
         self._plan: list[str] = []
-        self._claim: Pair | None = None
-        self._misled: set[Pair] = set()
-        self._way: list[str] = []
+        self._claim: VectorKey | None = None
+        self._ruled_out: set[VectorKey] = set()
+        self._path: list[str] = []
         self._passed = passed
 
-    async def go_on(self, until: float) -> Suspicion | None:
-        """To the end of the tour, or to that second of the monotonic clock; what was wrong there, if it was that."""
-        try:
-            return await self._go_on(until)
-        finally:
-            self._plan_anew()
+    async def run(self, until: float) -> Suspicion | None:
+        """Play until the end of the tour, at most until the second `until` of the monotonic clock.
 
-    async def _go_on(self, until: float) -> Suspicion | None:
+        Return the suspicion that ended the tour. None if the agent did not deviate.
+        """
+        try:
+            return await self._run_until(until)
+        finally:
+            self._discard_plan()
+
+    async def _run_until(self, until: float) -> Suspicion | None:
         while time.monotonic() < until and (name := self._next_input()) is not None:
-            state = state_of(self._subject.model)
-            pair = pair_of(state, INPUTS[name])
-            taken = self._map.take(pair)
-            seen = await self._subject.step(INPUTS[name])
-            if seen is not None:
-                self._way.append(name)
-            if seen is None or (seen.wrong and seen.late):
+            state = state_of(self._agent.model)
+            key = key_of(state, INPUTS[name])
+            taken = self._map.take(key)
+            observation = await self._agent.step(INPUTS[name])
+            if observation is not None:
+                self._path.append(name)
+            if observation is None or (observation.wrong and observation.late):
                 if taken:
-                    self._map.put_back(pair)
-                self._plan_anew()
-                if seen is None:
-                    self._misled.add(pair)
-                elif not self._subject.in_step:
+                    self._map.return_key(key)
+                self._discard_plan()
+                if observation is None:
+                    self._ruled_out.add(key)
+                elif not self._agent.reference_follows:
                     return None
                 continue
-            if seen.wrong:
-                return Suspicion(tuple(self._way), seen, self._subject.exchanges())
+            if observation.wrong:
+                return Suspicion(tuple(self._path), observation, self._agent.exchanges())
             if taken:
-                self._passed(pair)
-            if self._map.leads_to(state, name) not in (None, state_of(self._subject.model)):
-                self._misled.add(pair)
-                self._plan_anew()
+                self._passed(key)
+            if self._map.leads_to(state, name) not in (None, state_of(self._agent.model)):
+                self._ruled_out.add(key)
+                self._discard_plan()
         return None
 
-    def _plan_anew(self) -> None:
+    def _discard_plan(self) -> None:
         self._plan = []
         if self._claim is not None:
             self._map.claimed.discard(self._claim)
             self._claim = None
 
     def _next_input(self) -> str | None:
-        """What to give now; None if the tour should end here."""
-        state = state_of(self._subject.model)
-        if self._subject.hurried:
-            self._plan_anew()
+        """Return the name of the next input. None if the tour should end here."""
+        state = state_of(self._agent.model)
+        if self._agent.timer_is_near:
+            self._discard_plan()
             return TIMER
-        pair = self._map.unseen_in(state, self._misled)
-        if pair is not None and self._map.is_cheap(pair):
-            return pair.input
+        key = self._map.unseen_in(state, self._ruled_out)
+        if key is not None and self._map.is_cheap(key):
+            return key.input
         if not self._plan:
-            self._plan_anew()
-            way = self._map.way_from(state, self._misled)
-            if way is None:  # from what comes then a way may lead
-                return TIMER if self._subject.model.agent.next_timer() is not None else None
-            self._plan, self._claim = way
+            self._discard_plan()
+            path = self._map.path_from(state, self._ruled_out)
+            if path is None:  # a path may begin in the state after the next timer
+                return TIMER if self._agent.model.agent.next_timer() is not None else None
+            self._plan, self._claim = path
             if self._claim is not None:
                 self._map.claimed.add(self._claim)
         return self._plan.pop(0) if self._plan else None

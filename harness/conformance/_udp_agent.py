@@ -1,7 +1,8 @@
-"""An agent over UDP beside the reference: both are given an input, and then compared.
+"""An agent over UDP. The agent and the reference get the same input, and are then compared.
 
-What is seen of it: what it broadcasts, and what it says of itself (`status`), once it says that it has handled the
-input. So nobody waits where nothing must come, but for an agent that counts its handler runs otherwise.
+The comparison covers the agent's broadcasts, and its answer to the command `status`. The count of handler runs in the
+status shows when the agent has handled the input. Therefore an input without an expected message costs no waiting time,
+unless the agent counts its handler runs in another way.
 """
 
 import asyncio
@@ -16,23 +17,38 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
+from harness.conformance._agent_under_test import AgentUnderTest, Start
 from harness.conformance._alphabet import Input
-from harness.conformance._observation import COMPARED, MOST_ENDED, Exchange, Names, Seen, compare, told_datagram
+from harness.conformance._observation import (
+    COMPARED,
+    MAX_EARLY_TIMERS,
+    KnownNames,
+    Observation,
+    RecordedDatagram,
+    compare,
+    datagram_text,
+)
 from harness.conformance._reference_model import (
     AGENT,
     EVENT_ID,
     Action,
-    Command,
-    Datagram,
-    Expire,
-    Log,
-    Model,
-    Moment,
-    Outcome,
+    ControlCommand,
+    ExpectedOutcome,
+    LogEvent,
+    ModelSnapshot,
+    PeerDatagram,
+    ReferenceModel,
+    TimerExpiry,
 )
-from harness.conformance._state_space import Variant, ends_next, state_of
-from harness.conformance._subject import Start, Subject
-from harness.conformance._udp_lab import AgentEndedError, AgentExitedError, AgentHangsError, Air, Ear, Process
+from harness.conformance._state_space import SettingsVariant, next_timer_name, state_of
+from harness.conformance._udp_lab import (
+    AgentEndedError,
+    AgentExitedError,
+    AgentHangsError,
+    PeerSocket,
+    ProcessUnderTest,
+    UdpLab,
+)
 from harness.play.agent_control import AgentRefusedError
 from ucp.clock import MICROSECONDS
 from ucp.events import MalformedEventsError, decode_events
@@ -40,58 +56,70 @@ from ucp.messages import MalformedDatagramError, Message, decode
 
 
 @dataclass(frozen=True)
-class Pace:
-    """How time is scaled, and what is still in time, in wall seconds."""
+class Timing:
+    """Speed of mission time, and time limits in wall seconds."""
 
     speedup: float
+    """Mission seconds per wall second."""
     margin_s: float
-    """No input is given so near to the end of a timer."""
+    """Minimum time between an input and the next expiry of a timer."""
     early_s: float
-    """A timer may end so much earlier than it should."""
+    """Time by which a timer may expire too early."""
     patience_s: float
-    """So long after it should have come a message is late."""
+    """Time limit of an expected message."""
     calm_s: float
-    """So long nothing must have happened, if the agent does not say that it has handled its input."""
+    """Time without a change after which the input counts as handled, if the agent does not report it as handled."""
     linger_s: float
-    """So long it is looked what else comes."""
+    """Additional time in which unexpected messages are received."""
     ask_again_s: float
-    """After so long of waiting for a message the agent is asked whether it runs at all."""
+    """Time without an expected message after which the agent is asked for its status."""
 
 
-BESIDE_OTHERS = Pace(24.0, margin_s=0.08, early_s=0.15, patience_s=0.5, calm_s=0.08, linger_s=0.0, ask_again_s=0.1)
-ALONE = Pace(8.0, margin_s=0.3, early_s=0.1, patience_s=2.5, calm_s=0.3, linger_s=0.1, ask_again_s=0.25)
-CHANCES = 2
-"""So often an agent answers before it is said that it was not the machine that was late."""
+TIMING_IN_PARALLEL = Timing(
+    24.0, margin_s=0.08, early_s=0.15, patience_s=0.5, calm_s=0.08, linger_s=0.0, ask_again_s=0.1
+)
+TIMING_ALONE = Timing(8.0, margin_s=0.3, early_s=0.1, patience_s=2.5, calm_s=0.3, linger_s=0.1, ask_again_s=0.25)
+MIN_ANSWERS = 2
+"""Number of answers of an agent after which a missing message is the agent's fault, not that of a late machine."""
 
 
-class OverUdp(Subject):
-    """An agent as a process, from its start on."""
+class UdpAgent(AgentUnderTest):
+    """An agent as a process that is tested over UDP."""
 
-    def __init__(self, variant: Variant, pace: Pace, process: Process, ear: Ear, closed: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        variant: SettingsVariant,
+        timing: Timing,
+        process: ProcessUnderTest,
+        peer_socket: PeerSocket,
+        closed: Callable[[], None],
+    ) -> None:
         super().__init__(variant)
         self.process = process
-        self.ear = ear
-        self._pace = pace
+        self.peer_socket = peer_socket
+        self._timing = timing
         self._closed = closed
         self._epoch = 0.0
 
     @classmethod
-    async def start(cls, air: Air, variant: Variant, pace: Pace) -> "OverUdp":
-        """Raises NoAgentError, UnsupportedError, AgentEndedError."""
-        port = air.take_port()
+    async def start(cls, lab: UdpLab, variant: SettingsVariant, timing: Timing) -> "UdpAgent":
+        """Start an agent and its mission. Raises NoAgentError, UnsupportedError, AgentEndedError."""
+        port = lab.take_port()
         try:
-            process = await Process.start(air, air.new_directory(), air.mission(variant, port, pace.speedup), AGENT)
+            process = await ProcessUnderTest.start(
+                lab, lab.new_directory(), lab.mission(variant, port, timing.speedup), AGENT
+            )
         except BaseException:
-            air.give_back(port)
+            lab.return_port(port)
             raise
-        subject = cls(variant, pace, process, Ear(air, port), lambda: air.give_back(port))
+        agent = cls(variant, timing, process, PeerSocket(lab, port), lambda: lab.return_port(port))
         try:
             await process.ready()
-            await subject._begin()
+            await agent._begin()
         except BaseException:
-            await subject.close()
+            await agent.close()
             raise
-        return subject
+        return agent
 
     async def _begin(self) -> None:
         self._epoch = time.time()
@@ -99,101 +127,121 @@ class OverUdp(Subject):
         await self.process.ask("start", epoch_us=epoch_us)
 
     async def close(self) -> None:
-        self.ear.close()
+        self.peer_socket.close()
         await self.process.kill()
         shutil.rmtree(self.process.directory, ignore_errors=True)
         self._closed()
 
-    def exchanges(self) -> tuple[Exchange, ...]:
-        """All that has crossed the air."""
-        names = Names(self.model)
+    def exchanges(self) -> tuple[RecordedDatagram, ...]:
+        names = KnownNames(self.model)
         return tuple(
-            Exchange(round(self._mission(at_s), 3), by_agent, data, told_datagram(data, names))
-            for at_s, by_agent, data in self.ear.record
+            RecordedDatagram(round(self._mission_s(at_s), 3), by_agent, data, datagram_text(data, names))
+            for at_s, by_agent, data in self.peer_socket.record
         )
 
     def now(self) -> float:
-        """In mission seconds."""
-        return self._mission(time.time())
+        """Return the current mission second."""
+        return self._mission_s(time.time())
 
-    def _mission(self, at_s: float) -> float:
-        """The mission second at which it is so many seconds since the Unix epoch."""
-        return (at_s - self._epoch) * self._pace.speedup
+    def _mission_s(self, at_s: float) -> float:
+        """Return the mission second at a wall time, in seconds since the Unix epoch."""
+        return (at_s - self._epoch) * self._timing.speedup
 
-    def _wall(self, mission_s: float) -> float:
-        """Seconds since the Unix epoch at a mission second."""
-        return self._epoch + mission_s / self._pace.speedup
+    def _wall_s(self, mission_s: float) -> float:
+        """Return the wall time at a mission second, in seconds since the Unix epoch."""
+        return self._epoch + mission_s / self._timing.speedup
 
     @property
-    def hurried(self) -> bool:
+    def timer_is_near(self) -> bool:
         deadline = self.model.agent.next_timer()
-        return deadline is not None and self._wall(deadline) - time.time() < self._pace.margin_s
+        return deadline is not None and self._wall_s(deadline) - time.time() < self._timing.margin_s
 
-    async def _step(self, given: Input) -> Seen | None:
+    async def _step(self, given: Input) -> Observation | None:
         model = self.model
-        before, deadline, expired = state_of(model), model.agent.next_timer(), ends_next(model)
+        before, deadline, expired = state_of(model), model.agent.next_timer(), next_timer_name(model)
         action = given.make(model)
         if action is None:
             return None
-        moment = Moment(model)
-        self.ear.drain()
-        if self.ear.heard and not isinstance(action, Expire):  # what comes of the input could not be told from that
-            heard = self.ear.take()
-            seen = compare(model, given, before, Outcome(()), _data(heard), {}, ["it sent a message without an input"])
-            late = self._ended(deadline)
+        snapshot = ModelSnapshot(model)
+        self.peer_socket.drain()
+        if self.peer_socket.received and not isinstance(
+            action, TimerExpiry
+        ):  # such a message could not be distinguished from the answer to the input
+            received = self.peer_socket.take()
+            observation = compare(
+                model,
+                given,
+                before,
+                ExpectedOutcome(()),
+                _contents(received),
+                {},
+                ["it sent a message without an input"],
+            )
+            late = self._may_have_expired(deadline)
             if late:
-                self.in_step = self._explained(moment, [], heard, await self._status())
-            return dataclasses.replace(seen, mistimed=expired, late=late)
+                self.reference_follows = self._follow_timers(snapshot, [], received, await self._status())
+            return dataclasses.replace(observation, wrong_timer=expired, late=late)
         wrong: list[str] = []
-        began, ends = self.now(), self._wall(deadline or 0.0) if isinstance(action, Expire) else 0.0
+        began, ends_at = self.now(), self._wall_s(deadline or 0.0) if isinstance(action, TimerExpiry) else 0.0
         waiting: list[Any] = []
         status: dict[str, Any] = {}
-        mistimed = ended = None
+        wrong_timer = ended = None
         try:
-            if isinstance(action, Expire):
-                too_early = await self._wait_for_timer(ends, str(expired))
+            if isinstance(action, TimerExpiry):
+                too_early = await self._wait_for_timer(ends_at, str(expired))
                 if too_early is not None:
-                    wrong, mistimed = [*wrong, too_early], expired
-                began = max(deadline or 0.0, self._first_heard())
+                    wrong, wrong_timer = [*wrong, too_early], expired
+                began = max(deadline or 0.0, self._first_arrival_s())
             else:
                 waiting = await self._give(action)
         except (AgentEndedError, AgentRefusedError) as error:
             wrong.append(str(error))
             ended = _end(error)
-        if isinstance(action, Log):
-            outcome, made = log_as(model, action, began, waiting)
-            wrong += made
+        if isinstance(action, LogEvent):
+            outcome, problems = log_same_block(model, action, began, waiting)
+            wrong += problems
         else:
             outcome = model.feed(action, began)
-        ends_then = model.agent.next_timer()
-        chances, gave_up = 0, False
+        next_deadline = model.agent.next_timer()
+        answers, gave_up = 0, False
         try:
             if ended is None:
-                status, chances, gave_up = await self._settle(len(outcome.sent), max(time.time(), ends), ends_then)
+                status, answers, gave_up = await self._settle(
+                    len(outcome.sent), max(time.time(), ends_at), next_deadline
+                )
         except (AgentEndedError, AgentRefusedError) as error:
             wrong.append(str(error))
             ended = _end(error)
-        heard = self.ear.take()
+        received = self.peer_socket.take()
         timestamp_us = model.state.newest_block_timestamp_us
-        seen = compare(model, given, before, outcome, _data(heard), status, wrong)
-        late = ended is None and chances < CHANCES and self._ended(ends_then)
-        if seen.wrong and late:
-            given_now = [(action, began, timestamp_us)]
-            self.in_step = bool(status) and self._explained(moment, given_now, heard, status)
-            late = self.in_step or not gave_up
-        return dataclasses.replace(seen, late=late, mistimed=mistimed or seen.mistimed, ended=ended)
+        observation = compare(model, given, before, outcome, _contents(received), status, wrong)
+        late = ended is None and answers < MIN_ANSWERS and self._may_have_expired(next_deadline)
+        if observation.wrong and late:
+            fed_inputs = [(action, began, timestamp_us)]
+            self.reference_follows = bool(status) and self._follow_timers(snapshot, fed_inputs, received, status)
+            late = self.reference_follows or not gave_up
+        return dataclasses.replace(
+            observation, late=late, wrong_timer=wrong_timer or observation.wrong_timer, ended=ended
+        )
 
-    def _explained(
+    def _follow_timers(
         self,
-        moment: Moment,
+        snapshot: ModelSnapshot,
         given: Sequence[tuple[Action, float, int]],
-        heard: Sequence[tuple[float, bytes]],
+        received: Sequence[tuple[float, bytes]],
         status: Mapping[str, Any],
     ) -> bool:
-        """Whether all is as it should be if timers ended before or after the input; the reference is there then."""
-        first, last = (self._mission(heard[0][0]), self._mission(heard[-1][0])) if heard else (self.now(), self.now())
-        for before, after in sorted(product(range(MOST_ENDED), repeat=2), key=sum):
-            model, sent = moment.put_back(), list[bytes]()
+        """Return whether timers that expired before or after the input explain the messages and the status.
+
+        If so, the model then is in the state of the agent.
+        """
+        first, last = (
+            (self._mission_s(received[0][0]), self._mission_s(received[-1][0]))
+            if received
+            else (self.now(), self.now())
+        )
+        for before, after in sorted(product(range(MAX_EARLY_TIMERS), repeat=2), key=sum):
+            model, sent = snapshot.restore(), list[bytes]()
             for _ in range(before):
                 sent += _expire(model, first)
             for action, now, timestamp_us in given:
@@ -201,46 +249,46 @@ class OverUdp(Subject):
                 sent += model.datagrams
             for _ in range(after):
                 sent += _expire(model, last)
-            should = model.status()
-            if _messages(sent) == _messages(_data(heard)) and all(
-                status.get(key, should[key]) == should[key] for key in COMPARED
+            expected_status = model.status()
+            if _messages(sent) == _messages(_contents(received)) and all(
+                status.get(key, expected_status[key]) == expected_status[key] for key in COMPARED
             ):
                 return True
         return False
 
     async def _status(self) -> dict[str, Any]:
-        """What the agent says of itself now; nothing if it does not."""
+        """Return the status of the agent. Empty if it does not answer."""
         try:
             return await self.process.ask("status")
         except (AgentEndedError, AgentRefusedError):
             return {}
 
-    def _ended(self, deadline: float | None) -> bool:
-        """Whether the timer may have ended by now."""
-        return deadline is not None and self._wall(deadline) - time.time() < self._pace.early_s
+    def _may_have_expired(self, deadline: float | None) -> bool:
+        """Return whether the timer may have expired by now."""
+        return deadline is not None and self._wall_s(deadline) - time.time() < self._timing.early_s
 
     async def _wait_for_timer(self, until: float, name: str) -> str | None:
-        """Until the timer's end, or until anything is heard: what is wrong about that."""
-        while time.time() < until and not self.ear.heard:
-            await self.ear.arrival(until)
-        early_s = until - self.ear.heard[0][0] if self.ear.heard else 0.0
-        if early_s > self._pace.early_s:
-            early = f"{early_s * self._pace.speedup:.1f} mission seconds"
+        """Wait until the timer expires, or until a message arrives. Return a sentence if the message is too early."""
+        while time.time() < until and not self.peer_socket.received:
+            await self.peer_socket.arrival(until)
+        early_s = until - self.peer_socket.received[0][0] if self.peer_socket.received else 0.0
+        if early_s > self._timing.early_s:
+            early = f"{early_s * self._timing.speedup:.1f} mission seconds"
             return f"it sent a message {early} before its timer {name} expires"
         return None
 
-    def _first_heard(self) -> float:
-        """In mission seconds."""
-        return self._mission(self.ear.heard[0][0]) if self.ear.heard else 0.0
+    def _first_arrival_s(self) -> float:
+        """Return the mission second of the first received message. 0 without a message."""
+        return self._mission_s(self.peer_socket.received[0][0]) if self.peer_socket.received else 0.0
 
     async def _give(self, action: Action) -> list[Any]:
-        """Of an event, the blocks of the agent's export that it now holds."""
+        """Give the input to the agent. After an event, return the deque of the agent's export."""
         match action:
-            case Datagram():
-                self.ear.say(action.data)
-            case Command():
+            case PeerDatagram():
+                self.peer_socket.send(action.data)
+            case ControlCommand():
                 await self.process.ask(action.name)
-            case Log():
+            case LogEvent():
                 data = base64.b64encode(action.data).decode("ascii")
                 await self.process.ask("log", event_id=EVENT_ID, data=data)
                 export = await self.process.export()
@@ -249,89 +297,96 @@ class OverUdp(Subject):
         return []
 
     async def _settle(self, messages: int, since: float, deadline: float | None) -> tuple[dict[str, Any], int, bool]:
-        """The status once the agent has handled the input and sent as much as it should, or when that is too late.
+        """Wait until the agent has handled the input and sent the expected number of messages, or until it is too late.
 
-        And how often it has answered since it was given the input, before its next timer may have ended: whoever
-        answers runs, and could have handled what came before. And whether it was too late. Of an agent that counts its
-        handler runs otherwise all else must be as it should for a while.
+        `since` is the wall time of the input, and `deadline` is the mission second of the next timer. If the agent
+        counts its handler runs in another way, its status must have the expected values for a while.
+
+        Return the status, the number of answers, and whether it was too late. Only answers before the deadline count:
+        an agent that answers runs, and could have handled the input before.
         """
-        pace = self._pace
-        give_up, calm_since = since + pace.patience_s, math.inf
-        should = self.model.status()
-        chances = too_late = 0
+        timing = self._timing
+        give_up, calm_since = since + timing.patience_s, math.inf
+        expected_status = self.model.status()
+        answers = too_late = 0
         while True:
-            self.ear.drain()
-            over = time.time() >= give_up
-            if len(self.ear.heard) < messages and not over:
-                await self.ear.arrival(min(give_up, time.time() + pace.ask_again_s))
-                if self.ear.heard and len(self.ear.heard) >= messages:
+            self.peer_socket.drain()
+            is_over = time.time() >= give_up
+            if len(self.peer_socket.received) < messages and not is_over:
+                await self.peer_socket.arrival(min(give_up, time.time() + timing.ask_again_s))
+                if self.peer_socket.received and len(self.peer_socket.received) >= messages:
                     continue
             status = await self.process.ask("status")
-            if time.time() > since and not self._ended(deadline):
-                chances += 1
-            self.ear.drain()
-            too_late += over
-            if too_late >= CHANCES:
-                return status, chances, True
-            if len(self.ear.heard) < messages:
+            if time.time() > since and not self._may_have_expired(deadline):
+                answers += 1
+            self.peer_socket.drain()
+            too_late += is_over
+            if too_late >= MIN_ANSWERS:
+                return status, answers, True
+            if len(self.peer_socket.received) < messages:
                 continue
             handled = status.get("handled")
-            if isinstance(handled, int) and handled >= should["handled"]:
-                if not pace.linger_s:
-                    return status, chances, False
-                await asyncio.sleep(pace.linger_s)
-                return await self.process.ask("status"), chances, False
-            calm = all(status.get(key, should[key]) == should[key] for key in COMPARED)
+            if isinstance(handled, int) and handled >= expected_status["handled"]:
+                if not timing.linger_s:
+                    return status, answers, False
+                await asyncio.sleep(timing.linger_s)
+                return await self.process.ask("status"), answers, False
+            calm = all(status.get(key, expected_status[key]) == expected_status[key] for key in COMPARED)
             calm_since = min(calm_since, time.time()) if calm else math.inf
-            if time.time() - calm_since > pace.calm_s:
-                return status, chances, False
-            await self.ear.arrival(time.time() + 0.004)
+            if time.time() - calm_since > timing.calm_s:
+                return status, answers, False
+            await self.peer_socket.arrival(time.time() + 0.004)
 
 
 def _end(error: Exception) -> str | None:
-    """The end of the agent that the error reports. None if the machine may be late instead."""
+    """Return the end of the agent in words. None if a late machine may be the cause of the error."""
     return str(error) if isinstance(error, AgentHangsError | AgentExitedError) else None
 
 
-def _data(heard: Sequence[tuple[float, bytes]]) -> list[bytes]:
-    return [data for _, data in heard]
+def _contents(received: Sequence[tuple[float, bytes]]) -> list[bytes]:
+    return [data for _, data in received]
 
 
 def _messages(datagrams: Iterable[bytes]) -> list[Message] | None:
-    """None if any of them is not one."""
+    """Return the decoded messages. None if a datagram is malformed."""
     try:
         return [decode(data).message for data in datagrams]
     except MalformedDatagramError:
         return None
 
 
-def _expire(model: Model, now: float) -> list[bytes]:
-    """What the reference sends when its next timer ends, then or when it is due."""
+def _expire(model: ReferenceModel, now: float) -> list[bytes]:
+    """Let the next timer of the reference expire, at its deadline, or at `now` if the deadline has passed.
+
+    Return the datagrams that the reference sends. Empty if no timer runs.
+    """
     deadline = model.agent.next_timer()
     if deadline is None:
         return []
-    model.feed(Expire(), max(deadline, now))
+    model.feed(TimerExpiry(), max(deadline, now))
     return model.datagrams
 
 
-def log_as(model: Model, action: Log, now: float, waiting: list[Any]) -> tuple[Outcome, list[str]]:
-    """Have the reference make the block that the agent has made; and what is wrong about that.
+def log_same_block(
+    model: ReferenceModel, action: LogEvent, now: float, waiting: list[Any]
+) -> tuple[ExpectedOutcome, list[str]]:
+    """Give the reference the event with the timestamp of the agent, so that both complete the same block.
 
-    `waiting` is the deque of the agent's export.
+    `waiting` is the deque of the agent's export. Return the outcome, and sentences about a wrong block.
     """
-    otherwise_us = model.state.newest_block_timestamp_us + 1
+    fallback_us = model.state.newest_block_timestamp_us + 1
     held = len(model.state.blocks_to_be_committed)
     if len(waiting) != held + 1:
         wrong = f"the event did not fill a block: {len(waiting)} blocks in the deque of its export, not {held + 1}"
-        return model.feed(action, now, otherwise_us), [wrong]
-    made = waiting[-1]
+        return model.feed(action, now, fallback_us), [wrong]
+    problems = waiting[-1]
     try:
-        events = decode_events(base64.b64decode(made["event_data"], validate=True))
-        timestamp_us, block_hash = made["timestamp_us"], made["block_hash"]
+        events = decode_events(base64.b64decode(problems["event_data"], validate=True))
+        timestamp_us, block_hash = problems["timestamp_us"], problems["block_hash"]
     except (MalformedEventsError, binascii.Error, KeyError, TypeError, ValueError):
-        return model.feed(action, now, otherwise_us), ["the block in its export is not well-formed"]
+        return model.feed(action, now, fallback_us), ["the block in its export is not well-formed"]
     if [event.data for event in events] != [action.data] or events[0].event_id != EVENT_ID:
-        return model.feed(action, now, otherwise_us), ["the block does not contain the logged event"]
+        return model.feed(action, now, fallback_us), ["the block does not contain the logged event"]
     outcome = model.feed(action, now, events[0].timestamp_us)
     if model.state.newest_block_timestamp_us != timestamp_us:
         return outcome, ["the timestamp of the block differs from that of its newest event"]
@@ -340,10 +395,10 @@ def log_as(model: Model, action: Log, now: float, waiting: list[Any]) -> tuple[O
     return outcome, []
 
 
-def starting(air: Air) -> Start:
-    """Agents on this air."""
+def starter(lab: UdpLab) -> Start:
+    """Return a function that starts agents in this lab."""
 
-    async def start(variant: Variant, alone: bool) -> Subject:
-        return await OverUdp.start(air, variant, ALONE if alone else BESIDE_OTHERS)
+    async def start(variant: SettingsVariant, alone: bool) -> AgentUnderTest:
+        return await UdpAgent.start(lab, variant, TIMING_ALONE if alone else TIMING_IN_PARALLEL)
 
     return start

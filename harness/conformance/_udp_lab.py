@@ -1,6 +1,6 @@
-"""The air of conformance: one lab of two vehicles; on the first are the agents under test, the second is all peers.
+"""The lab of a conformance test over UDP, with two vehicles: one for all agents under test, and one for their peers.
 
-Each agent has a port of its own, on which nobody but the harness hears it, so that many can be tested side by side.
+Each agent has its own port. Therefore agents that are tested in parallel do not receive each other's messages.
 """
 
 import asyncio
@@ -18,8 +18,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from harness.conformance import _ports
-from harness.conformance._state_space import Variant
-from harness.conformance._subject import NO_KEYS, mission
+from harness.conformance._agent_under_test import NO_KEYS, mission
+from harness.conformance._state_space import SettingsVariant
 from harness.errors import HarnessError, MachineError, UnsupportedError
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
 from harness.play.child_processes import ChildProcesses
@@ -27,31 +27,31 @@ from netem.errors import LabUnavailable, NetemError, SpawnError
 from netem.lab import Lab, LabProcess
 from ucp.features import UNSUPPORTED
 
-AGENTS, PEERS_ON = 1, 2
-"""The lab's vehicles."""
+AGENTS_VEHICLE, PEERS_VEHICLE = 1, 2
+"""Vehicles of the lab: that of all agents under test, and that of their peers."""
 FIRST_PORT = 14600
 MAX_READ_BYTES = 65536
 START_LIMIT_S, ANSWER_LIMIT_S, GRACE_S = 30.0, 10.0, 5.0
-LOOK_AGAIN_S = 0.01
-LAST_CHANCES, CHANCE_S = 10, 1.0
+POLL_S = 0.01
+MAX_REPEATED_REQUESTS, REPEATED_REQUEST_LIMIT_S = 10, 1.0
 """Number of further requests to an agent that did not answer one within ANSWER_LIMIT_S, and their time limit. An agent
 that answers none of them hangs. A pause of the harness uses up one of them only."""
-MOMENT_S = 0.5
+END_REPORT_LIMIT_S = 0.5
 """Maximum wall time between the end of a process and the report of that end."""
 MAX_OUTPUT_BYTES = 16 * 1024 * 1024
-"""Of an agent that is not yet ready."""
+"""Maximum output of an agent that is not ready yet."""
 _SO_TIMESTAMPNS = 35
-"""Linux; Python has no name for it."""
+"""Socket option of Linux. Python has no name for it."""
 _TIMESPEC = struct.Struct("@qq")
 ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
 
 
 class NoAgentError(HarnessError):
-    """The agent does not start at all: nothing can be said of it."""
+    """The agent does not start, so it cannot be tested."""
 
 
 class AgentEndedError(Exception):
-    """The agent ended by itself, or does not answer: how."""
+    """The agent ended by itself, or does not answer. The message names the end."""
 
 
 class AgentExitedError(AgentEndedError):
@@ -59,11 +59,11 @@ class AgentExitedError(AgentEndedError):
 
 
 class AgentHangsError(AgentEndedError):
-    """The agent runs, but answers no request, however often it is asked."""
+    """The agent runs, but answered none of several requests."""
 
 
-class Air:
-    """Opened by `async with Air(place, command, jobs)`; hands out free ports."""
+class UdpLab:
+    """A lab with `count` ports. Open it with `async with`. `take_port` reserves a port for an agent."""
 
     def __init__(self, place: Path, command: Sequence[str], count: int) -> None:
         self.place = place
@@ -71,11 +71,11 @@ class Air:
         self._ports = [FIRST_PORT + number for number in range(count)]
         self._lab: Lab | None = None
         self._sockets: dict[int, socket.socket] = {}
-        self._lives = 0
+        self._incarnations = 0
 
     async def __aenter__(self) -> Self:
         try:
-            self._lab = await Lab.open((AGENTS, PEERS_ON), log=self.place / "lab.log")
+            self._lab = await Lab.open((AGENTS_VEHICLE, PEERS_VEHICLE), log=self.place / "lab.log")
             try:
                 self._sockets = dict(zip(self._ports, await self._open_sockets(), strict=True))
             except BaseException:
@@ -96,7 +96,7 @@ class Air:
 
     @property
     def lab(self) -> Lab:
-        assert self._lab is not None, "it is open"
+        assert self._lab is not None, "the lab is not open"
         return self._lab
 
     async def _open_sockets(self) -> list[socket.socket]:
@@ -104,11 +104,11 @@ class Air:
         directory = os.open(self.place, os.O_PATH)
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
-                listener.bind(f"/proc/self/fd/{directory}/{name}")  # an address holds 107 bytes
+                listener.bind(f"/proc/self/fd/{directory}/{name}")  # the address of a Unix socket has at most 107 bytes
                 listener.listen(1)
                 listener.setblocking(False)
                 helper = await self.lab.spawn(
-                    PEERS_ON,
+                    PEERS_VEHICLE,
                     [sys.executable, "-P", "-m", _ports.__name__, name, *map(str, self._ports)],
                     cwd=self.place,
                     env=dict(os.environ),
@@ -130,7 +130,7 @@ class Air:
             connection.setblocking(True)
             descriptors: list[int] = []
             while len(descriptors) < len(self._ports):
-                _, some, _, _ = socket.recv_fds(connection, 1, _ports.AT_ONCE)
+                _, some, _, _ = socket.recv_fds(connection, 1, _ports.MAX_DESCRIPTORS)
                 if not some:
                     raise MachineError(f"no sockets in the lab: {last_line(self.place / 'ports.log')}")
                 descriptors += some
@@ -139,20 +139,22 @@ class Air:
             air.setblocking(False)
         return sockets
 
-    def mission(self, variant: Variant, port: int, speedup: float, keys: Mapping[str, Any] = NO_KEYS) -> dict[str, Any]:
-        """The mission file of an agent on this port."""
-        address = self.lab.addresses[AGENTS]
+    def mission(
+        self, variant: SettingsVariant, port: int, speedup: float, keys: Mapping[str, Any] = NO_KEYS
+    ) -> dict[str, Any]:
+        """Return the mission file of an agent on this port. `keys` replace keys of it."""
+        address = self.lab.addresses[AGENTS_VEHICLE]
         return mission(variant, address=address, broadcast=self.lab.broadcast, port=port, speedup=speedup, keys=keys)
 
     def take_port(self) -> int:
         return self._ports.pop()
 
-    def give_back(self, port: int) -> None:
+    def return_port(self, port: int) -> None:
         self._ports.append(port)
 
     def new_directory(self) -> Path:
-        self._lives += 1
-        directory = self.place / f"life-{self._lives}"
+        self._incarnations += 1
+        directory = self.place / f"life-{self._incarnations}"
         directory.mkdir()
         return directory
 
@@ -160,62 +162,63 @@ class Air:
         return self._sockets[port]
 
 
-class Ear:
-    """What is heard on a port, as (when, datagram), and said there.
+class PeerSocket:
+    """The socket of an agent's peers: it receives the agent's datagrams, and sends those of the peers.
 
-    Seconds since the Unix epoch at which the kernel had it: however late the harness comes to read it.
+    `received` has pairs of arrival and datagram. The arrival is the time at which the kernel received the datagram, in
+    seconds since the Unix epoch. It does not depend on when the harness reads the socket.
     """
 
-    def __init__(self, air: Air, port: int) -> None:
+    def __init__(self, air: UdpLab, port: int) -> None:
         self._socket = air.socket_of(port)
         self._broadcast = (air.lab.broadcast, port)
-        self._own_address = air.lab.addresses[PEERS_ON]
+        self._own_address = air.lab.addresses[PEERS_VEHICLE]
         self._arrived = asyncio.Event()
-        self.heard: list[tuple[float, bytes]] = []
+        self.received: list[tuple[float, bytes]] = []
         self.record: list[tuple[float, bool, bytes]] = []
-        """All that crossed the air: when, whether the agent sent it, what."""
+        """All datagrams: wall time in seconds, true if the agent sent it, and content."""
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         with suppress(BlockingIOError):
             while True:
-                self._socket.recv(MAX_READ_BYTES)  # of an earlier life
+                self._socket.recv(MAX_READ_BYTES)  # discard datagrams of the previous agent on this port
         asyncio.get_running_loop().add_reader(self._socket, self.drain)
 
     def close(self) -> None:
         asyncio.get_running_loop().remove_reader(self._socket)
 
     def drain(self) -> None:
-        """Take in what waits in the socket."""
+        """Move all datagrams from the buffer of the socket to `received` and `record`."""
         with suppress(BlockingIOError):
             while True:
                 data, ancillary, _, (address, _) = self._socket.recvmsg(MAX_READ_BYTES, ANCILLARY_BYTES)
                 if address != self._own_address:
-                    at_s = _stamped(ancillary)
-                    self.heard.append((at_s, data))
+                    at_s = _timestamp(ancillary)
+                    self.received.append((at_s, data))
                     self.record.append((at_s, True, data))
                     self._arrived.set()
 
     async def arrival(self, until: float) -> None:
-        """Wait until something more arrives, or it is `until`, in seconds since the Unix epoch."""
+        """Wait until a datagram arrives, or until this wall time, in seconds since the Unix epoch."""
         self._arrived.clear()
         with suppress(TimeoutError):
             await asyncio.wait_for(self._arrived.wait(), max(0.0, until - time.time()))
 
     def take(self) -> list[tuple[float, bytes]]:
         self.drain()
-        heard, self.heard = self.heard, []
-        return heard
+        received, self.received = self.received, []
+        return received
 
-    def say(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         self.record.append((time.time(), False, data))
         with suppress(BlockingIOError):
             self._socket.sendto(data, self._broadcast)
 
 
-class Process:
-    """An agent as a process, from its start to its end, with the files that it leaves."""
+class ProcessUnderTest:
+    """The process of an agent, with its control socket and its files."""
 
     def __init__(
-        self, air: Air, directory: Path, agent_id: int, process: LabProcess, processes: ChildProcesses
+        self, air: UdpLab, directory: Path, agent_id: int, process: LabProcess, processes: ChildProcesses
     ) -> None:
         self._air = air
         self.directory = directory
@@ -225,11 +228,13 @@ class Process:
         self.control = AgentControl(directory / f"{agent_id}.control")
         self.output = directory / f"{agent_id}.out"
         self.signalled = False
-        """The harness sent a signal, so the agent need not answer."""
+        """True if the harness sent a signal, after which the agent may not answer."""
 
     @classmethod
-    async def start(cls, air: Air, directory: Path, mission: dict[str, Any] | bytes, agent_id: int) -> "Process":
-        """It may not be ready yet. Raises NoAgentError if there is no such program."""
+    async def start(
+        cls, air: UdpLab, directory: Path, mission: dict[str, Any] | bytes, agent_id: int
+    ) -> "ProcessUnderTest":
+        """Start the process. It may not be ready yet. Raises NoAgentError if the program does not exist."""
         name = f"{agent_id}.mission.json"
         text = mission if isinstance(mission, bytes) else json.dumps(mission).encode()
         (directory / name).write_bytes(text)
@@ -237,7 +242,7 @@ class Process:
         processes = ChildProcesses()
         try:
             process = await air.lab.spawn(
-                AGENTS,
+                AGENTS_VEHICLE,
                 [*air.command, name],
                 cwd=directory,
                 env=processes.environment(os.environ),
@@ -250,7 +255,7 @@ class Process:
         return cls(air, directory, agent_id, process, processes)
 
     async def ready(self) -> dict[str, Any]:
-        """Its first status. Raises UnsupportedError, AgentEndedError."""
+        """Wait until the agent answers, and return its status. Raises UnsupportedError, AgentEndedError."""
         deadline = time.monotonic() + START_LIMIT_S
         while True:
             try:
@@ -265,10 +270,10 @@ class Process:
                     raise AgentEndedError(f"{reason}: {last_line(self.output)}") from None
                 if self.output.stat().st_size > MAX_OUTPUT_BYTES:
                     raise AgentEndedError("it prints without end and does not answer its control socket") from None
-                await asyncio.sleep(LOOK_AGAIN_S)
+                await asyncio.sleep(POLL_S)
 
     def raise_end(self) -> None:
-        """Raises what its end means."""
+        """Raise UnsupportedError if the process ended with status 127, otherwise AgentExitedError."""
         if self.process.returncode == UNSUPPORTED:
             raise UnsupportedError(last_line(self.output))
         raise self._exited()
@@ -277,33 +282,36 @@ class Process:
         return AgentExitedError(f"it ended with {self.process.end}: {last_line(self.output)}")
 
     async def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
-        """Raises AgentEndedError if it does not answer, AgentRefusedError if it refuses."""
+        """Send a command, and return the answer.
+
+        Raises AgentEndedError if the agent does not answer, and AgentRefusedError if it refuses the command.
+        """
         try:
             return await self.control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
         except AgentSilentError as error:
             with suppress(TimeoutError):
-                await asyncio.wait_for(self.process.wait(), MOMENT_S)
+                await asyncio.wait_for(self.process.wait(), END_REPORT_LIMIT_S)
             if self.process.returncode is not None:
                 raise self._exited() from None
             await self.check_answers()
             raise AgentEndedError(str(error)) from None
 
     async def check_answers(self) -> None:
-        """Raises AgentHangsError if the agent runs and answers none of several requests."""
-        for _ in range(LAST_CHANCES):
-            next_chance = time.monotonic() + CHANCE_S
+        """Raise AgentHangsError if the agent runs and answers none of several requests."""
+        for _ in range(MAX_REPEATED_REQUESTS):
+            next_chance = time.monotonic() + REPEATED_REQUEST_LIMIT_S
             try:
-                await self.control.ask("status", timeout_s=CHANCE_S)
+                await self.control.ask("status", timeout_s=REPEATED_REQUEST_LIMIT_S)
                 return
             except AgentRefusedError:
                 return
             except AgentSilentError:
                 await asyncio.sleep(next_chance - time.monotonic())
         if self.process.returncode is None:
-            raise AgentHangsError(f"it hangs: it did not answer {LAST_CHANCES} requests in a row")
+            raise AgentHangsError(f"it hangs: it did not answer {MAX_REPEATED_REQUESTS} requests in a row")
 
     async def export(self) -> dict[str, Any]:
-        """Its chain export, made now. Raises AgentEndedError, AgentRefusedError."""
+        """Make the agent export its chain, and return the export. Raises AgentEndedError, AgentRefusedError."""
         answer = await self.ask("export")
         path = self.directory / f"{self.agent_id}.chain.json"
         try:
@@ -331,7 +339,7 @@ class Process:
         await self.process.wait()
 
 
-def _stamped(ancillary: Sequence[tuple[int, int, bytes]]) -> float:
+def _timestamp(ancillary: Sequence[tuple[int, int, bytes]]) -> float:
     for level, kind, data in ancillary:
         if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
             seconds, nanoseconds = _TIMESPEC.unpack_from(data)

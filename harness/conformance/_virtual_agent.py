@@ -1,6 +1,7 @@
-"""An agent in virtual time beside the reference: `COMMAND --virtual`, which reads inputs and writes answers as lines.
+"""An agent in virtual time: `COMMAND --virtual`, which reads inputs and writes answers as lines.
 
-Nobody waits for a timer, and the instant at which the next one ends is compared as well. One process lives many lives.
+A test in virtual time waits for no timer. It also compares the time at which the next timer expires. One process plays
+many incarnations of the agent, one after another.
 """
 
 import asyncio
@@ -16,15 +17,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from harness.conformance._agent_under_test import AgentUnderTest, Start
 from harness.conformance._alphabet import Input
-from harness.conformance._observation import Exchange, Names, Seen, compare, told_datagram
-from harness.conformance._reference_model import Expire, Model, Run
-from harness.conformance._state_space import STEP_S, Variant, ends_next, state_of
-from harness.conformance._subject import Start, Subject
+from harness.conformance._observation import KnownNames, Observation, RecordedDatagram, compare, datagram_text
+from harness.conformance._reference_model import ExpectedRun, ReferenceModel, TimerExpiry
+from harness.conformance._state_space import STEP_S, SettingsVariant, next_timer_name, state_of
 from harness.conformance._udp_lab import (
     ANSWER_LIMIT_S,
     GRACE_S,
-    LOOK_AGAIN_S,
+    POLL_S,
     START_LIMIT_S,
     AgentEndedError,
     AgentExitedError,
@@ -41,8 +42,8 @@ ANSWER_BYTES = 4 * 1024 * 1024
 NO_AGENT = "the agent does not answer in virtual time"
 
 
-class Program:
-    """A process of the agent."""
+class VirtualProgram:
+    """A process of `COMMAND --virtual`."""
 
     def __init__(
         self,
@@ -55,7 +56,7 @@ class Program:
     ) -> None:
         self._process = process
         self._processes = processes
-        self._given = given
+        self._input = given
         self._reading = reading
         self._answers = answers
         self._errors = errors
@@ -63,8 +64,11 @@ class Program:
         self.broken = False
 
     @classmethod
-    async def start(cls, command: Sequence[str], errors: Path) -> "Program":
-        """Not by asyncio's own subprocess_exec: where that is cancelled, it waits for ever for pipes nobody closes."""
+    async def start(cls, command: Sequence[str], errors: Path) -> "VirtualProgram":
+        """Start the process. Raises NoAgentError.
+
+        `asyncio.create_subprocess_exec` is no alternative: after a cancellation it waits forever for the pipes.
+        """
         try:
             processes = ChildProcesses()
             with errors.open("ab") as file:
@@ -86,10 +90,14 @@ class Program:
             raise
 
     @classmethod
-    async def _connected(cls, process: subprocess.Popen[bytes], processes: ChildProcesses, errors: Path) -> "Program":
+    async def _connected(
+        cls, process: subprocess.Popen[bytes], processes: ChildProcesses, errors: Path
+    ) -> "VirtualProgram":
         loop = asyncio.get_running_loop()
         answers = asyncio.StreamReader(ANSWER_BYTES)
-        protocol = asyncio.StreamReaderProtocol(asyncio.StreamReader())  # which tells a writer when there is room
+        protocol = asyncio.StreamReaderProtocol(
+            asyncio.StreamReader()
+        )  # a StreamWriter needs it to wait for free space
         reading, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(answers), process.stdout)
         try:
             writing, _ = await loop.connect_write_pipe(lambda: protocol, process.stdin)
@@ -99,25 +107,25 @@ class Program:
         return cls(process, processes, asyncio.StreamWriter(writing, protocol, None, loop), reading, answers, errors)
 
     async def ask(self, line: dict[str, Any], limit_s: float = ANSWER_LIMIT_S) -> dict[str, Any]:
-        """Its answer. Raises AgentEndedError, UnsupportedError."""
+        """Send a line, and return the answer. Raises AgentEndedError, UnsupportedError."""
         self._lines += 1
         try:
             async with asyncio.timeout(limit_s):
-                self._given.write(json.dumps(line).encode("ascii") + b"\n")
-                await self._given.drain()
+                self._input.write(json.dumps(line).encode("ascii") + b"\n")
+                await self._input.drain()
                 text = await self._answers.readline()
                 answer = json.loads(text) if text else None
         except TimeoutError:
             self.broken = True
-            line_number = f"line {self._lines} of its process"
-            raise AgentHangsError(f"it hangs: it did not answer {line_number} within {limit_s:g} s") from None
+            place = f"line {self._lines} of its process"
+            raise AgentHangsError(f"it hangs: it did not answer {place} within {limit_s:g} s") from None
         except (OSError, ValueError, RecursionError) as error:
             self.broken = True
             raise AgentEndedError(f"no readable answer: {error}") from None
         if answer is None:
             self.broken = True
             with suppress(TimeoutError):
-                await asyncio.wait_for(_ended(self._process), GRACE_S)
+                await asyncio.wait_for(_wait_for_end(self._process), GRACE_S)
             if self._process.returncode is None:
                 raise AgentEndedError("it closed its standard output and still runs")
             raise AgentExitedError(f"it ended with status {self._process.returncode}: {last_line(self._errors)}")
@@ -131,9 +139,9 @@ class Program:
         return answer
 
     async def close(self) -> None:
-        """With all that it has started, whoever else holds its pipes."""
-        if not self._given.is_closing():
-            self._given.transport.abort()
+        """End the process and all its children, even if other processes hold its pipes."""
+        if not self._input.is_closing():
+            self._input.transport.abort()
         self._reading.close()
         await _end(self._process, self._processes)
 
@@ -143,43 +151,45 @@ async def _end(process: subprocess.Popen[bytes], processes: ChildProcesses) -> N
         os.killpg(process.pid, signal.SIGKILL)
     for pipe in filter(None, (process.stdin, process.stdout)):
         pipe.close()
-    await _ended(process)
+    await _wait_for_end(process)
     processes.end()
 
 
-async def _ended(process: subprocess.Popen[bytes]) -> None:
+async def _wait_for_end(process: subprocess.Popen[bytes]) -> None:
     while process.poll() is None:
-        await asyncio.sleep(LOOK_AGAIN_S)
+        await asyncio.sleep(POLL_S)
 
 
-class InVirtualTime(Subject):
-    """One incarnation in a process, which the next one uses if `idle` is a list."""
+class VirtualTimeAgent(AgentUnderTest):
+    """One incarnation of an agent in virtual time. At its end its process goes into the list `idle`, if one exists."""
 
-    def __init__(self, variant: Variant, program: Program, idle: list[Program] | None) -> None:
+    def __init__(self, variant: SettingsVariant, program: VirtualProgram, idle: list[VirtualProgram] | None) -> None:
         super().__init__(variant)
         self._program = program
         self._idle = idle
         self._now = 0.0
-        self._record: list[Exchange] = []
-        self._stopped: dict[float, Run] = {}
-        """When timers would have ended, and what stopped them."""
+        self._record: list[RecordedDatagram] = []
+        self._stopped_timers: dict[float, ExpectedRun] = {}
+        """Former deadline of a stopped timer -> the handler run that stopped the timer."""
 
     @classmethod
-    async def start(cls, variant: Variant, program: Program, idle: list[Program] | None) -> "InVirtualTime":
-        subject = cls(variant, program, idle)
+    async def start(
+        cls, variant: SettingsVariant, program: VirtualProgram, idle: list[VirtualProgram] | None
+    ) -> "VirtualTimeAgent":
+        agent = cls(variant, program, idle)
         try:
             await program.ask({"t": 0.0, "mission": virtual_mission(variant), "trace": False}, START_LIMIT_S)
         except BaseException:
-            await subject.close()
+            await agent.close()
             raise
-        return subject
+        return agent
 
     @property
-    def hurried(self) -> bool:
+    def timer_is_near(self) -> bool:
         deadline = self.model.agent.next_timer()
         return deadline is not None and deadline - self._now <= STEP_S
 
-    def exchanges(self) -> tuple[Exchange, ...]:
+    def exchanges(self) -> tuple[RecordedDatagram, ...]:
         return tuple(self._record)
 
     async def close(self) -> None:
@@ -188,27 +198,27 @@ class InVirtualTime(Subject):
         else:
             self._idle.append(self._program)
 
-    async def _step(self, given: Input) -> Seen | None:
+    async def _step(self, given: Input) -> Observation | None:
         model = self.model
         before, deadline = state_of(model), model.agent.next_timer()
         action = given.make(model)
         if action is None:
             return None
-        self._now = deadline if isinstance(action, Expire) and deadline is not None else self._now + STEP_S
+        self._now = deadline if isinstance(action, TimerExpiry) and deadline is not None else self._now + STEP_S
         timestamp_us = round(self._now * MICROSECONDS)
         running = _deadlines(model)
         outcome = model.feed(action, self._now, timestamp_us)
-        if not isinstance(action, Expire):
-            self._stopped |= dict.fromkeys(running - _deadlines(model), outcome.runs[0]) if outcome.runs else {}
+        if not isinstance(action, TimerExpiry):
+            self._stopped_timers |= dict.fromkeys(running - _deadlines(model), outcome.runs[0]) if outcome.runs else {}
         line = given_line(action, self._now, timestamp_us)
         wrong, sent, status = list[str](), list[bytes](), dict[str, Any]()
         ended = None
-        ends, should = model.agent.next_timer(), model.agent.next_timer()
-        names = Names(model)
+        announced_s, expected_s = model.agent.next_timer(), model.agent.next_timer()
+        names = KnownNames(model)
         try:
             answer = await self._program.ask(line)
             sent = [base64.b64decode(text, validate=True) for text in answer["sent"]]
-            ends = answer.get("timer")
+            announced_s = answer.get("timer")
             told = (await self._program.ask({"t": self._now, "command": "status"})).get("answer")
             status = told if isinstance(told, dict) else {}
         except (AgentEndedError, UnsupportedError) as error:
@@ -218,40 +228,40 @@ class InVirtualTime(Subject):
             wrong.append("its answer has no `sent`, a list of datagrams in base64")
         if "datagram" in line:
             data = base64.b64decode(line["datagram"])
-            self._record.append(Exchange(self._now, False, data, told_datagram(data, names)))
-        self._record += [Exchange(self._now, True, data, told_datagram(data, names)) for data in sent]
-        timer = ends_next(model)
-        seen = replace(compare(model, given, before, outcome, sent, status, wrong), ended=ended)
-        if _same_instant(ends, should):
-            return replace(seen, started=timer)
-        sentence = f"according to its answer its next timer expires at {ends} s, not at {should} s"
-        told = replace(seen, wrong=(*seen.wrong, sentence))
-        if seen.wrong:  # what does something else starts other timers
+            self._record.append(RecordedDatagram(self._now, False, data, datagram_text(data, names)))
+        self._record += [RecordedDatagram(self._now, True, data, datagram_text(data, names)) for data in sent]
+        timer = next_timer_name(model)
+        observation = replace(compare(model, given, before, outcome, sent, status, wrong), ended=ended)
+        if _same_instant(announced_s, expected_s):
+            return replace(observation, running_timer=timer)
+        sentence = f"according to its answer its next timer expires at {announced_s} s, not at {expected_s} s"
+        told = replace(observation, wrong=(*observation.wrong, sentence))
+        if observation.wrong:  # a wrong handler run starts other timers, so this difference is no further evidence
             return told
-        if isinstance(ends, float) and ends in self._stopped:
-            return replace(told, hidden=self._stopped[ends])
+        if isinstance(announced_s, float) and announced_s in self._stopped_timers:
+            return replace(told, hidden_run=self._stopped_timers[announced_s])
         begun = (each.name for each in model.state.timers if each.deadline and each.deadline not in running)
-        return replace(told, mistimed=next(begun, None))
+        return replace(told, wrong_timer=next(begun, None))
 
 
-def _deadlines(model: Model) -> set[float]:
+def _deadlines(model: ReferenceModel) -> set[float]:
     return {timer.deadline for timer in model.state.timers if timer.deadline is not None}
 
 
-def _same_instant(ends: Any, should: float | None) -> bool:
-    if should is None or ends is None:
-        return should is ends
-    return isinstance(ends, int | float) and math.isclose(ends, should, rel_tol=1e-9)
+def _same_instant(announced_s: Any, expected_s: float | None) -> bool:
+    if expected_s is None or announced_s is None:
+        return expected_s is announced_s
+    return isinstance(announced_s, int | float) and math.isclose(announced_s, expected_s, rel_tol=1e-9)
 
 
-def starting(command: Sequence[str], errors: Path) -> tuple[Start, list[Program]]:
-    """Agents in virtual time; and the processes of which they are made, to be closed at the end."""
-    idle: list[Program] = []
+def starter(command: Sequence[str], errors: Path) -> tuple[Start, list[VirtualProgram]]:
+    """Return a function that starts agents in virtual time, and the list of idle processes to close at the end."""
+    idle: list[VirtualProgram] = []
 
-    async def start(variant: Variant, alone: bool) -> Subject:
+    async def start(variant: SettingsVariant, alone: bool) -> AgentUnderTest:
         if alone:  # an earlier incarnation of the process may be the cause of a failure
-            return await InVirtualTime.start(variant, await Program.start(command, errors), None)
-        program = idle.pop() if idle else await Program.start(command, errors)
-        return await InVirtualTime.start(variant, program, idle)
+            return await VirtualTimeAgent.start(variant, await VirtualProgram.start(command, errors), None)
+        program = idle.pop() if idle else await VirtualProgram.start(command, errors)
+        return await VirtualTimeAgent.start(variant, program, idle)
 
     return start, idle

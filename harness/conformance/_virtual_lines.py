@@ -1,7 +1,7 @@
-"""A way as lines of virtual time: what an agent that is driven by standard input is given, and what it must answer.
+"""A path as lines of virtual time: the inputs for `COMMAND --virtual`, and the expected answers.
 
-The lines are those of `COMMAND --virtual` (ucp/contract/CONTRACT.md): each input with its time, each answer with the
-datagrams in base64 and the instant at which the next timer ends. Beside them stands in words what they say.
+ucp/contract/CONTRACT.md describes the lines. An input has its time. An answer has datagrams in base64, and the time at
+which the next timer expires. Each line also has a description in words.
 """
 
 import base64
@@ -9,96 +9,110 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from harness.conformance._agent_under_test import mission
 from harness.conformance._alphabet import INPUTS, TIMER, Input
-from harness.conformance._observation import Names, told, told_datagram
-from harness.conformance._reference_model import EVENT_ID, Action, Command, Datagram, Expire, Log, Model, Outcome
-from harness.conformance._state_space import STEP_S, Variant
-from harness.conformance._subject import mission
+from harness.conformance._observation import KnownNames, datagram_text, message_text
+from harness.conformance._reference_model import (
+    EVENT_ID,
+    Action,
+    ControlCommand,
+    ExpectedOutcome,
+    LogEvent,
+    PeerDatagram,
+    ReferenceModel,
+    TimerExpiry,
+)
+from harness.conformance._state_space import STEP_S, SettingsVariant
 from ucp.clock import MICROSECONDS
 
 
 @dataclass(frozen=True)
-class Line:
-    """An input, and what must come of it."""
+class VirtualLine:
+    """An input and the expected answer."""
 
     name: str
     given: dict[str, Any]
     answer: dict[str, Any]
-    says: str
+    input_text: str
     """The input in words."""
-    sends: tuple[str, ...]
-    """What must be sent, in words."""
-    outcome: Outcome
+    sent_texts: tuple[str, ...]
+    """The expected messages in words."""
+    outcome: ExpectedOutcome
 
 
 class NotPlayableError(Exception):
     """An input is impossible in virtual time, because over UDP a timer expired late."""
 
 
-class Writer:
-    """The reference in virtual time, whose inputs and answers are written down."""
+class LineWriter:
+    """The reference in virtual time. It records each input and answer as a line."""
 
-    def __init__(self, variant: Variant) -> None:
-        self.model = Model(variant.settings)
+    def __init__(self, variant: SettingsVariant) -> None:
+        self.model = ReferenceModel(variant.settings)
         self.now = 0.0
         self._variant = variant
 
-    def first(self) -> dict[str, Any]:
-        """The line with which a life begins."""
+    def first_line(self) -> dict[str, Any]:
+        """Return the line that starts an incarnation of the agent."""
         return {"t": 0.0, "mission": virtual_mission(self._variant), "trace": False}
 
-    def lines(self, way: Sequence[str]) -> Iterator[Line]:
+    def lines(self, path: Sequence[str]) -> Iterator[VirtualLine]:
         """Yield the lines of these inputs. Raises NotPlayableError."""
-        for name in way:
+        for name in path:
             given = INPUTS[name]
-            if given.first is not None:
-                yield self.line(INPUTS[given.first])
+            if given.preceding is not None:
+                yield self.line(INPUTS[given.preceding])
                 yield self.line(INPUTS[TIMER])
             else:
                 yield self.line(given)
 
-    def line(self, given: Input) -> Line:
+    def line(self, given: Input) -> VirtualLine:
         action = given.make(self.model)
         if action is None:
             raise NotPlayableError(given.name)
         deadline = self.model.agent.next_timer()
-        self.now = deadline if isinstance(action, Expire) and deadline is not None else self.now + STEP_S
+        self.now = deadline if isinstance(action, TimerExpiry) and deadline is not None else self.now + STEP_S
         timestamp_us = round(self.now * MICROSECONDS)
         outcome = self.model.feed(action, self.now, timestamp_us)
-        names = Names(self.model)
+        names = KnownNames(self.model)
         answer = {
             "sent": [base64.b64encode(data).decode("ascii") for data in self.model.datagrams],
             "timer": self.model.agent.next_timer(),
         }
-        sends = tuple(told(message, names) for message in outcome.sent)
-        return Line(
-            given.name, given_line(action, self.now, timestamp_us), answer, _says(action, names), sends, outcome
+        sent_texts = tuple(message_text(message, names) for message in outcome.sent)
+        return VirtualLine(
+            given.name,
+            given_line(action, self.now, timestamp_us),
+            answer,
+            _input_text(action, names),
+            sent_texts,
+            outcome,
         )
 
 
-def virtual_mission(variant: Variant) -> dict[str, Any]:
+def virtual_mission(variant: SettingsVariant) -> dict[str, Any]:
     return mission(variant, address="10.0.0.1", broadcast="10.0.0.255", port=14600, speedup=1.0, keys={"epoch_us": 0})
 
 
 def given_line(action: Action, now: float, timestamp_us: int) -> dict[str, Any]:
-    """An input as `COMMAND --virtual` reads it."""
+    """Return an input in the form that `COMMAND --virtual` reads."""
     match action:
-        case Datagram():
+        case PeerDatagram():
             return {"t": now, "datagram": base64.b64encode(action.data).decode("ascii")}
-        case Log():
+        case LogEvent():
             data = base64.b64encode(action.data).decode("ascii")
             return {"t": now, "event_id": EVENT_ID, "data": data, "timestamp_us": timestamp_us}
-        case Command():
+        case ControlCommand():
             return {"t": now, "command": action.name}
     return {"t": now, "timer": True}
 
 
-def _says(action: Action, names: Names) -> str:
+def _input_text(action: Action, names: KnownNames) -> str:
     match action:
-        case Datagram():
-            return f"{told_datagram(action.data, names)} of agent {action.sender}"
-        case Log():
+        case PeerDatagram():
+            return f"{datagram_text(action.data, names)} of agent {action.sender}"
+        case LogEvent():
             return "an event that fills a block"
-        case Command():
+        case ControlCommand():
             return f"the command {action.name}"
     return "the next timer ends"

@@ -1,4 +1,4 @@
-"""Agents x Algorithms as a page, for a project with many implementations; in one file that loads nothing."""
+"""A page with the results of many agents: a table of agents and Algorithms, in one HTML file without external parts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from harness.conformance.results import FURTHER_CHECKS, TITLES, Results, Row
+from harness.conformance.results import FURTHER_CHECKS, TITLES, AlgorithmCounts, Results
 from harness.conformance.results_table import headline
 from harness.errors import HarnessError
 from harness.report import html
@@ -17,8 +17,8 @@ _STYLE = """
 td.holds { color: var(--good, #1a7f37); } td.violated { color: var(--bad, #cf222e); font-weight: 600; }
 td { font-variant-numeric: tabular-nums; text-align: center; } th[scope=row] { text-align: left; }
 """
-MOST_BYTES = 256 * 1024
-MOST_AGENTS = 50
+MAX_BYTES = 256 * 1024
+MAX_AGENTS = 50
 FAILURES_SHOWN = 20
 
 
@@ -27,19 +27,20 @@ class AgentsFileError(HarnessError):
 
 
 @dataclass(frozen=True)
-class Cell:
-    """What came of an agent's cases of one Algorithm, and the word of it for the style sheet."""
+class TableCell:
+    """The results of one agent in one Algorithm."""
 
     text: str
     kind: str
+    """CSS class of the cell."""
 
 
 def read_agents(path: Path) -> dict[str, list[str]]:
-    """Name -> command, from YAML. Raises AgentsFileError."""
+    """Return name -> command from a YAML file. Raises AgentsFileError."""
     form = "`name: [program, argument, ...]` for each agent"
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise AgentsFileError(f"{path} is larger than {MOST_BYTES} bytes: it must be {form}")
+        if path.stat().st_size > MAX_BYTES:
+            raise AgentsFileError(f"{path} is larger than {MAX_BYTES} bytes: it must be {form}")
         document: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise AgentsFileError(f"{path} cannot be read: {error.strerror}") from None
@@ -52,13 +53,13 @@ def read_agents(path: Path) -> dict[str, list[str]]:
         and all(isinstance(word, str) and "\0" not in word for word in command)
         for name, command in document.items()
     )
-    if not right or not 0 < len(document) <= MOST_AGENTS:
-        raise AgentsFileError(f"{path} must be {form}, with 1 to {MOST_AGENTS} agents")
+    if not right or not 0 < len(document) <= MAX_AGENTS:
+        raise AgentsFileError(f"{path} must be {form}, with 1 to {MAX_AGENTS} agents")
     return {name: list(command) for name, command in document.items()}
 
 
 def to_html(results: Mapping[str, Results | str]) -> str:
-    """The page. Of an agent that could not be tested there is a sentence instead of results."""
+    """Return the page. An agent that could not be tested has a sentence instead of results."""
     tested = {name: result for name, result in results.items() if isinstance(result, Results)}
     rows = {name: {row.algorithm: row for row in result.rows()} for name, result in tested.items()}
     numbers = [number for number in (*sorted(TITLES), FURTHER_CHECKS) if any(number in each for each in rows.values())]
@@ -69,22 +70,25 @@ def to_html(results: Mapping[str, Results | str]) -> str:
         headline=(f"{failed} failed", "violated") if failed else (f"{len(tested)} agents, all passed", "holds"),
         names=list(results),
         table=[
-            (Row(number).title, [_cell(rows.get(name, {}).get(number), name in tested) for name in results])
+            (
+                AlgorithmCounts(number).title,
+                [_table_cell(rows.get(name, {}).get(number), name in tested) for name in results],
+            )
             for number in numbers
         ],
         notes=[(name, _notes(result)) for name, result in results.items()],
     )
 
 
-def _cell(row: Row | None, tested: bool) -> Cell:
+def _table_cell(row: AlgorithmCounts | None, tested: bool) -> TableCell:
     if row is None:
-        return Cell("\u2013" if tested else "not tested", "")
+        return TableCell("\u2013" if tested else "not tested", "")
     if row.failed:
-        return Cell(f"{row.failed} failed, {row.passed} passed", "violated")
+        return TableCell(f"{row.failed} failed, {row.passed} passed", "violated")
     if row.passed:
         left = f", {row.not_tried} not tried" if row.not_tried else ""
-        return Cell(f"{row.passed} passed{left}", "holds")
-    return Cell("not applicable" if row.not_applicable else "not tried", "")
+        return TableCell(f"{row.passed} passed{left}", "holds")
+    return TableCell("not applicable" if row.not_applicable else "not tried", "")
 
 
 def _notes(result: Results | str) -> Sequence[str]:

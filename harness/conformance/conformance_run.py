@@ -1,4 +1,4 @@
-"""A whole run over UDP: the vectors by tours, then what is suspected alone; and what is to be kept of each failure."""
+"""A conformance test of one agent: play the vectors and the handwritten cases, and write the files of each failure."""
 
 import asyncio
 import time
@@ -7,157 +7,175 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from harness.conformance import _udp_subject
-from harness.conformance import _virtual_subject as virtual
-from harness.conformance._blame import Evidence
-from harness.conformance._handwritten import by_hand
+from harness.conformance import _udp_agent
+from harness.conformance import _virtual_agent as virtual
+from harness.conformance._blame import BlameEvidence
+from harness.conformance._handwritten import handwritten
 from harness.conformance._kept_failures import keep
 from harness.conformance._suite import (
-    ALONE_AT_ONCE,
-    FAILURES_OF_A_KIND,
-    MOST_SUSPICIONS,
-    SIDE_BY_SIDE,
-    Failure,
-    Suite,
-    Tally,
+    MAX_FAILURES_OF_A_KIND,
+    MAX_SUSPICIONS,
+    MAX_WORKERS,
+    RETRY_WORKERS,
+    ConfirmedFailure,
+    VariantResult,
+    VectorSuite,
 )
-from harness.conformance._udp_lab import Air
-from harness.conformance.results import FURTHER_CHECKS, Case, Results, Row
-from harness.conformance.vectors import Vectors, generate
+from harness.conformance._udp_lab import UdpLab
+from harness.conformance.results import FURTHER_CHECKS, AlgorithmCounts, CaseResult, Results
+from harness.conformance.vectors import VectorSet, generate
 from harness.errors import MachineError
 
-IN_VIRTUAL_TIME = 2
-"""Processes of the agent there."""
+VIRTUAL_WORKERS = 2
+"""Number of processes of the agent in virtual time."""
 LIMIT_S = 600.0
-"""Of the tours, in wall time; what has not been seen by then is not tried. A quiet machine needs a sixth of it."""
+"""Time limit of the tours in wall seconds. Vectors that are left then are not tried. An idle machine needs 100 s."""
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What is to be tested: `only` names one Algorithm, `keep` is where failures are written to."""
+class ConformanceRequest:
+    """The agent to test, and the options of the test."""
 
     command: tuple[str, ...]
     only: str | None
+    """Number or handler of the only Algorithm to test. None: test all."""
     keep: Path | None
+    """Directory for the files of failures. None: write no files."""
     virtual: bool = False
-    by_hand: bool = True
-    enough: int = MOST_SUSPICIONS
+    """True: test in virtual time."""
+    handwritten: bool = True
+    """True: also play the handwritten cases, over UDP."""
+    max_suspicions: int = MAX_SUSPICIONS
     limit_s: float = LIMIT_S
 
 
 def conform(
-    asked: Asked, place: Path, told: Callable[[int, int], None], generated: Sequence[Vectors] | None = None
+    request: ConformanceRequest,
+    place: Path,
+    show_progress: Callable[[int, int], None],
+    vector_sets: Sequence[VectorSet] | None = None,
 ) -> Results:
-    """Raises MachineError, NoAgentError. `told` is called with how many vectors have passed, of how many.
+    """Test an agent. Raises MachineError, NoAgentError.
 
-    `generated` are other vectors than all that `asked` is about.
+    `show_progress` receives the number of passed vectors, and the number of all vectors. `vector_sets` replace the
+    vectors that the request selects.
     """
-    results = Results(asked.command, 0.0, datetime.now(UTC).isoformat(timespec="seconds"))
+    results = Results(request.command, 0.0, datetime.now(UTC).isoformat(timespec="seconds"))
     began = time.monotonic()
     try:
-        chosen = generate(asked.only) if generated is None else generated
+        chosen = generate(request.only) if vector_sets is None else vector_sets
         total = sum(len(vectors.wanted) for vectors in chosen)
-        asyncio.run(_run(asked, place, chosen, lambda count: told(count, total), results))
+        asyncio.run(_run(request, place, chosen, lambda count: show_progress(count, total), results))
     except KeyboardInterrupt:
         results.interrupted = True
-    _keep_failures(results, asked)
+    _keep_failures(results, request)
     results.wall_s = time.monotonic() - began
     return results
 
 
 async def _run(
-    asked: Asked, place: Path, generated: Sequence[Vectors], told: Callable[[int], None], results: Results
+    request: ConformanceRequest,
+    place: Path,
+    vector_sets: Sequence[VectorSet],
+    show_progress: Callable[[int], None],
+    results: Results,
 ) -> None:
-    until = time.monotonic() + asked.limit_s
-    if asked.virtual:
-        start, programs = virtual.starting(asked.command, place / "errors.log")
+    until = time.monotonic() + request.limit_s
+    if request.virtual:
+        start, programs = virtual.starter(request.command, place / "errors.log")
         try:
-            await _play(Suite(start, generated, told, side_by_side=IN_VIRTUAL_TIME), until, asked, results)
+            await _play(
+                VectorSuite(start, vector_sets, show_progress, workers=VIRTUAL_WORKERS), until, request, results
+            )
         finally:
             for program in programs:
                 await program.close()
         return
-    async with Air(place, asked.command, SIDE_BY_SIDE + ALONE_AT_ONCE) as air:
-        start = _udp_subject.starting(air)
+    async with UdpLab(place, request.command, MAX_WORKERS + RETRY_WORKERS) as lab:
+        start = _udp_agent.starter(lab)
         await _play(
-            Suite(start, generated, told, side_by_side=SIDE_BY_SIDE, enough=asked.enough), until, asked, results
+            VectorSuite(start, vector_sets, show_progress, workers=MAX_WORKERS, max_suspicions=request.max_suspicions),
+            until,
+            request,
+            results,
         )
-        if asked.by_hand:
-            results.cases += await by_hand(air, asked.only)
+        if request.handwritten:
+            results.cases += await handwritten(lab, request.only)
 
 
-async def _play(suite: Suite, until: float, asked: Asked, results: Results) -> None:
+async def _play(suite: VectorSuite, until: float, request: ConformanceRequest, results: Results) -> None:
     try:
         await suite.run(until)
     finally:
-        _conclude(suite.tallies, asked, results)
+        _conclude(suite.variant_results, request, results)
 
 
-def _conclude(tallies: Sequence[Tally], asked: Asked, results: Results) -> None:
-    evidence = Evidence(tallies)
-    for tally in tallies:
-        failed = {failure.seen.pair for failure in tally.failures}
-        for pair, step in tally.vectors.wanted.items():
+def _conclude(variant_results: Sequence[VariantResult], request: ConformanceRequest, results: Results) -> None:
+    evidence = BlameEvidence(variant_results)
+    for variant_result in variant_results:
+        failed = {failure.observation.key for failure in variant_result.failures}
+        for key, step in variant_result.vectors.wanted.items():
             algorithm = step.outcome.algorithm
-            row = results.counted.setdefault(algorithm, Row(algorithm))
-            if pair in tally.passed:
+            row = results.counted.setdefault(algorithm, AlgorithmCounts(algorithm))
+            if key in variant_result.passed:
                 row.passed += 1
-            elif tally.unsupported is not None:
+            elif variant_result.unsupported is not None:
                 row.not_applicable += 1
-            elif pair not in failed:
+            elif key not in failed:
                 row.not_tried += 1
-        if tally.unsupported is not None:
-            features = ", ".join(tally.vectors.variant.features) or "the base"
-            results.notes.append(f"not supported: {features}: {tally.unsupported}")
-        results.cases += [_case(failure, evidence) for failure in tally.failures]
-        if tally.set_aside:
+        if variant_result.unsupported is not None:
+            features = ", ".join(variant_result.vectors.variant.features) or "the base"
+            results.notes.append(f"not supported: {features}: {variant_result.unsupported}")
+        results.cases += [_case(failure, evidence) for failure in variant_result.failures]
+        if variant_result.set_aside:
             results.notes.append(
-                f"{tally.set_aside} vectors were not run, because their branches had failed {FAILURES_OF_A_KIND} times"
+                f"{variant_result.set_aside} vectors were not run, because their branches had failed "
+                f"{MAX_FAILURES_OF_A_KIND} times"
             )
 
 
-def _case(failure: Failure, evidence: Evidence) -> Case:
-    seen = failure.seen
+def _case(failure: ConfirmedFailure, evidence: BlameEvidence) -> CaseResult:
+    observation = failure.observation
     if failure.unexplained_end is not None:
-        return Case(
-            f"{failure.unexplained_end}; its incarnation had {len(failure.way)} inputs",
+        return CaseResult(
+            f"{failure.unexplained_end}; its incarnation had {len(failure.path)} inputs",
             FURTHER_CHECKS,
             "failed",
             reason=failure.unexplained_end,
             settings=failure.variant,
-            inputs=failure.way,
-            expected=seen.expected,
-            came=seen.came,
+            inputs=failure.path,
+            expected=observation.expected,
+            received=observation.received,
             wrong=(failure.unexplained_end, "no short sequence that ends with the same input has this effect"),
             exchanges=failure.exchanges,
         )
     blamed = evidence.blame(failure)
-    return Case(
-        f"{seen.before.text}; {seen.given}",
+    return CaseResult(
+        f"{observation.before.text}; {observation.given}",
         blamed.algorithm,
         "failed",
         blamed.handler,
         blamed.branch,
-        seen.wrong[0],
+        observation.wrong[0],
         failure.variant,
-        failure.way,
-        seen.expected,
-        seen.came,
-        seen.wrong,
+        failure.path,
+        observation.expected,
+        observation.received,
+        observation.wrong,
         failure.exchanges,
     )
 
 
-def _keep_failures(results: Results, asked: Asked) -> None:
+def _keep_failures(results: Results, request: ConformanceRequest) -> None:
     """Write the files of each failure. If the disk refuses one, a note reports this, and the results stay."""
-    if asked.keep is None:
+    if request.keep is None:
         return
     kept = []
     try:
         for number, case in enumerate(results.cases, 1):
             if case.verdict == "failed":
-                place = asked.keep / f"{number:02d}-{case.handler or 'program'}"
-                keep(case, asked.command, place)
+                place = request.keep / f"{number:02d}-{case.handler or 'program'}"
+                keep(case, request.command, place)
                 case = replace(case, directory=str(place))
             kept.append(case)
     except MachineError as error:

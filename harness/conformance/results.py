@@ -1,38 +1,40 @@
-"""What came of it: cases passed, failed and not applicable, by Algorithm; each failure with what should have come."""
+"""The results of a conformance test: counts for each Algorithm, and the expected and received messages of failures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from harness.conformance._observation import Exchange
+from harness.conformance._observation import RecordedDatagram
 from harness.errors import CANNOT_HERE, INTERRUPTED, VIOLATED
 from ucp.agent import HANDLERS
 from ucp.trace import in_base64
 
 SCHEMA = "ucp-conformance/1"
 
-Verdict = Literal["passed", "failed", "not applicable", "not tried"]
+CaseVerdict = Literal["passed", "failed", "not applicable", "not tried"]
 TITLES = {handler.algorithm: handler.title for handler in HANDLERS.values()}
 FURTHER_CHECKS = 0
-"""In the place of an Algorithm: what none of them is about."""
+"""Number in place of an Algorithm, for cases about the program, its datagrams and its files."""
 
 
 @dataclass(frozen=True)
-class Case:
-    """One case. `reason` is a sentence; `inputs` lead to where it failed, the last of which was answered wrongly."""
+class CaseResult:
+    """The result of one case: a handwritten case, or a vector that failed."""
 
     name: str
     algorithm: int
-    verdict: Verdict
+    verdict: CaseVerdict
     handler: str = ""
     branch: str = ""
     reason: str = ""
+    """A sentence with the cause of the verdict."""
     settings: str = ""
     inputs: tuple[str, ...] = ()
+    """All inputs of the agent. It answered the last one wrongly."""
     expected: tuple[str, ...] = ()
-    came: tuple[str, ...] = ()
+    received: tuple[str, ...] = ()
     wrong: tuple[str, ...] = ()
-    exchanges: tuple[Exchange, ...] = ()
+    exchanges: tuple[RecordedDatagram, ...] = ()
     directory: str | None = None
     section: str = ""
 
@@ -53,7 +55,7 @@ class Case:
             "settings": self.settings,
             "inputs": list(self.inputs),
             "expected": list(self.expected),
-            "came": list(self.came),
+            "came": list(self.received),
             "wrong": list(self.wrong),
             "exchanges": [
                 {
@@ -69,8 +71,8 @@ class Case:
 
 
 @dataclass
-class Row:
-    """An Algorithm's counts."""
+class AlgorithmCounts:
+    """The number of cases of one Algorithm, by verdict."""
 
     algorithm: int
     passed: int = 0
@@ -89,27 +91,30 @@ class Row:
 
 @dataclass
 class Results:
-    """`counted` are the generated vectors that passed or were not tried, which have no case of their own."""
+    """The results of a test of one agent."""
 
     command: Sequence[str]
     wall_s: float
     started_at: str
-    cases: list[Case] = field(default_factory=list)
-    counted: dict[int, Row] = field(default_factory=dict)
+    cases: list[CaseResult] = field(default_factory=list)
+    counted: dict[int, AlgorithmCounts] = field(default_factory=dict)
+    """Algorithm -> number of its vectors that did not fail. They have no entry in `cases`."""
     notes: list[str] = field(default_factory=list)
     interrupted: bool = False
 
-    def rows(self) -> list[Row]:
-        rows = {number: Row(number) for number in (*sorted(TITLES), FURTHER_CHECKS)}
+    def rows(self) -> list[AlgorithmCounts]:
+        rows = {number: AlgorithmCounts(number) for number in (*sorted(TITLES), FURTHER_CHECKS)}
         for number, counted in self.counted.items():
-            rows[number] = Row(number, counted.passed, counted.failed, counted.not_applicable, counted.not_tried)
+            rows[number] = AlgorithmCounts(
+                number, counted.passed, counted.failed, counted.not_applicable, counted.not_tried
+            )
         for case in self.cases:
             row, key = rows[case.algorithm], case.verdict.replace(" ", "_")
             setattr(row, key, getattr(row, key) + 1)
         return [row for row in rows.values() if row.tried or row.not_applicable or row.not_tried]
 
     @property
-    def failures(self) -> list[Case]:
+    def failures(self) -> list[CaseResult]:
         return [case for case in self.cases if case.verdict == "failed"]
 
     @property
@@ -118,7 +123,7 @@ class Results:
 
     @property
     def exit_status(self) -> int:
-        """What was not tried has not passed."""
+        """The exit status of the command. A case that was not tried has not passed."""
         if self.interrupted:
             return INTERRUPTED
         if self.failures:

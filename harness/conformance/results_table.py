@@ -9,7 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from harness.conformance.results import Case, Results, Row
+from harness.conformance.results import AlgorithmCounts, CaseResult, Results
 from harness.errors import CANNOT_HERE
 from harness.present.junit import Case as JunitCase
 from harness.present.junit import to_xml
@@ -57,13 +57,13 @@ def summary(results: Results) -> str:
     return f"{words}; {results.wall_s:.0f} s"
 
 
-def _counts(row: Row) -> list[Text]:
+def _counts(row: AlgorithmCounts) -> list[Text]:
     styled = ((row.passed, "green"), (row.failed, "bold red"), (row.not_applicable, "yellow"), (row.not_tried, ""))
     return [Text(str(count), style=style) if count else Text("\u2013", style="dim") for count, style in styled]
 
 
-def headline(case: Case) -> str:
-    """ "Algorithm 4 Receive Vote Add Block, counted already: vote no of an agent that has voted"."""
+def headline(case: CaseResult) -> str:
+    """Return a line about a case: Algorithm, handler, branch, and name of the case."""
     where = f"Algorithm {case.algorithm} {case.handler}" if case.algorithm else case.handler or "the program"
     branch = f", branch {case.branch!r}" if case.branch else ""
     settings = f" (settings: {case.settings})" if case.settings not in ("", "default") else ""
@@ -71,15 +71,15 @@ def headline(case: Case) -> str:
     return f"{where}{branch}: {case.name}{settings}{section}"
 
 
-def lines_of(case: Case) -> Iterator[str]:
-    """All of a failure, for people."""
+def lines_of(case: CaseResult) -> Iterator[str]:
+    """Yield the lines of a failure: inputs, expected and received messages, deviations, and the last datagrams."""
     yield headline(case)
     if case.inputs:
         yield f"  after {'; '.join(case.inputs[:-1])}" if case.inputs[:-1] else "  from its start"
         yield f"  given {case.inputs[-1]}"
-    if case.inputs or case.expected or case.came:
+    if case.inputs or case.expected or case.received:
         yield f"  expected {'; '.join(case.expected) or 'nothing'}"
-        yield f"  came     {'; '.join(case.came) or 'nothing'}"
+        yield f"  came     {'; '.join(case.received) or 'nothing'}"
     for sentence in case.wrong[:WRONG_SHOWN]:
         yield f"  {sentence}"
     for exchange in case.exchanges[-EXCHANGES_SHOWN:]:
@@ -88,13 +88,13 @@ def lines_of(case: Case) -> Iterator[str]:
         yield f"  look into {case.directory}"
 
 
-def _failure(case: Case) -> list[Text]:
+def _failure(case: CaseResult) -> list[Text]:
     first, *others = lines_of(case)
     return [Text(f"✘ {first}", style="bold red"), *(Text(line) for line in others)]
 
 
 def to_junit(results: Results) -> str:
-    """A test case for each failure and each case by hand; one for each Algorithm's vectors that passed."""
+    """Return JUnit XML with a test case for each failure, each handwritten case, and the vectors of each Algorithm."""
     return to_xml("conformance", "conformance", results.started_at, results.wall_s, _junit_cases(results))
 
 
@@ -118,14 +118,14 @@ REDRAW_EVERY_S, LINE_EVERY_S = 0.2, 10.0
 
 @contextmanager
 def progress() -> Iterator[Callable[[int, int], None]]:
-    """A function that is told how many vectors have passed, of how many."""
+    """Yield a function that shows progress. Its arguments are the number of passed vectors, and that of all vectors."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     bar = Progress(*columns, console=console, auto_refresh=False, transient=True, disable=not console.is_terminal)
     task = bar.add_task("vectors", total=None)
     last = time.monotonic()
 
-    def told(count: int, total: int) -> None:
+    def show_progress(count: int, total: int) -> None:
         nonlocal last
         if time.monotonic() - last < (REDRAW_EVERY_S if console.is_terminal else LINE_EVERY_S):
             return
@@ -135,4 +135,4 @@ def progress() -> Iterator[Callable[[int, int], None]]:
             console.print(f"{count} of {total} vectors", highlight=False, soft_wrap=True)
 
     with bar:
-        yield told
+        yield show_progress

@@ -1,15 +1,15 @@
-"""The generated vectors, and the file that carries them to others.
+"""The generated vectors, and their file for tests of agents outside the harness.
 
 An agent with other settings is another agent. Its vectors are included if they differ from those of the default
 settings.
 
 The first line of the file describes the file. Each further line is one step: an input and the expected output. `after`
 is the number of the preceding step, so a reader finds all steps of a mission by going back. `in` and `out` are lines of
-virtual time (ucp/contract/CONTRACT.md): times are mission seconds, datagrams are in base64, and `timer` is the
-instant at which the next timer ends, null if none runs. `says` and `sends` are the same in words.
+virtual time (ucp/contract/CONTRACT.md): times are mission seconds, datagrams are in base64, and `timer` is the time at
+which the next timer expires, null if none runs. `says` and `sends` are the same in words.
 
-Over UDP the agent's own blocks have other timestamps, and so other hashes: put in those that its export has. Their
-names are 1.1, 1.2 and so on.
+Over UDP the agent's own blocks have other timestamps, and therefore other hashes. A reader must replace the hashes of
+the blocks 1.1, 1.2 and so on by those in the agent's export.
 """
 
 import json
@@ -18,57 +18,69 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
-from harness.conformance._reference_model import Outcome
-from harness.conformance._state_space import VARIANTS, Pair, Step, Variant, explore, in_short
-from harness.conformance._virtual_lines import Line, Writer
+from harness.conformance._reference_model import ExpectedOutcome
+from harness.conformance._state_space import (
+    VARIANTS,
+    SettingsVariant,
+    Transition,
+    VectorKey,
+    explore,
+    handlers_and_messages,
+)
+from harness.conformance._virtual_lines import LineWriter, VirtualLine
 
 
 @dataclass(frozen=True)
-class Vectors:
-    """Of one variant of the settings: all steps, and those that count."""
+class VectorSet:
+    """The vectors of one variant of the settings."""
 
-    variant: Variant
-    steps: Sequence[Step]
-    wanted: Mapping[Pair, Step]
+    variant: SettingsVariant
+    steps: Sequence[Transition]
+    """All transitions of the state space."""
+    wanted: Mapping[VectorKey, Transition]
+    """The transitions that are vectors. The others only lead to them."""
 
     @cached_property
-    def by_pair(self) -> dict[Pair, Step]:
-        return {step.pair: step for step in self.steps}
+    def by_key(self) -> dict[VectorKey, Transition]:
+        return {step.key: step for step in self.steps}
 
 
-def generate(only: str | None = None) -> list[Vectors]:
-    """The same at each call. `only`: a number or name of a handler, to whose branches the vectors are limited."""
+def generate(only: str | None = None) -> list[VectorSet]:
+    """Return all vectors, or those in which one handler runs. Each call returns the same.
+
+    `only` is the number of an Algorithm, or the name of its handler.
+    """
     if only is None:
-        return list(_all())
+        return list(_all_sets())
     return [
-        replace(vectors, wanted={pair: step for pair, step in vectors.wanted.items() if is_of(step.outcome, only)})
-        for vectors in _all()
+        replace(vectors, wanted={key: step for key, step in vectors.wanted.items() if is_of(step.outcome, only)})
+        for vectors in _all_sets()
     ]
 
 
 @cache
-def _all() -> tuple[Vectors, ...]:
-    """Made once, for however many agents: it takes seconds."""
-    usual: dict[Pair, tuple[object, ...]] = {}
+def _all_sets() -> tuple[VectorSet, ...]:
+    """Return all vectors. They are computed once for all agents, which takes seconds."""
+    default_results: dict[VectorKey, tuple[object, ...]] = {}
     generated = []
     for variant in VARIANTS.values():
         steps = list(explore(variant))
-        told = {step.pair: in_short(step.outcome) for step in steps}
-        wanted = {step.pair: step for step in steps if usual.get(step.pair) != told[step.pair]}
-        usual = usual or told
-        generated.append(Vectors(variant, steps, wanted))
+        expected = {step.key: handlers_and_messages(step.outcome) for step in steps}
+        wanted = {step.key: step for step in steps if default_results.get(step.key) != expected[step.key]}
+        default_results = default_results or expected
+        generated.append(VectorSet(variant, steps, wanted))
     return tuple(generated)
 
 
-def is_of(outcome: Outcome, only: str) -> bool:
+def is_of(outcome: ExpectedOutcome, only: str) -> bool:
     return any(only in (str(run.algorithm), run.handler) for run in outcome.runs)
 
 
 SCHEMA = "ucp-conformance-vectors/1"
 
 
-def to_lines(generated: Sequence[Vectors]) -> Iterator[str]:
-    """Lines of the file, each with its end; the same for the same vectors."""
+def to_lines(generated: Sequence[VectorSet]) -> Iterator[str]:
+    """Yield the lines of the file, each with its line end. The same vectors give the same lines."""
     total = sum(len(vectors.wanted) for vectors in generated)
     yield _line(
         {
@@ -82,31 +94,31 @@ def to_lines(generated: Sequence[Vectors]) -> Iterator[str]:
         if not vectors.wanted:
             continue
         root = number = number + 1
-        first = Writer(vectors.variant).first()
+        first = LineWriter(vectors.variant).first_line()
         yield _line({"step": root, "after": None, "settings": vectors.variant.name, "in": first, "out": None})
         numbers: dict[tuple[str, ...], int] = {(): root}
         for step in vectors.wanted.values():
-            way = (*step.way, step.pair.input)
-            known = next(length for length in range(len(way) - 1, -1, -1) if way[:length] in numbers)
-            writer = Writer(vectors.variant)
-            for _ in writer.lines(way[:known]):
+            path = (*step.path, step.key.input)
+            known = next(length for length in range(len(path) - 1, -1, -1) if path[:length] in numbers)
+            writer = LineWriter(vectors.variant)
+            for _ in writer.lines(path[:known]):
                 pass
-            after = numbers[way[:known]]
-            for length in range(known + 1, len(way) + 1):
-                lines = list(writer.lines(way[length - 1 : length]))
+            after = numbers[path[:known]]
+            for length in range(known + 1, len(path) + 1):
+                lines = list(writer.lines(path[length - 1 : length]))
                 for place, line in enumerate(lines, 1):
                     number += 1
-                    judged = length == len(way) and place == len(lines)
+                    judged = length == len(path) and place == len(lines)
                     yield _line(_step(number, after, line, step.before.text if judged else None))
                     after = number
-                numbers[way[:length]] = number
+                numbers[path[:length]] = number
 
 
-def _step(number: int, after: int, line: Line, state: str | None) -> dict[str, Any]:
-    """`state` in words is there only of a vector, not of a step on the way to one."""
+def _step(number: int, after: int, line: VirtualLine, state: str | None) -> dict[str, Any]:
+    """Return the document of a line. `state` is the state in words, or None for a step that only leads to a vector."""
     runs = [{"algorithm": run.algorithm, "handler": run.handler, "branch": run.branch} for run in line.outcome.runs]
     step = {"step": number, "after": after, "input": line.name, "in": line.given, "out": line.answer}
-    words = {"says": line.says, "sends": line.sends, "runs": runs}
+    words = {"says": line.input_text, "sends": line.sent_texts, "runs": runs}
     return {**step, **words, **({"vector": True, "state": state} if state is not None else {})}
 
 

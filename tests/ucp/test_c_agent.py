@@ -14,7 +14,7 @@ import pytest
 
 import ucp
 from harness.conformance._state_space import VARIANTS, explore
-from harness.conformance.vectors import Vectors, to_lines
+from harness.conformance.vectors import VectorSet, to_lines
 from harness.play.progress import Silent
 from harness.run.run import run
 from harness.run.simulate import simulate
@@ -136,7 +136,7 @@ def test_requests_in_doubt_are_answered_as_in_the_vectors(checked: Path, tmp_pat
 def test_generated_vectors(agent: Path) -> None:
     """Pairs of a state and an input, each path of them from its mission to its end."""
     steps = list(explore(VARIANTS["default"]))[::8]
-    lines = to_lines([Vectors(VARIANTS["default"], steps, {step.pair: step for step in steps})])
+    lines = to_lines([VectorSet(VARIANTS["default"], steps, {step.key: step for step in steps})])
     by_number = {step["step"]: step for step in map(json.loads, lines) if "step" in step}
     ends = by_number.keys() - {step["after"] for step in by_number.values()}
     played = []

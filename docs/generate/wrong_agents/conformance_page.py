@@ -17,9 +17,9 @@ from tempfile import TemporaryDirectory
 from docs.generate.matrix_thesis import put_between_markers
 from docs.generate.wrong_agents import quirky
 from docs.generate.wrong_agents.trials_page import rows_of
-from harness.conformance.conformance_run import Asked, conform
+from harness.conformance.conformance_run import ConformanceRequest, conform
 from harness.conformance.results import Results
-from harness.conformance.vectors import Vectors, generate
+from harness.conformance.vectors import VectorSet, generate
 from harness.errors import HarnessError
 from ucp.agent_files import write_atomically
 from ucp.quirks import QUIRKS
@@ -37,11 +37,11 @@ def test(quirk: str) -> Results:
     """Raises HarnessError."""
     command = (sys.executable, "-P", "-m", quirky.__name__, quirk)
     with TemporaryDirectory(prefix="ucp-conformance-") as place:
-        results = conform(Asked(command, None, None, virtual=True), Path(place), _no_progress, _vectors())
+        results = conform(ConformanceRequest(command, None, None, virtual=True), Path(place), _no_progress, _vectors())
     if results.failures:
         return results
     with TemporaryDirectory(prefix="ucp-conformance-") as place:
-        by_hand = conform(Asked(command, None, None), Path(place), _no_progress, [])
+        by_hand = conform(ConformanceRequest(command, None, None), Path(place), _no_progress, [])
     return replace(by_hand, counted=results.counted)
 
 
@@ -50,7 +50,7 @@ def _no_progress(count: int, total: int) -> None:
 
 
 @cache
-def _vectors() -> list[Vectors]:
+def _vectors() -> list[VectorSet]:
     """Return the vectors of the default settings."""
     return generate()[:1]
 

@@ -1,4 +1,4 @@
-"""What a case works with: an agent of its own, what its peers say and hear, and what should have come."""
+"""The test bench of a handwritten case: it starts agents, plays their peers, and checks their messages."""
 
 import asyncio
 import base64
@@ -9,137 +9,143 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from harness.conformance._agent_under_test import NO_KEYS
 from harness.conformance._reference_model import AGENT, EVENT_ID, INITIAL_DATA
 from harness.conformance._state_space import VARIANTS
-from harness.conformance._subject import NO_KEYS
-from harness.conformance._udp_lab import AgentEndedError, Air, Ear, Process
+from harness.conformance._udp_lab import AgentEndedError, PeerSocket, ProcessUnderTest, UdpLab
 from ucp.block import InceptionBlock
 from ucp.clock import MICROSECONDS
 from ucp.messages import ChainContainQuery, ChainContainResponse, MalformedDatagramError, Message, decode, encode
 
 SPEEDUP = 20.0
 PATIENCE_S = 3.0
-"""So long a case waits for what must come, in wall time."""
-CALM_S = 0.25
-"""So long for what must not come."""
+"""Time limit of an expected message in wall seconds."""
+SILENCE_S = 0.25
+"""Wall seconds without a message after which an agent counts as silent."""
 INCEPTION = InceptionBlock(INITIAL_DATA).chain_hash
 
 
-Heard = TypeVar("Heard", bound=Message)
+ReceivedMessage = TypeVar("ReceivedMessage", bound=Message)
 
 
-class WrongError(Exception):
-    """The agent did otherwise: what was expected, and what came."""
+class WrongBehaviourError(Exception):
+    """The agent did not do the expected. `expected` and `received` describe the difference."""
 
-    def __init__(self, expected: str, came: str) -> None:
-        super().__init__(f"expected {expected}; {came}")
-        self.expected, self.came = expected, came
+    def __init__(self, expected: str, received: str) -> None:
+        super().__init__(f"expected {expected}; {received}")
+        self.expected, self.received = expected, received
 
 
-class CannotTellError(Exception):
-    """Nothing can be said of this agent here: why."""
+class CannotJudgeError(Exception):
+    """The case cannot judge this agent on this machine. The message has the reason."""
 
 
 @dataclass(frozen=True)
-class ByHand:
-    """A case. `section` is that of the thesis, or of the contract."""
+class HandwrittenCase:
+    """A handwritten case."""
 
     name: str
     algorithm: int
+    """Number of the Algorithm under test. 0: none."""
     section: str
+    """Section of the thesis or of the agent contract that the case tests."""
     play: Callable[["Bench"], Awaitable[None]]
+    """Function that plays the case. It raises WrongBehaviourError if the case fails."""
 
 
-ALL: list[ByHand] = []
+ALL_CASES: list[HandwrittenCase] = []
 
 
 def case(name: str, section: str, algorithm: int = 0) -> Callable[[Callable[["Bench"], Awaitable[None]]], None]:
-    """Declare a function to be a case; 0 is no Algorithm."""
+    """Add the decorated function to `ALL_CASES`. The Algorithm 0 stands for none."""
 
     def declare(play: Callable[["Bench"], Awaitable[None]]) -> None:
-        ALL.append(ByHand(name, algorithm, section, play))
+        ALL_CASES.append(HandwrittenCase(name, algorithm, section, play))
 
     return declare
 
 
-def must(true: bool, expected: str, came: object) -> None:
-    """Raises WrongError."""
+def require(true: bool, expected: str, received: object) -> None:
+    """Raise WrongBehaviourError unless the condition is true."""
     if not true:
-        raise WrongError(expected, f"came {came}")
+        raise WrongBehaviourError(expected, f"came {received}")
 
 
-class Alone:
-    """An agent on the bench."""
+class BenchAgent:
+    """An agent on the test bench, with its peers."""
 
-    def __init__(self, process: Process, ear: Ear) -> None:
+    def __init__(self, process: ProcessUnderTest, peer_socket: PeerSocket) -> None:
         self.process = process
-        self.ear = ear
+        self.peer_socket = peer_socket
         self.agent_id = process.agent_id
         self.epoch_s = 0.0
         self._sequence = 0
 
     async def begin(self, ahead_s: float = 0.0) -> None:
-        """The mission starts in so many wall seconds, or did so long ago."""
+        """Start the mission in `ahead_s` wall seconds. A negative value means a start in the past."""
         self.epoch_s = time.time() + ahead_s
         await self.process.ask("start", epoch_us=round(self.epoch_s * MICROSECONDS))
 
     def mission_s(self) -> float:
         return (time.time() - self.epoch_s) * SPEEDUP
 
-    def say(self, sender: int, message: Message) -> None:
+    def send(self, sender: int, message: Message) -> None:
         self._sequence += 1
-        self.ear.say(encode(sender, self._sequence, message))
+        self.peer_socket.send(encode(sender, self._sequence, message))
 
     async def log(self, data: bytes) -> None:
         await self.process.ask("log", event_id=EVENT_ID, data=base64.b64encode(data).decode("ascii"))
 
-    async def hear(self, count: int, what: str, within_s: float = PATIENCE_S) -> list[Message]:
-        """The next messages. Raises WrongError if there are fewer."""
+    async def receive(self, count: int, what: str, within_s: float = PATIENCE_S) -> list[Message]:
+        """Return the next messages. Raises WrongBehaviourError if fewer arrive within the time limit."""
         until = time.time() + within_s
-        while len(self.ear.heard) < count and time.time() < until:
-            self.ear.drain()
-            await self.ear.arrival(min(until, time.time() + CALM_S))
-        heard = [_message(data) for _, data in self.ear.heard[:count]]
-        del self.ear.heard[:count]
-        must(len(heard) == count, what, f"{len(heard)} messages: {_names(heard)}")
-        return heard
+        while len(self.peer_socket.received) < count and time.time() < until:
+            self.peer_socket.drain()
+            await self.peer_socket.arrival(min(until, time.time() + SILENCE_S))
+        received = [_message(data) for _, data in self.peer_socket.received[:count]]
+        del self.peer_socket.received[:count]
+        require(len(received) == count, what, f"{len(received)} messages: {_names(received)}")
+        return received
 
-    async def hear_one(self, kind: type[Heard], after: str) -> Heard:
-        """Return the next message. Raises WrongError if there is none, or one of another type."""
+    async def receive_one(self, kind: type[ReceivedMessage], after: str) -> ReceivedMessage:
+        """Return the next message. Raises WrongBehaviourError if there is none, or one of another type."""
         what = f"a {kind.NAME} after {after}"
-        (heard,) = await self.hear(1, what)
-        if not isinstance(heard, kind):
-            raise WrongError(what, f"came {heard.NAME}")
-        return heard
+        (received,) = await self.receive(1, what)
+        if not isinstance(received, kind):
+            raise WrongBehaviourError(what, f"came {received.NAME}")
+        return received
 
-    async def hear_nothing(self, why: str, for_s: float = CALM_S) -> None:
+    async def receive_nothing(self, why: str, for_s: float = SILENCE_S) -> None:
         await asyncio.sleep(for_s)
-        heard = [_message(data) for _, data in self.ear.take()]
-        must(not heard, f"nothing {why}", _names(heard))
+        received = [_message(data) for _, data in self.peer_socket.take()]
+        require(not received, f"nothing {why}", _names(received))
 
-    async def answers_only(self, top: bytes, after: str) -> None:
-        """Asked whether it has this chain it says yes, and has said nothing else since."""
-        self.say(2 if self.agent_id != 2 else 3, ChainContainQuery(top))
-        (heard,) = await self.hear(1, f"an answer to a Chain Contain Query after {after}")
+    async def require_single_answer(self, top: bytes, after: str) -> None:
+        """Ask the agent whether it has this chain. Its next message must be the answer yes.
+
+        Raises WrongBehaviourError otherwise, for example if the agent has answered an earlier message.
+        """
+        self.send(2 if self.agent_id != 2 else 3, ChainContainQuery(top))
+        (received,) = await self.receive(1, f"an answer to a Chain Contain Query after {after}")
         right = ChainContainResponse(top, True)
-        must(heard == right, f"nothing but the answer to a Chain Contain Query after {after}", heard.NAME)
+        require(received == right, f"nothing but the answer to a Chain Contain Query after {after}", received.NAME)
 
     async def status(self) -> dict[str, Any]:
         return await self.process.ask("status")
 
     async def end(self) -> int:
-        """How it ended by itself. Raises WrongError if it did not."""
+        """Wait for the end of the process, and return its status. Raises WrongBehaviourError if it does not end."""
         try:
             return await asyncio.wait_for(self.process.process.wait(), PATIENCE_S * 2)
         except TimeoutError:
-            raise WrongError("the agent ends", "it runs on") from None
+            raise WrongBehaviourError("the agent ends", "it runs on") from None
 
 
 class Bench:
-    """Where a case puts its agents."""
+    """The test bench. It starts agents in the lab."""
 
-    def __init__(self, air: Air) -> None:
-        self.air = air
+    def __init__(self, lab: UdpLab) -> None:
+        self.lab = lab
 
     @asynccontextmanager
     async def agent(
@@ -150,15 +156,18 @@ class Bench:
         prepare: Callable[[Path], None] | None = None,
         directory: Path | None = None,
         port: int | None = None,
-    ) -> AsyncIterator[Alone]:
-        """An agent that is ready, and whose mission has begun if not told otherwise; `keys` are of its mission."""
+    ) -> AsyncIterator[BenchAgent]:
+        """Start an agent, wait until it is ready, and start its mission if `started` is true.
+
+        `keys` replace keys of the mission file. The other arguments are those of `program`.
+        """
         async with self.program(keys, prepare=prepare, directory=directory, port=port) as alone:
             await alone.process.ready()
             if started:
                 await alone.begin()
             try:
                 yield alone
-            except WrongError:
+            except WrongBehaviourError:
                 if not alone.process.signalled and alone.process.process.returncode is None:
                     await alone.process.check_answers()
                 raise
@@ -172,41 +181,52 @@ class Bench:
         prepare: Callable[[Path], None] | None = None,
         directory: Path | None = None,
         port: int | None = None,
-    ) -> AsyncIterator[Alone]:
-        """An agent that may never be ready. `text` is all of its mission file.
+    ) -> AsyncIterator[BenchAgent]:
+        """Start an agent that may never be ready.
 
-        `prepare` is given its directory, or `directory` is that of an earlier life.
+        `text` replaces the whole mission file. `prepare` receives the directory of the agent before its start.
+        `directory` and `port` are those of an earlier incarnation.
         """
-        taken = self.air.take_port() if port is None else port
+        taken = self.lab.take_port() if port is None else port
         try:
-            document = self.air.mission(VARIANTS["default"], taken, SPEEDUP, keys)
-            where = directory or self.air.new_directory()
+            document = self.lab.mission(VARIANTS["default"], taken, SPEEDUP, keys)
+            where = directory or self.lab.new_directory()
             if prepare is not None:
                 prepare(where)
             agent_id = int(keys.get("agent_id", AGENT))
-            ear = Ear(self.air, taken)
+            peer_socket = PeerSocket(self.lab, taken)
             try:
-                process = await Process.start(self.air, where, document if text is None else text, agent_id)
+                process = await ProcessUnderTest.start(self.lab, where, document if text is None else text, agent_id)
                 try:
-                    yield Alone(process, ear)
+                    yield BenchAgent(process, peer_socket)
                 finally:
                     await process.kill()
             finally:
-                ear.close()
+                peer_socket.close()
         finally:
             if port is None:
-                self.air.give_back(taken)
+                self.lab.return_port(taken)
 
 
 def _message(data: bytes) -> Message:
     try:
         return decode(data).message
     except MalformedDatagramError as error:
-        raise WrongError("well-formed messages", f"{len(data)} bytes: {error.reason}") from None
+        raise WrongBehaviourError("well-formed messages", f"{len(data)} bytes: {error.reason}") from None
 
 
 def _names(messages: Sequence[Message]) -> str:
     return ", ".join(message.NAME for message in messages) or "nothing"
 
 
-__all__ = ["ALL", "AgentEndedError", "Alone", "Bench", "ByHand", "CannotTellError", "WrongError", "case", "must"]
+__all__ = [
+    "ALL_CASES",
+    "AgentEndedError",
+    "Bench",
+    "BenchAgent",
+    "CannotJudgeError",
+    "HandwrittenCase",
+    "WrongBehaviourError",
+    "case",
+    "require",
+]

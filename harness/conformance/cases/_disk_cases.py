@@ -1,11 +1,19 @@
-"""The disk: full, or what is left on it when the power comes back."""
+"""Cases about the disk: a full disk, and restarts with the store of a killed agent."""
 
 import signal
 from collections.abc import Callable
 from pathlib import Path
 
 from harness.conformance._reference_model import AGENT, PEERS
-from harness.conformance.cases._bench import INCEPTION, AgentEndedError, Alone, Bench, CannotTellError, case, must
+from harness.conformance.cases._bench import (
+    INCEPTION,
+    AgentEndedError,
+    Bench,
+    BenchAgent,
+    CannotJudgeError,
+    case,
+    require,
+)
 from harness.play.agent_control import AgentRefusedError
 from ucp.block import Block, next_chain_hash
 from ucp.messages import BlockAddRequest, ChainContainQuery, ChainContainResponse, CommitBlock
@@ -23,11 +31,11 @@ async def _full(bench: Bench) -> None:
         try:
             await agent.process.ready()
         except AgentEndedError as error:
-            raise CannotTellError(f"it does not take /dev/full, which stands for a full disk: {error}") from None
+            raise CannotJudgeError(f"it does not take /dev/full, which stands for a full disk: {error}") from None
         await agent.begin()
-        await agent.answers_only(INCEPTION, "its trace could not be written")
+        await agent.require_single_answer(INCEPTION, "its trace could not be written")
         await agent.log(b"event")
-        await agent.hear(2, "a Block Add Request and a Commit Block")
+        await agent.receive(2, "a Block Add Request and a Commit Block")
 
 
 @case("an export that cannot be written gives an error and exit status 1", "contract, The program")
@@ -38,80 +46,80 @@ async def _no_export(bench: Bench) -> None:
     async with bench.agent(prepare=prepare) as agent:
         try:
             await agent.process.ask("export")
-            must(False, "`ok` false to export", "`ok` true")
+            require(False, "`ok` false to export", "`ok` true")
         except AgentRefusedError:
             pass
         await agent.process.send_signal(signal.SIGTERM)
         returned = await agent.end()
-        must(returned == 1, "exit status 1", f"status {returned}")
+        require(returned == 1, "exit status 1", f"status {returned}")
 
 
-async def _commit(agent: Alone, count: int) -> list[Block]:
-    """So many blocks of a peer come onto its chain."""
+async def _commit(agent: BenchAgent, count: int) -> list[Block]:
+    """Let the agent commit blocks of a peer, and return these blocks."""
     blocks, top = [], INCEPTION
     for number in range(count):
         block = Block(PEERS[0], number + 1, b"block %d" % number)
         top = next_chain_hash(top, block.block_hash)
-        agent.say(PEERS[0], CommitBlock(block, top))
+        agent.send(PEERS[0], CommitBlock(block, top))
         blocks.append(block)
-    await agent.answers_only(top, f"{count} commits")
+    await agent.require_single_answer(top, f"{count} commits")
     return blocks
 
 
-async def _comes_back(bench: Bench, spoil: Callable[[Path], None] | None) -> None:
-    port = bench.air.take_port()
+async def _require_restart(bench: Bench, damage: Callable[[Path], None] | None) -> None:
+    port = bench.lab.take_port()
     try:
         async with bench.agent(STORE, port=port) as first:
             blocks = await _commit(first, 3)
             await first.log(b"event")
-            (proposed,) = await first.hear(1, "a Block Add Request")
+            (proposed,) = await first.receive(1, "a Block Add Request")
             directory = first.process.directory
-        if spoil is not None:
-            spoil(directory / STORE_FILE)
+        if damage is not None:
+            damage(directory / STORE_FILE)
         async with bench.agent(STORE, port=port, directory=directory) as second:
-            (again,) = await second.hear(1, "the proposal of the waiting block from the restarted agent")
-            must(again == proposed, "the proposal of the waiting block", again.NAME)
+            (again,) = await second.receive(1, "the proposal of the waiting block from the restarted agent")
+            require(again == proposed, "the proposal of the waiting block", again.NAME)
             assert isinstance(proposed, BlockAddRequest)
             export = await second.process.export()
             held = [block["block_hash"] for block in export["chain"]]
-            must(held == [block.block_hash.hex() for block in blocks], "the three blocks of its chain", held)
-            must(export["completed"] == [proposed.block_hash.hex()], "its completed block", export["completed"])
+            require(held == [block.block_hash.hex() for block in blocks], "the three blocks of its chain", held)
+            require(export["completed"] == [proposed.block_hash.hex()], "its completed block", export["completed"])
     finally:
-        bench.air.give_back(port)
+        bench.lab.return_port(port)
 
 
 @case("a killed agent restarts with its chain, and proposes the waiting block", "contract, Store", 20)
 async def _reboot(bench: Bench) -> None:
-    await _comes_back(bench, None)
+    await _require_restart(bench, None)
 
 
 @case("a store with a truncated end is valid up to its last whole entry", "contract, Store", 20)
 async def _torn(bench: Bench) -> None:
-    def spoil(path: Path) -> None:
+    def damage(path: Path) -> None:
         with path.open("ab") as file:
             file.write(b"\x00half an ent")
 
-    await _comes_back(bench, spoil)
+    await _require_restart(bench, damage)
 
 
 @case("an agent killed during a reconcile restores its stack at the restart", "contract, Store", 20)
 async def _reboot_in_reconcile(bench: Bench) -> None:
-    port = bench.air.take_port()
+    port = bench.lab.take_port()
     try:
         async with bench.agent(STORE, port=port) as first:
             blocks = await _commit(first, 2)
             await first.process.ask("reconcile")
-            (asked,) = await first.hear(1, "a Chain Contain Query")
-            must(isinstance(asked, ChainContainQuery), "a Chain Contain Query", asked.NAME)
-            assert isinstance(asked, ChainContainQuery)
-            first.say(PEERS[0], ChainContainResponse(asked.chain_hash, False))
-            (below,) = await first.hear(1, "a Chain Contain Query about the chain below")
-            must(below != asked and below.NAME == asked.NAME, "a query about the chain below", below.NAME)
+            (query,) = await first.receive(1, "a Chain Contain Query")
+            require(isinstance(query, ChainContainQuery), "a Chain Contain Query", query.NAME)
+            assert isinstance(query, ChainContainQuery)
+            first.send(PEERS[0], ChainContainResponse(query.chain_hash, False))
+            (below,) = await first.receive(1, "a Chain Contain Query about the chain below")
+            require(below != query and below.NAME == query.NAME, "a query about the chain below", below.NAME)
             directory = first.process.directory
         async with bench.agent(STORE, port=port, directory=directory) as second:
-            (back,) = await second.hear(1, "a Commit Block of what was on the stack")
-            right = CommitBlock(blocks[1], asked.chain_hash)
-            must(back == right, "a Commit Block of what was on the stack", back.NAME)
-            await second.answers_only(asked.chain_hash, "it came back")
+            (back,) = await second.receive(1, "a Commit Block of what was on the stack")
+            right = CommitBlock(blocks[1], query.chain_hash)
+            require(back == right, "a Commit Block of what was on the stack", back.NAME)
+            await second.require_single_answer(query.chain_hash, "it came back")
     finally:
-        bench.air.give_back(port)
+        bench.lab.return_port(port)

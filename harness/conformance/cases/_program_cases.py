@@ -1,4 +1,4 @@
-"""The program: how it starts and ends, which missions it refuses, and its control socket."""
+"""Cases about the program: its start and end, refused missions, and its control socket."""
 
 import asyncio
 import base64
@@ -10,20 +10,20 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from harness.conformance._agent_under_test import NO_KEYS
 from harness.conformance._reference_model import PEERS
 from harness.conformance._state_space import VARIANTS
-from harness.conformance._subject import NO_KEYS
 from harness.conformance._udp_lab import last_line
 from harness.conformance.cases._bench import (
     INCEPTION,
     PATIENCE_S,
     SPEEDUP,
-    Alone,
     Bench,
-    CannotTellError,
-    WrongError,
+    BenchAgent,
+    CannotJudgeError,
+    WrongBehaviourError,
     case,
-    must,
+    require,
 )
 from harness.play.agent_control import AgentRefusedError
 from ucp.block import Block, next_chain_hash
@@ -41,12 +41,12 @@ SECONDS_WITHOUT_EVENT = 20.0
 """Mission seconds in which an agent would log an event with a probability of almost 1, if it drew one each second."""
 
 
-async def _refused(agent: Alone, command: str, why: str, **arguments: Any) -> None:
+async def _refused(agent: BenchAgent, command: str, why: str, **arguments: Any) -> None:
     try:
         await agent.process.ask(command, **arguments)
     except AgentRefusedError:
         return
-    raise WrongError(f"`ok` false to {command} {why}", "it said `ok` true")
+    raise WrongBehaviourError(f"`ok` false to {command} {why}", "it said `ok` true")
 
 
 @case(
@@ -55,13 +55,13 @@ async def _refused(agent: Alone, command: str, why: str, **arguments: Any) -> No
 )
 async def _not_started(bench: Bench) -> None:
     async with bench.agent(started=False) as agent:
-        must((await agent.status()).get("started") is False, "`started` false", "not")
-        agent.say(PEERS[0], ChainContainQuery(INCEPTION))
-        await agent.hear_nothing("before its mission starts")
+        require((await agent.status()).get("started") is False, "`started` false", "not")
+        agent.send(PEERS[0], ChainContainQuery(INCEPTION))
+        await agent.receive_nothing("before its mission starts")
         await _refused(agent, "log", "before the mission starts", event_id=1, data="")
         await _refused(agent, "reconcile", "before the mission starts")
         await agent.begin()
-        await agent.answers_only(INCEPTION, "the start")
+        await agent.require_single_answer(INCEPTION, "the start")
         await _refused(agent, "start", "once more", epoch_us=1)
 
 
@@ -70,12 +70,12 @@ async def _joins(bench: Bench) -> None:
     async with bench.agent(started=False) as agent:
         await agent.begin(ahead_s=-100.0)
         status = await agent.status()
-        must(status.get("started") is True, "`started` true", status.get("started"))
+        require(status.get("started") is True, "`started` true", status.get("started"))
         shown = status.get("mission_s")
         if shown is not None:
             right = isinstance(shown, int | float) and 0 <= shown - 100.0 * SPEEDUP < PATIENCE_S * SPEEDUP
-            must(right, f"mission second {100 * SPEEDUP:g} or a little later", shown)
-        await agent.answers_only(INCEPTION, "a start long ago")
+            require(right, f"mission second {100 * SPEEDUP:g} or a little later", shown)
+        await agent.require_single_answer(INCEPTION, "a start long ago")
 
 
 @case("mission time is 0 until the mission starts", "contract, Time")
@@ -83,26 +83,26 @@ async def _ahead(bench: Bench) -> None:
     async with bench.agent(started=False) as agent:
         await agent.begin(ahead_s=30.0)
         shown = (await agent.status()).get("mission_s")
-        must(shown in (None, 0), "mission second 0", shown)
+        require(shown in (None, 0), "mission second 0", shown)
 
 
 async def _ends(bench: Bench, number: int) -> None:
     async with bench.agent({"settings": NO_EXPIRY}) as agent:
         await agent.log(b"event")
-        await agent.hear_one(BlockAddRequest, "an event that fills a block")
+        await agent.receive_one(BlockAddRequest, "an event that fills a block")
         await agent.process.send_signal(number)
         returned = await agent.end()
-        await agent.hear_nothing("after its end")
-        must(returned == 0, "exit status 0", f"status {returned}")
+        await agent.receive_nothing("after its end")
+        require(returned == 0, "exit status 0", f"status {returned}")
         path = agent.process.directory / f"{agent.agent_id}.chain.json"
-        must(path.exists(), "a chain export", "none")
+        require(path.exists(), "a chain export", "none")
         export = json.loads(path.read_text(encoding="utf-8"))
-        must(len(export["completed"]) == 1, "one completed block in the export", len(export["completed"]))
+        require(len(export["completed"]) == 1, "one completed block in the export", len(export["completed"]))
         socket = agent.process.directory / f"{agent.agent_id}.control"
-        must(not socket.exists(), "no control socket any more", "it is there")
+        require(not socket.exists(), "no control socket any more", "it is there")
         own = {f"{agent.agent_id}.{each}" for each in ("mission.json", "chain.json", "trace.jsonl", "log", "out")}
         others = sorted({file.name for file in agent.process.directory.iterdir()} - own)
-        must(not others, "only the files that the contract lists", ", ".join(others))
+        require(not others, "only the files that the contract lists", ", ".join(others))
 
 
 @case("SIGTERM exports the chain, exit status 0", "contract, The program")
@@ -115,11 +115,11 @@ async def _sigint(bench: Bench) -> None:
     await _ends(bench, signal.SIGINT)
 
 
-async def _processes(agent: Alone) -> list[int]:
-    """The processes of the agent. Raises CannotTellError if they are not visible."""
+async def _processes(agent: BenchAgent) -> list[int]:
+    """Return the IDs of the agent's processes. Raises CannotJudgeError if they are not visible."""
     pids = await asyncio.to_thread(agent.process.processes.pids)
     if not pids:
-        raise CannotTellError("the processes of the agent are not visible here")
+        raise CannotJudgeError("the processes of the agent are not visible here")
     return pids
 
 
@@ -129,7 +129,9 @@ async def _whole_export(bench: Bench) -> None:
         await agent.process.export()
         with (agent.process.directory / f"{agent.agent_id}.chain.json").open() as earlier:
             await agent.process.export()
-            must(os.fstat(earlier.fileno()).st_nlink == 0, "a new file with the name of the earlier export", "the same")
+            require(
+                os.fstat(earlier.fileno()).st_nlink == 0, "a new file with the name of the earlier export", "the same"
+            )
 
 
 @case("the agent leaves no process running at its end", "contract, The program")
@@ -139,7 +141,7 @@ async def _children(bench: Bench) -> None:
         await agent.process.send_signal(signal.SIGTERM)
         await agent.end()
         left = await asyncio.to_thread(agent.process.processes.end_left_behind)
-        must(not left, "no process that runs after the end of the agent", ", ".join(left))
+        require(not left, "no process that runs after the end of the agent", ", ".join(left))
 
 
 @case("inputs and clients leave no descriptors open", "contract, The program")
@@ -147,18 +149,18 @@ async def _descriptors(bench: Bench) -> None:
     async with bench.agent() as agent:
         before = _open_descriptors(await _processes(agent))
         for _ in range(INPUTS):
-            agent.say(PEERS[0], ChainContainQuery(INCEPTION))
-            await agent.hear(1, "an answer to each Chain Contain Query")
+            agent.send(PEERS[0], ChainContainQuery(INCEPTION))
+            await agent.receive(1, "an answer to each Chain Contain Query")
             await _lines(agent, b'{"command": "status"}')
         opened = _open_descriptors(await _processes(agent)) - before
-        must(opened < INPUTS // 2, f"as many open descriptors after {INPUTS} messages and clients", f"{opened} more")
+        require(opened < INPUTS // 2, f"as many open descriptors after {INPUTS} messages and clients", f"{opened} more")
 
 
 def _open_descriptors(pids: Iterable[int]) -> int:
     try:
         return sum(len(list(Path(f"/proc/{pid}/fd").iterdir())) for pid in pids)
     except OSError:
-        raise CannotTellError("the descriptors of the agent are not visible here") from None
+        raise CannotJudgeError("the descriptors of the agent are not visible here") from None
 
 
 async def _ends_with(
@@ -166,8 +168,10 @@ async def _ends_with(
 ) -> None:
     async with bench.program(keys, text=text) as agent:
         returned = await agent.end()
-        must(returned == status, f"exit status {status} for {what}", f"status {returned}")
-        must(last_line(agent.process.output) != "it said nothing", f"a sentence on standard error for {what}", "none")
+        require(returned == status, f"exit status {status} for {what}", f"status {returned}")
+        require(
+            last_line(agent.process.output) != "it said nothing", f"a sentence on standard error for {what}", "none"
+        )
 
 
 _BROKEN: dict[str, bytes] = {
@@ -208,9 +212,9 @@ async def _quirk(bench: Bench) -> None:
     keys = {"features": ["quirks"], "quirks": {"ignore_commit": 1.0}}
     async with bench.agent(keys) as agent:
         block = Block(PEERS[0], 1, b"block")
-        agent.say(PEERS[0], CommitBlock(block, next_chain_hash(INCEPTION, block.block_hash)))
-        await agent.answers_only(INCEPTION, "a Commit Block, which the mission requests it to ignore")
-        must((await agent.status())["chain"] == 0, "an empty chain, as `ignore_commit` 1 requests", "a block")
+        agent.send(PEERS[0], CommitBlock(block, next_chain_hash(INCEPTION, block.block_hash)))
+        await agent.require_single_answer(INCEPTION, "a Commit Block, which the mission requests it to ignore")
+        require((await agent.status())["chain"] == 0, "an empty chain, as `ignore_commit` 1 requests", "a block")
 
 
 @case("missions in doubt are played or refused as in the vectors", "contract, Features")
@@ -230,24 +234,24 @@ async def _in_doubt(bench: Bench) -> None:
 @case("unknown keys of the mission file are ignored", "contract, The mission file")
 async def _unknown_keys(bench: Bench) -> None:
     async with bench.agent({"something": {"else": [1, 2, 3]}}) as agent:
-        await agent.answers_only(INCEPTION, "a mission with an unknown key")
+        await agent.require_single_answer(INCEPTION, "a mission with an unknown key")
 
 
 @case("a port in use gives an error and exit status 2", "contract, The program")
 async def _port(bench: Bench) -> None:
-    port = bench.air.take_port()
+    port = bench.lab.take_port()
     try:
         async with bench.agent(port=port):
-            document = bench.air.mission(VARIANTS["default"], port, SPEEDUP)
+            document = bench.lab.mission(VARIANTS["default"], port, SPEEDUP)
             text = json.dumps(document).encode()
             async with bench.program(text=text) as second:
                 returned = await second.end()
-                must(returned == WRONG_MISSION, "exit status 2 where the port is in use", f"status {returned}")
+                require(returned == WRONG_MISSION, "exit status 2 where the port is in use", f"status {returned}")
     finally:
-        bench.air.give_back(port)
+        bench.lab.return_port(port)
 
 
-async def _lines(agent: Alone, *requests: bytes) -> list[Any]:
+async def _lines(agent: BenchAgent, *requests: bytes) -> list[Any]:
     """Return the answers to raw lines, which arrive together on one connection."""
     directory = os.open(agent.process.directory, os.O_PATH)
     try:
@@ -264,7 +268,7 @@ async def _lines(agent: Alone, *requests: bytes) -> list[Any]:
             answers.append(json.loads(text) if text else None)
         return answers
     except (TimeoutError, OSError, ValueError) as error:
-        raise WrongError("an answer to each line on the control socket", f"came {error or 'none'}") from None
+        raise WrongBehaviourError("an answer to each line on the control socket", f"came {error or 'none'}") from None
     finally:
         writer.close()
 
@@ -276,14 +280,14 @@ async def _control(bench: Bench) -> None:
         answers = await _lines(agent, *wrong, b'{"command": "status"}')
         for request, answer in zip(wrong, answers, strict=False):
             refused = isinstance(answer, dict) and answer.get("ok") is False and bool(answer.get("error"))
-            must(refused, f"`ok` false and an `error` to {request.decode()}", answer)
-        must(isinstance(answers[-1], dict) and answers[-1].get("ok") is True, "a status after that", answers[-1])
+            require(refused, f"`ok` false and an `error` to {request.decode()}", answer)
+        require(isinstance(answers[-1], dict) and answers[-1].get("ok") is True, "a status after that", answers[-1])
         for vector in REFUSALS["requests"]:
             (answer,) = await _lines(agent, base64.b64decode(vector["line"]))
             right = {"unsupported": None, **vector["answer"]}
-            came = {key: answer.get(key) for key in right} if isinstance(answer, dict) else answer
-            must(came == right, f"{vector['answer']} for a request that is {vector['what']}", came)
-        await agent.answers_only(INCEPTION, "lines that are no commands")
+            received = {key: answer.get(key) for key in right} if isinstance(answer, dict) else answer
+            require(received == right, f"{vector['answer']} for a request that is {vector['what']}", received)
+        await agent.require_single_answer(INCEPTION, "lines that are no commands")
 
 
 @case("two simultaneous clients of the control socket are both answered", "contract, Control socket")
@@ -291,23 +295,23 @@ async def _two_clients(bench: Bench) -> None:
     async with bench.agent() as agent:
         status = b'{"command": "status"}'
         both = await asyncio.gather(_lines(agent, status, status), _lines(agent, status, status))
-        must(all(answer.get("ok") for answers in both for answer in answers), "four statuses", both)
+        require(all(answer.get("ok") for answers in both for answer in answers), "four statuses", both)
 
 
 @case("after stop_events, no further events are logged", "contract, Control socket", 1)
 async def _stop_events(bench: Bench) -> None:
     often = {"source": "random", "mean_s": 1.0}
     async with bench.agent({"events": often, "settings": {**NO_EXPIRY, "max_event_bytes": 267}}) as agent:
-        await agent.hear_one(BlockAddRequest, "random events")
+        await agent.receive_one(BlockAddRequest, "random events")
         await agent.process.ask("stop_events")
         before = await agent.process.export()
         await asyncio.sleep(SECONDS_WITHOUT_EVENT / SPEEDUP)
         after = await agent.process.export()
         same = all(before[key] == after[key] for key in ("completed", "current_block"))
-        must(same, "no random event after stop_events", "another current block")
+        require(same, "no random event after stop_events", "another current block")
     async with bench.agent() as agent:
         await agent.process.ask("stop_events")
         with suppress(AgentRefusedError):
             await agent.log(b"event")
-        await agent.hear_nothing("after stop_events")
-        must((await agent.status())["completed"] == 0, "no completed block", "one")
+        await agent.receive_nothing("after stop_events")
+        require((await agent.status())["completed"] == 0, "no completed block", "one")

@@ -13,7 +13,15 @@ from harness.checker.evidence import Evidence
 from harness.checker.judgement import Judgement
 from harness.conformance._reference_model import INITIAL_DATA, PEERS, ROSTER, STRANGER
 from harness.conformance._state_space import VARIANTS
-from harness.conformance.cases._bench import INCEPTION, SPEEDUP, Bench, CannotTellError, WrongError, case, must
+from harness.conformance.cases._bench import (
+    INCEPTION,
+    SPEEDUP,
+    Bench,
+    CannotJudgeError,
+    WrongBehaviourError,
+    case,
+    require,
+)
 from harness.errors import ExportError
 from ucp.block import Block, next_chain_hash
 from ucp.clock import MICROSECONDS
@@ -40,43 +48,43 @@ class _Records:
     trace: Trace
     export: Export
     status: dict[str, Any]
-    said: Sequence[tuple[float, bytes]]
+    to_agent: Sequence[tuple[float, bytes]]
     """Mission second and content of each datagram to the agent."""
     sent: Sequence[bytes]
     export_s: tuple[float, float]
     """Mission seconds before and after the command `export`."""
     epoch_us: int
 
-    def judged_by(self, judgement: Judgement, bad: str, expected: str) -> None:
+    def require_verdict(self, judgement: Judgement, bad: str, expected: str) -> None:
         found = judgement.evidence[0].detail if judgement.evidence else judgement.reason
-        must(judgement.verdict != bad, expected, found)
+        require(judgement.verdict != bad, expected, found)
 
     def evidence(self) -> Evidence:
         agent_id = self.export.agent_id
         return Evidence({agent_id: self.export}, {agent_id: self.trace})
 
 
-async def _played(bench: Bench) -> _Records:
+async def _play_recorded_mission(bench: Bench) -> _Records:
     """Return the records of an agent that commits, votes, reconciles, drops datagrams, and is then killed."""
     async with bench.agent({"settings": SETTINGS, "roster": [*ROSTER, *PEERS]}) as agent:
         first, second, *_ = PEERS
         block = Block(first, 1, b"block")
         top = next_chain_hash(INCEPTION, block.block_hash)
-        agent.say(first, CommitBlock(block, top))
-        agent.ear.say(b"UC")
-        agent.say(STRANGER, ChainContainQuery(top))
-        agent.say(second, RequestForBlock(block.block_hash))
-        await agent.hear_one(BlockResponse, "a Request for Block")
+        agent.send(first, CommitBlock(block, top))
+        agent.peer_socket.send(b"UC")
+        agent.send(STRANGER, ChainContainQuery(top))
+        agent.send(second, RequestForBlock(block.block_hash))
+        await agent.receive_one(BlockResponse, "a Request for Block")
         for _ in range(EVENTS_OF_A_BLOCK):
             await agent.log(LARGEST_EVENT)
-        proposed = await agent.hear_one(BlockAddRequest, "events that fill a block")
-        agent.say(first, BlockAddResponse(proposed.block_hash, True))
-        await agent.hear_one(CommitBlock, "an approved vote")
+        proposed = await agent.receive_one(BlockAddRequest, "events that fill a block")
+        agent.send(first, BlockAddResponse(proposed.block_hash, True))
+        await agent.receive_one(CommitBlock, "an approved vote")
         await agent.process.ask("reconcile")
-        asked = await agent.hear_one(ChainContainQuery, "the command reconcile")
-        agent.say(first, ChainContainResponse(asked.chain_hash, False))
-        await agent.hear_one(ChainContainQuery, "an agent disagrees")
-        await agent.hear_one(CommitBlock, "a reconcile without further answers")
+        query = await agent.receive_one(ChainContainQuery, "the command reconcile")
+        agent.send(first, ChainContainResponse(query.chain_hash, False))
+        await agent.receive_one(ChainContainQuery, "an agent disagrees")
+        await agent.receive_one(CommitBlock, "a reconcile without further answers")
         await agent.log(b"event of the next block")
         await agent.process.ask("stop_events")
         before_s = agent.mission_s()
@@ -84,21 +92,21 @@ async def _played(bench: Bench) -> _Records:
         export_s = before_s, agent.mission_s()
         status = await agent.status()
         directory, agent_id = agent.process.directory, agent.agent_id
-        record, epoch_s = list(agent.ear.record), agent.epoch_s
+        record, epoch_s = list(agent.peer_socket.record), agent.epoch_s
         path = directory / f"{agent_id}{SUFFIX}"
         if not path.exists():
-            raise CannotTellError("the agent writes no trace")
+            raise CannotJudgeError("the agent writes no trace")
     trace = read_trace(path)
     if trace is None:
-        raise WrongError("a trace with a valid first line", "its first line is missing or invalid")
-    must(trace.problem is None, "a trace that can be read", trace.problem)
+        raise WrongBehaviourError("a trace with a valid first line", "its first line is missing or invalid")
+    require(trace.problem is None, "a trace that can be read", trace.problem)
     try:
         export = read_export(directory / f"{agent_id}.chain.json")
     except ExportError as error:
-        raise WrongError("a chain export that can be read", str(error)) from None
-    said = [((at_s - epoch_s) * SPEEDUP, data) for at_s, by_agent, data in record if not by_agent]
+        raise WrongBehaviourError("a chain export that can be read", str(error)) from None
+    to_agent = [((at_s - epoch_s) * SPEEDUP, data) for at_s, by_agent, data in record if not by_agent]
     sent = [data for _, by_agent, data in record if by_agent]
-    return _Records(trace, export, status, said, sent, export_s, round(epoch_s * MICROSECONDS))
+    return _Records(trace, export, status, to_agent, sent, export_s, round(epoch_s * MICROSECONDS))
 
 
 def _bytes(recorded: RecordedBytes | None) -> bytes:
@@ -107,64 +115,64 @@ def _bytes(recorded: RecordedBytes | None) -> bytes:
 
 @case("the trace has each datagram, event and command, in order and with its time", "contract, Trace")
 async def _inputs(bench: Bench) -> None:
-    played = await _played(bench)
+    played = await _play_recorded_mission(bench)
     runs, asides = played.trace.runs, [aside for _, aside in played.trace.asides]
     drops = {aside.datagram.text: aside.dropped for aside in asides if isinstance(aside, DroppedDatagram)}
-    said = dict.fromkeys(data for _, data in played.said)
+    to_agent = dict.fromkeys(data for _, data in played.to_agent)
     expected = {base64.b64encode(b"UC").decode(): "truncated"}
-    stranger = next(data for data in said if data[4:8] == STRANGER.to_bytes(4, "big"))
+    stranger = next(data for data in to_agent if data[4:8] == STRANGER.to_bytes(4, "big"))
     expected[base64.b64encode(stranger).decode()] = "sender not on the roster"
-    must(drops == expected, f"lines for 2 dropped datagrams: {', '.join(expected.values())}", drops)
+    require(drops == expected, f"lines for 2 dropped datagrams: {', '.join(expected.values())}", drops)
     received = [(run.t, _bytes(run.input)) for run in runs if run.trigger.kind == "message"]
-    handled = [data for _, data in played.said if base64.b64encode(data).decode() not in expected]
-    must([data for _, data in received] == handled, f"lines for {len(handled)} messages", f"{len(received)} lines")
+    handled = [data for _, data in played.to_agent if base64.b64encode(data).decode() not in expected]
+    require([data for _, data in received] == handled, f"lines for {len(handled)} messages", f"{len(received)} lines")
     for t, data in received:
-        sent_s = next(at_s for at_s, each in played.said if each == data)
+        sent_s = next(at_s for at_s, each in played.to_agent if each == data)
         late_s = t - sent_s
         right = late_s > -MOMENT_S and t <= played.export_s[1]
-        must(right, f"`t` {sent_s:.1f} or a little later for a message of that mission second", t)
+        require(right, f"`t` {sent_s:.1f} or a little later for a message of that mission second", t)
     sent = [_bytes(sent.datagram) for run in runs for sent in run.sent]
-    must(sent == played.sent, f"lines with {len(played.sent)} sent messages", f"{len(sent)} messages")
+    require(sent == played.sent, f"lines with {len(played.sent)} sent messages", f"{len(sent)} messages")
     events = sum(run.trigger.kind == "event" for run in runs)
-    must(events == EVENTS_OF_A_BLOCK + 1, f"{EVENTS_OF_A_BLOCK + 1} lines for events", events)
+    require(events == EVENTS_OF_A_BLOCK + 1, f"{EVENTS_OF_A_BLOCK + 1} lines for events", events)
     commands = [aside.command for aside in asides if not isinstance(aside, DroppedDatagram)]
-    must(commands == ["stop_events", "export"], "lines for the commands stop_events and export", commands)
+    require(commands == ["stop_events", "export"], "lines for the commands stop_events and export", commands)
 
 
 @case("the first line of the trace describes the mission", "contract, Trace")
 async def _header(bench: Bench) -> None:
-    played = await _played(bench)
+    played = await _play_recorded_mission(bench)
     header = played.trace.header
-    must(sorted(header.roster) == sorted(ROSTER), f"each agent of {list(ROSTER)} once", header.roster)
-    must(header.initial_data == base64.b64encode(INITIAL_DATA).decode(), "the initial data", header.initial_data)
+    require(sorted(header.roster) == sorted(ROSTER), f"each agent of {list(ROSTER)} once", header.roster)
+    require(header.initial_data == base64.b64encode(INITIAL_DATA).decode(), "the initial data", header.initial_data)
     lacking = {name: value for name, value in SETTINGS.items() if header.settings.get(name) != value}
-    must(not lacking, "the settings of the mission", f"other values of {', '.join(lacking)}")
+    require(not lacking, "the settings of the mission", f"other values of {', '.join(lacking)}")
     clock = {"epoch_us": played.epoch_us, "speedup": SPEEDUP}
-    must(header.clock == clock, f"the clock {clock}", header.clock)
+    require(header.clock == clock, f"the clock {clock}", header.clock)
 
 
 @case("each handler run in the trace follows Algorithms 1 to 20", "contract, Trace")
 async def _steps(bench: Bench) -> None:
-    played = await _played(bench)
-    played.judged_by(steps.check(played.evidence()), "deviates", "the steps of the reference")
+    played = await _play_recorded_mission(bench)
+    played.require_verdict(steps.check(played.evidence()), "deviates", "the steps of the reference")
 
 
 @case("status, chain export and trace agree", "contract, Judgement")
 async def _agree(bench: Bench) -> None:
-    played = await _played(bench)
+    played = await _play_recorded_mission(bench)
     status, trace, export = played.status, played.trace, played.export
     runs = len(trace.runs)
-    must(status["handled"] == runs, f"`handled` {runs}, the number of lines of handler runs", status["handled"])
+    require(status["handled"] == runs, f"`handled` {runs}, the number of lines of handler runs", status["handled"])
     sent_bytes = sum(map(len, played.sent))
-    must(status["bytes_sent"] == sent_bytes, f"`bytes_sent` {sent_bytes}", status["bytes_sent"])
+    require(status["bytes_sent"] == sent_bytes, f"`bytes_sent` {sent_bytes}", status["bytes_sent"])
     drops = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, DroppedDatagram))
-    must(status.get("dropped", drops) == drops, f"`dropped` {dict(drops)}", status.get("dropped"))
+    require(status.get("dropped", drops) == drops, f"`dropped` {dict(drops)}", status.get("dropped"))
     completed = trace.completed()
-    must(export.completed == completed, "the completed blocks of the trace in the export", export.completed)
+    require(export.completed == completed, "the completed blocks of the trace in the export", export.completed)
     at_s = (export.exported_at_us - played.epoch_us) / MICROSECONDS
     earliest, latest = played.export_s
     in_time = earliest - MOMENT_S <= at_s <= latest + MOMENT_S
-    must(in_time, f"`exported_at_us` at mission second {earliest:.1f}", f"{at_s:.1f}")
+    require(in_time, f"`exported_at_us` at mission second {earliest:.1f}", f"{at_s:.1f}")
     current = base64.b64decode(export.current_block.event_data)
-    must(current.endswith(b"event of the next block"), "the event of the unfinished block", f"{len(current)} bytes")
-    played.judged_by(records.check(played.evidence()), "contradict", "records that agree")
+    require(current.endswith(b"event of the next block"), "the event of the unfinished block", f"{len(current)} bytes")
+    played.require_verdict(records.check(played.evidence()), "contradict", "records that agree")

@@ -1,4 +1,4 @@
-"""Missions with keys: who is answered, what is dropped, and what a revocation makes of it."""
+"""Cases about missions with keys: authentic and forged datagrams, signed blocks, and revocations."""
 
 import asyncio
 import os
@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.conformance._reference_model import AGENT, PEERS, ROSTER
-from harness.conformance.cases._bench import CALM_S, INCEPTION, PATIENCE_S, Alone, Bench, CannotTellError, case, must
+from harness.conformance.cases._bench import (
+    INCEPTION,
+    PATIENCE_S,
+    SILENCE_S,
+    Bench,
+    BenchAgent,
+    CannotJudgeError,
+    case,
+    require,
+)
 from ucp.clock import MICROSECONDS
 from ucp.messages import (
     BlockAddRequest,
@@ -26,67 +35,73 @@ if TYPE_CHECKING:
     from ucp.secure.sealed_datagrams import OpenedDatagram
 
 BUNDLE = "keys.json"
-ASKS, LOST = PEERS[:2]
+ASKING_PEER, LOST_PEER = PEERS[:2]
 SECTION = "contract, Secured missions"
 
 
-class Air:
-    """What the peers of a secured agent say and hear, who have keys."""
+class SecuredPeers:
+    """The peers of a secured agent, with their keys."""
 
-    def __init__(self, agent: Alone, keys: "KeySet") -> None:
+    def __init__(self, agent: BenchAgent, keys: "KeySet") -> None:
         from ucp.secure.opening import Opener
         from ucp.secure.secured_agent import make_boot
         from ucp.secure.session import Session
 
         boot = make_boot(round(time.time() * MICROSECONDS), os.urandom(8))
-        self.sessions = {peer: Session(keys.bundle(peer), boot) for peer in (ASKS, LOST)}
+        self.sessions = {peer: Session(keys.bundle(peer), boot) for peer in (ASKING_PEER, LOST_PEER)}
         self.agent = agent
-        self._opener = Opener(keys.bundle(ASKS))
+        self._opener = Opener(keys.bundle(ASKING_PEER))
         self._sequence = 0
 
     def sealed(self, sender: int, message: Message) -> bytes:
-        """Its next datagram."""
+        """Return the next datagram of a peer, sealed with its keys."""
         self._sequence += 1
         return self.sessions[sender].seal(self._sequence, message, None, None, 0)
 
-    async def hear(self, count: int, what: str) -> "list[OpenedDatagram]":
-        """The next datagrams, which anybody with keys can open."""
-        ear, until = self.agent.ear, time.time() + PATIENCE_S
-        while len(ear.heard) < count and time.time() < until:
-            ear.drain()
-            await ear.arrival(min(until, time.time() + CALM_S))
-        datagrams = [data for _, data in ear.heard[:count]]
-        del ear.heard[:count]
-        must(len(datagrams) == count, what, f"{len(datagrams)} datagrams")
+    async def receive(self, count: int, what: str) -> "list[OpenedDatagram]":
+        """Return the next datagrams of the agent, opened with the keys of a peer.
+
+        Raises WrongBehaviourError if fewer arrive, or if one is not authentic.
+        """
+        peer_socket, until = self.agent.peer_socket, time.time() + PATIENCE_S
+        while len(peer_socket.received) < count and time.time() < until:
+            peer_socket.drain()
+            await peer_socket.arrival(min(until, time.time() + SILENCE_S))
+        datagrams = [data for _, data in peer_socket.received[:count]]
+        del peer_socket.received[:count]
+        require(len(datagrams) == count, what, f"{len(datagrams)} datagrams")
         try:
             return [self._opener.open(data) for data in datagrams]
         except MalformedDatagramError as error:
-            must(False, f"{what}, authentic and sealed", f"one that is not: {error.reason}")
+            require(False, f"{what}, authentic and sealed", f"one that is not: {error.reason}")
             raise
 
-    async def answers_only(self, after: str) -> bytes:
-        """It answers a new question, naming that, and has said nothing else; the question as it was sent."""
-        asked = self.sealed(ASKS, ChainContainQuery(INCEPTION))
-        self.agent.ear.say(asked)
-        (heard,) = await self.hear(1, f"an answer after {after}")
-        must(
-            heard.datagram.message == ChainContainResponse(INCEPTION, True),
+    async def require_single_answer(self, after: str) -> bytes:
+        """Ask the agent whether it has the inception block. Its next datagram must be the answer, naming the request.
+
+        Return the datagram of the question.
+        """
+        asked = self.sealed(ASKING_PEER, ChainContainQuery(INCEPTION))
+        self.agent.peer_socket.send(asked)
+        (received,) = await self.receive(1, f"an answer after {after}")
+        require(
+            received.datagram.message == ChainContainResponse(INCEPTION, True),
             f"that answer after {after}",
-            heard.datagram,
+            received.datagram,
         )
-        request = heard.request
+        request = received.request
         named = None if request is None else (request.sender, request.boot, request.sequence)
-        right = ASKS, self.sessions[ASKS].boot, self._sequence
-        must(named == right, "an answer that names the request", named)
+        right = ASKING_PEER, self.sessions[ASKING_PEER].boot, self._sequence
+        require(named == right, "an answer that names the request", named)
         return asked
 
 
 @asynccontextmanager
-async def _secured(bench: Bench) -> AsyncIterator[tuple[Air, "KeySet"]]:
+async def _secured(bench: Bench) -> AsyncIterator[tuple[SecuredPeers, "KeySet"]]:
     try:
         from ucp.secure.bundle import KeySet, write_bundle
     except ModuleNotFoundError as error:
-        raise CannotTellError(f"{error.name} is not installed here: pip install ucp-harness[secure]") from None
+        raise CannotJudgeError(f"{error.name} is not installed here: pip install ucp-harness[secure]") from None
     keys = KeySet.derived(os.urandom(32), ROSTER)
 
     def prepare(directory: Path) -> None:
@@ -94,7 +109,7 @@ async def _secured(bench: Bench) -> AsyncIterator[tuple[Air, "KeySet"]]:
 
     asked = {"features": ["secured"], "security": {"bundle": BUNDLE}}
     async with bench.agent(asked, prepare=prepare) as agent:
-        yield Air(agent, keys), keys
+        yield SecuredPeers(agent, keys), keys
 
 
 @case("with keys, only authentic and new datagrams have an effect", SECTION)
@@ -103,28 +118,30 @@ async def _authentic(bench: Bench) -> None:
     from ucp.secure.envelope import CLEAR
     from ucp.secure.session import Session
 
-    async with _secured(bench) as (air, keys):
-        before = await air.answers_only("its start")
+    async with _secured(bench) as (peers, keys):
+        before = await peers.require_single_answer("its start")
         query = ChainContainQuery(INCEPTION)
-        strangers = Session(KeySet.derived(os.urandom(32), ROSTER).bundle(ASKS), air.sessions[ASKS].boot)
-        elder = Session(keys.bundle(ASKS), bytes(16))
-        fresh = air.sealed(ASKS, query)
+        foreign_session = Session(
+            KeySet.derived(os.urandom(32), ROSTER).bundle(ASKING_PEER), peers.sessions[ASKING_PEER].boot
+        )
+        earlier_session = Session(keys.bundle(ASKING_PEER), bytes(16))
+        fresh = peers.sealed(ASKING_PEER, query)
         parts = {"header": 9, "ciphertext": CLEAR.size, "tag": len(fresh) - 80, "signature": len(fresh) - 1}
         hostile = {
             "that is a replay": before,
-            "in plain": encode(ASKS, 1, query),
-            "of another mission": strangers.seal(500, query, None, None, 0),
-            "of an earlier life": elder.seal(501, query, None, None, 0),
+            "in plain": encode(ASKING_PEER, 1, query),
+            "of another mission": foreign_session.seal(500, query, None, None, 0),
+            "of an earlier life": earlier_session.seal(501, query, None, None, 0),
             "that is cut off": fresh[:-1],
-            "that answers no request": air.sealed(ASKS, ChainContainResponse(INCEPTION, True)),
+            "that answers no request": peers.sealed(ASKING_PEER, ChainContainResponse(INCEPTION, True)),
             **{
                 f"with a bit flipped in its {name}": fresh[:at] + bytes([fresh[at] ^ 1]) + fresh[at + 1 :]
                 for name, at in parts.items()
             },
         }
         for what, datagram in hostile.items():
-            air.agent.ear.say(datagram)
-            await air.answers_only(f"a datagram {what}")
+            peers.agent.peer_socket.send(datagram)
+            await peers.require_single_answer(f"a datagram {what}")
 
 
 @case("with keys, blocks are signed in messages and in the export", SECTION, 1)
@@ -132,15 +149,15 @@ async def _signed(bench: Bench) -> None:
     from ucp.secure.block_signature import block_claim
     from ucp.secure.crypto_suite import verify
 
-    async with _secured(bench) as (air, keys):
-        while (await air.agent.status())["completed"] == 0:
-            await air.agent.log(bytes(200))
-        proposed, committed = await air.hear(2, "a Block Add Request and a Commit Block")
-        must(isinstance(proposed.datagram.message, BlockAddRequest), "a Block Add Request", proposed.datagram)
+    async with _secured(bench) as (peers, keys):
+        while (await peers.agent.status())["completed"] == 0:
+            await peers.agent.log(bytes(200))
+        proposed, committed = await peers.receive(2, "a Block Add Request and a Commit Block")
+        require(isinstance(proposed.datagram.message, BlockAddRequest), "a Block Add Request", proposed.datagram)
         message = committed.datagram.message
-        assert isinstance(message, CommitBlock), "it follows the other"
+        assert isinstance(message, CommitBlock), "no Commit Block after the Block Add Request"
         public = keys.public.vehicles[AGENT], keys.public.mission, message.block.block_data()
-        must(
+        require(
             verify(block_claim(*public, committed.block_signature)),
             "a Commit Block with its maker's signature",
             "another",
@@ -153,17 +170,21 @@ async def _revoked(bench: Bench) -> None:
 
     from ucp.secure.revocation import Revocation
 
-    async with _secured(bench) as (air, keys):
+    async with _secured(bench) as (peers, keys):
         authority = Ed25519PrivateKey.from_private_bytes(keys.authority)
-        forged = Revocation.signed(Ed25519PrivateKey.generate(), keys.public.mission, 2, [ASKS]).encode()
-        air.agent.ear.say(air.sessions[LOST].revocation_datagram(2, forged))
-        await air.answers_only("a revocation that the authority did not sign")
-        body = Revocation.signed(authority, keys.public.mission, 1, [LOST]).encode()
-        air.agent.ear.say(air.sessions[ASKS].revocation_datagram(1, body))
-        await asyncio.sleep(CALM_S)
-        told = [data for _, data in air.agent.ear.take()]
-        must(any(data.endswith(body) for data in told), "the revocation, passed on", f"{len(told)} other datagrams")
-        air.agent.ear.say(air.sealed(LOST, ChainContainQuery(INCEPTION)))
-        await asyncio.sleep(CALM_S)
-        heard = air.agent.ear.take()
-        must(not heard, "nothing after a question of a revoked vehicle", f"{len(heard)} datagrams")
+        forged = Revocation.signed(Ed25519PrivateKey.generate(), keys.public.mission, 2, [ASKING_PEER]).encode()
+        peers.agent.peer_socket.send(peers.sessions[LOST_PEER].revocation_datagram(2, forged))
+        await peers.require_single_answer("a revocation that the authority did not sign")
+        body = Revocation.signed(authority, keys.public.mission, 1, [LOST_PEER]).encode()
+        peers.agent.peer_socket.send(peers.sessions[ASKING_PEER].revocation_datagram(1, body))
+        await asyncio.sleep(SILENCE_S)
+        passed_on = [data for _, data in peers.agent.peer_socket.take()]
+        require(
+            any(data.endswith(body) for data in passed_on),
+            "the revocation, passed on",
+            f"{len(passed_on)} other datagrams",
+        )
+        peers.agent.peer_socket.send(peers.sealed(LOST_PEER, ChainContainQuery(INCEPTION)))
+        await asyncio.sleep(SILENCE_S)
+        received = peers.agent.peer_socket.take()
+        require(not received, "nothing after a question of a revoked vehicle", f"{len(received)} datagrams")

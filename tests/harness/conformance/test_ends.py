@@ -8,25 +8,27 @@ import pytest
 from harness.conformance import _udp_lab
 from harness.conformance._kept_failures import keep
 from harness.conformance._state_space import VARIANTS, explore
-from harness.conformance.conformance_run import Asked, conform
-from harness.conformance.results import Case, Results
+from harness.conformance.conformance_run import ConformanceRequest, conform
+from harness.conformance.results import CaseResult, Results
 from harness.conformance.results_table import lines_of
-from harness.conformance.vectors import Vectors
+from harness.conformance.vectors import VectorSet
 from tests.harness.conformance import wrong_programs
 
 
 def results_of(mistake: str, place: Path, *, virtual: bool = False) -> Results:
     steps = list(explore(VARIANTS["default"]))
-    wanted = {step.pair: step for step in steps if step.before.doing == "idle" and len(step.way) <= 2}
+    wanted = {step.key: step for step in steps if step.before.activity == "idle" and len(step.path) <= 2}
     command = (sys.executable, "-P", "-m", wrong_programs.__name__, mistake)
-    asked = Asked(command, None, place / "kept", virtual=virtual, by_hand=False, enough=2, limit_s=60.0)
-    return conform(asked, place, lambda count, total: None, [Vectors(VARIANTS["default"], steps, wanted)])
+    asked = ConformanceRequest(
+        command, None, place / "kept", virtual=virtual, handwritten=False, max_suspicions=2, limit_s=60.0
+    )
+    return conform(asked, place, lambda count, total: None, [VectorSet(VARIANTS["default"], steps, wanted)])
 
 
 @pytest.mark.lab
 @pytest.mark.any_user
 def test_agent_that_hangs_after_many_inputs_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, seconds in (("ANSWER_LIMIT_S", 3.0), ("CHANCE_S", 0.3)):
+    for name, seconds in (("ANSWER_LIMIT_S", 3.0), ("REPEATED_REQUEST_LIMIT_S", 0.3)):
         monkeypatch.setattr(_udp_lab, name, seconds)
     results = results_of("hangs_after_20_inputs", tmp_path)
     assert results.exit_status == 1
@@ -41,7 +43,7 @@ def test_agent_that_ends_after_many_inputs_is_named(tmp_path: Path) -> None:
 
 
 def test_failure_without_a_path_in_virtual_time_is_kept(tmp_path: Path) -> None:
-    case = Case("a late timer", 5, "failed", settings="default", inputs=("the next timer ends", "vote yes"))
+    case = CaseResult("a late timer", 5, "failed", settings="default", inputs=("the next timer ends", "vote yes"))
     keep(case, ("agent",), tmp_path / "kept")
     assert [path.name for path in (tmp_path / "kept").iterdir()] == ["failure.txt"]
     assert "is impossible in virtual time" in (tmp_path / "kept" / "failure.txt").read_text()
@@ -54,5 +56,5 @@ def test_failure_without_files_is_reported(tmp_path: Path) -> None:
 
 
 def test_failure_without_messages_shows_its_reason_alone() -> None:
-    case = Case("it hangs", 0, "failed", reason="it hangs", wrong=("it hangs",))
+    case = CaseResult("it hangs", 0, "failed", reason="it hangs", wrong=("it hangs",))
     assert list(lines_of(case)) == ["the program: it hangs", "  it hangs"]

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from harness.conformance._handwritten import _play
-from harness.conformance._udp_lab import Air
-from harness.conformance.cases import ALL
-from harness.conformance.results import Case
+from harness.conformance._udp_lab import UdpLab
+from harness.conformance.cases import ALL_CASES
+from harness.conformance.results import CaseResult
 from tests.harness.conformance import wrong_programs
 
 pytestmark = pytest.mark.lab
@@ -20,10 +20,10 @@ STEPS = "each handler run in the trace follows Algorithms 1 to 20"
 AGREE = "status, chain export and trace agree"
 
 
-def played(case: str, place: Path, *command: str) -> Case:
-    async def play() -> Case:
-        async with Air(place, command, 1) as air:
-            return await _play(air, next(each for each in ALL if each.name == case))
+def played(case: str, place: Path, *command: str) -> CaseResult:
+    async def play() -> CaseResult:
+        async with UdpLab(place, command, 1) as lab:
+            return await _play(lab, next(each for each in ALL_CASES if each.name == case))
 
     return asyncio.run(play())
 
