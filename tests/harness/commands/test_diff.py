@@ -173,7 +173,7 @@ def test_innermost_keys_differ_and_lists_of_other_lengths_as_a_whole() -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "sentence"),
+    ("damage", "sentence"),
     [
         (
             lambda b: trace(b).unlink(),

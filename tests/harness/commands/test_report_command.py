@@ -68,7 +68,7 @@ NO_VERDICT = "the run has no verdict: `ucp-harness check {run}` judges the files
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("damage", "expected"),
     [
         (
             lambda run: (run / "run.json").unlink(),
@@ -109,15 +109,15 @@ NO_VERDICT = "the run has no verdict: `ucp-harness check {run}` judges the files
     ],
 )
 def test_missing_or_truncated_file_is_reported_and_the_rest_is_drawn(
-    run_dir: Path, damage: Callable[[Path], object], said: list[str]
+    run_dir: Path, damage: Callable[[Path], object], expected: list[str]
 ) -> None:
     damage(run_dir)
     done = harness("report", run_dir)
     assert (done.returncode, done.stdout) == (0, f"{run_dir / 'report.html'}\n")
-    assert sentences(done.stderr) == [sentence.format(run=run_dir) for sentence in said]
+    assert sentences(done.stderr) == [sentence.format(run=run_dir) for sentence in expected]
     page, short = ((run_dir / name).read_text() for name in ("report.html", "report.md"))
-    assert said[-1] in page
-    assert said[-1] in short
+    assert expected[-1] in page
+    assert expected[-1] in short
     assert "inception block" in page
 
 
@@ -131,13 +131,13 @@ def test_directory_without_a_run_has_status_2(run_dir: Path, what: str) -> None:
         edit(run_dir / "run.json", lambda record: record.update(schema="ucp-matrix/1"))
     done = harness("report", run_dir)
     assert (done.returncode, done.stdout) == (2, "")
-    (said,) = sentences(done.stderr)
+    (sentence,) = sentences(done.stderr)
     expected = {
         "nowhere": "does not exist",
         "no run": "neither a run directory",
         "another record": "run.json: its schema",
     }
-    assert expected[what] in said
+    assert expected[what] in sentence
 
 
 def test_unwritable_report_has_status_3(run_dir: Path) -> None:
