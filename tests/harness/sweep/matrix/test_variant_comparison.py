@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.harness.command import harness
-from tests.harness.run.test_variant import CORE, HEAD, REFERENCE, written
+from tests.harness.run.test_variant import CORE, HEAD, REFERENCE, write_variant
 
 MATRIX = """
 name: Ties
@@ -33,7 +33,7 @@ def compared(matrix: Path, variant: Path, out: Path) -> dict[float, dict[str, An
 
 
 def test_variant_is_compared_with_the_original_seed_by_seed(matrix: Path, tmp_path: Path) -> None:
-    variant = written(tmp_path, HEAD + CORE + REFERENCE)
+    variant = write_variant(tmp_path, HEAD + CORE + REFERENCE)
     rows = compared(matrix, variant, tmp_path / "out")
     assert rows[0]["messages"]["differing_seeds"] == [], "without losses there is no tie"
     assert rows[0.3]["messages"]["differing_seeds"], "with losses there is one"
@@ -48,12 +48,12 @@ def test_variant_is_compared_with_the_original_seed_by_seed(matrix: Path, tmp_pa
 
 def test_variant_that_changes_nothing_has_no_difference(matrix: Path, tmp_path: Path) -> None:
     same = HEAD + CORE.replace("yes <= no", "yes < no") + REFERENCE.replace("yes > no", "yes >= no")
-    rows = compared(matrix, written(tmp_path, same), tmp_path / "out")
+    rows = compared(matrix, write_variant(tmp_path, same), tmp_path / "out")
     assert [row["differing_seeds"] for cell in rows.values() for row in cell.values()] == [[]] * 22
 
 
 def test_variant_excludes_other_comparisons(matrix: Path, tmp_path: Path) -> None:
-    variant = written(tmp_path, HEAD + CORE + REFERENCE)
+    variant = write_variant(tmp_path, HEAD + CORE + REFERENCE)
     done = harness("matrix", matrix, "--variant", variant, "--nights", tmp_path / "nights")
     assert done.returncode == 2
     assert "--variant excludes" in " ".join(done.stderr.split())
