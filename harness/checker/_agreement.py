@@ -18,12 +18,12 @@ from harness.checker.records import cross_examine
 from harness.checker.recurring_cycles import cycle_of
 
 
-def never(name: str, evidence: Evidence) -> Judgement | None:
+def check_endless_cycle(name: str, evidence: Evidence) -> Judgement | None:
     """Return `violated` if all agents are present and connected, but some never finish. Otherwise return None.
 
     `harness.checker._liveness` has the evidence.
     """
-    cycle = evidence.once(cycle_of)
+    cycle = evidence.cached(cycle_of)
     if cycle is None or evidence.connected_since_s is None or evidence.missing or evidence.paused_at_end:
         return None
     return Judgement(name, "violated", f"the system is fully connected, but {recurring_cycles.in_short(cycle)}")
@@ -33,7 +33,7 @@ MAX_REASONS = 3
 """Maximum number of agents in a reason."""
 
 
-def why_unknown(evidence: Evidence) -> str | None:
+def explain_unknown(evidence: Evidence) -> str | None:
     """Return the reason why the exports do not show the whole system in an idle state. None if they show it."""
     if not evidence.exports:
         return "the run has no chain exports"
@@ -51,7 +51,7 @@ def _idle(ids: list[int]) -> str:
     return "it was idle" if len(ids) == 1 else "they were idle"
 
 
-def why_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
+def explain_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
     """Return the reason why no differing agent had the chance to agree. None if at least one had it."""
     if evidence.record is None:
         return "exports do not show whether the system was fully connected"
@@ -65,20 +65,20 @@ def why_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
             f"the trace of {agents(untraced)} is missing, so it is unknown whether {agents(differing)} had a chance "
             "to reconcile"
         )
-    if short := sorted(evidence.once(cross_examine).short):
+    if short := sorted(evidence.cached(cross_examine).short):
         return f"the trace of {agents(short)} is incomplete, so it is unknown whether there was a chance to reconcile"
-    if unknown := evidence.unknown_word("handler", "branch", "operation"):
+    if unknown := evidence.describe_unknown_name("handler", "branch", "operation"):
         return f"it is unknown whether there was a chance to reconcile: {unknown}"
-    if not had_a_chance(evidence, differing):
+    if not find_agents_with_chance(evidence, differing):
         without = sorted(differing)
         more = len(without) - MAX_REASONS
-        told = [_why_none(evidence, since, agent_id) for agent_id in without[:MAX_REASONS]]
+        reasons = [_explain_agent(evidence, since, agent_id) for agent_id in without[:MAX_REASONS]]
         without_chance = f"{more} more {'agents' if more > 1 else 'agent'} had no chance"
-        return "; ".join([*told, *([without_chance] if more > 0 else [])])
+        return "; ".join([*reasons, *([without_chance] if more > 0 else [])])
     return None
 
 
-def _why_none(evidence: Evidence, since: float, agent_id: int) -> str:
+def _explain_agent(evidence: Evidence, since: float, agent_id: int) -> str:
     """Return the reason why this agent, which has a trace, had no chance."""
     changed = {peer: trace.chain_changed_at() for peer, trace in evidence.traces.items() if peer != agent_id}
     peer = max(changed, key=lambda peer: changed[peer], default=agent_id)
@@ -86,7 +86,7 @@ def _why_none(evidence: Evidence, since: float, agent_id: int) -> str:
     if changed.get(peer, 0.0) > since:
         since, when = changed[peer], f"the chain of agent {peer} changed last"
     proposed = [run.t for run in evidence.traces[agent_id].runs if run.branch == "proposed" and run.t >= since]
-    if (there_s := evidence.all_there_s)[0] > since:
+    if (there_s := evidence.presence_s)[0] > since:
         since, when = there_s[0], "others were switched off"
     within = f"that began after {since:g} s, when {when}"
     if there_s[1] < math.inf:
@@ -97,13 +97,13 @@ def _why_none(evidence: Evidence, since: float, agent_id: int) -> str:
     return sentence + (f"and its vote at {proposed[-1]:g} s led to none" if proposed else "and proposed no block since")
 
 
-def without(evidence: Evidence) -> str:
+def describe_absent_agents(evidence: Evidence) -> str:
     """Return the switched-off agents, whose exports do not count, for the end of a sentence."""
     away = set(evidence.exports) - set(evidence.present)
     return f"; without {agents(away)}, which {'was' if len(away) == 1 else 'were'} switched off" if away else ""
 
 
-def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
+def find_agents_with_chance(evidence: Evidence, differing: set[int]) -> set[int]:
     """Return the agents of `differing` that completed a reconcile after full connectivity and the others' last change.
 
     During this reconcile all judged agents ran, none was paused, and no other agent was present.
@@ -112,7 +112,7 @@ def had_a_chance(evidence: Evidence, differing: set[int]) -> set[int]:
     if since is None:
         return set()
     had = set()
-    from_s, until_s = evidence.all_there_s
+    from_s, until_s = evidence.presence_s
     last_change = {agent_id: trace.chain_changed_at() for agent_id, trace in evidence.traces.items()}
     for agent_id in differing & set(evidence.traces):
         others_changed_at = max((t for peer, t in last_change.items() if peer != agent_id), default=0.0)

@@ -1,6 +1,12 @@
 """Characteristic 5: in a fully connected system every completed block is in every living agent's chain, eventually."""
 
-from harness.checker._agreement import had_a_chance, never, why_no_chance, why_unknown, without
+from harness.checker._agreement import (
+    check_endless_cycle,
+    describe_absent_agents,
+    explain_no_chance,
+    explain_unknown,
+    find_agents_with_chance,
+)
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, agents, violated
 
@@ -12,26 +18,26 @@ def check(evidence: Evidence) -> Judgement:
 
     `not applicable` where an export is missing, an agent was not idle, or those that lack a block had no chance.
     """
-    if never_agrees := never(NAME, evidence):
+    if never_agrees := check_endless_cycle(NAME, evidence):
         return never_agrees
-    unknown = why_unknown(evidence)
+    unknown = explain_unknown(evidence)
     if unknown:
         return Judgement(NAME, "not applicable", unknown)
-    gone, completed = _gone_and_left(evidence)
+    gone, completed = _split_completed(evidence)
     lacking: dict[int, list[str]] = {}
     for agent_id, export in evidence.present.items():
         in_chain = set(export.chain_of_block_hashes)
         missing = [block_hash for block_hash in completed if block_hash not in in_chain]
         if missing:
             lacking[agent_id] = missing
-    if not lacking and (untold := evidence.not_told_completed()):
-        why = evidence.unknown_word("operation", agent_id=min(untold))
-        return Judgement(NAME, "not applicable", f"the completed blocks of {agents(untold)} are unknown: {why}")
+    if not lacking and (unknown_agents := evidence.agents_with_unknown_completed()):
+        why = evidence.describe_unknown_name("operation", agent_id=min(unknown_agents))
+        return Judgement(NAME, "not applicable", f"the completed blocks of {agents(unknown_agents)} are unknown: {why}")
     if not lacking:
-        but = f"; {gone} more were lost with agents that {_left(evidence)}" if gone else ""
+        but = f"; {gone} more were lost with agents that {_describe_end(evidence)}" if gone else ""
         whole = f"all {len(completed)} completed blocks are in every chain"
-        return Judgement(NAME, "holds", whole + without(evidence) + but)
-    no_chance = why_no_chance(evidence, set(lacking))
+        return Judgement(NAME, "holds", whole + describe_absent_agents(evidence) + but)
+    no_chance = explain_no_chance(evidence, set(lacking))
     if no_chance:
         lack, first = sum(map(len, lacking.values())), lacking[min(lacking)][0]
         return Judgement(
@@ -47,13 +53,13 @@ def check(evidence: Evidence) -> Judgement:
             evidence.name(block_hash),
             block_hash,
         )
-        for agent_id in sorted(had_a_chance(evidence, set(lacking)))
+        for agent_id in sorted(find_agents_with_chance(evidence, set(lacking)))
         for block_hash in lacking[agent_id]
     ]
     return violated(NAME, "an agent that had the chance to reconcile lacks a completed block", findings)
 
 
-def _gone_and_left(evidence: Evidence) -> tuple[int, list[str]]:
+def _split_completed(evidence: Evidence) -> tuple[int, list[str]]:
     """Return the number of completed blocks that no present agent holds, and the hashes of the other ones.
 
     The former were lost with killed agents (Section 3.3), or an agent that was switched off has them.
@@ -71,5 +77,5 @@ def _gone_and_left(evidence: Evidence) -> tuple[int, list[str]]:
     return len(gone), [block_hash for block_hash in completed if block_hash not in gone]
 
 
-def _left(evidence: Evidence) -> str:
+def _describe_end(evidence: Evidence) -> str:
     return "were killed or switched off" if evidence.switched_off else "were killed"

@@ -47,16 +47,16 @@ def check(evidence: Evidence) -> Judgement:
             ran: set[str] = set()
             for line, run in life:
                 ran.add(run.handler)
-                if _is_plainly_right(run, ran, sent):
+                if _is_certainly_correct(run, ran, sent):
                     continue  # a fast path for most runs
                 sender = run.trigger.sender if isinstance(run.trigger, MessageTrigger) else None
                 if sender is not None and sender not in sent:
                     untraced.add(sender)
                     continue
-                if not _is_in_known_words(run) or sender in sends_unknown:
+                if not _has_known_names(run) or sender in sends_unknown:
                     continue
                 wrong = _wrong_trigger(run, ran, sent)
-                if wrong and sender in evidence.injected.heard_of:
+                if wrong and sender in evidence.injected.outside_senders:
                     untraced.add(sender)
                     continue
                 if wrong and not (sender is not None and evidence.traces[sender].problem):
@@ -64,7 +64,7 @@ def check(evidence: Evidence) -> Judgement:
     findings += waited_too_long(evidence)
     if findings:
         return violated(NAME, "a handler ran without a valid trigger, or waited for another agent", findings)
-    if unknown := evidence.unknown_word("trigger", "handler", "timer", "message", "branch"):
+    if unknown := evidence.describe_unknown_name("trigger", "handler", "timer", "message", "branch"):
         return Judgement(NAME, "not applicable", unknown)
     silent = sorted(set(evidence.roster or evidence.exports) - set(evidence.traces))
     if untraced or silent:
@@ -79,7 +79,7 @@ def check(evidence: Evidence) -> Judgement:
     return Judgement(NAME, "holds", f"{runs} handler runs, each triggered locally or by a message that its sender sent")
 
 
-def _is_plainly_right(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings]) -> bool:
+def _is_certainly_correct(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings]) -> bool:
     """Return true if the trigger is its own timer, an event, an earlier handler, or a message that its sender sent."""
     trigger, handler = run.trigger, run.handler
     if isinstance(trigger, MessageTrigger):
@@ -92,7 +92,7 @@ def _is_plainly_right(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings])
     return isinstance(trigger, TimerTrigger) and _OF_TIMER.get(trigger.timer) == handler
 
 
-def _is_in_known_words(run: HandlerRun) -> bool:
+def _has_known_names(run: HandlerRun) -> bool:
     """Return true if the agent contract defines the names of handler and trigger."""
     if run.handler not in HANDLERS:
         return False

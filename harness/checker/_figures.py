@@ -8,17 +8,18 @@ from harness.checker.uniform_chain import common_prefix
 
 
 def figures(evidence: Evidence) -> dict[str, float | int | None]:
-    """Return the figures by name. None means not known. `copies` are of each completed block, per agent.
+    """Return the figures by name. None means unknown.
 
-    `uniform_at_s` is when the chains became what they all are in the end, in mission seconds; None if they differ.
+    `copies` counts the chains that contain a completed block. `uniform_at_s` is the mission second since which all
+    chains are equal, or None if they differ.
     """
     chains = [export.chain_of_block_hashes for export in evidence.exports.values()]
     completed = evidence.completed_blocks()
-    all_known = not evidence.not_told_completed()
+    all_known = not evidence.agents_with_unknown_completed()
     copies = Counter(block_hash for chain in chains for block_hash in chain)
     per_block = [copies[block_hash] for block_hash in completed]
     distinct = len(set(chains))
-    messages = _of_all_agents(evidence, "messages_sent")
+    messages = _sum_over_agents(evidence, "messages_sent")
     result: dict[str, float | int | None] = {
         "agents": len(chains),
         "blocks": len(completed) if all_known else None,
@@ -27,10 +28,10 @@ def figures(evidence: Evidence) -> dict[str, float | int | None]:
         "distinct_chains": distinct,
         "copies_min": min(per_block, default=None) if all_known else None,
         "copies_mean": round(sum(per_block) / len(per_block), 3) if per_block and all_known else None,
-        "uniform_at_s": uniform_at_s(evidence),
-        "reconciles": _of_all_agents(evidence, "reconciles"),
+        "uniform_at_s": compute_uniform_at_s(evidence),
+        "reconciles": _sum_over_agents(evidence, "reconciles"),
         "messages": messages,
-        "bytes": _of_all_agents(evidence, "bytes_sent"),
+        "bytes": _sum_over_agents(evidence, "bytes_sent"),
         "messages_per_block": round(messages / len(completed), 1)
         if completed and messages is not None and all_known
         else None,
@@ -48,25 +49,25 @@ def figures(evidence: Evidence) -> dict[str, float | int | None]:
     return result
 
 
-def _of_all_agents(evidence: Evidence, counter: str) -> int | None:
-    """The sum of a counter that the run's record has of every agent; else what whole traces have; else None."""
+def _sum_over_agents(evidence: Evidence, counter: str) -> int | None:
+    """Return the sum of a counter over all agents, from the record or from complete traces. None without both."""
     agents = evidence.record.agents.values() if evidence.record else ()
     counts: list[int | None] = [getattr(agent, counter) for agent in agents]
     known = [count for count in counts if count is not None]
     if known and len(known) == len(counts):
         return sum(known)
     runs = [run for trace in evidence.traces.values() for run in trace.runs]
-    if not runs or evidence.once(cross_examine).short:
+    if not runs or evidence.cached(cross_examine).short:
         return None
     match counter:
         case "messages_sent":
             return sum(len(run.sent) for run in runs)
-        case "reconciles" if evidence.unknown_word("handler", "branch") is None:
+        case "reconciles" if evidence.describe_unknown_name("handler", "branch") is None:
             return sum(run.handler == "reconcile_begin" and run.branch == "begun" for run in runs)
     return None
 
 
-def uniform_at_s(evidence: Evidence) -> float | None:
+def compute_uniform_at_s(evidence: Evidence) -> float | None:
     """Return the mission second since which all chains are equal: that of the last change of any chain.
 
     None if the chains differ at the end, or if their changes are not on record.
@@ -79,9 +80,9 @@ def uniform_at_s(evidence: Evidence) -> float | None:
         agent, trace = recorded.get(str(agent_id)), evidence.traces.get(agent_id)
         if agent is not None and agent.chain_changed_at_s is not None:
             last_s = max(last_s, agent.chain_changed_at_s)
-        elif evidence.unknown_word("operation", agent_id=agent_id):
+        elif evidence.describe_unknown_name("operation", agent_id=agent_id):
             return None
-        elif trace is not None and agent_id not in evidence.once(cross_examine).short:
+        elif trace is not None and agent_id not in evidence.cached(cross_examine).short:
             last_s = max(last_s, round(trace.chain_changed_at(), 3))
         else:
             return None

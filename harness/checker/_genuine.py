@@ -25,7 +25,7 @@ _Link = tuple[str, str, str | None]
 
 
 @dataclass
-class _Recomputed:
+class _VerifiedHashes:
     """Verified hashes. A block that many agents hold is hashed once."""
 
     blocks: set[_Content] = field(default_factory=set)
@@ -50,7 +50,7 @@ class _Recomputed:
         return True
 
 
-class _Signatures:
+class _SignatureChecks:
     """Signatures of blocks. Each is verified once."""
 
     def __init__(self, keys: "PublicKeys", verified: "Callable[[SignatureClaim], bool] | None") -> None:
@@ -60,14 +60,14 @@ class _Signatures:
         self._verified = verified or verify
         self._checked: dict[tuple[_Content, str | None], str | None] = {}
 
-    def what_is_wrong(self, block: ExportedBlock) -> str | None:
+    def find_error(self, block: ExportedBlock) -> str | None:
         """Return the end of a sentence about a block without a valid signature, else None."""
         claim = (block.agent_id, block.timestamp_us, block.event_data, block.block_hash), block.signature
         if claim not in self._checked:
-            self._checked[claim] = self._look(block)
+            self._checked[claim] = self._verify(block)
         return self._checked[claim]
 
-    def _look(self, block: ExportedBlock) -> str | None:
+    def _verify(self, block: ExportedBlock) -> str | None:
         from ucp.secure.block_signature import block_claim
 
         public_key = self._keys.vehicles.get(block.agent_id)
@@ -92,18 +92,18 @@ def check(evidence: Evidence) -> Judgement:
     findings: list[Finding] = []
     roster = evidence.roster
     completed = evidence.completed_blocks()
-    known = {*evidence.exports, *evidence.traces, *completed.values()} - evidence.injected.heard_of
-    known -= evidence.not_told_completed()
+    known = {*evidence.exports, *evidence.traces, *completed.values()} - evidence.injected.outside_senders
+    known -= evidence.agents_with_unknown_completed()
     unknown: set[int] = set()
     blocks = 0
-    recomputed = _Recomputed()
-    signatures = _Signatures(evidence.public_keys, evidence.verified) if evidence.public_keys else None
+    recomputed = _VerifiedHashes()
+    signatures = _SignatureChecks(evidence.public_keys, evidence.verified) if evidence.public_keys else None
     for agent_id, export in evidence.exports.items():
-        findings += _hashes_that_do_not_recompute(agent_id, export, evidence, recomputed)
+        findings += _check_hashes(agent_id, export, evidence, recomputed)
         for block in export.blocks():
             blocks += 1
             on_the_roster = roster is None or block.agent_id in roster
-            wrong_signature = signatures.what_is_wrong(block) if signatures else None
+            wrong_signature = signatures.find_error(block) if signatures else None
             if on_the_roster and not wrong_signature and completed.get(block.block_hash) == block.agent_id:
                 continue  # most are like this
             name = evidence.name(block.block_hash)
@@ -120,10 +120,10 @@ def check(evidence: Evidence) -> Judgement:
                 detail += (
                     ", although the block is signed with its key, so its key is known to others" if signatures else ""
                 )
-                detail += _since(evidence.traces.get(agent_id), block.block_hash)
+                detail += _describe_arrival(evidence.traces.get(agent_id), block.block_hash)
             findings.append(Finding(agent_id, detail, name, block.block_hash))
     for agent_id, export in evidence.before_final_reconcile.items():
-        edited = _hashes_that_do_not_recompute(agent_id, export, evidence, recomputed)
+        edited = _check_hashes(agent_id, export, evidence, recomputed)
         findings += [replace(finding, detail=f"{finding.detail}, before the final reconcile") for finding in edited]
     if findings:
         return violated(NAME, "a block was not made by an agent of this mission", findings)
@@ -143,7 +143,7 @@ def check(evidence: Evidence) -> Judgement:
     return Judgement(NAME, "holds", reason)
 
 
-def _since(trace: Trace | None, block_hash: str) -> str:
+def _describe_arrival(trace: Trace | None, block_hash: str) -> str:
     """Return the time and the handler of the block's arrival, for the end of a sentence."""
     came = ("chain+", block_hash)
     for run in trace.runs if trace else ():
@@ -152,9 +152,7 @@ def _since(trace: Trace | None, block_hash: str) -> str:
     return ""
 
 
-def _hashes_that_do_not_recompute(
-    agent_id: int, export: Export, evidence: Evidence, recomputed: _Recomputed
-) -> list[Finding]:
+def _check_hashes(agent_id: int, export: Export, evidence: Evidence, recomputed: _VerifiedHashes) -> list[Finding]:
     findings = []
     inception = InceptionBlock(base64.b64decode(export.inception.block_data))
     if (inception.block_hash.hex(), inception.chain_hash.hex()) != (

@@ -11,7 +11,7 @@ def check(evidence: Evidence) -> Judgement:
 
     `not applicable` where an agent was not idle at the end, or left no export.
     """
-    findings = [*_in_exports(evidence), *_in_traces(evidence)]
+    findings = [*_check_exports(evidence), *_check_traces(evidence)]
     if findings:
         return violated(NAME, "an idle agent held a completed block that was not in its chain", findings)
     if not evidence.exports:
@@ -23,14 +23,14 @@ def check(evidence: Evidence) -> Judgement:
         )
     if evidence.missing:
         return Judgement(NAME, "not applicable", f"the export of {agents(evidence.missing)} is missing")
-    if unknown := evidence.unknown_word("operation"):
+    if unknown := evidence.describe_unknown_name("operation"):
         return Judgement(NAME, "not applicable", unknown)
     looked = "at the end and after every traced step" if evidence.traces else "at the end"
     blocks = sum(len(export.completed) for export in evidence.exports.values())
     return Judgement(NAME, "holds", f"all {blocks} completed blocks are in their agents' chains, {looked}")
 
 
-def _in_exports(evidence: Evidence) -> list[Finding]:
+def _check_exports(evidence: Evidence) -> list[Finding]:
     findings = []
     for agent_id, export in evidence.exports.items():
         if not export.idle:
@@ -50,12 +50,14 @@ def _in_exports(evidence: Evidence) -> list[Finding]:
     return findings
 
 
-def _in_traces(evidence: Evidence) -> list[Finding]:
+def _check_traces(evidence: Evidence) -> list[Finding]:
     findings = []
     for agent_id, incarnations in evidence.incarnations.items():
         for incarnation in incarnations:
-            for sight in incarnation.idle_too_early:
-                waiting, run = sight.block_hash, sight.run
-                detail = f"trace line {sight.line}, t={run.t:g} s: idle after {run.handler} with {sight.what}"
+            for observation in incarnation.idle_too_early:
+                waiting, run = observation.block_hash, observation.run
+                detail = (
+                    f"trace line {observation.line}, t={run.t:g} s: idle after {run.handler} with {observation.what}"
+                )
                 findings.append(Finding(agent_id, detail, evidence.name(waiting) if waiting else None, waiting))
     return findings

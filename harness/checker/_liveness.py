@@ -5,8 +5,8 @@ still commit blocks, the rate of these commits gives an estimate of the remainin
 """
 
 from harness.checker import recurring_cycles
-from harness.checker._agreement import without
-from harness.checker._figures import uniform_at_s
+from harness.checker._agreement import describe_absent_agents
+from harness.checker._figures import compute_uniform_at_s
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents
 
@@ -15,19 +15,19 @@ NAME = "liveness"
 
 def check(evidence: Evidence) -> Judgement:
     """Return `never finishes` if the records show it, `not finished` if the swarm was not idle, else `finished`."""
-    unknown = _why_unknown(evidence)
+    unknown = _explain_unknown(evidence)
     if unknown:
         return Judgement(NAME, "not applicable", unknown)
     if not evidence.busy:
-        return Judgement(NAME, "finished", _finished(evidence))
-    cycle = evidence.once(recurring_cycles.cycle_of)
+        return Judgement(NAME, "finished", _describe_idle_end(evidence))
+    cycle = evidence.cached(recurring_cycles.cycle_of)
     if cycle is not None:
         return Judgement(NAME, "never finishes", recurring_cycles.in_words(cycle), recurring_cycles.findings(cycle))
-    findings = [Finding(agent_id, _left_to_do(evidence, agent_id)) for agent_id in evidence.busy]
-    return Judgement(NAME, "not finished", _not_finished(evidence), findings[:MAX_EVIDENCE])
+    findings = [Finding(agent_id, _describe_open_work(evidence, agent_id)) for agent_id in evidence.busy]
+    return Judgement(NAME, "not finished", _describe_busy_end(evidence), findings[:MAX_EVIDENCE])
 
 
-def _why_unknown(evidence: Evidence) -> str | None:
+def _explain_unknown(evidence: Evidence) -> str | None:
     if evidence.record is None:
         return "exports do not show whether the run ended normally"
     if evidence.record.outcome != "completed":
@@ -44,29 +44,29 @@ def _why_unknown(evidence: Evidence) -> str | None:
     return None
 
 
-def _finished(evidence: Evidence) -> str:
+def _describe_idle_end(evidence: Evidence) -> str:
     there = evidence.present
     idle = f"all {len(there)} agents were idle" if len(there) > 1 else "the agent was idle"
     when = "" if evidence.ended_at_s is None else f" at {evidence.ended_at_s:.0f} s"
     at = " when they were switched off" if set(there) <= set(evidence.switched_off) else when
     chains = len({export.chain_of_block_hashes for export in there.values()})
-    uniform_s = uniform_at_s(evidence)
+    uniform_s = compute_uniform_at_s(evidence)
     since = "" if uniform_s is None else f" since {uniform_s:.1f} s"
     one = "one chain" if chains == 1 else f"{chains} distinct chains"
-    return f"{idle}{at}, with {one}{since}{without(evidence)}"
+    return f"{idle}{at}, with {one}{since}{describe_absent_agents(evidence)}"
 
 
-def _not_finished(evidence: Evidence) -> str:
+def _describe_busy_end(evidence: Evidence) -> str:
     still = f"{recurring_cycles.named(evidence.busy)} {'were' if len(evidence.busy) > 1 else 'was'} not idle"
     at = "" if evidence.ended_at_s is None else f" when the run ended at {evidence.ended_at_s:.0f} s"
     connected = evidence.connected_since_s is not None
     conditions = (
         "" if connected else f", not fully connected ({evidence.network_at_end or 'network conditions not recorded'})"
     )
-    return f"{still}{at}{conditions}; {_needed(evidence)}"
+    return f"{still}{at}{conditions}; {_estimate_remaining_time(evidence)}"
 
 
-def _needed(evidence: Evidence) -> str:
+def _estimate_remaining_time(evidence: Evidence) -> str:
     """Estimate the remaining time from the rate of commits since the last completed block."""
     waiting = sum(len(export.blocks_to_be_committed) for export in evidence.exports.values())
     blocks = f"{waiting} block{'s' if waiting != 1 else ''} waited for their commit"
@@ -90,7 +90,7 @@ def _needed(evidence: Evidence) -> str:
     return f"{blocks}; at {rate:.2g} commits a minute this would have taken {more} minute{'s' if more > 1 else ''} more"
 
 
-def _left_to_do(evidence: Evidence, agent_id: int) -> str:
+def _describe_open_work(evidence: Evidence, agent_id: int) -> str:
     export = evidence.exports[agent_id]
     waiting, aside = len(export.blocks_to_be_committed), len(export.reconcile_stack)
     doing = "in a reconcile" if export.reconcile_in_progress else "not in a reconcile"

@@ -29,7 +29,7 @@ def check(evidence: Evidence) -> Judgement:
         return Judgement(NAME, "not applicable", "the run has no chain exports")
     if evidence.missing:
         return Judgement(NAME, "not applicable", f"the export of {agents(evidence.missing)} is missing")
-    if unknown := evidence.unknown_word("operation"):
+    if unknown := evidence.describe_unknown_name("operation"):
         return Judgement(NAME, "not applicable", unknown)
     looked = " and after every traced step" if evidence.traces else ""
     return Judgement(NAME, "holds", f"no duplicate block in {len(evidence.exports)} exports{looked}")

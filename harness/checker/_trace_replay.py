@@ -1,6 +1,6 @@
-"""A trace replayed: the changes of each handler run, in order, against what its `state` says the agent then held.
+"""Replay a trace: apply the changes of each handler run, and compare the result with the state in the same line.
 
-One pass over each trace, for all who judge what an agent held at which step.
+One pass over each trace collects the observations for all checks that need the blocks of an agent at each step.
 """
 
 from collections.abc import Iterator
@@ -57,16 +57,16 @@ class Incarnation:
     second_copies: list[Observation] = field(default_factory=list)
     idle_too_early: list[Observation] = field(default_factory=list)
     """Idle states with own blocks outside of the chain, or with blocks in the deque or on the stack."""
-    otherwise: list[Observation] = field(default_factory=list)
+    wrong_lengths: list[Observation] = field(default_factory=list)
     """The first state whose lengths contradict the changes."""
-    another_top: list[Observation] = field(default_factory=list)
+    wrong_tops: list[Observation] = field(default_factory=list)
     """The first top chain hash that differs from that of the chain (eq. 3.2)."""
     flags: list[Observation] = field(default_factory=list)
     """Impossible flags."""
     back_in_time: list[Observation] = field(default_factory=list)
     out_of_sequence: list[Observation] = field(default_factory=list)
 
-    def numbered(self) -> Iterator[tuple[int, HandlerRun]]:
+    def numbered_runs(self) -> Iterator[tuple[int, HandlerRun]]:
         """Return the runs with their lines."""
         return next(islice(self.trace.incarnations(), self.number, None))
 
@@ -75,25 +75,25 @@ def replay(trace: Trace, inception: str | None) -> list[Incarnation]:
     """Return each incarnation of the agent. `inception` is the chain hash CH_0 of the mission, or None if unknown."""
     bounds = [0, *trace.starts, len(trace.runs)]
     return [
-        _replayed(Incarnation(trace, number, trace.runs[start:end]), inception)
+        _replay_incarnation(Incarnation(trace, number, trace.runs[start:end]), inception)
         for number, (start, end) in enumerate(pairwise(bounds))
     ]
 
 
-def _replayed(incarnation: Incarnation, inception: str | None) -> Incarnation:
-    holds = _Holds(incarnation, inception)
+def _replay_incarnation(incarnation: Incarnation, inception: str | None) -> Incarnation:
+    held = _HeldBlocks(incarnation, inception)
     checked: StateSummary | None = None
     reconciling, compared, now, sequence = False, True, 0.0, 0
-    for line, run in incarnation.numbered():
+    for line, run in incarnation.numbered_runs():
         state = run.state
         if run.changes and not incarnation.unknown:
-            holds.change(line, run)
+            held.change(line, run)
             checked = None
             compared = compared and not incarnation.unknown
         if state is not checked:
             checked = state
             if compared:
-                compared = holds.compare(line, run)
+                compared = held.compare(line, run)
             if state.reconciling != reconciling:
                 reconciling = state.reconciling
                 if run.handler in HANDLERS and run.handler not in BEGINS_OR_ENDS_A_RECONCILE:
@@ -103,8 +103,8 @@ def _replayed(incarnation: Incarnation, inception: str | None) -> Incarnation:
                     incarnation.flags.append(Observation(line, run, what))
             if state.idle and reconciling:
                 incarnation.flags.append(Observation(line, run, "idle and reconciling at once"))
-        if state.idle and holds.anything_aside and not incarnation.unknown:
-            incarnation.idle_too_early.append(holds.idle_too_early(line, run))
+        if state.idle and held.has_blocks_aside and not incarnation.unknown:
+            incarnation.idle_too_early.append(held.idle_too_early(line, run))
         if not now <= run.t <= LATEST_S:
             incarnation.back_in_time.append(Observation(line, run, f"the time goes back from {now:g} s to {run.t:g} s"))
         now = run.t
@@ -118,21 +118,21 @@ def _replayed(incarnation: Incarnation, inception: str | None) -> Incarnation:
     return incarnation
 
 
-class _Holds:
+class _HeldBlocks:
     """The blocks of an agent, step by step."""
 
     def __init__(self, incarnation: Incarnation, inception: str | None) -> None:
-        self._life = incarnation
+        self._incarnation = incarnation
         self._copies: dict[str, int] = {}
         self._places = {"chain": incarnation.chain, "deque": incarnation.deque, "stack": incarnation.stack}
         self._chain_hashes = [bytes.fromhex(inception)] if inception is not None else None
         """Chain hashes of the chain, from the inception block on. None if they are not known."""
         self._completed: set[str] = set()
         self._not_in_chain: dict[str, None] = {}
-        self.anything_aside = False
+        self.has_blocks_aside = False
 
     def change(self, line: int, run: HandlerRun) -> None:
-        incarnation = self._life
+        incarnation = self._incarnation
         if not OPERATIONS.issuperset(operation for operation, _ in run.changes):
             incarnation.unknown = True
             return
@@ -154,7 +154,7 @@ class _Holds:
                 self._put(operation[:-1], place, block)
                 if self._copies[block] > 1:
                     incarnation.second_copies.append(Observation(line, run, "", block))
-        self.anything_aside = bool(self._not_in_chain or incarnation.deque or incarnation.stack)
+        self.has_blocks_aside = bool(self._not_in_chain or incarnation.deque or incarnation.stack)
 
     def _put(self, name: str, place: list[str], block: str) -> None:
         place.append(block)
@@ -186,7 +186,7 @@ class _Holds:
 
     def compare(self, line: int, run: HandlerRun) -> bool:
         """Whether the state is what the changes have led to."""
-        incarnation, state = self._life, run.state
+        incarnation, state = self._incarnation, run.state
         if (state.chain, state.deque, state.stack) != (
             len(incarnation.chain),
             len(incarnation.deque),
@@ -196,18 +196,18 @@ class _Holds:
                 f"records that {_lengths(state.chain, state.deque, state.stack)}, but its changes so far lead to "
                 f"{_lengths(len(incarnation.chain), len(incarnation.deque), len(incarnation.stack), '')}"
             )
-            incarnation.otherwise.append(Observation(line, run, what))
+            incarnation.wrong_lengths.append(Observation(line, run, what))
             return False
         if self._chain_hashes is not None and state.top != self._chain_hashes[-1].hex():
             what = f"the top chain hash {state.top[:12]} does not match the {state.chain} blocks of the chain (eq. 3.2)"
-            incarnation.another_top.append(
+            incarnation.wrong_tops.append(
                 Observation(line, run, what, incarnation.chain[-1] if incarnation.chain else None)
             )
             return False
         return True
 
     def idle_too_early(self, line: int, run: HandlerRun) -> Observation:
-        incarnation = self._life
+        incarnation = self._incarnation
         what = f"{len(incarnation.deque)} blocks to be committed and {len(incarnation.stack)} on the reconcile stack"
         return Observation(line, run, what, next(iter(self._not_in_chain), None))
 
@@ -220,5 +220,5 @@ def _digest(block_hash: str) -> bytes:
         return bytes(HASH_BYTES)
 
 
-def _lengths(chain: int, deque: int, stack: int, holds: str = "holds ") -> str:
-    return f"the chain {holds}{chain} blocks, the deque {deque} and the stack {stack}"
+def _lengths(chain: int, deque: int, stack: int, verb: str = "holds ") -> str:
+    return f"the chain {verb}{chain} blocks, the deque {deque} and the stack {stack}"

@@ -103,7 +103,7 @@ def check(run: Evidence | RunArchive) -> Result:
         beside = {key: unjudged.pop(key) for key in FURTHER_CHECKS}
         return Result(unjudged, figures(evidence), beside, evidence.errors, chains)
     return Result(
-        {number: in_doubt(number, judge(evidence), evidence.once(cross_examine)) for number, judge in CHECKS.items()},
+        {number: in_doubt(number, judge(evidence), evidence.cached(cross_examine)) for number, judge in CHECKS.items()},
         figures(evidence),
         {key: judge(evidence) for key, judge in FURTHER_CHECKS.items()},
         evidence.errors,

@@ -62,7 +62,7 @@ class _Wait:
 def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
     """Yield each wait that lasted longer than the timers of an agent that was not paused."""
     for agent_id, trace in evidence.traces.items():
-        if evidence.unknown_word("handler", "branch", agent_id=agent_id):
+        if evidence.describe_unknown_name("handler", "branch", agent_id=agent_id):
             continue  # what goes on, and what waits, is told by these
         vote_s, reconcile_s = longest(trace, VOTE_TIMERS), longest(trace, RECONCILE_TIMERS)
         for life in trace.incarnations():

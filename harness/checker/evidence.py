@@ -96,19 +96,19 @@ class RogueTraffic:
     """Sender, sequence number and type."""
     counted: bool = False
     """True if only the number of some messages is on record."""
-    heard_of: set[int] = field(default_factory=set)
+    outside_senders: set[int] = field(default_factory=set)
     """Agents whose datagrams from another place the scenario delivers. The records of that place are missing."""
 
-    def take_down(self, datagrams: Iterable[InjectedDatagram]) -> "RogueTraffic":
+    def add(self, datagrams: Iterable[InjectedDatagram]) -> "RogueTraffic":
         """Add datagrams of the rogue node. Return this object."""
         for datagram in datagrams:
             self.messages.add((datagram.sender, datagram.sequence, datagram.message))
             self.counted |= datagram.count is not None
             if datagram.injection == OF_NO_INJECTION and datagram.sender is not None:
-                self.heard_of.add(datagram.sender)
+                self.outside_senders.add(datagram.sender)
         return self
 
-    def may_be(self, trigger: MessageTrigger) -> bool:
+    def may_include(self, trigger: MessageTrigger) -> bool:
         """Return true if the rogue node may have sent the message that triggered a handler."""
         if not self.messages:
             return False
@@ -165,7 +165,7 @@ class Evidence:
         words = {agent_id: unknown_names(trace.runs) for agent_id, trace in self.traces.items()}
         return {agent_id: unknown for agent_id, unknown in words.items() if unknown}
 
-    def unknown_word(self, *kinds: Kind, agent_id: int | None = None) -> str | None:
+    def describe_unknown_name(self, *kinds: Kind, agent_id: int | None = None) -> str | None:
         """Describe the first unknown name of these kinds in the trace of the agent, or in any trace. Else None."""
         for named, unknown in self.unknown.items():
             if agent_id in (None, named) and (words := first_unknown(unknown, kinds)):
@@ -196,7 +196,7 @@ class Evidence:
             sendings[agent_id] = dict(of_agent)
         return sendings
 
-    def once(self, derive: Callable[["Evidence"], Derived]) -> Derived:
+    def cached(self, derive: Callable[["Evidence"], Derived]) -> Derived:
         """Return `derive(self)`. The value is computed at the first call."""
         if derive not in self._derived:
             self._derived[derive] = derive(self)
@@ -263,7 +263,7 @@ class Evidence:
         return there or self.exports
 
     @property
-    def all_there_s(self) -> tuple[float, float]:
+    def presence_s(self) -> tuple[float, float]:
         """The mission seconds between which exactly the `present` agents ran: start and end."""
         off_s = self.switched_off.values()
         if set(self.exports) <= set(self.switched_off):
@@ -302,7 +302,7 @@ class Evidence:
         return self.record.network[-1].detail if self.record and self.record.network else None
 
     @cached_property
-    def links_asked(self) -> set[LinkConditions] | None:
+    def requested_links(self) -> set[LinkConditions] | None:
         """All conditions that the scenario asked for any link. None if they are not on record, or not readable."""
         if self.conditions is None:
             return None
@@ -327,7 +327,7 @@ class Evidence:
         """True if vehicles shared a radio channel, on which messages wait and are lost for further reasons."""
         return self.record is not None and self.record.channel is not None
 
-    def not_told_completed(self) -> set[int]:
+    def agents_with_unknown_completed(self) -> set[int]:
         """Return the agents whose completed blocks are unknown because their traces contain unknown operations."""
         unknown = {agent_id for agent_id, words in self.unknown.items() if "operation" in words}
         return {agent for agent in unknown if agent not in self.exports or self.was_restarted(agent)}
@@ -352,7 +352,7 @@ def gather(archive: RunArchive) -> Evidence:
     problems = list(archive.problems)
     if archive.record_problems and archive.judged_record is None:
         problems[0] += "; the exports are checked without it"
-    injected = RogueTraffic().take_down(archive.injected(InjectedDatagram))
+    injected = RogueTraffic().add(archive.injected(InjectedDatagram))
     return Evidence(
         archive.exports.by_agent,
         archive.traces,

@@ -71,23 +71,23 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
     if not injections:
         return []
     tallies = {injection.number: _Tally() for injection in injections}
-    named_otherwise = any(
+    has_unknown_names = any(
         {"message", "trigger"} & unknown_names(trace.runs).keys() for trace in archive.traces.values()
     )
     copies: dict[_Key, list[tuple[float, int]]] = defaultdict(list)
     for line in archive.injected(_Line):
         if line.injection in tallies:
-            _take_down(line, tallies[line.injection], copies, secured=scenario.security is not None)
+            _count_line(line, tallies[line.injection], copies, secured=scenario.security is not None)
     for trace in archive.traces.values():
         for key, runs in _triggered_by(trace, copies).items():
-            for number, copy, run in _paired(copies.get(key), key, runs):
+            for number, copy, run in _pair_with_copies(copies.get(key), key, runs):
                 if number in tallies:
                     tally, message = tallies[number], str(key[2])
                     tally.handled[message][run.branch] += 1
                     tally.changed[message] += bool(run.changes)
                     tally.reached[message].add((key, copy))
     return [
-        _told(injection.at_s, injection.what, injection.detail, tallies[injection.number], named_otherwise)
+        _to_record(injection.at_s, injection.what, injection.detail, tallies[injection.number], has_unknown_names)
         for injection in injections
     ]
 
@@ -106,7 +106,7 @@ def in_words(injection: RogueInjection) -> str:
     return f"{injection.what} at {injection.at_s:g} s, {injection.detail}: {counts}"
 
 
-def done_with(messages: InjectedMessages) -> str:
+def describe_handling(messages: InjectedMessages) -> str:
     """Return the branches of the handler runs, such as "held already 4, committed 1"."""
     done = [f"{branch} {count}" for branch, count in messages.handled.items()]
     return (
@@ -114,7 +114,7 @@ def done_with(messages: InjectedMessages) -> str:
     )
 
 
-def _take_down(line: _Line, tally: _Tally, copies: dict[_Key, list[tuple[float, int]]], *, secured: bool) -> None:
+def _count_line(line: _Line, tally: _Tally, copies: dict[_Key, list[tuple[float, int]]], *, secured: bool) -> None:
     tally.bytes += line.bytes
     if isinstance(line.refused, str):
         tally.refused[line.refused] += 1
@@ -142,7 +142,7 @@ def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[H
     return triggered
 
 
-def _paired(
+def _pair_with_copies(
     copies: Sequence[tuple[float, int]] | None, key: _Key, runs: list[HandlerRun]
 ) -> Iterator[tuple[int, int, HandlerRun]]:
     """Yield (number of the injection, index of the copy, run). The last run belongs to the last copy."""
@@ -156,15 +156,17 @@ def _paired(
             yield number, copy, left.pop()
 
 
-def _told(at_s: float, what: str, detail: str, tally: _Tally, named_otherwise: bool) -> RogueInjection:
-    """Return the effect of an injection. With `named_otherwise`, traces contain unknown names of messages."""
+def _to_record(at_s: float, what: str, detail: str, tally: _Tally, has_unknown_names: bool) -> RogueInjection:
+    """Return the effect of an injection. With `has_unknown_names`, traces contain unknown names of messages."""
     messages = [
         InjectedMessages(
             message=message,
             sent=sent,
             handled=dict(tally.handled[message].most_common()),
             changed=tally.changed[message],
-            unhandled=None if named_otherwise else max(0, sent - len(tally.reached[message]) - tally.untraced[message]),
+            unhandled=None
+            if has_unknown_names
+            else max(0, sent - len(tally.reached[message]) - tally.untraced[message]),
         )
         for message, sent in tally.sent.most_common()
     ]

@@ -14,13 +14,13 @@ from harness.archive.traces import HeldBlocks, Trace
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import agents
 
-LOSSES_TOLD = 5
+MAX_SENTENCES = 5
 
 
 def survival(evidence: Evidence) -> Survival:
     """Return the blocks that each loss of vehicles affected, and the smallest further loss that would lose a block."""
     at_end = _holders(evidence.exports)
-    completed = None if evidence.not_told_completed() else evidence.completed_blocks()
+    completed = None if evidence.agents_with_unknown_completed() else evidence.completed_blocks()
     lost = [fault for fault in (evidence.record.faults if evidence.record else ()) if fault.loses_data]
     return Survival(
         losses=_losses(evidence, lost, at_end),
@@ -60,8 +60,8 @@ def _least_held(evidence: Evidence, exports: Mapping[int, Export]) -> LeastHeld 
 
 
 def _losses(evidence: Evidence, lost: list[FaultRecord], at_end: Mapping[str, list[int]]) -> list[Loss]:
-    untold = [trace for trace in evidence.traces.values() if trace.problem]
-    if untold or evidence.unknown_word("operation") or set(evidence.roster or ()) - set(evidence.traces):
+    incomplete = [trace for trace in evidence.traces.values() if trace.problem]
+    if incomplete or evidence.describe_unknown_name("operation") or set(evidence.roster or ()) - set(evidence.traces):
         return [Loss(at_s=fault.at_s, what=fault.what, vehicles=fault.agents or []) for fault in lost]
     instants = [fault.at_s for fault in lost]
     held = {
@@ -112,7 +112,7 @@ def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) 
     waiting, blocks_held = deque(instants), []
     held, at_s = HeldBlocks(), -math.inf
 
-    def take_down() -> None:
+    def record_held() -> None:
         instant = waiting.popleft()
         gone = any(at_s <= loss < instant for loss in lost_at)
         blocks_held.append(set() if gone else {block for block, copies in held.copies.items() if copies})
@@ -121,19 +121,19 @@ def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) 
         new = HeldBlocks()
         for _, run in life:
             while waiting and waiting[0] < run.t:
-                take_down()
+                record_held()
             held, at_s = new, run.t
             held.replay(run)
     while waiting:
-        take_down()
+        record_held()
     return blocks_held
 
 
 def in_words(survived: Survival) -> list[str]:
     """Return a sentence for each of the first losses, for the end, and for the smallest further loss."""
-    sentences = [_loss_in_words(loss) for loss in survived.losses[:LOSSES_TOLD]]
-    if len(survived.losses) > LOSSES_TOLD:
-        sentences.append(f"{len(survived.losses) - LOSSES_TOLD} more losses of vehicles are in run.json")
+    sentences = [_loss_in_words(loss) for loss in survived.losses[:MAX_SENTENCES]]
+    if len(survived.losses) > MAX_SENTENCES:
+        sentences.append(f"{len(survived.losses) - MAX_SENTENCES} more losses of vehicles are in run.json")
     if survived.losses and survived.gone is not None and survived.completed is not None:
         sentences.append(f"at the end {_of(survived.gone, survived.completed)} {_is(survived.gone)} gone")
     elif survived.losses:

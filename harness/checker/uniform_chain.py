@@ -2,7 +2,13 @@
 
 from collections import Counter
 
-from harness.checker._agreement import had_a_chance, never, why_no_chance, why_unknown, without
+from harness.checker._agreement import (
+    check_endless_cycle,
+    describe_absent_agents,
+    explain_no_chance,
+    explain_unknown,
+    find_agents_with_chance,
+)
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, agents, violated
 
@@ -14,9 +20,9 @@ def check(evidence: Evidence) -> Judgement:
 
     `not applicable` where an export is missing, an agent was not idle, or those that differ had no chance.
     """
-    if never_agrees := never(NAME, evidence):
+    if never_agrees := check_endless_cycle(NAME, evidence):
         return never_agrees
-    unknown = why_unknown(evidence)
+    unknown = explain_unknown(evidence)
     if unknown:
         return Judgement(NAME, "not applicable", unknown)
     chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.present.items()}
@@ -24,16 +30,16 @@ def check(evidence: Evidence) -> Judgement:
     if len(holders) == 1:
         who = f"{len(chains)} agents hold the same" if len(chains) > 1 else f"{agents(set(chains))} holds a"
         same = f"{who} chain of {len(next(iter(holders)))} blocks"
-        return Judgement(NAME, "holds", same + without(evidence))
+        return Judgement(NAME, "holds", same + describe_absent_agents(evidence))
     most_common = max(holders, key=lambda chain: (holders[chain], len(chain), chain))
     differing = {agent_id for agent_id, chain in chains.items() if chain != most_common}
-    no_chance = why_no_chance(evidence, differing)
+    no_chance = explain_no_chance(evidence, differing)
     if no_chance:
         shared = common_prefix([*holders])
         which = f"{len(holders)} distinct chains, which share {shared} block{'s' if shared != 1 else ''}"
         return Judgement(NAME, "not applicable", f"{which}; {no_chance}")
     findings = []
-    for agent_id in sorted(had_a_chance(evidence, differing)):
+    for agent_id in sorted(find_agents_with_chance(evidence, differing)):
         chain = chains[agent_id]
         shared = common_prefix([chain, most_common])
         parts = chain[shared] if shared < len(chain) else None

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from harness.archive.run_record import RogueInjection
-from harness.checker.injections import done_with, in_words
+from harness.checker.injections import describe_handling, in_words
 from harness.present import text
 
 MAX_ROWS = 500
@@ -42,7 +42,7 @@ def sentences(injections: Sequence[RogueInjection]) -> list[str]:
 
 
 def _rows(injection: RogueInjection) -> list[InjectionRow]:
-    outcomes = [(of.message, of.sent, done_with(of), text.value(of.changed)) for of in injection.messages]
+    outcomes = [(of.message, of.sent, describe_handling(of), text.value(of.changed)) for of in injection.messages]
     outcomes += [(f"none: {reason}", count, "refused", "\u2013") for reason, count in injection.refused.items()]
     outcomes += (
         [("any", injection.untraced, "indistinguishable from their originals", "\u2013")] if injection.untraced else []

@@ -194,7 +194,7 @@ class RunRecording:
         result, survived = checker.check(evidence), survival(evidence)
         wall_s = time.monotonic() - self._started
         rogue = account(self._scenario, archive)
-        found = evidence.once(cycle_of)
+        found = evidence.cached(cycle_of)
         cycle = found.model_dump() if found else None
         self._update(
             **result.to_json(),

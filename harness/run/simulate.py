@@ -137,7 +137,7 @@ class MemoryRecorder:
         """Do nothing: the record of the run has it."""
 
     def injected(self, record: dict[str, Any]) -> None:
-        self._injected.take_down([InjectedDatagram.model_validate(record)])
+        self._injected.add([InjectedDatagram.model_validate(record)])
 
     def transmitted(self, record: dict[str, Any]) -> None:
         """Do nothing: the record of the run has the totals."""

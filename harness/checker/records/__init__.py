@@ -70,14 +70,14 @@ def cross_examine(evidence: Evidence) -> Examination:
     for contradiction in contradictions:
         if contradiction.short:
             short.setdefault(contradiction.finding.agent_id, contradiction.finding.detail)
-    for agent_id in _untold(evidence):
+    for agent_id in _agents_without_known_end(evidence):
         short.setdefault(agent_id, "the run did not end normally, so the expected end of the trace is unknown")
     recorded = {agent_id: evidence.recorded(agent_id) for agent_id in evidence.traces}
     unsent = {agent_id: agent.send_failures for agent_id, agent in recorded.items() if agent and agent.send_failures}
     return Examination(contradictions, short, unsent)
 
 
-def _untold(evidence: Evidence) -> Iterator[int]:
+def _agents_without_known_end(evidence: Evidence) -> Iterator[int]:
     """Yield the agents of an interrupted run whose number of handler runs is not on record."""
     if evidence.record is None or evidence.record.outcome != "running":
         return
@@ -89,7 +89,7 @@ def _untold(evidence: Evidence) -> Iterator[int]:
 
 def check(evidence: Evidence) -> Judgement:
     """Return `contradict` for any contradiction, `not applicable` if a trace is missing or incomplete, else `agree`."""
-    examination = evidence.once(cross_examine)
+    examination = evidence.cached(cross_examine)
     findings = [contradiction.finding for contradiction in examination.contradictions]
     if findings:
         reason = f"{times(len(findings))}: two records contradict each other"
@@ -103,10 +103,10 @@ def check(evidence: Evidence) -> Judgement:
             f"the trace of {agents(untraced)} is missing, so it is not compared with the other records",
         )
     if examination.short:
-        return Judgement(NAME, "not applicable", not_whole(examination))
+        return Judgement(NAME, "not applicable", describe_incomplete(examination))
     if not evidence.exports:
         return Judgement(NAME, "not applicable", "the run has no chain exports to compare with the traces")
-    if unknown := evidence.unknown_word("trigger", "handler", "branch", "message", "operation"):
+    if unknown := evidence.describe_unknown_name("trigger", "handler", "branch", "message", "operation"):
         return Judgement(NAME, "not applicable", unknown)
     runs = sum(len(trace.runs) for trace in evidence.traces.values())
     record = " and run.json" if evidence.record else ""
@@ -115,7 +115,7 @@ def check(evidence: Evidence) -> Judgement:
     )
 
 
-def not_whole(examination: Examination) -> str:
+def describe_incomplete(examination: Examination) -> str:
     """Describe the incomplete traces. At least one must exist."""
     agent_id, why = next(iter(examination.short.items()))
     others = len(examination.short) - 1

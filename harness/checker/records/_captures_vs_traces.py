@@ -39,8 +39,8 @@ def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
         if unsent > 0:
             detail = f"{times(unsent)} its trace has a sent message that is missing in the capture of its vehicle"
             yield of_agent(agent_id, detail, "1")
-        if untold := sum((left[agent_id] - sent).values()):
-            detail = f"{times(untold)} the capture of its vehicle has a sent message that is missing in its trace"
+        if untraced := sum((left[agent_id] - sent).values()):
+            detail = f"{times(untraced)} the capture of its vehicle has a sent message that is missing in its trace"
             yield of_agent(agent_id, detail, "1", short=True)
         triggers = (run.trigger for run in trace.runs)
         heard = {(each.sender, each.sequence) for each in triggers if isinstance(each, MessageTrigger)}
@@ -111,11 +111,11 @@ def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
             detail = f"it handled {heard} messages, but the kernel counted {counted.passed} messages to its vehicle"
             yield of_agent(agent_id, detail, "1")
         on_the_way = sum(messages for sender, messages in sent.items() if sender != agent_id)
-        if on_the_way > (told_of := counted.passed + counted.lost + counted.cut):
+        if on_the_way > (counted_messages := counted.passed + counted.lost + counted.cut):
             detail = (
                 f"the other agents sent {on_the_way} messages, but the counters of the kernel for its vehicle have "
             )
-            yield of_agent(agent_id, f"{detail}{told_of}", "1")
+            yield of_agent(agent_id, f"{detail}{counted_messages}", "1")
 
 
 def _sent_by(evidence: Evidence, agent_id: int, mission_s: float) -> int:

@@ -121,7 +121,7 @@ def _counted(
             f"it sent {recorded.bytes_sent} bytes according to run.json, but {sent_bytes} according to its trace",
             "1",
         )
-    if recorded.reconciles is not None and not evidence.unknown_word("handler", "branch", agent_id=agent_id):
+    if recorded.reconciles is not None and not evidence.describe_unknown_name("handler", "branch", agent_id=agent_id):
         begun = sum([run.handler == "reconcile_begin" and run.branch == "begun" for run in trace.runs])
         if recorded.reconciles != begun:
             detail = (
@@ -198,12 +198,11 @@ def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
                 )
                 yield _of_block(evidence, agent_id, detail, untraced[0], short=True)
         if recorded is not None and (recorded.outcome == "killed" or (recorded.outcome == "exported" and export)):
-            told = {*exported, *before}
-            if untold := [block for block in traced if block not in told]:
-                detail = (
-                    f"it completed {_named(evidence, untold)} according to its trace, but not according to its export"
-                )
-                yield _of_block(evidence, agent_id, detail, untold[0])
+            reported = {*exported, *before}
+            if unreported := [block for block in traced if block not in reported]:
+                named = _named(evidence, unreported)
+                detail = f"it completed {named} according to its trace, but not according to its export"
+                yield _of_block(evidence, agent_id, detail, unreported[0])
         if export is not None and _out_of_order(exported, incarnations[-1].completed):
             detail = "its export and its trace list its completed blocks in different order"
             yield _of_block(evidence, agent_id, detail, exported[0])

@@ -36,7 +36,7 @@ def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
         counted = record.datagrams.get(str(agent_id))
         if counted is None or trace.problem or not trace.header.has_inputs:
             continue
-        if evidence.unknown_word("trigger", agent_id=agent_id):
+        if evidence.describe_unknown_name("trigger", agent_id=agent_id):
             continue
         if evidence.injected.messages and _killed_at(evidence, agent_id):
             continue  # the datagrams of a rogue node may have been under way
@@ -85,7 +85,7 @@ def _at_the_end(evidence: Evidence, agent_id: int, trace: Trace, wall_s: float) 
     ends = _killed_at(evidence, agent_id)
     if (last_s := evidence.end_of(agent_id)) is not None:
         ends.append(last_s)
-    sent = evidence.once(_sent_at)
+    sent = evidence.cached(_sent_at)
     return sum(1 + bisect_right(sent, end + before_s) - bisect_left(sent, end - before_s) for end in set(ends))
 
 

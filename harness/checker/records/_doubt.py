@@ -1,7 +1,7 @@
 """Adjust the judgement on a characteristic to the contradictions between records, and to their gaps."""
 
 from harness.checker.judgement import MAX_EVIDENCE, Judgement, agents, times
-from harness.checker.records import Examination, not_whole
+from harness.checker.records import Examination, describe_incomplete
 
 NEEDS_TRACES = frozenset("123")
 """Characteristics that must hold at every step. They do not hold if steps are missing on record."""
@@ -19,7 +19,7 @@ def in_doubt(number: str, judgement: Judgement, examination: Examination) -> Jud
         evidence = [*(judgement.evidence if violated else ()), *touching]
         return Judgement(judgement.name, "violated", reason, evidence[:MAX_EVIDENCE])
     if judgement.verdict == "holds" and number in NEEDS_TRACES and examination.short:
-        return Judgement(judgement.name, "not applicable", not_whole(examination))
+        return Judgement(judgement.name, "not applicable", describe_incomplete(examination))
     if judgement.verdict == "violated" and number in NEEDS_CONNECTIVITY and examination.unsent:
         unsent = sum(examination.unsent.values())
         reason = f"{agents([*examination.unsent])} could not send {unsent} messages, so not all agents were connected"

@@ -36,7 +36,7 @@ def compare_export(evidence: Evidence) -> Iterator[Contradiction]:
         if incarnations[-1].runs and state == incarnations[-1].runs[-1].state:
             yield from _contents(agent_id, export, incarnations[-1])
         elif state not in _states_when(export, trace):
-            yield _otherwise(agent_id, "its export", state, _last_state(incarnations, export), short=True)
+            yield _difference(agent_id, "its export", state, _last_state(incarnations, export), short=True)
     for agent_id, export in evidence.before_final_reconcile.items():
         yield from _before_final_reconcile(evidence, agent_id, export)
 
@@ -50,7 +50,7 @@ def _before_final_reconcile(evidence: Evidence, agent_id: int, export: Export) -
         return
     states = _states_when(export, trace)
     if states and _state(export) not in states:
-        yield _otherwise(agent_id, what, _state(export), states[-1])
+        yield _difference(agent_id, what, _state(export), states[-1])
     elif any(incarnation.unknown for incarnation in evidence.incarnations[agent_id]):
         return
     elif export.completed not in _completed_when(export, evidence.incarnations[agent_id]):
@@ -99,7 +99,7 @@ def _last_state(incarnations: list[Incarnation], export: Export) -> StateSummary
     )
 
 
-def _otherwise(
+def _difference(
     agent_id: int, what: str, exported: StateSummary, traced: StateSummary, *, short: bool = False
 ) -> Contradiction:
     differing = [
@@ -118,7 +118,7 @@ def _value(value: object) -> str:
 
 def _contents(agent_id: int, export: Export, incarnation: Incarnation) -> Iterator[Contradiction]:
     """Compare the blocks of an export with those of the trace, whose lengths and top chain hash agree."""
-    if incarnation.otherwise or incarnation.another_top or incarnation.impossible or incarnation.unknown:
+    if incarnation.wrong_lengths or incarnation.wrong_tops or incarnation.impossible or incarnation.unknown:
         return
     for place, exported, traced, touches in (
         ("chain", export.chain, incarnation.chain, "6"),
@@ -144,8 +144,8 @@ def compare_with_itself(evidence: Evidence) -> Iterator[Contradiction]:
 def _in_incarnation(evidence: Evidence, agent_id: int, incarnation: Incarnation) -> Iterator[Contradiction]:
     for observations, touches in (
         (incarnation.impossible, "3"),
-        (incarnation.otherwise, "3"),
-        (incarnation.another_top, "4"),
+        (incarnation.wrong_lengths, "3"),
+        (incarnation.wrong_tops, "4"),
         (incarnation.flags, None),
         (incarnation.back_in_time, None),
         (incarnation.out_of_sequence, "1"),
@@ -168,7 +168,7 @@ def _between_incarnations(
     for incarnation in incarnations:
         if incarnation.runs and incarnation.runs[0].t < now - slack:
             what = f"an incarnation starts at {incarnation.runs[0].t:g} s, before the previous one ends at {now:g} s"
-            line, run = next(incarnation.numbered())
+            line, run = next(incarnation.numbered_runs())
             observation = Observation(line, run, what)
             yield Contradiction(finding(evidence, agent_id, observation))
         now = incarnation.runs[-1].t if incarnation.runs else now

@@ -41,7 +41,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         if cuts is None and not stops:
             continue
         for incarnation in evidence.incarnations[agent_id]:
-            for line, run in incarnation.numbered():
+            for line, run in incarnation.numbered_runs():
                 for what in (_while_stopped(run, stops), _over_a_cut(evidence, agent_id, run, cuts)):
                     if what is not None:
                         yield Contradiction(finding(evidence, agent_id, Observation(line, run, what)), "1")
@@ -110,7 +110,7 @@ def _cuts(evidence: Evidence) -> _Cuts | None:
     Scripted fates deliver messages regardless of the loss, netem may pass a second copy of a lost message, and on a
     shared channel a message waits before it is sent.
     """
-    if evidence.has_fates or evidence.has_channel or any(link.duplicate > 0 for link in evidence.links_asked or ()):
+    if evidence.has_fates or evidence.has_channel or any(link.duplicate > 0 for link in evidence.requested_links or ()):
         return None
     if not any(loss == 1.0 for _, losses in evidence.link_losses for loss in losses.values()):
         return None
@@ -125,7 +125,7 @@ def _over_a_cut(evidence: Evidence, agent_id: int, run: HandlerRun, cuts: _Cuts 
     sent = evidence.sendings.get(trigger.sender, {}).get(trigger.message, {}).get(trigger.sequence, ())
     if not sent or not all(cuts.cut_at((trigger.sender, agent_id), sent_s) for sent_s, _ in sent):
         return None
-    if evidence.injected.may_be(trigger):
+    if evidence.injected.may_include(trigger):
         return None
     return (
         f"handled {trigger.message} number {trigger.sequence}, which agent {trigger.sender} sent at {sent[0][0]:g} s, "

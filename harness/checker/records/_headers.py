@@ -23,12 +23,12 @@ def compare_headers(evidence: Evidence) -> Iterator[Contradiction]:
         first.setdefault("initial_data", (export.inception.block_data, f"the export of agent {agent_id}"))
     for agent_id, trace in evidence.traces.items():
         header = trace.header
-        told: dict[str, object] = {"roster": sorted(header.roster)}
-        told |= {f"settings.{name}": value for name, value in _in_common(evidence, agent_id).items()}
-        told |= {name: header.clock.get(name) for name in ("epoch_us", "speedup")}
+        expected: dict[str, object] = {"roster": sorted(header.roster)}
+        expected |= {f"settings.{name}": value for name, value in _in_common(evidence, agent_id).items()}
+        expected |= {name: header.clock.get(name) for name in ("epoch_us", "speedup")}
         if header.initial_data is not None:
-            told["initial_data"] = header.initial_data
-        for name, value in told.items():
+            expected["initial_data"] = header.initial_data
+        for name, value in expected.items():
             common, source = first.setdefault(name, (value, f"the trace of agent {agent_id}"))
             if value != common:
                 what = WORDS.get(name, name)

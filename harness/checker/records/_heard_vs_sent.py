@@ -26,7 +26,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     for agent_id, incarnations in evidence.incarnations.items():
         handled: Counter[tuple[int, str, int]] = Counter()
         for incarnation in incarnations:
-            for line, run in incarnation.numbered():
+            for line, run in incarnation.numbered_runs():
                 trigger = run.trigger
                 if not isinstance(trigger, MessageTrigger):
                     continue
@@ -36,32 +36,32 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                 if once:
                     key = trigger.sender, trigger.message, trigger.sequence
                     handled[key] += 1
-                    if handled[key] > len(sent) and not evidence.injected.may_be(trigger):
+                    if handled[key] > len(sent) and not evidence.injected.may_include(trigger):
                         what = f"handled {_named(trigger)} again, although nothing duplicates messages"
                         yield Contradiction(finding(evidence, agent_id, Observation(line, run, what)), "1")
                 first_s, message = sent[0]
-                told = message.datagram
-                as_it_went = told is not None and (run.input is told or run.input == told)
-                if as_it_went and run.t >= first_s - slack and not run.changes:
+                recorded = message.datagram
+                unchanged = recorded is not None and (run.input is recorded or run.input == recorded)
+                if unchanged and run.t >= first_s - slack and not run.changes:
                     continue  # most are like this
-                if not evidence.injected.may_be(trigger):
-                    for observation, touches in _unlike(line, run, trigger, sent, first_s - slack):
+                if not evidence.injected.may_include(trigger):
+                    for observation, touches in _find_differences(line, run, trigger, sent, first_s - slack):
                         yield Contradiction(finding(evidence, agent_id, observation), touches)
 
 
 def _may_duplicate(evidence: Evidence) -> bool:
     """Return true if the network or a script can deliver a message twice, or if the network is not on record."""
-    links = evidence.links_asked
+    links = evidence.requested_links
     return links is None or evidence.has_fates or any(link.duplicate > 0 for link in links)
 
 
-def _unlike(
+def _find_differences(
     line: int, run: HandlerRun, trigger: MessageTrigger, sent: Sending, earliest_s: float
 ) -> Iterator[tuple[Observation, str]]:
     """Yield each difference between the handled and the sent message, and the characteristic that it concerns."""
     if run.t < earliest_s:
         yield Observation(line, run, f"handled {_named(trigger)} before it was sent at {sent[0][0]:g} s"), "1"
-    if run.input is not None and not _as_it_went(run.input, sent):
+    if run.input is not None and not _is_unchanged(run.input, sent):
         yield Observation(line, run, f"handled {_named(trigger)}, whose content differs from the sent message"), "1"
     elif run.changes and (other := _another_block(run, trigger, sent)):
         yield (
@@ -76,9 +76,9 @@ def _named(trigger: MessageTrigger) -> str:
     return f"{trigger.message} number {trigger.sequence} of agent {trigger.sender}"
 
 
-def _as_it_went(datagram: RecordedBytes, sent: Sending) -> bool:
-    told = [message.datagram for _, message in sent]
-    return None in told or datagram in told
+def _is_unchanged(datagram: RecordedBytes, sent: Sending) -> bool:
+    recorded = [message.datagram for _, message in sent]
+    return None in recorded or datagram in recorded
 
 
 def _another_block(run: HandlerRun, trigger: MessageTrigger, sent: Sending) -> str | None:

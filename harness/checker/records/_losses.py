@@ -49,11 +49,11 @@ class _Expected:
     most: float = 0.0
     handled: int = 0
 
-    def loses(self) -> tuple[float, float]:
+    def loss_range(self) -> tuple[float, float]:
         """Return the least and the greatest mean loss of these messages."""
         return self.least / self.messages, self.most / self.messages
 
-    def passes(self) -> tuple[float, float]:
+    def pass_range(self) -> tuple[float, float]:
         """Return the least and the greatest mean probability that such a message passes."""
         return 1 - self.most / self.messages, 1 - self.least / self.messages
 
@@ -63,7 +63,7 @@ class _Expected:
         self.most += losses[1]
 
 
-class _History:
+class _LossHistory:
     """The loss of each link over time."""
 
     def __init__(self, link_losses: list[tuple[float, dict[Link, float]]], slack_s: float) -> None:
@@ -75,7 +75,7 @@ class _History:
                 self._times[link].append(at_s)
                 self._losses[link].append(loss)
 
-    def around(self, link: Link, sent_s: float) -> tuple[float, float]:
+    def range_at(self, link: Link, sent_s: float) -> tuple[float, float]:
         """Return the least and the greatest loss within the slack of this time."""
         times, losses = self._times[link], self._losses[link]
         if len(losses) == 1:
@@ -87,7 +87,7 @@ class _History:
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
     """Yield each receiver whose messages cannot have been lost as recorded."""
-    links = evidence.links_asked
+    links = evidence.requested_links
     if not links or not evidence.link_losses or evidence.has_fates or evidence.injected.messages:
         return
     if evidence.has_channel:
@@ -106,9 +106,9 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     together = [(min(expected), "all agents together", _sum(expected.values()))] if expected else []
     for group in (alone, together):
         found = [each for each in group if _is_impossible_at(each[2], sides)]
-        for receiver, who, seen in found:
+        for receiver, subject, seen in found:
             detail = (
-                f"{who} handled {seen.handled} of {seen.messages} messages, but the recorded loss is "
+                f"{subject} handled {seen.handled} of {seen.messages} messages, but the recorded loss is "
                 f"{100 * seen.least / seen.messages:.3g} %"
             )
             yield of_agent(receiver, detail, "1")
@@ -129,7 +129,7 @@ def _sum(expected: Iterable[_Expected]) -> _Expected:
 
 def _is_impossible_at(seen: _Expected, sides: tuple[bool, ...]) -> bool:
     return seen.messages > 0 and any(
-        _is_impossible(seen.handled, seen.messages, seen.passes(), fewer=fewer) for fewer in sides
+        _is_impossible(seen.handled, seen.messages, seen.pass_range(), fewer=fewer) for fewer in sides
     )
 
 
@@ -139,14 +139,14 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
     `over_cuts` replaces the least and the greatest loss of a message whose link is cut.
     """
     slack = max([SAME_TIME_S, *map(slack_s, evidence.traces.values())])
-    history = _History(evidence.link_losses, slack)
+    history = _LossHistory(evidence.link_losses, slack)
     known = {link for _, losses in evidence.link_losses for link in losses}
     expected: dict[int, _Expected] = {}
     for receiver, trace in evidence.traces.items():
         seen = expected[receiver] = _Expected()
         triggers = [run.trigger for run in trace.runs if isinstance(run.trigger, MessageTrigger)]
         handled = Counter((trigger.sender, trigger.message, trigger.sequence) for trigger in triggers)
-        ready = _Ready(evidence, receiver) if in_virtual_time(trace) else None
+        ready = _ReadyTimes(evidence, receiver) if in_virtual_time(trace) else None
         for sender, of_sender in evidence.traces.items():
             if (sender, receiver) not in known:
                 continue
@@ -155,8 +155,8 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
                 for message in run.sent:
                     if ready is not None and not ready.handles(message.message, run.t):
                         continue
-                    around = history.around((sender, receiver), sent_at(run, message, spread_s))
-                    seen.add(over_cuts if over_cuts is not None and around[1] == 1.0 else around)
+                    range_at = history.range_at((sender, receiver), sent_at(run, message, spread_s))
+                    seen.add(over_cuts if over_cuts is not None and range_at[1] == 1.0 else range_at)
                     key = sender, message.message, message.seq
                     if handled[key] > 0:
                         handled[key] -= 1
@@ -164,7 +164,7 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
     return expected
 
 
-class _Ready:
+class _ReadyTimes:
     """The times at which an agent in virtual time handles each arriving message that is never withheld."""
 
     def __init__(self, evidence: Evidence, agent_id: int) -> None:
@@ -211,7 +211,7 @@ def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterato
         if counted is None or counted.passed is None or counted.lost is None or not seen.messages:
             continue
         packets = counted.passed + counted.lost
-        least, most = seen.loses()
+        least, most = seen.loss_range()
         if packets and any(
             _is_impossible(counted.lost, packets, (least, most), fewer=fewer) for fewer in (False, True)
         ):

@@ -51,7 +51,7 @@ def _around_the_end(trace: Trace, end_s: float) -> tuple[float, float]:
 def _compare_runs(evidence: Evidence, agent_id: int, latest_s: float) -> Iterator[Contradiction]:
     for incarnation in evidence.incarnations[agent_id]:
         if incarnation.runs and incarnation.runs[-1].t > latest_s:
-            line, run = next((line, run) for line, run in incarnation.numbered() if run.t > latest_s)
+            line, run = next((line, run) for line, run in incarnation.numbered_runs() if run.t > latest_s)
             what = f"ran at {run.t:g} s, although the agent ended at {evidence.end_of(agent_id):g} s"
             yield Contradiction(finding(evidence, agent_id, Observation(line, run, what)))
 
@@ -76,7 +76,7 @@ def _has_recorded_events(evidence: Evidence) -> bool:
 def _compare_events(evidence: Evidence, agent_id: int, trace: Trace) -> Iterator[Contradiction]:
     slack = max(slack_s(trace), SAME_TIME_S)
     for incarnation in evidence.incarnations[agent_id]:
-        for line, run in incarnation.numbered():
+        for line, run in incarnation.numbered_runs():
             if not isinstance(run.trigger, EventTrigger):
                 continue
             logged_s = _time_of_event(run, trace)

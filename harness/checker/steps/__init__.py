@@ -61,7 +61,7 @@ def check(evidence: Evidence) -> Judgement:
     for agent_id, words in evidence.unknown.items():
         unjudged.setdefault(agent_id, f"the trace has unknown words: {first_unknown(words)}")
     unjudged |= {
-        agent_id: f"the trace is incomplete: {why}" for agent_id, why in evidence.once(cross_examine).short.items()
+        agent_id: f"the trace is incomplete: {why}" for agent_id, why in evidence.cached(cross_examine).short.items()
     }
     if unjudged or not evidence.traces:
         return Judgement(NAME, "not applicable", _why(unjudged))

@@ -61,7 +61,7 @@ class Played:
 def play(document: Document) -> Played:
     try:
         simulated = simulate(parse(document), SEED, tracing=True)
-        result, cycle = simulated.result, simulated.evidence.once(cycle_of)
+        result, cycle = simulated.result, simulated.evidence.cached(cycle_of)
     except AgentFailedError as error:
         result, cycle = result_of_failure(error), None
     return Played(document, _bad(result), cycle, len({*result.chains.values()}))

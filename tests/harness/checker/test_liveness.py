@@ -102,10 +102,10 @@ def test_traces_show_it_whenever_the_run_ends(name: str, monkeypatch: pytest.Mon
     for more_s in range(0, 30, 2):
         run = simulate(Scenario.model_validate({**document, "settle": {"limit_s": 250 + more_s}}), seed=1, tracing=True)
         assert liveness(run).verdict == "never finishes", f"{run.played.mission_s:.0f} s"
-        assert run.evidence.once(cycle_of) is not None
-        assert set(run.evidence.busy) <= set(run.evidence.once(cycle_of).agents)
+        assert run.evidence.cached(cycle_of) is not None
+        assert set(run.evidence.busy) <= set(run.evidence.cached(cycle_of).agents)
         idle.add(len(run.evidence.busy))
-        go_round.add(tuple(run.evidence.once(cycle_of).agents))
+        go_round.add(tuple(run.evidence.cached(cycle_of).agents))
     assert len(idle) > 1 or name != "drawn_in"
     assert len(go_round) == 1, "whoever goes round is told, idle or not"
 
@@ -157,7 +157,7 @@ def test_traces_tell_since_when_an_agent_hangs() -> None:
     hanging = scenario(agents=4, duration_s=900, network={"loss": 0.3}, quirks={"crash_on_tie": True})
     for seed in range(10):
         run = simulate(hanging, seed, tracing=True)
-        cycle = run.evidence.once(cycle_of)
+        cycle = run.evidence.cached(cycle_of)
         if cycle is not None:
             tied_at = {
                 agent_id: next(line.t for line in trace.runs if line.branch.endswith(CRASHED))

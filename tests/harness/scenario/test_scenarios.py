@@ -243,7 +243,7 @@ def by_turns(run: Simulated, seed: int) -> None:
 def livelock(run: Simulated) -> tuple[float, float | None]:
     """Return the mission second at which the cycle began, and its period in seconds."""
     assert run.result.bad == ("5", "6", "liveness")
-    cycle = run.evidence.once(cycle_of)
+    cycle = run.evidence.cached(cycle_of)
     assert cycle is not None and cycle.proven
     assert run.played.mission_s < 400
     return cycle.since_s, cycle.period_s

@@ -109,7 +109,7 @@ def play_trial(scenario: Scenario, seed: int) -> Trial:
     watcher = Watcher()
     result, evidence = _played(scenario, seed, watcher.step)
     divergence = None if scenario.final_reconcile or result.bad else _known_divergences(result)
-    found = identities(result, evidence.once(cycle_of) if evidence else None, scenario)
+    found = identities(result, evidence.cached(cycle_of) if evidence else None, scenario)
     if evidence is None:
         return Trial(watcher.reached, found)
     timer_ends = timers_ended(evidence)
@@ -129,7 +129,7 @@ def _known_divergences(result: Result) -> Divergence | None:
 def findings_of(scenario: Scenario, seed: int) -> tuple[Identity, ...]:
     """Return the findings of a run. Raises HarnessError if the scenario cannot be played."""
     result, evidence = _played(scenario, seed, lambda state, run: None)
-    return identities(result, evidence.once(cycle_of) if evidence else None, scenario)
+    return identities(result, evidence.cached(cycle_of) if evidence else None, scenario)
 
 
 def _played(scenario: Scenario, seed: int, watch: Watch) -> tuple[Result, Evidence | None]:
