@@ -1,7 +1,7 @@
-"""The checker: decides from exports, and more from traces, whether the six characteristics hold (Section 4.3).
+"""The checker decides from exports and traces whether the six characteristics of Section 4.3 hold.
 
-One file per characteristic, each a function from `Evidence` to `Judgement`; `_verdict.py` gathers them. Beside
-them, `survival.py` says what the loss of vehicles took and could take.
+One file decides each characteristic, with a function from `Evidence` to `Judgement`. `_verdict.py` collects the
+judgements. `survival.py` reports the blocks that were lost together with vehicles, and those that a loss would take.
 """
 
 from harness.checker._verdict import Result, check

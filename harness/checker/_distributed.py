@@ -1,7 +1,7 @@
 """Characteristic 1: distributed, event driven and asynchronous.
 
-Every handler run has a local trigger or a message that its sender really sent, and no vote waits for anybody: it ends
-when its own timer does. Only traces can tell, and only in words that are known.
+Every handler run has a local trigger, or a message that its sender really sent. Every vote ends with its own timer, so
+no vote waits for another agent. Only traces show this, and only if their names are known.
 """
 
 from typing import Any

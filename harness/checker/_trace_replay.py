@@ -43,7 +43,7 @@ class Incarnation:
 
     trace: Trace
     number: int
-    """From 0."""
+    """Number of the incarnation, from 0."""
     runs: list[HandlerRun]
     chain: list[str] = field(default_factory=list)
     deque: list[str] = field(default_factory=list)
@@ -185,7 +185,7 @@ class _HeldBlocks:
         return f"{block[:12]} leaves the {name}, but is not {'in front' if name == 'deque' else 'on top'}"
 
     def compare(self, line: int, run: HandlerRun) -> bool:
-        """Whether the state is what the changes have led to."""
+        """Return whether the state in the line equals the result of all changes so far."""
         incarnation, state = self._incarnation, run.state
         if (state.chain, state.deque, state.stack) != (
             len(incarnation.chain),
@@ -213,7 +213,7 @@ class _HeldBlocks:
 
 
 def _digest(block_hash: str) -> bytes:
-    """The raw block hash; of what is none, nothing that is one."""
+    """Return the block hash as bytes. An invalid hash gives zeros, which are the hash of no block."""
     try:
         return bytes.fromhex(block_hash)
     except ValueError:

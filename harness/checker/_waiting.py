@@ -1,6 +1,6 @@
-"""Part of characteristic 1: no agent waits for another. A vote and each step of a reconcile end with a timer.
+"""The part of characteristic 1 about waiting: no agent waits for another one.
 
-An agent that waits longer than its own timers say, waits for what will never happen.
+A vote and each step of a reconcile end with a timer. An agent that waits longer than its timers run would wait forever.
 """
 
 import math
@@ -33,7 +33,7 @@ NO_STEP = frozenset(("already in progress", "not in phase 3", "another block"))
 """Branches of these handlers in which a reconcile does not continue."""
 
 
-def _goes_on(run: HandlerRun) -> bool:
+def _continues_reconcile(run: HandlerRun) -> bool:
     return run.handler in RECONCILE_STEPS and run.branch not in NO_STEP
 
 
@@ -63,35 +63,35 @@ def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
     """Yield each wait that lasted longer than the timers of an agent that was not paused."""
     for agent_id, trace in evidence.traces.items():
         if evidence.describe_unknown_name("handler", "branch", agent_id=agent_id):
-            continue  # what goes on, and what waits, is told by these
+            continue  # only known names show the steps of votes and reconciles
         vote_s, reconcile_s = longest(trace, VOTE_TIMERS), longest(trace, RECONCILE_TIMERS)
-        for life in trace.incarnations():
+        for incarnation in trace.incarnations():
             vote = _Wait("a vote began and did not end", vote_s)
             reconcile = _Wait("a reconcile did not continue", reconcile_s)
-            yield from _in_life(evidence, agent_id, life, vote, reconcile)
+            yield from _find_in_incarnation(evidence, agent_id, incarnation, vote, reconcile)
         whole = agent_id in evidence.exports and not trace.problem
         if whole and (ended_at_s := evidence.end_of(agent_id)) is not None:
-            yield from _overdue(evidence, agent_id, ended_at_s, vote, reconcile)
+            yield from _find_overdue(evidence, agent_id, ended_at_s, vote, reconcile)
 
 
-def _in_life(
-    evidence: Evidence, agent_id: int, life: Iterator[tuple[int, HandlerRun]], vote: _Wait, reconcile: _Wait
+def _find_in_incarnation(
+    evidence: Evidence, agent_id: int, incarnation: Iterator[tuple[int, HandlerRun]], vote: _Wait, reconcile: _Wait
 ) -> Iterator[Finding]:
-    for line, run in life:
+    for line, run in incarnation:
         step = run.handler in STEPS
         if run.handler == "vote_timer_expiration":
             vote.since = math.inf
-        elif step and _goes_on(run):
+        elif step and _continues_reconcile(run):
             reconcile.since = math.inf
         if run.t > vote.since + vote.longest or run.t > reconcile.since + reconcile.longest:
-            yield from _overdue(evidence, agent_id, run.t, vote, reconcile)
+            yield from _find_overdue(evidence, agent_id, run.t, vote, reconcile)
         if run.branch == "proposed":
             vote.line, vote.since = line, run.t
-        elif step and _goes_on(run) and run.state.reconciling:
+        elif step and _continues_reconcile(run) and run.state.reconciling:
             reconcile.line, reconcile.since = line, run.t
 
 
-def _overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Wait) -> Iterator[Finding]:
+def _find_overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Wait) -> Iterator[Finding]:
     for wait in waits:
         if now > wait.since + wait.longest:
             if not evidence.was_paused(agent_id, wait.since, now):

@@ -1,4 +1,4 @@
-"""The step judge: did each handler run of each agent do what the 20 algorithms say?
+"""The step judge decides whether each handler run of each agent follows Algorithms 1 to 20.
 
 The judge feeds the record of each agent, step by step, into the independent reference (`harness.checker.reference`). It
 compares branch, changes, messages, timers, tallies and state. It needs only the record, so it judges agents in any

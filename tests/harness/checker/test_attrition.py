@@ -1,4 +1,4 @@
-"""Vehicles are lost and come back as processes, as they do in virtual time, and the run's record says the same."""
+"""Losses and restarts of vehicles have the same effect with processes and in virtual time."""
 
 import json
 import re
@@ -33,21 +33,21 @@ STORY: dict[str, Any] = {
 }
 
 
-def told(faults: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
+def summary_of(faults: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
     return [(fault["what"], fault.get("agents"), fault.get("disk")) for fault in faults]
 
 
-def test_a_story_of_attrition_is_the_same_with_processes_as_in_virtual_time(tmp_path: Path) -> None:
+def test_attrition_is_the_same_with_processes_and_in_virtual_time(tmp_path: Path) -> None:
     scenario, out = write_scenario(tmp_path, **STORY, vehicles={"kind": "embedded"}), tmp_path / "run"
     done = harness("run", scenario, "--seed", 5, "--out", out)
     assert done.returncode == 0, done.stdout + done.stderr
     record = json.loads((out / "run.json").read_text())
     simulated = simulate(Scenario.model_validate({"name": "test", **STORY}), 5)
-    assert told(record["faults"]) == told(simulated.played.faults)
+    assert summary_of(record["faults"]) == summary_of(simulated.played.faults)
     assert {one["verdict"] for one in record["characteristics"].values()} == {"holds"}
-    lives = ("outcome", "restarts", "reboots")
-    assert {agent: [one[key] for key in lives] for agent, one in record["agents"].items()} == {
-        agent: [one[key] for key in lives] for agent, one in simulated.played.agents.items()
+    keys = ("outcome", "restarts", "reboots")
+    assert {agent: [one[key] for key in keys] for agent, one in record["agents"].items()} == {
+        agent: [one[key] for key in keys] for agent, one in simulated.played.agents.items()
     }
     assert [bool(record["agents"][agent]["completed_before"]) for agent in "12345"] == [False, True, False, True, True]
     assert [(loss["what"], loss["vehicles"]) for loss in record["survival"]["losses"]] == [
@@ -57,39 +57,39 @@ def test_a_story_of_attrition_is_the_same_with_processes_as_in_virtual_time(tmp_
     ]
     assert re.search(r"^at \d+ s vehicle 2 was lost \(kill\), and with it", done.stdout, re.MULTILINE)
     assert not processes(out)
-    _every_life_is_kept(out)
-    _the_vehicle_fell(record["vehicles"]["4"])
+    _check_files_of_incarnations(out)
+    _check_fallen_vehicle(record["vehicles"]["4"])
 
 
-def _every_life_is_kept(out: Path) -> None:
+def _check_files_of_incarnations(out: Path) -> None:
     agents, vehicles = out / "agents", out / "vehicles"
     assert {path.name for path in agents.iterdir() if path.is_dir()} == {"2-2", "3-2", "5-2"}
     assert {path.name for path in vehicles.iterdir()} == {"1", "2", "2-2", "3", "4", "5"}
     assert (vehicles / "2-2" / "telemetry.tlog").stat().st_size > 1000
     assert not list(out.rglob("*.control"))
     assert sorted(path.name for path in agents.glob("*.store")) == ["3.store"]
-    assert not list(agents.glob("4.chain.json")), "what it held is gone"
+    assert not list(agents.glob("4.chain.json")), "the data of a crashed agent is lost"
     for agent, boots in (("2", False), ("3", True), ("5", False)):
         trace = read_trace(agents / f"{agent}.trace.jsonl")
         last = read_trace(agents / f"{agent}-2" / f"{agent}.trace.jsonl")
         assert trace is not None and last is not None and not trace.problem
-        first_life, second_life = ([run for _, run in life] for life in trace.incarnations())
-        assert second_life == last.runs
-        assert max(run.t for run in first_life) < min(run.t for run in second_life)
-        assert (second_life[0].trigger.kind == "boot") == boots
+        first_runs, second_runs = ([run for _, run in incarnation] for incarnation in trace.incarnations())
+        assert second_runs == last.runs
+        assert max(run.t for run in first_runs) < min(run.t for run in second_runs)
+        assert (second_runs[0].trigger.kind == "boot") == boots
         assert "ready" in (agents / f"{agent}.log").read_text()
         assert (agents / f"{agent}.chain.json").read_text() == (
             agents / f"{agent}-2" / f"{agent}.chain.json"
         ).read_text()
 
 
-def _the_vehicle_fell(vehicle: dict[str, Any]) -> None:
+def _check_fallen_vehicle(vehicle: dict[str, Any]) -> None:
     assert not vehicle["armed"]
     assert vehicle["altitude_m"] < 1
 
 
 @pytest.mark.any_user
-def test_an_agent_that_stays_paused_is_woken_for_its_export_and_the_run_is_not_settled(tmp_path: Path) -> None:
+def test_agent_paused_to_the_end_still_exports(tmp_path: Path) -> None:
     keys = {"vehicles": {"kind": "none"}, "final_reconcile": True, "settle": {"limit_s": 200}}
     scenario = write_scenario(tmp_path, **keys, timeline=[{"at_s": 100, "pause": [3]}])
     done = harness("run", scenario, "--seed", 1, "--out", tmp_path / "run")
@@ -101,12 +101,12 @@ def test_an_agent_that_stays_paused_is_woken_for_its_export_and_the_run_is_not_s
 
 
 @pytest.mark.any_user
-def test_an_agent_that_dies_unasked_in_its_second_life_fails_the_run(tmp_path: Path) -> None:
+def test_crash_of_a_second_incarnation_fails_the_run(tmp_path: Path) -> None:
     timeline = [{"at_s": 20, "kill": [2]}, {"at_s": 40, "restart": [2]}]
     scenario = write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}, timeline=timeline)
     run = Running(scenario, tmp_path / "run")
     second = run.out / "agents" / "2-2" / "2.trace.jsonl"
-    run.wait_for(lambda: second.exists() and second.read_text().count("\n") > 1, "the second life")
+    run.wait_for(lambda: second.exists() and second.read_text().count("\n") > 1, "the second incarnation")
     run.signal_agent(2, signal.SIGKILL)
     status, _, err = run.end()
     assert status == 1
@@ -115,7 +115,7 @@ def test_an_agent_that_dies_unasked_in_its_second_life_fails_the_run(tmp_path: P
 
 
 @pytest.mark.any_user
-def test_a_run_that_is_interrupted_while_an_agent_is_down_says_so(tmp_path: Path) -> None:
+def test_interrupted_run_records_a_rebooting_agent(tmp_path: Path) -> None:
     timeline = [{"at_s": 20, "reboot": [2], "down_s": 90_000, "disk": "kept"}]
     scenario = write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}, timeline=timeline)
     run = Running(scenario, tmp_path / "run")

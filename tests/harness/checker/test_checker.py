@@ -1,4 +1,4 @@
-"""Each characteristic holds where it should, is violated where somebody broke it, and never holds unseen."""
+"""Each characteristic holds for a good run, is violated by a manipulated one, and never holds without evidence."""
 
 import re
 from pathlib import Path
@@ -15,7 +15,7 @@ from ucp.messages import CommitBlock
 
 
 def verdicts(result: Result) -> str:
-    """One letter per characteristic: h(olds), v(iolated), n(ot applicable)."""
+    """Return one letter for each characteristic: h(olds), v(iolated), n(ot applicable)."""
     return "".join(result.characteristics[number].verdict[0] for number in "123456")
 
 
@@ -33,7 +33,7 @@ def run_dir(perfect: Air, tmp_path: Path) -> Path:
     return write_run(perfect, tmp_path / "run", CONNECTED)
 
 
-def test_a_perfect_run_holds_in_all_six(run_dir: Path) -> None:
+def test_perfect_run_holds_in_all_six(run_dir: Path) -> None:
     result = check(gather(RunArchive(run_dir)))
     assert verdicts(result) == "hhhhhh"
     assert result.figures["distinct_chains"] == 1
@@ -43,14 +43,14 @@ def test_a_perfect_run_holds_in_all_six(run_dir: Path) -> None:
     assert not result.errors
 
 
-def test_exports_alone_say_nothing_of_what_triggered_handlers(perfect: Air, tmp_path: Path) -> None:
+def test_exports_alone_make_1_not_applicable(perfect: Air, tmp_path: Path) -> None:
     paths = write_exports(perfect, tmp_path, traces=False)
     result = check(gather(RunArchive(*paths)))
     assert verdicts(result) == "nhhhhh"
     assert result.figures["messages"] is None
 
 
-def test_after_loss_equal_chains_hold_and_different_ones_do_not_apply(tmp_path: Path) -> None:
+def test_different_chains_after_loss_make_5_and_6_not_applicable(tmp_path: Path) -> None:
     air = fly(loss=0.3, seed=3)
     assert len(set(air.chains())) > 1
     result = check(gather(RunArchive(write_run(air, tmp_path / "before", LOSSY))))
@@ -65,7 +65,7 @@ def test_after_loss_equal_chains_hold_and_different_ones_do_not_apply(tmp_path: 
 
 
 def missed_last_block(reconcile_before: bool = False) -> Air:
-    """Fully connected but for one lost commit after which nobody votes: agent 2 stays different."""
+    """Return a fully connected swarm that loses one commit, after which no agent votes. Agent 2 stays different."""
     air = Air([1, 2, 3])
     air.fill_block(1)
     air.settle()
@@ -80,7 +80,7 @@ def missed_last_block(reconcile_before: bool = False) -> Air:
 
 
 @pytest.mark.parametrize("reconcile_before", [False, True])
-def test_a_difference_that_no_vote_could_find_does_not_apply(tmp_path: Path, reconcile_before: bool) -> None:
+def test_difference_without_a_later_vote_makes_5_and_6_not_applicable(tmp_path: Path, reconcile_before: bool) -> None:
     result = check(gather(RunArchive(write_run(missed_last_block(reconcile_before), tmp_path / "run", CONNECTED))))
     assert verdicts(result) == "hhhhnn"
     assert re.fullmatch(
@@ -93,11 +93,11 @@ def test_a_difference_that_no_vote_could_find_does_not_apply(tmp_path: Path, rec
     )
 
 
-def test_a_difference_that_outlives_a_reconcile_violates_5_and_6(tmp_path: Path) -> None:
+def test_difference_after_a_reconcile_violates_5_and_6(tmp_path: Path) -> None:
     air = missed_last_block()
     agent = air.agents[2]
     agent.begin_reconcile(air.now)
-    agent.messages_to_send()  # a radio that is on record as perfect, and says nothing
+    agent.messages_to_send()  # discard the messages, although the record has a perfect radio
     air.flush(2)
     air.settle()
     result = check(gather(RunArchive(write_run(air, tmp_path / "run", CONNECTED))))
@@ -106,14 +106,14 @@ def test_a_difference_that_outlives_a_reconcile_violates_5_and_6(tmp_path: Path)
     assert (finding.agent_id, finding.block) == (2, "3.1")
 
 
-def test_exports_alone_that_differ_do_not_tell_whether_the_system_was_connected(tmp_path: Path) -> None:
+def test_exports_alone_do_not_show_whether_the_system_was_connected(tmp_path: Path) -> None:
     paths = write_exports(missed_last_block(), tmp_path, traces=False)
     result = check(gather(RunArchive(*paths)))
     assert verdicts(result)[4:] == "nn"
     assert "exports do not show whether" in reason(result, "6")
 
 
-def test_an_agent_that_never_became_idle_is_not_judged(tmp_path: Path) -> None:
+def test_agent_that_is_not_idle_makes_2_5_and_6_not_applicable(tmp_path: Path) -> None:
     air = Air([1, 2])
     air.fill_block(1)
     result = check(gather(RunArchive(write_run(air, tmp_path / "run", CONNECTED))))
@@ -121,14 +121,14 @@ def test_an_agent_that_never_became_idle_is_not_judged(tmp_path: Path) -> None:
     assert "agent 1 was not idle at the end" in reason(result, "2")
 
 
-def test_an_agent_whose_export_is_missing_is_never_taken_for_agreeing(run_dir: Path) -> None:
+def test_missing_export_makes_2_3_5_and_6_not_applicable(run_dir: Path) -> None:
     (run_dir / "agents" / "4.chain.json").unlink()
     result = check(gather(RunArchive(run_dir)))
     assert verdicts(result) == "hnnhnn"
     assert "the export of agent 4 is missing" in reason(result, "6")
 
 
-def test_an_idle_agent_with_an_uncommitted_block_violates_2(run_dir: Path) -> None:
+def test_idle_agent_with_an_uncommitted_block_violates_2(run_dir: Path) -> None:
     def hide(export: dict) -> None:
         export["blocks_to_be_committed"].append({**export["chain"].pop(), "chain_hash": None})
 
@@ -138,7 +138,7 @@ def test_an_idle_agent_with_an_uncommitted_block_violates_2(run_dir: Path) -> No
     assert result.characteristics["2"].evidence[0].agent_id == 2
 
 
-def test_a_trace_that_was_idle_with_a_full_deque_violates_2(run_dir: Path) -> None:
+def test_idle_state_with_a_full_deque_in_a_trace_violates_2(run_dir: Path) -> None:
     def claim_idle(lines: list[dict]) -> None:
         voting = next(line for line in lines[1:] if line["state"]["deque"])
         voting["state"]["idle"] = True
@@ -149,7 +149,7 @@ def test_a_trace_that_was_idle_with_a_full_deque_violates_2(run_dir: Path) -> No
     assert "trace line" in result.characteristics["2"].evidence[0].detail
 
 
-def test_a_second_copy_in_an_export_violates_3(run_dir: Path) -> None:
+def test_second_copy_in_an_export_violates_3(run_dir: Path) -> None:
     def copy(export: dict) -> None:
         export["reconcile_stack"].append({**export["chain"][0], "chain_hash": None})
 
@@ -161,7 +161,7 @@ def test_a_second_copy_in_an_export_violates_3(run_dir: Path) -> None:
     assert finding.block is not None
 
 
-def test_a_second_copy_at_one_step_of_a_trace_violates_3(run_dir: Path) -> None:
+def test_second_copy_at_one_step_of_a_trace_violates_3(run_dir: Path) -> None:
     def copy(lines: list[dict]) -> None:
         commit = next(line for line in lines[1:] if line["handler"] == "receive_commit_block" and line["changes"])
         commit["changes"].append(["stack+", commit["changes"][0][1]])
@@ -171,20 +171,20 @@ def test_a_second_copy_at_one_step_of_a_trace_violates_3(run_dir: Path) -> None:
     assert result.characteristics["3"].verdict == "violated"
 
 
-def test_an_edited_block_violates_4(run_dir: Path) -> None:
+def test_edited_block_violates_4(run_dir: Path) -> None:
     edit(run_dir / "agents" / "1.chain.json", lambda export: export["chain"][2].update(timestamp_us=1))
     result = check(gather(RunArchive(run_dir)))
     assert result.characteristics["4"].verdict == "violated"
     assert "does not match its block hash" in result.characteristics["4"].evidence[0].detail
 
 
-def test_a_reordered_chain_violates_4(run_dir: Path) -> None:
+def test_reordered_chain_violates_4(run_dir: Path) -> None:
     edit(run_dir / "agents" / "1.chain.json", lambda export: export["chain"].insert(0, export["chain"].pop(1)))
     result = check(gather(RunArchive(run_dir)))
     assert "the chain hash at block" in result.characteristics["4"].evidence[0].detail
 
 
-def test_a_block_that_its_agent_never_completed_violates_4(run_dir: Path) -> None:
+def test_block_that_its_agent_never_completed_violates_4(run_dir: Path) -> None:
     block = []
 
     def disown(export: dict) -> None:
@@ -197,13 +197,13 @@ def test_a_block_that_its_agent_never_completed_violates_4(run_dir: Path) -> Non
     assert {finding.block_hash for finding in result.characteristics["4"].evidence} == set(block)
 
 
-def test_a_block_of_a_stranger_violates_4(run_dir: Path) -> None:
+def test_block_of_an_agent_outside_the_roster_violates_4(run_dir: Path) -> None:
     edit(run_dir / "run.json", lambda record: record.update(roster=[1, 2, 3, 4]))
     result = check(gather(RunArchive(run_dir)))
     assert "agent 5, which is not on the roster" in result.characteristics["4"].evidence[0].detail
 
 
-def test_blocks_of_an_agent_that_left_nothing_are_not_taken_for_genuine(perfect: Air, tmp_path: Path) -> None:
+def test_blocks_of_an_agent_without_records_make_4_not_applicable(perfect: Air, tmp_path: Path) -> None:
     paths = write_exports(perfect, tmp_path, traces=False)
     result = check(gather(RunArchive(*(path for path in paths if path.name != "3.chain.json"))))
     assert result.characteristics["4"].verdict == "not applicable"
@@ -221,7 +221,7 @@ def test_blocks_of_an_agent_that_left_nothing_are_not_taken_for_genuine(perfect:
         ({"boot": 3}, "was triggered by a boot, which only ends a reconcile"),
     ],
 )
-def test_a_handler_without_a_trigger_of_its_own_violates_1(run_dir: Path, trigger: dict, detail: str) -> None:
+def test_handler_without_a_valid_trigger_violates_1(run_dir: Path, trigger: dict, detail: str) -> None:
     def forge(lines: list[dict]) -> None:
         next(line for line in lines[1:] if line["handler"] == "receive_commit_block")["trigger"] = trigger
 
@@ -232,17 +232,17 @@ def test_a_handler_without_a_trigger_of_its_own_violates_1(run_dir: Path, trigge
 
 
 def hang(lines: list[dict]) -> None:
-    """In a trace: no vote ends."""
+    """Remove the ends of votes from a trace."""
     lines[:] = [line for line in lines if line.get("handler") != "vote_timer_expiration"]
 
 
-def test_a_vote_that_never_ends_violates_1(run_dir: Path) -> None:
+def test_vote_that_never_ends_violates_1(run_dir: Path) -> None:
     edit_lines(run_dir / "agents" / "2.trace.jsonl", hang)
     result = check(gather(RunArchive(run_dir)))
     assert any("a vote began and did not end" in one.detail for one in result.characteristics["1"].evidence)
 
 
-def test_a_killed_run_without_exports_is_judged_by_its_traces(run_dir: Path) -> None:
+def test_killed_run_without_exports_is_judged_by_its_traces(run_dir: Path) -> None:
     for export in (run_dir / "agents").glob("*.chain.json"):
         export.unlink()
     result = check(gather(RunArchive(run_dir)))
@@ -251,7 +251,7 @@ def test_a_killed_run_without_exports_is_judged_by_its_traces(run_dir: Path) -> 
     assert check(gather(RunArchive(run_dir))).characteristics["1"].verdict == "violated"
 
 
-def test_a_missing_or_damaged_trace_is_never_taken_for_a_good_one(run_dir: Path) -> None:
+def test_missing_or_damaged_trace_prevents_a_good_verdict(run_dir: Path) -> None:
     trace = run_dir / "agents" / "2.trace.jsonl"
     lines = trace.read_text().splitlines(keepends=True)
     trace.write_text("".join(lines[:-1]) + "{]\n")
@@ -264,7 +264,7 @@ def test_a_missing_or_damaged_trace_is_never_taken_for_a_good_one(run_dir: Path)
     assert "the trace of agent 2 is missing" in reason(result, "1")
 
 
-def test_half_a_last_line_is_that_of_a_killed_agent_and_no_damage(run_dir: Path) -> None:
+def test_incomplete_last_line_of_a_trace_is_no_damage(run_dir: Path) -> None:
     trace = run_dir / "agents" / "2.trace.jsonl"
     trace.write_text(trace.read_text() + '{"t": 1')
     result = check(gather(RunArchive(run_dir)))
@@ -272,7 +272,7 @@ def test_half_a_last_line_is_that_of_a_killed_agent_and_no_damage(run_dir: Path)
     assert not result.errors
 
 
-def test_a_damaged_record_is_told_and_the_exports_are_checked_without_it(run_dir: Path) -> None:
+def test_damaged_record_is_reported_and_exports_are_checked(run_dir: Path) -> None:
     (run_dir / "run.json").write_text('{"schema": "ucp-run/1", "roster": "all", "network": [7]}')
     result = check(gather(RunArchive(run_dir)))
     assert "run.json: `roster` is wrong" in result.errors[0]
@@ -288,7 +288,7 @@ strange = st.recursive(
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
 @given(data=st.data())
-def test_whatever_a_run_directory_holds_there_is_a_verdict(run_dir: Path, data: st.DataObject) -> None:
+def test_any_content_of_a_run_directory_gets_a_verdict(run_dir: Path, data: st.DataObject) -> None:
     trace, record = run_dir / "agents" / "2.trace.jsonl", run_dir / "run.json"
     kept = trace.read_text(), record.read_text()
 
@@ -305,7 +305,7 @@ def test_whatever_a_run_directory_holds_there_is_a_verdict(run_dir: Path, data: 
         record.write_text(kept[1])
 
 
-def test_a_trace_that_a_full_disk_ended_is_never_taken_for_a_whole_one(run_dir: Path) -> None:
+def test_trace_ended_by_a_full_disk_counts_as_incomplete(run_dir: Path) -> None:
     full = {"outcome": "exported", "trace_problem": "No space left on device"}
     edit(run_dir / "run.json", lambda record: record.update(agents={"3": full}))
     result = check(gather(RunArchive(run_dir)))

@@ -1,4 +1,4 @@
-"""Liveness: a swarm becomes idle, or it is shown never to, or it is said how long it would still have needed."""
+"""The liveness check reports an idle swarm, a cycle without end, or an estimate of the remaining time."""
 
 import json
 import re
@@ -28,18 +28,18 @@ def liveness(simulated: Simulated) -> Judgement:
 
 
 def judged(evidence: Evidence, **record: Any) -> dict[str, Judgement]:
-    """As `evidence` would be judged if its record said this."""
+    """Return the judgements on the evidence with a changed record."""
     assert evidence.record is not None
     changed = replace(evidence, record=evidence.record.model_copy(update=record))
     return check(changed).judgements
 
 
-def without_looking(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As processes are: nobody sees the global state, and a run goes on until its time is up."""
-    monkeypatch.setattr(Simulation, "_looks_for_recurrence", lambda simulation: None)
+def disable_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Disable the search for a cycle, so that a simulation runs to its limit as processes do."""
+    monkeypatch.setattr(Simulation, "_new_recurrence", lambda simulation: None)
 
 
-def test_a_swarm_that_becomes_idle_has_finished() -> None:
+def test_idle_swarm_has_finished() -> None:
     run = simulate(scenario(agents=5, duration_s=600), seed=1)
     uniform_at_s = run.result.figures["uniform_at_s"]
     assert liveness(run).verdict == "finished"
@@ -49,11 +49,11 @@ def test_a_swarm_that_becomes_idle_has_finished() -> None:
 
 
 @pytest.mark.parametrize("tracing", [False, True])
-def test_a_swarm_in_step_never_finishes_and_violates_5_and_6(tracing: bool) -> None:
+def test_swarm_in_step_never_finishes_and_violates_5_and_6(tracing: bool) -> None:
     run = simulate(in_step(), seed=1, tracing=tracing)
     assert liveness(run).verdict == "never finishes"
-    for said in ("the global state recurs every 15 s", "agents 1, 2, 3, 4 and 5 ask each other in vain"):
-        assert said in liveness(run).reason
+    for phrase in ("the global state recurs every 15 s", "agents 1, 2, 3, 4 and 5 ask each other in vain"):
+        assert phrase in liveness(run).reason
     for number in ("5", "6"):
         reason = run.result.characteristics[number].reason
         assert re.fullmatch(
@@ -68,9 +68,9 @@ def test_a_swarm_in_step_never_finishes_and_violates_5_and_6(tracing: bool) -> N
     assert "vote_timer_expiration" in finding.detail
 
 
-def test_traces_tell_which_handlers_follow_each_other_and_since_when() -> None:
+def test_traces_show_the_handlers_and_the_start_of_a_cycle() -> None:
     run = simulate(in_step(), seed=1, tracing=True)
-    assert "since 11 s" in liveness(run).reason, "the first reconcile in step, long before anybody looked"
+    assert "since 11 s" in liveness(run).reason, "the first reconcile in step, long before the search started"
     assert liveness(run).reason.endswith("; agents 1, 2, 3, 4 and 5 refuse each other's blocks")
     assert liveness(run).evidence[0].detail == (
         "as agents 2, 3, 4 and 5, runs vote_timer_expiration (not approved), reconcile_begin (begun), reconcile_phase_1"
@@ -79,8 +79,8 @@ def test_traces_tell_which_handlers_follow_each_other_and_since_when() -> None:
     )
 
 
-def test_traces_alone_show_the_same_handler_runs_over_and_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_looking(monkeypatch)
+def test_traces_alone_show_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
+    disable_search(monkeypatch)
     run = simulate(in_step(), seed=1, tracing=True)
     assert run.played.cycle is None
     assert liveness(run).verdict == "never finishes"
@@ -94,24 +94,24 @@ def test_traces_alone_show_the_same_handler_runs_over_and_over(monkeypatch: pyte
 
 
 @pytest.mark.parametrize("name", LIVELOCKS)
-def test_traces_show_it_whenever_the_run_ends(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also while some of those who take part are idle."""
-    without_looking(monkeypatch)
+def test_traces_show_a_cycle_at_any_end_of_the_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cycle is found even if some of its agents are idle at the end of the run."""
+    disable_search(monkeypatch)
     document = load_scenario(SCENARIOS / f"{name}.yaml").model_dump(exclude={"expect"}, exclude_unset=True)
-    idle, go_round = set(), set()
+    idle, in_cycle = set(), set()
     for more_s in range(0, 30, 2):
         run = simulate(Scenario.model_validate({**document, "settle": {"limit_s": 250 + more_s}}), seed=1, tracing=True)
         assert liveness(run).verdict == "never finishes", f"{run.played.mission_s:.0f} s"
         assert run.evidence.cached(cycle_of) is not None
         assert set(run.evidence.busy) <= set(run.evidence.cached(cycle_of).agents)
         idle.add(len(run.evidence.busy))
-        go_round.add(tuple(run.evidence.cached(cycle_of).agents))
+        in_cycle.add(tuple(run.evidence.cached(cycle_of).agents))
     assert len(idle) > 1 or name != "drawn_in"
-    assert len(go_round) == 1, "whoever goes round is told, idle or not"
+    assert len(in_cycle) == 1, "the cycle contains idle agents too"
 
 
-def test_a_few_times_in_a_row_may_be_a_coincidence(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_looking(monkeypatch)
+def test_few_repetitions_do_not_count_as_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
+    disable_search(monkeypatch)
     run = simulate(in_step(settle={"limit_s": 10}), seed=1, tracing=True)
     assert liveness(run).verdict == "not finished"
     assert "5 blocks waited for their commit, and none was" in liveness(run).reason
@@ -119,33 +119,33 @@ def test_a_few_times_in_a_row_may_be_a_coincidence(monkeypatch: pytest.MonkeyPat
     assert run.result.characteristics["5"].verdict == "not applicable"
 
 
-def test_where_messages_may_be_lost_the_same_runs_over_and_over_show_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_looking(monkeypatch)
+def test_repetitions_on_a_lossy_network_do_not_count_as_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
+    disable_search(monkeypatch)
     evidence = simulate(in_step(), seed=1, tracing=True).evidence
     assert evidence.record is not None
     lossy = [state.model_copy(update={"fully_connected": False}) for state in evidence.record.network]
     assert judged(evidence, network=lossy)["liveness"].verdict == "not finished"
 
 
-def test_a_backlog_that_drains_is_no_cycle_and_its_rate_tells_how_long_it_needs() -> None:
+def test_commit_rate_gives_an_estimate_of_the_remaining_time() -> None:
     busy: dict[str, Any] = {"agents": 5, "duration_s": 600, "events": {"source": "random", "mean_s": 4}}
     cut = simulate(scenario(**busy, settle={"limit_s": 400}), seed=1, tracing=True)
     assert liveness(cut).verdict == "not finished"
-    told = re.search(r"at ([\d.]+) commits a minute this would have taken (\d+) minutes more", liveness(cut).reason)
-    assert told, liveness(cut).reason
+    estimate = re.search(r"at ([\d.]+) commits a minute this would have taken (\d+) minutes more", liveness(cut).reason)
+    assert estimate, liveness(cut).reason
     finished = simulate(scenario(**busy, settle={"limit_s": 4000}), seed=1)
     assert liveness(finished).verdict == "finished"
     needed_minutes = (finished.played.mission_s - cut.played.mission_s) / 60
-    assert needed_minutes / 2 < int(told[2]) < needed_minutes * 2
-    assert cut.result.bad == ("liveness",), "characteristics 5 and 6 wait for a swarm that has had its time"
+    assert needed_minutes / 2 < int(estimate[2]) < needed_minutes * 2
+    assert cut.result.bad == ("liveness",), "characteristics 5 and 6 are not judged before the swarm is idle"
 
 
-def test_without_traces_nothing_tells_how_fast_a_backlog_drains() -> None:
+def test_commit_rate_is_unknown_without_traces() -> None:
     busy = scenario(agents=5, duration_s=600, events={"source": "random", "mean_s": 4}, settle={"limit_s": 400})
     assert "without traces the commit rate is unknown" in liveness(simulate(busy, seed=1)).reason
 
 
-def test_an_agent_that_hangs_never_finishes() -> None:
+def test_hanging_agent_never_finishes() -> None:
     hanging = scenario(agents=4, duration_s=900, network={"loss": 0.3}, quirks={"crash_on_tie": True})
     verdicts = [liveness(simulate(hanging, seed)) for seed in range(10)]
     hang = [verdict for verdict in verdicts if verdict.verdict == "never finishes"]
@@ -153,7 +153,7 @@ def test_an_agent_that_hangs_never_finishes() -> None:
     assert all("no running timer can change this" in verdict.reason for verdict in hang)
 
 
-def test_traces_tell_since_when_an_agent_hangs() -> None:
+def test_traces_show_since_when_an_agent_hangs() -> None:
     hanging = scenario(agents=4, duration_s=900, network={"loss": 0.3}, quirks={"crash_on_tie": True})
     for seed in range(10):
         run = simulate(hanging, seed, tracing=True)
@@ -167,7 +167,7 @@ def test_traces_tell_since_when_an_agent_hangs() -> None:
             assert max(tied_at.values()) <= cycle.since_s <= run.played.mission_s
 
 
-def test_where_there_was_no_looking_nothing_is_said() -> None:
+def test_liveness_is_not_applicable_without_complete_evidence() -> None:
     evidence = simulate(scenario(agents=3, duration_s=600), seed=1).evidence
     for outcome in ("running", "interrupted", "failed"):
         judgement = judged(evidence, outcome=outcome)["liveness"]
@@ -181,13 +181,13 @@ def test_where_there_was_no_looking_nothing_is_said() -> None:
     assert check(some).beside["liveness"].reason == "the export of agents 2 and 3 is missing"
 
 
-def test_an_agent_that_stands_still_to_the_end_is_not_judged() -> None:
+def test_agent_paused_to_the_end_is_not_judged() -> None:
     run = simulate(scenario(agents=3, duration_s=600, timeline=[{"at_s": 100, "pause": [3]}]), seed=1)
     assert (liveness(run).verdict, liveness(run).reason) == ("not applicable", "agent 3 stayed paused to the end")
 
 
-def test_who_asks_one_that_stands_still_had_no_chance_to_agree() -> None:
-    """Agent 3 has a block that nobody else has, and is paused to the end: the final reconcile asks it in vain."""
+def test_reconcile_beside_a_paused_agent_is_no_chance_to_agree() -> None:
+    """Agent 3 alone has a block, and is paused to the end, so it answers no query of the final reconcile."""
     run = simulate(
         scenario(
             agents=3,
@@ -206,8 +206,8 @@ def test_who_asks_one_that_stands_still_had_no_chance_to_agree() -> None:
     assert "and during which all agents were running" in run.result.characteristics["5"].reason
 
 
-def test_time_until_uniform_is_known_of_every_run_that_ends_with_one_chain() -> None:
-    """Traced or not, and it is when the chains were last changed."""
+def test_uniform_time_is_known_if_all_chains_are_equal() -> None:
+    """The time is that of the last change of a chain, with or without traces."""
     for seed in range(5):
         play = scenario(agents=5, duration_s=600, network={"loss": 0.15}, final_reconcile=True)
         plain, traced = (simulate(play, seed, tracing=tracing) for tracing in (False, True))
@@ -219,8 +219,8 @@ def test_time_until_uniform_is_known_of_every_run_that_ends_with_one_chain() -> 
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_a_process_that_goes_round_is_found_by_its_trace(tmp_path: Path) -> None:
-    """Nobody approves of anything, so that each vote of the one agent with a block ends in a reconcile, and so on."""
+def test_cycle_of_processes_is_found_in_traces(tmp_path: Path) -> None:
+    """All agents disapprove of every block. Each vote of the one agent with a block therefore ends in a reconcile."""
     refusing = write_scenario(
         tmp_path,
         agents=2,
@@ -231,7 +231,7 @@ def test_a_process_that_goes_round_is_found_by_its_trace(tmp_path: Path) -> None
         quirks={"disapprove_everything": True},
         settle={"limit_s": 180},
     )
-    done = harness("run", refusing, "--seed", 37, "--out", tmp_path / "run")  # of which only agent 1 completes a block
+    done = harness("run", refusing, "--seed", 37, "--out", tmp_path / "run")  # only agent 1 completes a block
     assert done.returncode == 1, done.stdout + done.stderr
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert record["liveness"]["verdict"] == "never finishes"

@@ -1,4 +1,4 @@
-"""Records that were edited, cut, doubled or mixed are never green; those of an honest run never contradict."""
+"""Edited, cut, doubled or mixed records never get a good verdict. Unaltered records never contradict each other."""
 
 import base64
 import json
@@ -25,7 +25,7 @@ Document = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three agents with loss, one of them shot down and begun anew, one rebooted, and a final reconcile."""
+    """A run of three agents with loss, a kill with a restart, a reboot, and a final reconcile."""
     asked = scenario(
         agents=3,
         duration_s=240,
@@ -72,22 +72,22 @@ def export(directory: Path, agent: int) -> Path:
 
 
 def contradicted(result: Result) -> list[str]:
-    """What the records contradict, and which characteristics are violated by it."""
+    """Check that records contradict each other, and return the characteristics that this violates."""
     assert result.beside["records"].verdict == "contradict"
     return [number for number, judgement in result.characteristics.items() if judgement.verdict == "violated"]
 
 
-def said(result: Result) -> str:
+def details(result: Result) -> str:
     return "\n".join(finding.detail for finding in result.beside["records"].evidence)
 
 
-def test_an_honest_run_contradicts_itself_nowhere(whole: Path) -> None:
+def test_records_of_an_unaltered_run_agree(whole: Path) -> None:
     result = judged(whole)
     assert result.beside["records"].verdict == "agree"
     assert {judgement.verdict for judgement in result.characteristics.values()} == {"holds"}
 
 
-def hash_anew(document: Document) -> None:
+def recompute_hashes(document: Document) -> None:
     chain_hash = bytes.fromhex(document["inception"]["chain_hash"])
     for block in document["chain"]:
         chain_hash = next_chain_hash(chain_hash, bytes.fromhex(block["block_hash"]))
@@ -96,40 +96,40 @@ def hash_anew(document: Document) -> None:
 
 def reverse(document: Document) -> None:
     document["chain"].reverse()
-    hash_anew(document)
+    recompute_hashes(document)
 
 
-def test_chains_that_are_all_reversed_and_hashed_anew_are_not_those_of_the_traces(directory: Path) -> None:
+def test_reversed_chains_with_new_hashes_contradict_the_traces(directory: Path) -> None:
     for agent in (1, 2, 3):
         edit(export(directory, agent), reverse)
     result = judged(directory)
     assert contradicted(result) == ["6"]
-    assert "its export differs from its trace: top chain hash" in said(result)
+    assert "its export differs from its trace: top chain hash" in details(result)
 
 
-def test_completed_blocks_that_are_left_out_are_missed(directory: Path) -> None:
+def test_missing_completed_block_is_found(directory: Path) -> None:
     edit(export(directory, 1), lambda document: document["completed"].pop())
     result = judged(directory)
     assert contradicted(result) == ["5"]
-    assert "according to its trace, but not according to its export" in said(result)
+    assert "according to its trace, but not according to its export" in details(result)
 
 
-def test_a_trace_that_was_cut_at_a_line_end_has_not_been_looked_at(directory: Path) -> None:
+def test_trace_cut_at_a_line_end_is_found(directory: Path) -> None:
     edit_lines(trace(directory, 1), lambda lines: lines.__delitem__(slice(len(lines) // 2, None)))
     result = judged(directory)
     assert result.beside["records"].verdict == "contradict"
     assert not [number for number in "123" if result.characteristics[number].verdict == "holds"]
-    assert "the agent had counted" in said(result)
+    assert "the agent had counted" in details(result)
 
 
-def test_a_trace_that_lost_its_last_line_has_not_been_looked_at(directory: Path) -> None:
+def test_trace_without_its_last_line_is_found(directory: Path) -> None:
     edit_lines(trace(directory, 1), lambda lines: lines.pop())
     result = judged(directory)
     assert result.beside["records"].verdict == "contradict"
     assert not [number for number in "123" if result.characteristics[number].verdict == "holds"]
 
 
-def test_a_commit_that_is_left_out_is_missed(directory: Path) -> None:
+def test_missing_commit_in_a_trace_is_found(directory: Path) -> None:
     def leave_out(lines: list[Document]) -> None:
         lines.remove(next(line for line in lines[1:] if any(change[0] == "chain+" for change in line["changes"])))
 
@@ -137,35 +137,35 @@ def test_a_commit_that_is_left_out_is_missed(directory: Path) -> None:
     assert "3" in contradicted(judged(directory))
 
 
-def test_a_top_that_is_not_of_the_blocks_below_it_is_not_genuine(directory: Path) -> None:
+def test_wrong_top_chain_hash_violates_4_and_6(directory: Path) -> None:
     edit_lines(trace(directory, 2), lambda lines: lines[-1]["state"].update(top="00" * 32))
     result = judged(directory)
     assert {"4", "6"} <= {*contradicted(result)}
-    assert "does not match the" in said(result)
+    assert "does not match the" in details(result)
 
 
-def test_a_clock_that_jumps_back_is_told(directory: Path) -> None:
+def test_clock_that_goes_back_is_found(directory: Path) -> None:
     def jump(lines: list[Document]) -> None:
         for line in lines[len(lines) // 2 :]:
             if "t" in line:
                 line["t"] -= 100
 
     edit_lines(trace(directory, 1), jump)
-    assert "the time goes back from" in said(judged(directory))
+    assert "the time goes back from" in details(judged(directory))
 
 
-def test_a_life_that_is_left_out_is_missed(directory: Path) -> None:
+def test_missing_incarnation_is_found(directory: Path) -> None:
     def leave_out(lines: list[Document]) -> None:
         second = [number for number, line in enumerate(lines) if "schema" in line][1]
         del lines[:second]
 
     edit_lines(trace(directory, 3), leave_out)
     result = judged(directory)
-    assert "its trace has 1 header, but it started 2 times according to run.json" in said(result)
+    assert "its trace has 1 header, but it started 2 times according to run.json" in details(result)
     assert not [number for number in "123" if result.characteristics[number].verdict == "holds"]
 
 
-def test_a_doubled_line_is_one_too_many(directory: Path) -> None:
+def test_doubled_line_of_a_trace_is_found(directory: Path) -> None:
     def double(lines: list[Document]) -> None:
         quiet = next(number for number, line in enumerate(lines[1:], 1) if not line["changes"] and not line["sent"])
         lines.insert(quiet, lines[quiet])
@@ -173,10 +173,10 @@ def test_a_doubled_line_is_one_too_many(directory: Path) -> None:
     edit_lines(trace(directory, 1), double)
     result = judged(directory)
     assert contradicted(result) == ["1"]
-    assert "the agent had counted" in said(result)
+    assert "the agent had counted" in details(result)
 
 
-def test_a_message_is_not_heard_before_it_is_sent(directory: Path) -> None:
+def test_message_handled_before_it_was_sent_is_found(directory: Path) -> None:
     def early(lines: list[Document]) -> None:
         number = next(number for number, line in enumerate(lines) if "message" in line.get("trigger", {}))
         for line in lines[1 : number + 1]:
@@ -185,22 +185,22 @@ def test_a_message_is_not_heard_before_it_is_sent(directory: Path) -> None:
     edit_lines(trace(directory, 1), early)
     result = judged(directory)
     assert "1" in contradicted(result)
-    assert "before it was sent at" in said(result)
+    assert "before it was sent at" in details(result)
 
 
-def test_settings_are_the_same_for_all(directory: Path) -> None:
+def test_differing_settings_are_found(directory: Path) -> None:
     edit_lines(trace(directory, 2), lambda lines: lines[0]["settings"].update(vote_timeout_s=11))
-    assert "settings.vote_timeout_s" in said(judged(directory))
+    assert "settings.vote_timeout_s" in details(judged(directory))
 
 
-def test_the_export_before_the_final_reconcile_is_what_the_trace_had_led_to(directory: Path) -> None:
+def test_altered_export_before_the_final_reconcile_is_found(directory: Path) -> None:
     edit(directory / "before_final_reconcile" / "1.chain.json", reverse)
     result = judged(directory)
     assert contradicted(result) == ["6"]
-    assert "before the final reconcile" in said(result)
+    assert "before the final reconcile" in details(result)
 
 
-def test_a_message_is_heard_with_the_content_that_it_was_sent_with(directory: Path) -> None:
+def test_message_handled_with_another_content_is_found(directory: Path) -> None:
     def turn_a_vote(lines: list[Document]) -> None:
         vote = next(line for line in lines[1:] if line.get("trigger", {}).get("message") == "Block Add Response")
         datagram = bytearray(base64.b64decode(vote["input"]))
@@ -210,29 +210,29 @@ def test_a_message_is_heard_with_the_content_that_it_was_sent_with(directory: Pa
     edit_lines(trace(directory, 1), turn_a_vote)
     result = judged(directory)
     assert contradicted(result) == ["1"]
-    assert "whose content differs from the sent message" in said(result)
+    assert "whose content differs from the sent message" in details(result)
 
 
-def test_run_json_and_network_jsonl_tell_the_same(directory: Path) -> None:
+def test_difference_of_run_json_and_network_jsonl_is_found(directory: Path) -> None:
     edit(directory / "run.json", lambda record: record["network"][0].update(fully_connected=True))
-    assert "only run.json has: start at 0 s" in said(judged(directory))
+    assert "only run.json has: start at 0 s" in details(judged(directory))
 
 
-def test_a_fault_that_is_left_out_is_missed(directory: Path) -> None:
+def test_missing_fault_is_found(directory: Path) -> None:
     edit(directory / "run.json", lambda record: record["faults"].pop(0))
-    assert "only network.jsonl has: reboot at 60 s" in said(judged(directory))
+    assert "only network.jsonl has: reboot at 60 s" in details(judged(directory))
 
 
-def test_traces_of_two_runs_do_not_mix(directory: Path, tmp_path: Path) -> None:
+def test_trace_of_another_run_is_found(directory: Path, tmp_path: Path) -> None:
     asked = scenario(agents=3, duration_s=300, events={"source": "random", "mean_s": 5})
     other = run(asked, 4, tmp_path / "other", Silent(), backend="sim").directory
     shutil.copy(trace(other, 2), trace(directory, 2))
     result = judged(directory)
     assert "1" in contradicted(result)
-    assert "as the inception block's data, but" in said(result)
+    assert "as the inception block's data, but" in details(result)
 
 
-def test_a_trace_that_goes_on_with_that_of_another_run_is_read_up_to_there(directory: Path, tmp_path: Path) -> None:
+def test_appended_trace_of_another_run_is_not_read(directory: Path, tmp_path: Path) -> None:
     asked = scenario(agents=3, duration_s=100)
     other = run(asked, 4, tmp_path / "other", Silent(), backend="sim").directory
     lines = len(trace(directory, 2).read_bytes().splitlines())
@@ -244,13 +244,13 @@ def test_a_trace_that_goes_on_with_that_of_another_run_is_read_up_to_there(direc
     assert not [number for number in "123" if result.characteristics[number].verdict == "holds"]
 
 
-def test_a_trace_of_a_newer_version_says_so(directory: Path) -> None:
+def test_trace_of_a_newer_version_is_an_error(directory: Path) -> None:
     edit_lines(trace(directory, 2), lambda lines: lines[0].update(schema="ucp-trace/9"))
     (error,) = judged(directory).errors
     assert "its schema is 'ucp-trace/9', and this version reads 'ucp-trace/1' and 'ucp-trace/2'" in error
 
 
-def test_a_trace_of_an_agent_that_is_not_on_the_roster_is_left_out(directory: Path) -> None:
+def test_trace_of_an_agent_outside_the_roster_is_left_out(directory: Path) -> None:
     shutil.copy(trace(directory, 2), trace(directory, 9))
     edit_lines(trace(directory, 9), lambda lines: [line.update(agent_id=9) for line in lines if "schema" in line])
     (error,) = judged(directory).errors
@@ -258,7 +258,7 @@ def test_a_trace_of_an_agent_that_is_not_on_the_roster_is_left_out(directory: Pa
 
 
 @pytest.mark.parametrize("name", ["agents/2.trace.jsonl", "agents/2.chain.json", "before_final_reconcile/2.chain.json"])
-def test_a_file_of_a_gigabyte_is_not_read(directory: Path, name: str) -> None:
+def test_file_of_a_gigabyte_is_not_read(directory: Path, name: str) -> None:
     os.truncate(directory / name, 1 << 30)
     tracemalloc.start()
     (error,) = judged(directory).errors
@@ -268,11 +268,11 @@ def test_a_file_of_a_gigabyte_is_not_read(directory: Path, name: str) -> None:
     assert peak < 64 << 20
 
 
-def test_captures_show_what_was_sent_and_heard(tmp_path: Path) -> None:
+def test_captures_show_messages_that_a_trace_lacks(tmp_path: Path) -> None:
     asked = scenario(agents=3, duration_s=200, capture=True, events={"source": "random", "mean_s": 5})
     directory = run(asked, 1, tmp_path / "run", Silent(), backend="sim").directory
     assert judged(directory).beside["records"].verdict == "agree"
-    (directory / "run.json").unlink()  # which knows how much was sent
+    (directory / "run.json").unlink()  # it also contains the number of sent messages
 
     def leave_out_a_vote(lines: list[Document]) -> None:
         lines.remove(
@@ -280,7 +280,7 @@ def test_captures_show_what_was_sent_and_heard(tmp_path: Path) -> None:
         )
 
     edit_lines(trace(directory, 1), leave_out_a_vote)
-    assert "the capture of its vehicle has a sent message that is missing in its trace" in said(judged(directory))
+    assert "the capture of its vehicle has a sent message that is missing in its trace" in details(judged(directory))
 
 
 LISTS = st.sampled_from(["take one out", "double one", "swap two"])
@@ -291,7 +291,7 @@ LISTS = st.sampled_from(["take one out", "double one", "swap two"])
 def test_no_block_can_be_moved_in_any_record(
     whole: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
-    """Of what agents held, completed, heard and sent nothing can be taken out, doubled or swapped unseen."""
+    """No block, line or change can be removed, doubled or swapped in exports or traces without a bad verdict."""
     directory = tmp_path_factory.mktemp("edited") / "run"
     shutil.copytree(whole, directory)
     agent = data.draw(st.sampled_from([1, 2, 3]))
@@ -304,25 +304,25 @@ def test_no_block_can_be_moved_in_any_record(
         )
         document = json.loads(path.read_text())
         place = data.draw(st.sampled_from(["chain", "completed"]))
-        document[place] = disordered(data, document[place])
-        hash_anew(document)
+        document[place] = disorder(data, document[place])
+        recompute_hashes(document)
         path.write_text(json.dumps(document))
     else:
         path = trace(directory, agent)
         lines = [json.loads(line) for line in path.read_text().splitlines()]
         if kind == "trace":
-            lines = disordered(data, lines)
+            lines = disorder(data, lines)
         else:
             line = data.draw(st.sampled_from([line for line in lines if len(line.get("changes", ())) > 0]))
-            line["changes"] = disordered(data, line["changes"])
+            line["changes"] = disorder(data, line["changes"])
         path.write_text("".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines))
     result = judged(directory)
     assert result.bad or result.errors
     shutil.rmtree(directory.parent)
 
 
-def disordered(data: st.DataObject, entries: list[Any]) -> list[Any]:
-    """With one taken out, one doubled, or two that differ swapped."""
+def disorder(data: st.DataObject, entries: list[Any]) -> list[Any]:
+    """Return the entries with one removed, one doubled, or two different ones swapped."""
     how = data.draw(LISTS)
     number = data.draw(st.integers(0, len(entries) - 1))
     if how == "double one":
@@ -336,7 +336,7 @@ def disordered(data: st.DataObject, entries: list[Any]) -> list[Any]:
     return swapped
 
 
-def test_of_a_run_that_was_broken_off_nothing_tells_how_long_its_traces_should_be(directory: Path) -> None:
+def test_interrupted_run_has_traces_of_unknown_length(directory: Path) -> None:
     def break_off(document: Document) -> None:
         document.update(outcome="running", agents={})
 
@@ -368,7 +368,7 @@ def test_report_before_the_last_handler_run_may_differ_from_the_export(
         document["agents"]["1"].update(idle=False, handler_runs=[report])
 
     edit(directory / "run.json", report_busy)
-    assert ("it was not idle at the end" in said(judged(directory))) != agrees
+    assert ("it was not idle at the end" in details(judged(directory))) != agrees
 
 
 @pytest.mark.parametrize(
@@ -379,7 +379,7 @@ def test_report_before_the_last_handler_run_may_differ_from_the_export(
         (-20, 0, "but the counters of the kernel for its vehicle have"),
     ],
 )
-def test_the_kernel_counted_what_was_sent_and_heard(
+def test_counters_of_the_kernel_are_compared_with_traces(
     tmp_path: Path, passed: int, lost: int, sentence: str | None
 ) -> None:
     asked = scenario(agents=3, duration_s=200, events={"source": "random", "mean_s": 5})
@@ -387,7 +387,7 @@ def test_the_kernel_counted_what_was_sent_and_heard(
     sent = {agent: sum(len(step.get("sent", ())) for step in lines(trace(directory, agent))) for agent in (1, 2, 3)}
 
     def count(document: Document) -> None:
-        """As a run of processes has it, with so many more or fewer for agent 2."""
+        """Add the counters of the kernel. Those of agent 2 differ by `passed` and `lost`."""
         others = {agent: sum(sent.values()) - sent[agent] for agent in sent}
         receivers = {str(agent): {"passed": others[agent], "lost": 0, "cut": 0} for agent in sent}
         receivers["2"] |= {"passed": max(0, others[2] + passed), "lost": min(lost, others[2])}
@@ -398,7 +398,7 @@ def test_the_kernel_counted_what_was_sent_and_heard(
     if sentence is None:
         assert result.beside["records"].verdict == "agree"
     else:
-        assert sentence in said(result)
+        assert sentence in details(result)
 
 
 def lines(path: Path) -> list[Document]:

@@ -1,4 +1,4 @@
-"""The step judge: each step of each agent against the reference core."""
+"""The step judge compares each step of each agent with the reference."""
 
 import dataclasses
 import json
@@ -41,7 +41,7 @@ def with_traces(evidence: Evidence, traces: dict[int, Trace]) -> Evidence:
 
 
 def edited(evidence: Evidence, agent: int, change: Callable[[list[HandlerRun]], Any]) -> Evidence:
-    """The evidence with another trace of this agent."""
+    """Return the evidence with a changed trace of this agent."""
     runs = [HANDLER_RUN.validate_json(run.to_line()) for run in evidence.traces[agent].runs]
     change(runs)
     return with_traces(evidence, {**evidence.traces, agent: dataclasses.replace(evidence.traces[agent], runs=runs)})
@@ -68,14 +68,14 @@ def commit(runs: list[HandlerRun]) -> HandlerRun:
 
 
 def without_expiry(runs: list[HandlerRun]) -> None:
-    """Nothing of all that the first end of a vote had for a consequence."""
+    """Remove the first end of a vote, and all handler runs that it triggered."""
     position = runs.index(expiry(runs))
     del runs[position]
     while runs[position].trigger.kind == "local":
         del runs[position]
 
 
-def test_the_reference_does_what_the_reference_does(honest: Evidence) -> None:
+def test_unaltered_run_is_as_specified(honest: Evidence) -> None:
     judgement = steps.check(honest)
     assert judgement.verdict == "as specified"
     assert judgement.reason.startswith(f"{sum(len(trace.runs) for trace in honest.traces.values())} handler runs")
@@ -98,7 +98,7 @@ def test_the_reference_does_what_the_reference_does(honest: Evidence) -> None:
     ],
     ids=["clocks", "readings", "timers", "asking", "reboot", "restart", "pause", "netem"],
 )
-def test_what_an_agent_may_choose_or_suffer_is_no_finding(keys: dict[str, Any]) -> None:
+def test_settings_clocks_and_faults_are_no_deviation(keys: dict[str, Any]) -> None:
     judgement = judged(**{**LOSSY, **keys})
     assert judgement.verdict == "as specified", judgement
 
@@ -118,7 +118,7 @@ def test_what_an_agent_may_choose_or_suffer_is_no_finding(keys: dict[str, Any]) 
         ("give_up_unfinished", "reconcile_phase_3_timer_expiration", "it triggered nothing; it should have triggered"),
     ],
 )
-def test_a_wrong_agent_is_named_by_what_it_did_first(quirk: str, handler: str, sentence: str) -> None:
+def test_wrong_agent_is_reported_at_its_first_deviation(quirk: str, handler: str, sentence: str) -> None:
     judgement = judged(network={"loss": 0.3}, duration_s=1200, quirks={quirk: True})
     assert judgement.verdict == "deviates"
     assert judgement.evidence[0].handler == handler
@@ -137,8 +137,8 @@ def test_one_mistake_is_one_finding(honest: Evidence) -> None:
     assert "it took the branch 'disapprove'; it should have taken 'approve'" in finding.detail
 
 
-def test_an_agent_that_goes_on_is_compared_from_its_own_state(honest: Evidence) -> None:
-    """It says to have committed nothing, and all that follows is said of a shorter chain: that is one mistake, too."""
+def test_agent_is_followed_from_its_own_state_after_a_deviation(honest: Evidence) -> None:
+    """An agent that ignores a commit has a shorter chain afterwards. Each ignored commit is one difference."""
     simulated = simulate(scenario(**LOSSY, quirks={"ignore_commit": 0.1}), 1, tracing=True)
     ignored = sum(
         run.branch == "ignored by quirk" for trace in simulated.evidence.traces.values() for run in trace.runs
@@ -181,7 +181,7 @@ def test_an_agent_that_goes_on_is_compared_from_its_own_state(honest: Evidence) 
         (lambda runs: runs.insert(9, HANDLER_RUN.validate_json(runs[9].to_line())), "; it should have "),
     ],
 )
-def test_what_a_record_lacks_or_has_too_much_of_is_found(
+def test_missing_or_superfluous_parts_of_a_trace_are_found(
     honest: Evidence, change: Callable[[list[HandlerRun]], Any], sentence: str
 ) -> None:
     judgement = steps.check(edited(honest, 4, change))
@@ -191,7 +191,7 @@ def test_what_a_record_lacks_or_has_too_much_of_is_found(
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_any_line_that_says_something_else_is_found(honest: Evidence, data: st.DataObject) -> None:
+def test_any_changed_line_of_a_trace_is_found(honest: Evidence, data: st.DataObject) -> None:
     agent = data.draw(st.sampled_from(sorted(honest.traces)))
     number = data.draw(st.integers(0, len(honest.traces[agent].runs) - 1))
     document = json.loads(honest.traces[agent].runs[number].to_line())
@@ -211,13 +211,13 @@ def test_any_line_that_says_something_else_is_found(honest: Evidence, data: st.D
     assert any(finding.agent_id == agent for finding in judgement.evidence)
 
 
-def test_a_run_that_was_never_text_is_as_its_line_says(honest: Evidence) -> None:
+def test_handler_run_in_memory_equals_its_line(honest: Evidence) -> None:
     for trace in honest.traces.values():
         read = [HANDLER_RUN.validate_json(run.to_line()) for run in trace.runs]
         assert read == [dataclasses.replace(run, t=round(run.t, 6)) for run in trace.runs]
 
 
-def test_a_datagram_that_was_dropped_and_is_good_is_found(honest: Evidence) -> None:
+def test_dropped_valid_datagram_is_found(honest: Evidence) -> None:
     trace = honest.traces[3]
     request = first_run(trace.runs, "receive_request_add_block")
     assert request.input is not None
@@ -231,7 +231,7 @@ def test_a_datagram_that_was_dropped_and_is_good_is_found(honest: Evidence) -> N
     assert "it dropped a Block Add Request of agent" in finding.detail
 
 
-def test_an_agent_need_not_tell_what_it_counts_and_which_timers_it_starts(honest: Evidence) -> None:
+def test_tallies_and_started_timers_are_optional(honest: Evidence) -> None:
     def silent(runs: list[HandlerRun]) -> None:
         for run in runs:
             run.tally = run.started = None
@@ -245,7 +245,7 @@ def test_an_agent_need_not_tell_what_it_counts_and_which_timers_it_starts(honest
     assert steps.check(edited(honest, 1, votes_only)).verdict == "as specified"
 
 
-def test_who_tells_which_timers_it_starts_is_found_when_it_starts_none(honest: Evidence) -> None:
+def test_missing_start_of_a_timer_is_found(honest: Evidence) -> None:
     def start_nothing(runs: list[HandlerRun]) -> None:
         first_run(runs, "process_next_deque_block", "proposed").started = None
 
@@ -253,7 +253,7 @@ def test_who_tells_which_timers_it_starts_is_found_when_it_starts_none(honest: E
     assert "it started no timer; it should have started the voting timer for 10 s" in judgement.evidence[0].detail
 
 
-def test_of_a_trace_of_the_first_version_steps_are_not_judged(honest: Evidence) -> None:
+def test_trace_of_version_1_is_not_judged(honest: Evidence) -> None:
     header = Header.model_validate(honest.traces[2].header.model_dump() | {"schema": "ucp-trace/1"})
     old = dataclasses.replace(honest.traces[2], header=header)
     judgement = steps.check(with_traces(honest, {**honest.traces, 2: old}))
@@ -270,26 +270,26 @@ def test_agent_with_a_setting_that_the_reference_lacks_is_not_judged(monkeypatch
     assert "the settings include phase1_tie, which the reference lacks" in judgement.reason
 
 
-def test_without_a_trace_of_everybody_steps_are_not_as_specified(honest: Evidence) -> None:
+def test_missing_trace_makes_steps_not_applicable(honest: Evidence) -> None:
     assert steps.check(with_traces(honest, {})).verdict == "not applicable"
     some = {agent: trace for agent, trace in honest.traces.items() if agent != 5}
     judgement = steps.check(with_traces(honest, some))
     assert (judgement.verdict, judgement.reason) == ("not applicable", "of agent 5 there is no trace")
 
 
-def test_a_mission_that_cannot_be_is_told(honest: Evidence) -> None:
+def test_impossible_header_is_a_deviation(honest: Evidence) -> None:
     trace = honest.traces[1]
-    for part, told in (
+    for part, sentence in (
         ({"settings": {"vote_timeout_s": -1}}, "the header of its trace has invalid settings"),
         ({"clock": {"speedup": 0}}, "clock"),
     ):
         header = trace.header.model_copy(update=part)
         judgement = steps.check(with_traces(honest, {**honest.traces, 1: dataclasses.replace(trace, header=header)}))
         assert judgement.verdict == "deviates"
-        assert told in judgement.evidence[0].detail
+        assert sentence in judgement.evidence[0].detail
 
 
-def test_an_agent_that_holds_what_nobody_can_know_is_followed_no_further(honest: Evidence) -> None:
+def test_agent_with_an_unrecorded_block_is_not_followed(honest: Evidence) -> None:
     def conjure(runs: list[HandlerRun]) -> None:
         runs[3].changes.append(("chain+", "ab" * 32))
         runs[3].state.chain += 1
@@ -301,7 +301,7 @@ def test_an_agent_that_holds_what_nobody_can_know_is_followed_no_further(honest:
     )
 
 
-def test_an_agent_that_goes_on_wrongly_from_a_broken_reconcile_is_followed_all_the_same() -> None:
+def test_agent_is_followed_after_a_wrong_boot() -> None:
     agent = Agent(1, [1, 2], b"mission")
     stack = [Block(1, 5, b"below"), Block(1, 6, b"above")]
     agent.boot(StoredState(completed=[block.block_hash for block in stack], stack=stack), 0.0)
@@ -317,7 +317,7 @@ def test_an_agent_that_goes_on_wrongly_from_a_broken_reconcile_is_followed_all_t
 
 
 def left_out(good: Any, core: Core, *inputs: object, branch: str) -> str:
-    """The handler says that it took the branch, and does nothing."""
+    """Return the branch without doing anything."""
     return branch
 
 
@@ -328,11 +328,11 @@ def done_twice(good: Any, core: Core, *inputs: object) -> str:
 
 
 def nothing(good: Any, core: Core, *arguments: object) -> None:
-    """In the place of what the core does for a handler."""
+    """Replace a function of the core, and do nothing."""
 
 
 def mistakes(handler: EventHandler[Any]) -> Iterator[Quirk]:
-    """All mistakes of the simplest kinds that an implementation of this handler can make."""
+    """Yield the simplest mistakes of this handler: to do nothing, to run twice, or to omit one kind of action."""
     wrong = {f"takes {branch}": partial(left_out, branch=branch) for branch in handler.branches}
     for name, run in {**wrong, "twice": done_twice}.items():
         yield mistake(handler, name, run, None)
@@ -349,25 +349,25 @@ def mistake(handler: EventHandler[Any], name: str, wrong: Callable[..., Any], he
     return Quirk(name, name, (handler.algorithm,), wrong, helper, (), *may, chance=False)
 
 
-def told(evidence: Evidence) -> list[str]:
+def trace_lines(evidence: Evidence) -> list[str]:
     return [run.to_line() for _, trace in sorted(evidence.traces.items()) for run in trace.runs]
 
 
 @pytest.fixture(scope="module")
 def right() -> list[str]:
-    return told(simulate(scenario(**LOSSY), 1, tracing=True, deliver_all=True).evidence)
+    return trace_lines(simulate(scenario(**LOSSY), 1, tracing=True, deliver_all=True).evidence)
 
 
 @pytest.mark.parametrize("handler", HANDLERS.values(), ids=lambda handler: handler.name)
-def test_whatever_a_handler_leaves_out_or_does_twice_is_found_and_named(
+def test_omitted_or_doubled_actions_of_a_handler_are_found(
     handler: EventHandler[Any], right: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What makes no difference in this mission cannot be found in it."""
+    """Mistakes that do not change this mission are skipped."""
     different = 0
     for quirk in mistakes(handler):
         monkeypatch.setitem(QUIRKS, quirk.name, quirk)
         run = simulate(scenario(**LOSSY, settle={"limit_s": 100}, quirks={quirk.name: True}), 1, tracing=True)
-        if told(run.evidence) == right:
+        if trace_lines(run.evidence) == right:
             continue
         different += 1
         judgement = run.result.beside["steps"]
@@ -376,7 +376,7 @@ def test_whatever_a_handler_leaves_out_or_does_twice_is_found_and_named(
     assert different
 
 
-def test_handlers_that_there_are_not_are_not_judged_however_many_names_they_have(honest: Evidence) -> None:
+def test_unknown_handlers_are_not_judged_and_the_reason_is_short(honest: Evidence) -> None:
     def rename(runs: list[HandlerRun]) -> None:
         for number, run in enumerate(runs):
             run.handler = f"handler_{number}" * 20
@@ -387,7 +387,7 @@ def test_handlers_that_there_are_not_are_not_judged_however_many_names_they_have
     assert len(judgement.reason) < 500
 
 
-def test_what_an_agent_did_wrong_before_it_said_what_nobody_knows_is_found(honest: Evidence) -> None:
+def test_deviation_before_an_unknown_handler_is_found(honest: Evidence) -> None:
     def first_wrong_then_unknown(runs: list[HandlerRun]) -> None:
         proposal(runs).sent.clear()
         runs[-1].handler = "no_handler"
@@ -397,17 +397,19 @@ def test_what_an_agent_did_wrong_before_it_said_what_nobody_knows_is_found(hones
     assert "it sent nothing; it should have sent" in judgement.evidence[0].detail
 
 
-def test_of_a_step_with_an_unknown_branch_all_else_is_compared(honest: Evidence) -> None:
-    def otherwise(runs: list[HandlerRun]) -> None:
+def test_step_with_an_unknown_branch_is_compared_otherwise(honest: Evidence) -> None:
+    def rename_branches(runs: list[HandlerRun]) -> None:
         for run in runs:
             run.branch = run.branch.upper()
 
-    judgement = steps.check(edited(honest, 3, otherwise))
+    judgement = steps.check(edited(honest, 3, rename_branches))
     assert (judgement.verdict, "unknown branch 'BUILDING' of build_data_block" in judgement.reason) == (
         "not applicable",
         True,
     )
-    judgement = steps.check(edited(honest, 3, lambda runs: (otherwise(runs), proposal_in_capitals(runs).sent.clear())))
+    judgement = steps.check(
+        edited(honest, 3, lambda runs: (rename_branches(runs), proposal_in_capitals(runs).sent.clear()))
+    )
     assert judgement.verdict == "deviates"
     (finding, *_) = judgement.evidence
     assert "branch" not in finding.detail
@@ -418,5 +420,5 @@ def proposal_in_capitals(runs: list[HandlerRun]) -> HandlerRun:
 
 
 @pytest.mark.parametrize("moment", [math.nan, math.inf, -1e300, 1e300])
-def test_a_moment_that_cannot_be_is_no_traceback(honest: Evidence, moment: float) -> None:
+def test_impossible_time_causes_no_exception(honest: Evidence, moment: float) -> None:
     steps.check(edited(honest, 2, lambda runs: setattr(runs[7], "t", moment)))

@@ -1,4 +1,4 @@
-"""Which blocks survive which loss of vehicles, and which loss the swarm could bear, in runs with a known answer."""
+"""The blocks that survive a loss of vehicles, and the loss that a swarm can bear, in runs with a known answer."""
 
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ ATTRITION = Path(__file__).parents[3] / "scenarios" / "attrition.yaml"
 
 
 def evidence(timeline: list[dict[str, Any]], *, tracing: bool = True, **keys: Any) -> Evidence:
-    """Agent 1 completes a block at 10 s, agent 3 one at 15 s; each is committed where it is heard ten seconds later."""
+    """Play a run in which agent 1 completes a block at 10 s, and agent 3 at 15 s. Receivers commit them 10 s later."""
     script = [{"at_s": 10, "agent": 1}, {"at_s": 15, "agent": 3}]
     one = scenario(
         agents=4,
@@ -38,7 +38,7 @@ def counts(loss: Loss) -> tuple[int | None, ...]:
     return loss.completed, loss.survived, loss.gone, loss.gone_at_end
 
 
-def test_a_block_that_only_the_lost_vehicles_held_is_gone() -> None:
+def test_block_that_only_lost_vehicles_held_is_gone() -> None:
     survived = survival(evidence([PAIRS, {"at_s": 100, "kill": [1, 2]}, {"at_s": 110, "heal": True}]))
     (loss,) = survived.losses
     assert (loss.at_s, loss.what, loss.vehicles) == (100, "kill", [1, 2])
@@ -50,7 +50,7 @@ def test_a_block_that_only_the_lost_vehicles_held_is_gone() -> None:
     assert (survived.at_end.holders, survived.at_end.vehicles, survived.at_end.of) == ([3, 4], 2, 1)
 
 
-def test_a_block_survives_its_maker_on_others_until_they_are_lost_too() -> None:
+def test_block_survives_on_other_vehicles_until_they_are_lost() -> None:
     survived = survival(evidence([PAIRS, {"at_s": 100, "crash": [1]}, {"at_s": 200, "kill": [2]}]))
     first, second = survived.losses
     assert counts(first) == (2, 2, 0, 1)
@@ -59,32 +59,32 @@ def test_a_block_survives_its_maker_on_others_until_they_are_lost_too() -> None:
     assert [block.agent_id for block in second.blocks] == [1]
 
 
-def test_before_a_block_is_committed_only_its_maker_has_it() -> None:
+def test_only_its_maker_holds_a_block_before_the_commit() -> None:
     survived = survival(evidence([{"at_s": 18, "kill": [1]}]))
     assert counts(survived.losses[0]) == (2, 1, 1, 1)
     at_once = survival(evidence([{"at_s": 12, "kill": [3]}]))
     assert counts(at_once.losses[0]) == (1, 1, 0, 0)
 
 
-def test_what_is_completed_later_does_not_count_and_what_is_in_that_instant_does() -> None:
+def test_block_completed_at_the_instant_of_a_loss_counts() -> None:
     survived = survival(evidence([{"at_s": 10, "kill": [2]}]))
     assert counts(survived.losses[0]) == (1, 1, 0, 0)
 
 
 @pytest.mark.parametrize(("disk", "gone"), [("kept", [0]), ("lost", [0, 1])])
-def test_the_disk_of_a_vehicle_that_reboots_counts_if_it_is_kept(disk: str, gone: list[int]) -> None:
+def test_kept_disk_of_a_rebooting_vehicle_counts(disk: str, gone: list[int]) -> None:
     reboot = {"at_s": 100, "reboot": [2], "down_s": 50, "disk": disk}
     survived = survival(evidence([PAIRS, reboot, {"at_s": 120, "kill": [1]}]))
     assert [loss.gone for loss in survived.losses] == gone
 
 
-def test_a_vehicle_that_came_back_with_nothing_holds_nothing_of_before() -> None:
+def test_restarted_vehicle_holds_no_earlier_blocks() -> None:
     back = [{"at_s": 50, "kill": [2]}, {"at_s": 60, "restart": [2]}]
     survived = survival(evidence([PAIRS, *back, {"at_s": 100, "kill": [1]}]))
     assert [loss.gone for loss in survived.losses] == [0, 1]
 
 
-def test_the_next_loss_is_named_by_the_block_that_the_fewest_hold() -> None:
+def test_next_loss_is_that_of_the_block_with_the_fewest_holders() -> None:
     survived = survival(evidence([{"at_s": 0, "partition": [[1], [2, 3, 4]]}], final_reconcile=True))
     before, after = survived.before_final_reconcile, survived.at_end
     assert before is not None and after is not None
@@ -93,19 +93,19 @@ def test_the_next_loss_is_named_by_the_block_that_the_fewest_hold() -> None:
     assert not survived.losses
 
 
-def test_without_all_traces_only_the_end_is_known() -> None:
+def test_only_the_end_is_known_without_all_traces() -> None:
     survived = survival(evidence([PAIRS, {"at_s": 100, "kill": [1, 2]}], tracing=False))
     assert counts(survived.losses[0]) == (None, None, None, None)
     assert survived.gone == 1
     assert "the traces do not show which blocks were lost" in in_words(survived)[0]
 
 
-def test_nothing_at_all_is_no_survival() -> None:
+def test_empty_evidence_has_no_losses() -> None:
     assert survival(Evidence({})) == Survival(completed=0, gone=0)
     assert in_words(Survival(completed=0, gone=0)) == []
 
 
-def test_it_is_told_in_words() -> None:
+def test_survival_is_described_in_words() -> None:
     assert in_words(survival(evidence([PAIRS, {"at_s": 100, "kill": [1, 2]}]))) == [
         "at 100 s vehicles 1 and 2 were lost (kill), and with them 1 of 2 completed blocks",
         "at the end 1 of 2 completed blocks is gone",
@@ -124,7 +124,7 @@ def test_it_is_told_in_words() -> None:
     assert in_words(survival(evidence(many)))[5] == "2 more losses of vehicles are in run.json"
 
 
-def test_the_scenario_of_attrition_answers_the_thesis_s_question_from_its_directory_too(tmp_path: Path) -> None:
+def test_attrition_scenario_shows_survival_also_from_its_directory(tmp_path: Path) -> None:
     one = load_scenario(ATTRITION)
     finished = run(one, 2, tmp_path / "run", Silent(), "sim")
     assert finished.exit_status == 0

@@ -1,4 +1,4 @@
-"""How late the agents' vote timers fired, from traces made by hand."""
+"""The lateness of vote timers, computed from synthetic traces."""
 
 import pytest
 
@@ -15,7 +15,7 @@ def _run(t: float, handler: str, branch: str, reconciling: bool = False) -> Hand
 
 
 def _votes(*late_s: float, reconciling: bool = False) -> Trace:
-    """An agent whose votes, set to 10 s, ended so late."""
+    """Return the trace of an agent whose voting timers of 10 s ended this late."""
     header = Header(agent_id=1, roster=[1], settings={"vote_timeout_s": 10.0}, clock={})
     runs = [
         run
@@ -38,16 +38,14 @@ def test_lateness_is_that_of_the_latest_twentieth(late_s: float, tolerable: bool
     assert found.tolerable is tolerable
 
 
-def test_one_late_timer_of_many_is_nothing_to_speak_of() -> None:
+def test_one_late_timer_of_many_is_tolerable() -> None:
     found = timer_lag([_votes(*[0.01] * 99, 5.0)])
     assert found is not None
     assert found.tolerable
 
 
 @pytest.mark.parametrize(("machine_s", "tolerable"), [(0.001, True), (1.0, False)])
-def test_lateness_that_the_measured_lag_does_not_explain_is_not_of_the_machine(
-    machine_s: float, tolerable: bool
-) -> None:
+def test_lateness_beyond_the_measured_lag_is_not_attributed_to_the_machine(machine_s: float, tolerable: bool) -> None:
     votes = _votes(*[5.0] * 40)
     votes.header.clock["speedup"] = 20
     line = {"from_s": 0, "until_s": 10_000, "machine_s": machine_s, "busy_s": {"1": 0.0}}
@@ -56,9 +54,9 @@ def test_lateness_that_the_measured_lag_does_not_explain_is_not_of_the_machine(
     assert found.tolerable is tolerable
 
 
-def test_too_few_votes_tell_nothing() -> None:
+def test_too_few_votes_give_no_result() -> None:
     assert timer_lag([_votes(*[5.0] * (ENOUGH - 1))]) is None
 
 
-def test_a_vote_that_a_reconcile_paused_does_not_count() -> None:
+def test_vote_paused_by_a_reconcile_does_not_count() -> None:
     assert timer_lag([_votes(*[50.0] * 100, reconciling=True)]) is None
