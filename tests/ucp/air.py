@@ -1,4 +1,4 @@
-"""A few agents on a simulated air, for tests: virtual time, and a fate for every single delivery."""
+"""A few agents in virtual time, with a chosen delay or loss for each delivery."""
 
 import heapq
 import itertools
@@ -12,7 +12,10 @@ from ucp.settings import Settings
 from ucp.trace import HandlerRun
 
 Fate = Callable[[int, int, Message], list[float]]
-"""(sender, receiver, message) -> delays in seconds, one per delivery; [] loses the message."""
+"""Function of (sender, receiver, message) that returns the delays of the deliveries in seconds.
+
+[] loses the message.
+"""
 
 INITIAL_DATA = b"test mission"
 
@@ -41,7 +44,7 @@ class Air:
         self.flush(agent_id)
 
     def fill_block(self, agent_id: int) -> bytes:
-        """Log events until a block is complete; its hash."""
+        """Log events until a block is complete, and return its hash."""
         agent = self.agents[agent_id]
         count = len(agent.state.completed)
         while len(agent.state.completed) == count:
@@ -49,13 +52,13 @@ class Air:
         return agent.state.completed[-1]
 
     def reconcile(self, agent_id: int) -> None:
-        """Have the agent reconcile, and wait until all are done."""
+        """Start a reconcile of the agent, and run until no event is left."""
         self.agents[agent_id].begin_reconcile(self.now)
         self.flush(agent_id)
         self.settle()
 
     def flush(self, agent_id: int) -> None:
-        """Put what the agent broadcasts on the air."""
+        """Schedule the deliveries of the messages that the agent broadcasts."""
         agent = self.agents[agent_id]
         for sequence, message in agent.messages_to_send():
             datagram = encode(agent_id, sequence, message)
@@ -72,7 +75,7 @@ class Air:
         return min(times, default=None)
 
     def step(self) -> bool:
-        """The next delivery, timer or event; False if nothing is left to happen."""
+        """Run the next delivery, timer or event. Return False if none is left."""
         time = self.next_time()
         if time is None:
             return False
@@ -102,7 +105,7 @@ class Air:
         self.now = time
 
     def settle(self, limit_s: float = 3600.0) -> None:
-        """Run until nothing is left to happen."""
+        """Run until no delivery, timer or event is left."""
         limit = self.now + limit_s
         while self.step():
             assert self.now < limit, "the agents did not become idle"
@@ -122,7 +125,7 @@ def uniform_latency(rng: Random, low_s: float = 0.002, high_s: float = 0.05, los
 
 
 def assert_characteristics_2_to_4(agent: Agent, completed_by: dict[int, set[bytes]]) -> None:
-    """Characteristics 2, 3 and 4 of one agent, from its state."""
+    """Assert characteristics 2, 3 and 4 of an agent from its state."""
     chain = [block.block_hash for block in agent.state.chain]
     aside = [block.block_hash for block in (*agent.state.blocks_to_be_committed, *agent.state.reconcile_stack)]
     if agent.state.idle:

@@ -1,7 +1,7 @@
-"""Which tests take which branch of the 20 event handlers; `python -m tests.ucp.branches` writes it down.
+"""The tests that take each branch of the 20 event handlers. `python -m tests.ucp.branches` writes them to BRANCHES.md.
 
-A test names the branches that it is about, `@takes("vote_timer_expiration", "approved", "chain changed")`, and fails
-if no agent takes them while it runs (`conftest.py`). `test_branches.py` fails while a branch has no such test.
+A test declares its branches, for example `@takes("vote_timer_expiration", "approved", "chain changed")`. It fails if no
+agent takes them while it runs (`conftest.py`). `test_branches.py` fails if a branch has no such test.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -19,7 +19,7 @@ from ucp.agent import HANDLERS
 from ucp.handler import EventHandler
 
 Branch = tuple[str, str]
-"""(handler, branch)"""
+"""A handler and one of its branches."""
 
 PAGE = Path(ucp.__path__[0]) / "contract" / "BRANCHES.md"
 
@@ -160,19 +160,22 @@ WHEN: dict[str, dict[str, str]] = {
 
 
 def takes(handler: str, *branches: str) -> pytest.MarkDecorator:
-    """The test takes these branches of `handler`. Can be given repeatedly, and as `marks` to one `pytest.param`."""
+    """Declare that a test takes these branches of `handler`.
+
+    It can be repeated, and used as a mark of a `pytest.param`.
+    """
     return pytest.mark.branch(handler=handler, branches=branches)
 
 
 def declared(marks: Iterable[pytest.Mark | pytest.MarkDecorator]) -> set[Branch]:
-    """The branches that a test with these marks takes."""
+    """Return the branches that a test with these marks declares."""
     taken = (mark.kwargs for mark in marks if mark.name == "branch")
     return {(branches["handler"], branch) for branches in taken for branch in branches["branches"]}
 
 
 @contextmanager
 def recorded() -> Iterator[set[Branch]]:
-    """The branches that the agents take meanwhile."""
+    """Collect the branches that agents take inside the context."""
     taken: set[Branch] = set()
 
     def recording(handler: EventHandler[Any]) -> Callable[..., str]:
@@ -193,7 +196,7 @@ def recorded() -> Iterator[set[Branch]]:
 
 
 def taken_by() -> dict[Branch, list[str]]:
-    """The tests in this folder that take each branch; one that may be skipped or is expected to fail does not count."""
+    """Return the tests in this folder that take each branch. Tests that may be skipped or to fail do not count."""
     tests: dict[Branch, list[str]] = {}
     for path in sorted(Path(__file__).parent.glob("test_*.py")):
         for name, test in _tests_in(import_module(f"{__package__}.{path.stem}")):

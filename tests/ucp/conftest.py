@@ -1,4 +1,4 @@
-"""A test takes the branches that it declares, or fails."""
+"""Fail a test that does not take the branches that it declares."""
 
 from collections.abc import Generator
 

@@ -1,4 +1,4 @@
-"""Messages with real events in their blocks, and what a bad radio makes of datagrams."""
+"""Random messages with real events in their blocks, and damaged datagrams."""
 
 from hypothesis import strategies as st
 
@@ -21,7 +21,7 @@ datagrams = st.builds(encode, senders, sequences, all_messages)
 
 @st.composite
 def damaged(draw: st.DrawFn) -> bytes:
-    """A datagram with some bytes changed, most of them near its beginning, cut off, or with others behind it."""
+    """Draw a datagram with changed bytes (mostly near its beginning), a missing end, or additional bytes."""
     datagram = bytearray(draw(datagrams))
     for _ in range(draw(st.integers(0, 3))):
         place = draw(st.integers(0, 16) | st.integers(0, len(datagram) - 1))

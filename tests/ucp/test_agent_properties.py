@@ -1,4 +1,4 @@
-"""What holds after every step, whatever the radio, the clock and the neighbours do."""
+"""Properties that hold after each step, for any behaviour of radio, clock and neighbours."""
 
 import base64
 import pickle
@@ -18,7 +18,7 @@ from ucp.trace import DroppedDatagram
 
 
 def state_of(agent: Agent) -> bytes:
-    """Everything but the counters of what was received and dropped."""
+    """Return the state without the counters of received and dropped datagrams."""
     state = {name: value for name, value in vars(agent.state).items() if name not in ("now", "running")}
     return pickle.dumps({**state, "chain": vars(agent.state.chain), "trace": vars(agent)["_trace"]})
 
@@ -36,7 +36,7 @@ hostile = st.one_of(
 
 
 @given(st.lists(hostile, min_size=1, max_size=20), st.booleans())
-def test_hostile_input_is_counted_and_dropped_and_changes_nothing(datagrams: list[bytes], reconciling: bool) -> None:
+def test_hostile_datagram_is_counted_and_changes_no_state(datagrams: list[bytes], reconciling: bool) -> None:
     air = Air([1, 2])
     air.fill_block(1)
     agent = air.agents[1]
@@ -62,7 +62,7 @@ def test_hostile_input_is_counted_and_dropped_and_changes_nothing(datagrams: lis
     assert state_of(agent) == before
 
 
-def test_a_block_of_an_agent_that_is_not_on_the_roster_is_dropped() -> None:
+def test_block_of_an_agent_outside_the_roster_is_dropped() -> None:
     agent = Agent(1, [1, 2], b"")
     block = Block(3, 1, b"x")
     commit = CommitBlock(block, next_chain_hash(agent.state.chain.top_chain_hash, block.block_hash))
@@ -72,7 +72,7 @@ def test_a_block_of_an_agent_that_is_not_on_the_roster_is_dropped() -> None:
 
 
 @given(st.lists(messages, max_size=30), st.integers(0, 3))
-def test_well_formed_messages_of_a_liar_never_break_characteristics_2_and_3(lies: list[Message], blocks: int) -> None:
+def test_false_messages_never_break_characteristics_2_and_3(lies: list[Message], blocks: int) -> None:
     air = Air(range(1, 65), fate=lambda *_: [])
     for _ in range(blocks):
         air.fill_block(1)
@@ -120,7 +120,7 @@ def test_characteristics_2_to_4_hold_after_every_step(
 
 @settings(max_examples=25)
 @given(loss=st.sampled_from([0.0, 0.15, 0.5]), seed=st.integers(0, 2**32))
-def test_equal_inputs_give_equal_outputs_and_traces_replay_to_the_state(loss: float, seed: int) -> None:
+def test_equal_inputs_give_equal_outputs_and_a_trace_replays(loss: float, seed: int) -> None:
     def run() -> Air:
         rng = Random(seed)
         air = Air(range(1, 5), lambda *_: [] if rng.random() < loss else [rng.uniform(0.002, 0.05)])

@@ -1,4 +1,4 @@
-"""Hashes are the thesis's equations, and the chain is a stack that answers by hash."""
+"""Hashes follow the equations of the thesis, and a chain finds its blocks by hash."""
 
 import hashlib
 

@@ -1,5 +1,4 @@
-"""The agent in C, `ucp/contract/examples/ucp_agent.c`: what any agent has to do, and what only a program in C can get
-wrong."""
+"""The agent in C (`ucp/contract/examples/ucp_agent.c`): the duties of any agent, and errors that only C allows."""
 
 import json
 import os
@@ -63,7 +62,7 @@ def agent(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same, but it ends as soon as it does what C does not define, or leaks."""
+    """The agent in C with sanitizers. It ends at the first undefined behaviour or memory leak."""
     folder = tmp_path_factory.mktemp("checked")
     probe = ["cc", "-fsanitize=address,undefined", "-x", "c", "-o", folder / "probe", "-"]
     if shutil.which("cc") and subprocess.run(probe, input=b"int main(void){return 0;}", check=False).returncode != 0:
@@ -74,7 +73,7 @@ def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def secured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same with keys, and it ends as soon as it does what C does not define, or leaks."""
+    """The secured agent in C with sanitizers. It ends at the first undefined behaviour or memory leak."""
     folder = tmp_path_factory.mktemp("secured")
     probe = ["cc", "-fsanitize=address,undefined", "-x", "c", "-o", folder / "probe", "-", "-lcrypto"]
     code = b"#include <openssl/evp.h>\nint main(void){return EVP_chacha20_poly1305() == 0;}"
@@ -111,30 +110,30 @@ def vectors(name: str) -> Any:
 
 
 @pytest.mark.parametrize("name", sorted(TRANSCRIPTS - SECURED))
-def test_a_transcript(name: str, player: Player) -> None:
+def test_c_agent_plays_each_transcript(name: str, player: Player) -> None:
     assert play(player, INDEX.with_name(f"{name}.jsonl")) is None
 
 
 @pytest.mark.parametrize("name", sorted(SECURED))
-def test_a_transcript_with_keys(name: str, player: Player, secured: Path) -> None:
+def test_c_agent_plays_the_secured_transcript(name: str, player: Player, secured: Path) -> None:
     lacks = play(player, INDEX.with_name(f"{name}.jsonl"))
     assert lacks is not None and lacks.startswith("not supported")
     with Player([str(secured)]) as playing:
         assert play(playing, INDEX.with_name(f"{name}.jsonl")) is None
 
 
-def test_missions_in_doubt_are_played_or_refused(agent: Path, secured: Path, tmp_path: Path) -> None:
+def test_agent_plays_or_refuses_ambiguous_missions_as_specified(agent: Path, secured: Path, tmp_path: Path) -> None:
     for command, features in ((agent, FEATURES), (secured, (*FEATURES, "secured", "sealed"))):
         assert not refusals.wrong_missions([str(command)], features)
         assert not refusals.wrong_exits([str(command)], features, tmp_path)
 
 
-def test_requests_in_doubt_are_answered_as_in_the_vectors(checked: Path, tmp_path: Path) -> None:
+def test_agent_answers_ambiguous_requests_as_in_the_vectors(checked: Path, tmp_path: Path) -> None:
     assert not refusals.wrong_answers([str(checked)], tmp_path)
 
 
-def test_generated_vectors(agent: Path) -> None:
-    """Pairs of a state and an input, each path of them from its mission to its end."""
+def test_c_agent_passes_generated_vectors(agent: Path) -> None:
+    """Return the generated paths. Each is a list of states with their inputs, from the mission to the end."""
     steps = list(explore(VARIANTS["default"]))[::8]
     lines = to_lines([VectorSet(VARIANTS["default"], steps, {step.key: step for step in steps})])
     by_number = {step["step"]: step for step in map(json.loads, lines) if "step" in step}
@@ -154,7 +153,7 @@ def test_generated_vectors(agent: Path) -> None:
             assert {key: answer[key] for key in step["out"]} == step["out"], step
 
 
-def test_what_is_dropped_and_why(player: Player) -> None:
+def test_c_agent_drops_datagrams_with_the_reasons_of_the_vectors(player: Player) -> None:
     drops = vectors("drops")
     player.give({"t": 0, "mission": mission(agent_id=drops["agent_id"], roster=drops["roster"])})
     for number, drop in enumerate(drops["datagrams"]):
@@ -162,7 +161,7 @@ def test_what_is_dropped_and_why(player: Player) -> None:
         assert line.get("dropped") == drop["dropped"], drop["what"]
 
 
-def test_blocks_and_when_they_are_full(player: Player) -> None:
+def test_c_agent_builds_the_blocks_of_the_vectors(player: Player) -> None:
     for case in vectors("blocks"):
         settings = {key: case[key] for key in ("max_block_bytes", "max_event_bytes")}
         player.give(
@@ -176,7 +175,7 @@ def test_blocks_and_when_they_are_full(player: Player) -> None:
                 assert line["changes"][0] == ["complete", event["block"]["block_hash"]]
 
 
-def test_inception_blocks(player: Player) -> None:
+def test_c_agent_computes_inception_blocks(player: Player) -> None:
     for block in vectors("hashes")["inception"]:
         player.give({"t": 0, "mission": mission(initial_data=block["initial_data"])})
         assert player.give({"t": 0, "command": "status"})["answer"]["top_chain_hash"] == block["chain_hash"]
@@ -195,7 +194,7 @@ def test_inception_blocks(player: Player) -> None:
         ({"roster": [1, 28]}, 2, "roster"),
     ],
 )
-def test_a_mission_that_it_cannot_play_is_one_sentence(
+def test_c_agent_refuses_a_mission_in_one_sentence(
     agent: Path, tmp_path: Path, changed: dict[str, Any], status: int, word: str
 ) -> None:
     (tmp_path / "7.mission.json").write_text(json.dumps(mission(**changed)))
@@ -204,8 +203,8 @@ def test_a_mission_that_it_cannot_play_is_one_sentence(
     assert word in done.stderr
 
 
-def test_hostile_lines_do_no_harm(checked: Path) -> None:
-    """Lines of transcripts with bytes that are wrong or missing: each is answered, and nothing leaks."""
+def test_hostile_lines_do_not_harm_the_c_agent(checked: Path) -> None:
+    """The agent answers damaged lines of transcripts, and leaks no memory."""
     random = Random(1)
     told = []
     for transcript in sorted(INDEX.parent.glob("*.jsonl")):
@@ -225,7 +224,7 @@ def test_hostile_lines_do_no_harm(checked: Path) -> None:
     assert 0 < sum("error" in answer for answer in answers) < len(told)
 
 
-def test_a_mission_in_virtual_time_with_ours_among_them(agent: Path, tmp_path: Path) -> None:
+def test_c_agents_and_our_agent_agree_in_virtual_time(agent: Path, tmp_path: Path) -> None:
     reboot = {"at_s": 130, "reboot": [3], "down_s": 5, "disk": "kept"}
     keys = {**HARD_RUN, "timeline": [*HARD_RUN["timeline"], reboot], "duration_s": 200}
     mixed = scenario(agents=3, agent_command={1: [str(agent)], 3: [str(agent)]}, **keys)
@@ -236,14 +235,14 @@ def test_a_mission_in_virtual_time_with_ours_among_them(agent: Path, tmp_path: P
     assert record["agents"]["1"]["version"] == "ucp_agent.c, 1"
 
 
-def test_without_keys_it_says_that_it_lacks_them(agent: Path) -> None:
+def test_c_agent_without_keys_reports_the_missing_feature(agent: Path) -> None:
     with Player([str(agent)]) as player:
         for keys in ({"features": ["secured"], "security": {"bundle": "7.json"}}, {"security": {"bundle": "7.json"}}):
             answer = player.give({"t": 0, "mission": mission(**keys)})
             assert answer["unsupported"] and "secured" in answer["error"]
 
 
-def test_with_keys_it_drops_what_is_to_be_dropped(secured: Path) -> None:
+def test_secured_c_agent_drops_the_datagrams_of_the_vectors(secured: Path) -> None:
     vectors = json.loads((VECTORS / "secured.json").read_text(encoding="ascii"))
     drops = vectors["drops"]
     told = mission(roster=drops["roster"], features=["secured"], security={"bundle": "7.bundle.json"})
@@ -271,8 +270,8 @@ SECURED_RUN: dict[str, Any] = {
 }
 
 
-def test_with_keys_it_is_ours_to_the_byte(secured: Path) -> None:
-    """Sealed and signed, rebooted, told of a revocation, and replayed to."""
+def test_secured_c_agent_sends_the_same_bytes_as_our_agent(secured: Path) -> None:
+    """The mission is sealed and has a reboot, a revocation and replayed datagrams."""
     ours = scenario(agents=4, security={"seal": True}, **SECURED_RUN)
     mixed = ours.model_copy(update={"agent_command": {1: [str(secured)], 3: [str(secured)]}})
     played, among_ours = simulate(mixed, 1, tracing=True), simulate(ours, 1, tracing=True, deliver_all=True)
@@ -288,7 +287,7 @@ def test_with_keys_it_is_ours_to_the_byte(secured: Path) -> None:
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_with_keys_over_udp_with_ours_among_them(secured: Path, tmp_path: Path) -> None:
+def test_secured_c_agents_and_our_agent_agree_over_udp(secured: Path, tmp_path: Path) -> None:
     commands = {1: [str(secured)], 3: [str(secured)]}
     keys = {"agents": 4, "agent_command": commands, "security": {"seal": True, "captured": 4}}
     path = write_scenario(tmp_path, vehicles={"kind": "none"}, speedup=20, **keys, **SECURED_RUN)
@@ -302,7 +301,7 @@ def test_with_keys_over_udp_with_ours_among_them(secured: Path, tmp_path: Path) 
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_a_mission_over_udp_with_ours_among_them(checked: Path, agent: Path, tmp_path: Path) -> None:
+def test_c_agents_and_our_agent_agree_over_udp(checked: Path, agent: Path, tmp_path: Path) -> None:
     commands = {1: [str(agent)], 3: [str(checked)]}
     path = write_scenario(tmp_path, vehicles={"kind": "none"}, duration_s=150, agent_command=commands, **HARD_RUN)
     environment = {**os.environ, "ASAN_OPTIONS": "exitcode=99"}

@@ -1,4 +1,4 @@
-"""Algorithms 1-6, handler by handler."""
+"""Tests of Algorithms 1 to 6, handler by handler."""
 
 from random import Random
 
@@ -38,14 +38,14 @@ def test_blocks_completed_in_the_same_microsecond_still_differ() -> None:
     assert air.fill_block(1) != air.fill_block(1)
 
 
-def test_no_block_is_later_than_the_last_timestamp() -> None:
+def test_no_block_is_later_than_the_latest_timestamp() -> None:
     agent = Air([1]).agents[1]
     for number in range(6):
         agent.add_event(LoggableEvent(2**64 - 1, 1 + number, bytes(256)), 0.0)
     assert [block.timestamp_us for block in agent.state.blocks_to_be_committed] == [2**64 - 1] * 2
 
 
-def test_an_event_larger_than_the_mission_s_largest_is_refused() -> None:
+def test_event_above_max_event_bytes_is_refused() -> None:
     agent = Air([1]).agents[1]
     with pytest.raises(ValueError, match="max_event_bytes 267"):
         agent.add_event(LoggableEvent(0, 1, bytes(257)), 0.0)
@@ -66,7 +66,7 @@ def test_a_full_block_is_proposed_to_go_on_top_of_the_own_chain() -> None:
 
 
 @takes("receive_request_add_block", "approve", "disapprove")
-def test_an_agent_approves_what_goes_on_top_of_its_own_chain() -> None:
+def test_agent_approves_a_block_on_top_of_its_own_chain() -> None:
     agent = Air([1, 2]).agents[1]
     for chain_hash in (agent.state.chain.top_chain_hash, bytes(32)):
         agent.receive_message(2, 0, BlockAddRequest(b"\1" * 32, chain_hash), 0.0)
@@ -76,7 +76,7 @@ def test_an_agent_approves_what_goes_on_top_of_its_own_chain() -> None:
 
 
 @takes("process_next_deque_block", "deque empty")
-def test_an_agent_alone_commits_its_own_blocks_after_the_vote() -> None:
+def test_agent_without_neighbours_commits_its_blocks_after_the_vote() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     block_hash = air.fill_block(1)
     air.run_until(9.99)
@@ -90,7 +90,7 @@ def test_an_agent_alone_commits_its_own_blocks_after_the_vote() -> None:
 @takes("receive_vote_add_block", "yes")
 @takes("vote_timer_expiration", "approved")
 @takes("receive_commit_block", "committed")
-def test_an_approved_block_is_committed_by_everybody() -> None:
+def test_all_agents_commit_an_approved_block() -> None:
     air = Air(range(1, 6))
     block_hash = air.fill_block(3)
     air.settle()
@@ -146,7 +146,7 @@ def test_a_tied_vote_is_not_approved() -> None:
 
 
 @takes("vote_timer_expiration", "reconcile in progress")
-def test_a_vote_that_ends_during_a_reconcile_decides_nothing_and_is_repeated_after_it() -> None:
+def test_vote_that_ends_during_a_reconcile_is_repeated_after_it() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     block_hash = air.fill_block(1)
     agent = air.agents[1]
@@ -162,7 +162,7 @@ def test_a_vote_that_ends_during_a_reconcile_decides_nothing_and_is_repeated_aft
 
 @takes("vote_timer_expiration", "chain changed")
 def test_an_approved_vote_is_repeated_when_the_chain_changed_meanwhile() -> None:
-    """Without it an agent would go idle with a block in its deque (characteristic 2)."""
+    """Otherwise the agent would become idle with a block in its deque (characteristic 2)."""
     air = Air([1, 2, 3])
     first = air.fill_block(1)
     air.run_until(5.0)
@@ -180,7 +180,7 @@ def test_an_approved_vote_is_repeated_when_the_chain_changed_meanwhile() -> None
         pytest.param(True, "chain changed", marks=takes("vote_timer_expiration", "chain changed")),
     ],
 )
-def test_the_order_of_algorithm_5_s_tests_is_a_setting(changed_before_tally: bool, expected: str) -> None:
+def test_setting_changes_the_order_of_the_tests_of_algorithm_5(changed_before_tally: bool, expected: str) -> None:
     settings = Settings(changed_before_tally=changed_before_tally)
     air = Air([1, 2], fate=lambda *_: [], settings=settings)
     block_hash = air.fill_block(1)
@@ -211,7 +211,7 @@ def test_a_late_vote_of_an_earlier_round_counts_unless_votes_name_the_chain(name
 
 
 @takes("reconcile_finalize", "asked who follows")
-def test_who_misses_a_commit_learns_it_when_it_is_asked_who_follows() -> None:
+def test_agent_that_missed_a_commit_reconciles_after_asks_after_commit() -> None:
     air = Air([1, 2, 3], settings=Settings(asks_after_commit=True))
     air.fate = lambda _, to, message: [] if to == 2 and isinstance(message, CommitBlock) else [0.01]
     air.fill_block(1)
@@ -221,7 +221,7 @@ def test_who_misses_a_commit_learns_it_when_it_is_asked_who_follows() -> None:
     assert len({agent.state.chain.top_chain_hash for agent in air.agents.values()}) == 1
 
 
-def test_a_reconcile_that_begins_in_the_gap_asks_itself() -> None:
+def test_reconcile_in_the_gap_replaces_the_query_of_asks_after_commit() -> None:
     air = Air([1], settings=Settings(asks_after_commit=True))
     air.fill_block(1)
     air.run_until(10.0)
@@ -249,7 +249,7 @@ def test_a_commit_that_does_not_succeed_the_top_is_not_followed() -> None:
 
 @takes("receive_commit_block", "held already")
 def test_a_second_copy_of_a_block_is_never_committed() -> None:
-    """No agent in good faith sends one; characteristic 3 holds all the same."""
+    """No correct agent sends one. Characteristic 3 holds nevertheless."""
     air = Air([1, 2])
     air.fill_block(2)
     air.settle()

@@ -1,4 +1,4 @@
-"""The agent contract: its schemas and vectors are those of the code, and its page has every word that a trace has."""
+"""The schemas and vectors of the agent contract agree with the code, and its page explains all names of the formats."""
 
 import copy
 import json
@@ -47,7 +47,7 @@ def fits(name: str, document: object) -> bool:
     return bool(validator(name).is_valid(document))
 
 
-def test_the_vectors_are_up_to_date_to_the_byte() -> None:
+def test_vector_files_are_up_to_date() -> None:
     texts = vectors.texts()
     for path, text in texts.items():
         assert path.read_text(encoding="ascii") == text, "run `python -m ucp.contract.vectors`"
@@ -57,7 +57,7 @@ def test_the_vectors_are_up_to_date_to_the_byte() -> None:
 # The page
 
 
-def test_the_page_has_each_handler_with_its_number_and_each_of_its_branches() -> None:
+def test_page_lists_each_handler_with_its_number_and_branches() -> None:
     chapters = re.split(r"^(?=\d+ +[a-z_0-9]+\()", PAGE, flags=re.MULTILINE)
     told = {chapter.split("(")[0]: chapter.split("```")[0] for chapter in chapters[1:]}
     assert set(told) == {f"{handler.algorithm:<2} {handler.name}" for handler in HANDLERS.values()}
@@ -86,11 +86,11 @@ def test_page_has_the_table_of_settings() -> None:
     ],
     ids=["messages", "timers", "operations", "drops", "features", "settings", "commands", "status", "triggers"],
 )
-def test_the_page_has_every_word(words: list[str]) -> None:
+def test_page_contains_every_name_of_the_formats(words: list[str]) -> None:
     assert not [word for word in words if word not in PAGE]
 
 
-def test_the_page_s_mission_file_is_one() -> None:
+def test_mission_file_on_the_page_is_valid() -> None:
     (text,) = re.findall(r'^```json\n({\n  "schema": "ucp-mission/1".*?^})\n```$', PAGE, re.MULTILINE | re.DOTALL)
     assert fits("mission", json.loads(text))
 
@@ -100,7 +100,7 @@ def test_the_page_s_mission_file_is_one() -> None:
 
 @pytest.fixture(scope="module")
 def left(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[Document]]]:
-    """What an agent was told, what it said, and what it left."""
+    """The inputs of an agent, its outputs, and its files."""
     directory = tmp_path_factory.mktemp("agent")
     told = mission()
     agent = AgentUnderTest(directory, told)
@@ -133,12 +133,12 @@ def left(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[Do
 
 
 @pytest.mark.parametrize("name", ["mission", "control", "chain-export", "trace"])
-def test_what_an_agent_reads_and_writes_fits_its_schema(left: dict[str, list[Document]], name: str) -> None:
+def test_inputs_and_outputs_of_an_agent_fit_their_schemas(left: dict[str, list[Document]], name: str) -> None:
     for document in left[name]:
         validator(name).validate(document)
 
 
-def test_mission_files_fit_their_schema_and_name_the_features_that_they_need() -> None:
+def test_mission_files_fit_their_schema_and_name_needed_features() -> None:
     plain = Scenario.model_validate({"name": "plain"})
     rich = Scenario.model_validate(
         {
@@ -216,7 +216,7 @@ LINES_REFUSED: tuple[tuple[str, Change], ...] = (
 @pytest.mark.parametrize(
     ("name", "number"), [(name, number) for name, changes in REFUSED.items() for number in range(len(changes))]
 )
-def test_what_is_wrong_does_not_fit(left: dict[str, list[Document]], name: str, number: int) -> None:
+def test_wrong_documents_do_not_fit_their_schemas(left: dict[str, list[Document]], name: str, number: int) -> None:
     (document,) = copy.deepcopy(left[name])
     assert fits(name, document)
     REFUSED[name][number](document)
@@ -224,7 +224,7 @@ def test_what_is_wrong_does_not_fit(left: dict[str, list[Document]], name: str, 
 
 
 @pytest.mark.parametrize(("kind", "change"), LINES_REFUSED)
-def test_a_wrong_line_of_a_trace_does_not_fit(left: dict[str, list[Document]], kind: str, change: Change) -> None:
+def test_wrong_trace_line_does_not_fit_its_schema(left: dict[str, list[Document]], kind: str, change: Change) -> None:
     lines = [copy.deepcopy(line) for line in left["trace"] if kind in line]
     assert lines
     for line in lines:
@@ -232,7 +232,7 @@ def test_a_wrong_line_of_a_trace_does_not_fit(left: dict[str, list[Document]], k
         assert not fits("trace", line), line
 
 
-def test_what_is_no_exchange_does_not_fit(left: dict[str, list[Document]]) -> None:
+def test_wrong_exchange_does_not_fit_its_schema(left: dict[str, list[Document]]) -> None:
     for exchange in left["control"]:
         answer = exchange["answer"]
         assert fits("control", {**exchange, "answer": {"ok": False, "unsupported": True, "error": "no such command"}})
@@ -248,7 +248,7 @@ def test_what_is_no_exchange_does_not_fit(left: dict[str, list[Document]]) -> No
 # The missions
 
 
-def test_the_missions_take_every_branch_of_every_handler() -> None:
+def test_transcripts_take_every_branch_of_every_handler() -> None:
     exchanges = [json.loads(line) for path in TRANSCRIPTS for line in path.read_text().splitlines()]
     lines = [line for exchange in exchanges for line in exchange["output"]["trace"]]
     taken = {(line["handler"], line["branch"]) for line in lines if "handler" in line}
@@ -263,12 +263,12 @@ def replayed(command: list[str]) -> tuple[int, str]:
     return played.returncode, played.stdout + played.stderr
 
 
-def test_the_agent_that_comes_along_plays_the_missions_as_it_should() -> None:
+def test_our_agent_plays_all_transcripts() -> None:
     status, said = replayed([sys.executable, "-m", "ucp.node"])
     assert (status, said.count("as it should be")) == (0, len(TRANSCRIPTS)), said
 
 
-def test_another_agent_is_shown_the_first_difference_and_what_happens_there() -> None:
+def test_replay_prints_the_first_difference_of_a_wrong_agent() -> None:
     wrong = "import ucp.messages, ucp.virtual; ucp.messages.VERSION = 2; ucp.virtual.main()"
     status, said = replayed([sys.executable, "-c", wrong])
     assert status == 1
@@ -281,13 +281,13 @@ def test_another_agent_is_shown_the_first_difference_and_what_happens_there() ->
     ("code", "sentence"),
     [("", "the agent"), ("import time; print('hello', flush=True); input()", "the agent wrote 'hello")],
 )
-def test_what_is_no_agent_in_virtual_time_is_one_sentence(code: str, sentence: str) -> None:
+def test_replay_of_a_program_that_is_no_agent_ends_in_one_sentence(code: str, sentence: str) -> None:
     status, said = replayed([sys.executable, "-c", code])
     assert (status, said.count("\n"), sentence in said) == (1, 1, True), said
     assert replayed([shlex.quote("no such program")])[0] == 1
 
 
-def test_more_than_is_wanted_is_no_difference_and_a_tally_may_be_missing() -> None:
+def test_additional_keys_and_a_missing_tally_are_no_difference() -> None:
     wanted = {"sent": [], "timer": 1.5, "trace": [{"handler": "x", "tally": {"yes": 1}, "state": {"idle": True}}]}
     got = {"sent": [], "timer": 1.5, "trace": [{"handler": "x", "state": {"idle": True}, "by": "me"}], "cpu_s": 1}
     assert [*differences(got, wanted)] == []

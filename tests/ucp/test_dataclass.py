@@ -1,4 +1,4 @@
-"""The agent's own dataclasses beside the standard library's."""
+"""The agent's own dataclasses compared with those of the standard library."""
 
 import copy
 import dataclasses
@@ -50,7 +50,7 @@ def _anew(each: dataclasses.Field[Any]) -> Any:
 
 
 @pytest.mark.parametrize("made", MADE, ids=repr)
-def test_it_is_what_the_standard_library_makes(made: Any) -> None:
+def test_dataclass_equals_that_of_the_standard_library(made: Any) -> None:
     theirs = of_the_standard_library(type(made))
     arguments = {each.name: getattr(made, each.name) for each in dataclasses.fields(made) if each.init}
     twin = theirs(**arguments)
@@ -61,7 +61,7 @@ def test_it_is_what_the_standard_library_makes(made: Any) -> None:
     assert type(made).__match_args__ == theirs.__match_args__
 
 
-def test_equal_is_what_has_equal_fields_and_is_of_the_same_class() -> None:
+def test_objects_of_one_class_with_equal_fields_are_equal() -> None:
     assert Frozen(3) == Frozen(3)
     assert hash(Frozen(3)) == hash(Frozen(3))
     assert Frozen(3) != Frozen(3, b"x")
@@ -71,14 +71,14 @@ def test_equal_is_what_has_equal_fields_and_is_of_the_same_class() -> None:
         hash(Changing("a"))
 
 
-def test_each_has_parts_of_its_own() -> None:
+def test_default_factory_gives_each_object_its_own_value() -> None:
     one, other = Changing("a"), Changing("b")
     one.parts.append(1)
     assert other.parts == []
 
 
 @pytest.mark.parametrize("made", [Frozen(3), Unequal()], ids=repr)
-def test_nobody_changes_what_is_frozen(made: Any) -> None:
+def test_frozen_object_cannot_be_changed(made: Any) -> None:
     name = dataclasses.fields(made)[0].name
     with pytest.raises(AttributeError):
         setattr(made, name, 4)
@@ -87,13 +87,13 @@ def test_nobody_changes_what_is_frozen(made: Any) -> None:
 
 
 @pytest.mark.parametrize("made", [made for made in MADE if not isinstance(made, Unequal)], ids=repr)
-def test_it_comes_back_from_a_pickle_and_a_copy(made: Any) -> None:
+def test_object_survives_pickle_and_copy(made: Any) -> None:
     assert pickle.loads(pickle.dumps(made)) == made  # noqa: S301  made here
     assert copy.deepcopy(made) == copy.copy(made) == made
     assert dataclasses.replace(made) == made
 
 
-def test_pydantic_reads_it() -> None:
+def test_pydantic_validates_the_class() -> None:
     assert TypeAdapter(Changing).validate_json('{"name": "a", "parts": [1]}') == Changing("a", [1])
     with pytest.raises(ValueError, match="parts"):
         TypeAdapter(Changing).validate_json('{"name": "a", "parts": ["x"]}')

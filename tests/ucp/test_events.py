@@ -1,4 +1,4 @@
-"""Loggable events and Algorithm 21."""
+"""Tests of loggable events and Algorithm 21."""
 
 from random import Random
 
@@ -12,12 +12,12 @@ loggable_events = st.builds(LoggableEvent, st.integers(0, 2**64 - 1), st.integer
 
 
 @given(st.lists(loggable_events, max_size=8))
-def test_a_run_of_events_is_read_back(events: list[LoggableEvent]) -> None:
+def test_encoded_events_decode_to_the_same_events(events: list[LoggableEvent]) -> None:
     assert decode_events(b"".join(event.encode() for event in events)) == events
 
 
 @given(st.binary(max_size=300))
-def test_random_event_data_is_read_or_malformed_and_nothing_worse(data: bytes) -> None:
+def test_random_event_data_decodes_or_raises_malformed(data: bytes) -> None:
     try:
         events = decode_events(data)
     except MalformedEventsError:
@@ -31,7 +31,7 @@ def test_event_ids_are_1_to_254(event_id: int) -> None:
         LoggableEvent(0, event_id, b"")
 
 
-def test_random_events_come_every_30_seconds_on_average_with_the_thesis_s_sizes() -> None:
+def test_random_events_have_the_interval_and_sizes_of_the_thesis() -> None:
     source = RandomEvents(Random(1))
     events = [source.next() for _ in range(3000)]
     times = [at_s for at_s, _, _ in events]

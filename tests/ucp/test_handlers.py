@@ -1,4 +1,4 @@
-"""Handlers do what they declare, and the diagram shows what they declare."""
+"""Handlers follow their declarations, and the diagram shows these declarations."""
 
 import ast
 from collections.abc import Iterator
@@ -41,7 +41,7 @@ RUNS = {
     "asking": {"network": {"loss": 0.25}, "settings": {"asks_after_commit": True}},
 }
 HELD_ALREADY = ("reconcile_phase_3", "Reconcile Finalize")
-"""What no chain in good faith leads to: the mutual successor is in the chain already."""
+"""Return an agent whose mutual successor is already in its chain. Correct agents never reach this state."""
 
 
 def traces(**keys: Any) -> Iterator[Trace]:
@@ -52,7 +52,7 @@ def traces(**keys: Any) -> Iterator[Trace]:
 
 
 def done(trace: Trace, handlers: dict[str, EventHandler[Any]]) -> Iterator[tuple[str, str]]:
-    """(handler, what it sent, started or triggered) of a trace; fails at the first line that is not as declared."""
+    """Yield (handler, sent message, started timer or triggered event) of a trace. Fail at the first undeclared one."""
     for life in trace.incarnations():
         ran: set[str] = set()
         for number, run in life:
@@ -87,7 +87,7 @@ def done(trace: Trace, handlers: dict[str, EventHandler[Any]]) -> Iterator[tuple
             ran.add(run.handler)
 
 
-def test_every_line_of_a_trace_is_as_declared_and_all_that_is_declared_is_done() -> None:
+def test_trace_lines_match_the_declarations_of_all_handlers() -> None:
     seen = {deed for keys in RUNS.values() for trace in traces(**keys) for deed in done(trace, HANDLERS)}
     declared = {
         (handler.name, what)
@@ -97,7 +97,7 @@ def test_every_line_of_a_trace_is_as_declared_and_all_that_is_declared_is_done()
     assert seen == declared - {HELD_ALREADY}
 
 
-def test_what_a_handler_does_not_declare_is_refused() -> None:
+def test_undeclared_action_of_a_handler_raises_an_error() -> None:
     core = Core(1, b"", Settings())
     core.running = HANDLERS["build_data_block"]
     with pytest.raises(AssertionError, match="build_data_block does not declare that it sends Request for Block"):
@@ -109,8 +109,8 @@ def test_what_a_handler_does_not_declare_is_refused() -> None:
     assert not core.outbox and not core.triggered and not core.voting_timer.active
 
 
-def test_each_algorithm_has_one_handler_and_each_handler_one_table_but_reconcile_finalize() -> None:
-    """The pause of Section 4.2 between two commits of Algorithm 20 ends with a timer."""
+def test_each_algorithm_has_one_handler_in_one_table() -> None:
+    """The pause between two commits of Algorithm 20 (Section 4.2) ends with a timer."""
     assert [handler.algorithm for handler in HANDLERS.values()] == list(range(1, 21))
     tabled = [handler.name for table in (ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT) for handler in table.values()]
     assert sorted(tabled) == sorted([*HANDLERS, "reconcile_finalize"])
@@ -127,21 +127,21 @@ def test_each_algorithm_has_one_handler_and_each_handler_one_table_but_reconcile
         ("Reconcile Finalize", {11, 15, 16, 19}),  # Figure 3.23; 16 where the block is held already
     ],
 )
-def test_local_events_are_triggered_by_whom_the_thesis_says(event: LocalEvent, by: set[int]) -> None:
+def test_handlers_trigger_the_local_events_of_the_thesis(event: LocalEvent, by: set[int]) -> None:
     assert {handler.algorithm for handler in HANDLERS.values() if event in handler.triggers} == by
 
 
-def test_each_message_and_timer_has_a_handler_and_somebody_who_sends_or_starts_it() -> None:
+def test_each_message_and_timer_has_a_handler_and_a_source() -> None:
     sent: set[type[Message]] = {message for handler in HANDLERS.values() for message in handler.sends}
     assert sent == set(ON_MESSAGE)
     assert {timer for handler in HANDLERS.values() for timer in handler.starts} == set(ON_TIMER)
 
 
-def test_the_diagram_is_of_the_handlers_that_there_are() -> None:
+def test_diagram_shows_the_existing_handlers() -> None:
     assert PAGE.read_text() == page(), "write it again: python -m docs.generate.handlers"
 
 
-def test_what_handlers_do_to_the_state_no_driver_is_offered() -> None:
+def test_driver_interface_offers_no_operation_on_the_state() -> None:
     offered = {name for face in (Agent, AgentState) for name in dir(face)}
     verbs = {name for name in vars(Core) if not name.startswith("_")}
     assert {"commit", "pop_to_stack", "send", "trigger"} <= verbs
@@ -149,7 +149,7 @@ def test_what_handlers_do_to_the_state_no_driver_is_offered() -> None:
 
 
 def test_no_module_of_ucp_imports_in_a_circle() -> None:
-    """Not even for types alone. Raises CycleError naming the circle."""
+    """Imports for type checking count too. CycleError names the circle."""
     folder = Path(ucp.__path__[0])
     modules = {path.stem: imported(path) for path in folder.glob("*.py")}
     order = list(TopologicalSorter(modules).static_order())
@@ -158,7 +158,7 @@ def test_no_module_of_ucp_imports_in_a_circle() -> None:
 
 
 def imported(path: Path) -> set[str]:
-    """The modules of the package `ucp` that the file names in an import."""
+    """Return the modules of the package `ucp` that a file imports."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module == "ucp":

@@ -1,4 +1,4 @@
-"""The loop that an agent's process waits in, and the control socket on it."""
+"""The event loop of an agent's process, and the control socket that uses it."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from ucp.control import MAX_LINE_BYTES, ControlServer
 from ucp.loop import Loop
 
 
-def test_what_is_due_comes_in_its_order_and_what_is_cancelled_never() -> None:
+def test_loop_calls_due_timers_in_order_and_skips_cancelled_ones() -> None:
     loop, came = Loop(), []
     loop.call_later(0.02, lambda: came.append("third"))
     loop.call_later(0.01, lambda: came.append("second"))
@@ -24,7 +24,7 @@ def test_what_is_due_comes_in_its_order_and_what_is_cancelled_never() -> None:
     assert came == ["first", "second", "third"]
 
 
-def test_what_a_callback_raises_is_told_or_ends_the_loop() -> None:
+def test_exception_of_a_callback_is_reported_or_ends_the_loop() -> None:
     failures: list[Exception] = []
     loop, after = Loop(failures.append), []
     loop.call_later(0, lambda: 1 / 0)
@@ -37,7 +37,7 @@ def test_what_a_callback_raises_is_told_or_ends_the_loop() -> None:
         loop.run()
 
 
-def test_a_socket_that_a_callback_closes_is_not_called_back_any_more() -> None:
+def test_loop_does_not_call_back_a_closed_socket() -> None:
     loop, read = Loop(), []
     pairs = [socket.socketpair() for _ in range(2)]
 
@@ -54,7 +54,7 @@ def test_a_socket_that_a_callback_closes_is_not_called_back_any_more() -> None:
     assert read == [1]
 
 
-def test_a_signal_ends_a_loop_that_waits_for_nothing() -> None:
+def test_signal_ends_a_loop_without_sockets_and_timers() -> None:
     before = signal.getsignal(signal.SIGUSR1)
     loop = Loop()
     loop.stop_on(signal.SIGUSR1)
@@ -75,7 +75,7 @@ class Client:
         self.heard = b""
 
     def hear(self) -> bool:
-        """Whether the server has ended the connection."""
+        """Return whether the server has closed the connection."""
         try:
             data = self.socket.recv(1 << 20)
         except BlockingIOError:
@@ -97,7 +97,7 @@ def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Client:
     return Client(tmp_path / "7.control", loop)
 
 
-def test_a_client_that_asks_much_and_reads_late_gets_every_answer_in_its_order(client: Client) -> None:
+def test_slow_client_gets_all_answers_in_order(client: Client) -> None:
     lines = [
         json.dumps({"command": "echo", "text": f"{number}" + "x" * 1000}).encode() + b"\n" for number in range(900)
     ]
@@ -116,7 +116,7 @@ def test_a_client_that_asks_much_and_reads_late_gets_every_answer_in_its_order(c
     assert [int(answer["text"].rstrip("x")) for answer in client.answers()] == list(range(900))
 
 
-def test_a_line_in_pieces_is_one_and_a_line_without_end_ends_the_connection(client: Client) -> None:
+def test_split_line_is_answered_and_an_endless_line_disconnects(client: Client) -> None:
     client.socket.send(b'{"command": ')
     run_until(client.loop, lambda: True, after_s=0.02)
     assert not client.hear()

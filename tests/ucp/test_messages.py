@@ -1,4 +1,4 @@
-"""The wire format: what is encoded is decoded, fits a datagram, and nothing else is accepted."""
+"""The wire format: an encoded message decodes and fits one datagram, and other bytes are rejected."""
 
 import pytest
 from hypothesis import given
@@ -43,7 +43,7 @@ sequences = st.integers(0, 2**32 - 1)
 
 
 @given(senders, sequences, messages)
-def test_what_is_encoded_is_decoded_and_fits_one_datagram(sender: int, sequence: int, message: Message) -> None:
+def test_encoded_message_decodes_and_fits_one_datagram(sender: int, sequence: int, message: Message) -> None:
     datagram = encode(sender, sequence, message)
     assert len(datagram) <= MAX_DATAGRAM_BYTES
     assert decode(datagram) == (sender, sequence, message)
@@ -75,19 +75,19 @@ def test_a_foreign_header_is_malformed(offset: int, value: int, reason: str) -> 
 
 
 @pytest.mark.parametrize("sender", [0, 65536, 2**32 - 1])
-def test_a_sender_that_no_agent_can_be_is_malformed(sender: int) -> None:
+def test_impossible_sender_is_malformed(sender: int) -> None:
     with pytest.raises(MalformedDatagramError, match="impossible sender"):
         decode(HEADER.pack(b"UC", 1, 8, sender, 0, 32) + bytes(32))
 
 
 @given(st.binary(max_size=1600))
-def test_random_bytes_are_malformed_and_nothing_worse(data: bytes) -> None:
+def test_random_bytes_raise_only_malformed_datagram(data: bytes) -> None:
     with pytest.raises(MalformedDatagramError):
         decode(data)
 
 
 @given(st.sampled_from(sorted(TYPE_CODES.values())), st.binary(max_size=1100))
-def test_a_random_body_is_decoded_or_malformed_and_nothing_worse(code: int, body: bytes) -> None:
+def test_random_body_decodes_or_raises_malformed_datagram(code: int, body: bytes) -> None:
     datagram = HEADER.pack(b"UC", 1, code, 1, 0, len(body)) + body
     try:
         sender, sequence, message = decode(datagram)

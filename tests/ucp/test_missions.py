@@ -1,4 +1,4 @@
-"""Whole missions of the thesis (Section 4.3), five agents for 20 minutes, in virtual time."""
+"""Missions of the thesis (Section 4.3) in virtual time: five agents, 20 minutes."""
 
 from random import Random
 
@@ -35,7 +35,7 @@ def test_disconnected_agents_hold_their_own_blocks_only(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_at_15_percent_loss_no_block_is_lost_and_a_final_reconcile_makes_one_chain(seed: int) -> None:
+def test_final_reconcile_makes_one_chain_after_15_percent_loss(seed: int) -> None:
     air = mission(0.15, seed)
     completed = {block_hash for agent in air.agents.values() for block_hash in agent.state.completed}
     assert completed <= {block_hash for chain in air.chains() for block_hash in chain}
@@ -48,7 +48,7 @@ def test_at_15_percent_loss_no_block_is_lost_and_a_final_reconcile_makes_one_cha
 
 
 def mutual_share(loss: float, seeds: range = range(5)) -> float:
-    """Blocks in the chain that all share, of all blocks; the mean over a few missions."""
+    """Return the share of all blocks that are in the mutual chain, as the mean over a few missions."""
     shares = []
     for seed in seeds:
         air = mission(loss, seed)
@@ -57,8 +57,11 @@ def mutual_share(loss: float, seeds: range = range(5)) -> float:
     return sum(shares) / len(shares)
 
 
-def test_chains_diverge_as_section_4_3_saw_it() -> None:
-    """One chain up to 0.15, visible divergence from 0.30, thrashing with hardly any mutual chain from 0.50."""
+def test_chains_diverge_as_in_section_4_3() -> None:
+    """All agents have one chain up to a loss of 0.15.
+
+    From 0.30 chains diverge, and from 0.50 they share hardly a block.
+    """
     assert mutual_share(0.15) > 0.85
     assert 0.3 < mutual_share(0.30) < 0.9
     assert mutual_share(0.50) < 0.15

@@ -1,4 +1,4 @@
-"""Algorithms 7-20, handler by handler, with divergences and ties that the thesis could not force."""
+"""Tests of Algorithms 7 to 20, handler by handler, with divergences and ties that the thesis could not force."""
 
 from itertools import accumulate, pairwise
 from random import Random
@@ -24,7 +24,7 @@ from ucp.settings import Settings
 
 
 def part(*groups: set[int]):
-    """Groups hear only themselves."""
+    """Return a network in which an agent receives only messages of its group."""
     latency = uniform_latency(Random(2))
     return lambda sender, receiver, message: (
         latency(sender, receiver, message) if any({sender, receiver} <= group for group in groups) else []
@@ -32,7 +32,7 @@ def part(*groups: set[int]):
 
 
 def diverged(blocks_on_2: int = 1, **settings: object) -> Air:
-    """Three agents; 2 and 3 have a chain of their own, 1 has one block of its own."""
+    """Return three agents. 2 and 3 share a chain, and 1 has a different chain of one block."""
     air = Air([1, 2, 3], fate=part({1}, {2, 3}), settings=Settings(**settings))
     air.fill_block(1)
     for _ in range(blocks_on_2):
@@ -43,7 +43,7 @@ def diverged(blocks_on_2: int = 1, **settings: object) -> Air:
 
 
 def with_blocks(count: int) -> Agent:
-    """An agent with that many blocks in its chain."""
+    """Return an agent with `count` blocks in its chain."""
     air = Air([1, 2], fate=lambda *_: [])
     for _ in range(count):
         air.fill_block(1)
@@ -80,7 +80,7 @@ def test_each_phase_asks_its_question_and_waits_for_answers() -> None:
 
 
 @takes("receive_request_chain_contain", "yes", "no")
-def test_an_agent_says_whether_its_chain_contains_another() -> None:
+def test_agent_answers_whether_its_chain_contains_a_chain_hash() -> None:
     agent = with_blocks(2)
     (_, below), (_, top) = agent.state.chain.with_chain_hashes()
     for chain_hash, contained in ((below, True), (top, True), (bytes(32), False)):
@@ -88,7 +88,7 @@ def test_an_agent_says_whether_its_chain_contains_another() -> None:
 
 
 @takes("receive_request_next_in_sequence", "successor", "top of chain")
-def test_an_agent_names_its_next_block_or_the_top_of_its_chain_and_the_timestamp() -> None:
+def test_agent_answers_with_its_next_block_or_the_top_of_its_chain() -> None:
     agent = with_blocks(2)
     (_, below), (block, top) = agent.state.chain.with_chain_hashes()
     successor = NextInSequenceResponse(below, block.block_hash, block.timestamp_us)
@@ -97,7 +97,7 @@ def test_an_agent_names_its_next_block_or_the_top_of_its_chain_and_the_timestamp
 
 
 @takes("receive_request_block_for_hash", "sent", "not held")
-def test_an_agent_sends_a_block_of_its_chain_and_says_nothing_of_others() -> None:
+def test_agent_sends_only_requested_blocks_of_its_chain() -> None:
     agent = with_blocks(1)
     (block,) = agent.state.chain
     assert answers(agent, RequestForBlock(block.block_hash)) == [BlockResponse(block)]
@@ -107,7 +107,7 @@ def test_an_agent_sends_a_block_of_its_chain_and_says_nothing_of_others() -> Non
 @takes("receive_phase_1_response", "not in phase 1")
 @takes("receive_response_next_in_sequence", "not in phase 2")
 @takes("receive_response_block_for_hash", "not in phase 3")
-def test_an_answer_that_nobody_waits_for_changes_nothing() -> None:
+def test_unexpected_answer_changes_nothing() -> None:
     agent = with_blocks(1)
     top = agent.state.chain.top_chain_hash
     late = Block(2, 1, b"late")
@@ -124,7 +124,7 @@ def test_an_answer_that_nobody_waits_for_changes_nothing() -> None:
 @takes("reconcile_phase_2_timer_expiration", "block", "top of chain")
 @takes("receive_response_block_for_hash", "committed")
 @takes("reconcile_finalize", "done")
-def test_an_outvoted_agent_rebuilds_on_the_majority_s_chain_and_gives_back_its_own_block() -> None:
+def test_outvoted_agent_rebuilds_on_the_chain_of_the_majority() -> None:
     air = diverged(blocks_on_2=2)
     (own,) = air.agents[1].state.completed
     theirs = tuple(air.agents[2].state.completed)
@@ -146,8 +146,8 @@ def test_a_vote_against_a_diverged_chain_starts_the_reconcile() -> None:
 
 
 @takes("reconcile_phase_3", "from the stack")
-def test_blocks_popped_in_phase_1_are_taken_from_the_stack_and_not_asked_for() -> None:
-    """2 and 3 hold 1's first block on top of theirs: phase 3 finds it on 1's stack."""
+def test_block_on_the_stack_is_committed_without_a_request() -> None:
+    """2 and 3 have 1's first block on top of their blocks. Phase 3 finds it on 1's stack."""
     air = diverged()
     own = next(iter(air.agents[1].state.chain))
     for agent in (air.agents[2], air.agents[3]):
@@ -159,8 +159,8 @@ def test_blocks_popped_in_phase_1_are_taken_from_the_stack_and_not_asked_for() -
 
 
 @takes("receive_request_next_in_sequence", "diverged")
-def test_a_queried_agent_that_does_not_have_the_chain_reconciles_too() -> None:
-    """Agent 3 missed a block; agent 1's phase 2 tells it so (Algorithm 13)."""
+def test_queried_agent_without_the_chain_starts_a_reconcile() -> None:
+    """Agent 3 missed a block. It detects this from the phase 2 query of agent 1 (Algorithm 13)."""
     air = Air([1, 2, 3], fate=part({1, 2}, {3}))
     air.fill_block(1)
     air.settle()
@@ -171,7 +171,7 @@ def test_a_queried_agent_that_does_not_have_the_chain_reconciles_too() -> None:
 
 
 @takes("reconcile_phase_1_timer_expiration", "no response")
-def test_nobody_answers_phase_1() -> None:
+def test_reconcile_ends_without_answers_in_phase_1() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     air.reconcile(1)
     assert air.now == 5.0
@@ -180,7 +180,7 @@ def test_nobody_answers_phase_1() -> None:
 
 
 @takes("reconcile_phase_2_timer_expiration", "no response")
-def test_nobody_answers_phase_2() -> None:
+def test_reconcile_ends_without_answers_in_phase_2() -> None:
     air = diverged()
     latency = air.fate
     air.fate = lambda s, r, m: [] if isinstance(m, NextInSequenceResponse) else latency(s, r, m)
@@ -190,7 +190,7 @@ def test_nobody_answers_phase_2() -> None:
 
 
 @takes("reconcile_phase_3_timer_expiration", "gave up")
-def test_no_block_comes_in_phase_3_and_the_rest_of_the_stack_goes_back() -> None:
+def test_missing_block_in_phase_3_returns_the_rest_of_the_stack() -> None:
     air = diverged()
     latency = air.fate
     air.fate = lambda s, r, m: [] if isinstance(m, BlockResponse) else latency(s, r, m)
@@ -220,7 +220,7 @@ def test_the_inception_block_is_never_popped() -> None:
         pytest.param("pop", "not contained", marks=takes("reconcile_phase_1_timer_expiration", "not contained")),
     ],
 )
-def test_a_tie_in_phase_1(phase1_tie: str, expected: str) -> None:
+def test_tie_in_phase_1_continues_with_phase_2_or_pops(phase1_tie: str, expected: str) -> None:
     air = Air([1, 2, 3], fate=lambda *_: [], settings=Settings(phase1_tie=phase1_tie))
     air.fill_block(1)
     air.settle()
@@ -236,7 +236,7 @@ def test_a_tie_in_phase_1(phase1_tie: str, expected: str) -> None:
 
 
 def in_phase_2(agents: int, **settings: object) -> Air:
-    """Agent 1 has asked for the successor of the inception block, at 5 s; nobody hears anybody."""
+    """Return agents without a network. Agent 1 asked for the successor of the inception block at 5 s."""
     air = Air(range(1, agents + 1), fate=lambda *_: [], settings=Settings(**settings))
     agent = air.agents[1]
     agent.begin_reconcile(0.0)
@@ -246,7 +246,7 @@ def in_phase_2(agents: int, **settings: object) -> Air:
 
 
 def phase_2(answers: list[tuple[bytes | None, int]], **settings: object) -> tuple[Air, str]:
-    """Agent 1 in phase 2 gets one answer (block hash, timestamp) from each of 2, 3, ..."""
+    """Give agent 1 one answer of phase 2 (block hash, timestamp) from each of the agents 2, 3, ..."""
     air = in_phase_2(len(answers) + 1, **settings)
     agent = air.agents[1]
     for sender, (block_hash, timestamp_us) in enumerate(answers, start=2):
@@ -285,7 +285,7 @@ def test_a_tie_of_equal_timestamps_goes_to_the_lowest_hash() -> None:
 
 
 @takes("reconcile_phase_2_timer_expiration", "tie: top of chain")
-def test_a_tie_with_top_of_chain_ends_the_search_as_the_mutual_block_is_older() -> None:
+def test_tie_with_top_of_chain_ends_the_search() -> None:
     air, branch = phase_2([(A, 5), (None, 0)])
     assert branch == "tie: top of chain"
     assert air.agents[1].state.idle
@@ -293,7 +293,7 @@ def test_a_tie_with_top_of_chain_ends_the_search_as_the_mutual_block_is_older() 
 
 
 @takes("reconcile_phase_2_timer_expiration", "tie: block")
-def test_a_tie_never_ends_the_search_while_a_block_is_on_offer_if_so_set() -> None:
+def test_setting_phase2_tie_block_prefers_a_block_in_a_tie() -> None:
     air, branch = phase_2([(A, 5), (None, 0)], phase2_tie="block")
     assert branch == "tie: block"
     assert air.agents[1].state.majority_response_block_hash == A
@@ -310,7 +310,7 @@ def test_a_tie_never_ends_the_search_while_a_block_is_on_offer_if_so_set() -> No
         pytest.param([(B, 9)], "block", B, id="one to one"),
     ],
 )
-def test_top_of_chain_ends_the_search_only_with_what_a_vote_needs_if_so_set(
+def test_setting_top_needs_majority_requires_a_majority(
     answers: list[tuple[bytes | None, int]], branch: str, chosen: bytes | None
 ) -> None:
     air, taken = phase_2(answers, top_needs_majority=True)
@@ -319,8 +319,8 @@ def test_top_of_chain_ends_the_search_only_with_what_a_vote_needs_if_so_set(
 
 
 @takes("receive_response_next_in_sequence", "counted already", "another chain")
-def test_a_responder_of_phase_2_counts_once_and_only_for_the_chain_asked_about() -> None:
-    """One for A and one for B, who is older: not two or three for A."""
+def test_phase_2_counts_each_responder_once_for_the_queried_chain() -> None:
+    """A repeated answer and an answer about another chain do not count, so A and the older B tie."""
     air = in_phase_2(agents=4)
     agent = air.agents[1]
     top = agent.state.chain.top_chain_hash
@@ -332,7 +332,7 @@ def test_a_responder_of_phase_2_counts_once_and_only_for_the_chain_asked_about()
 
 
 @takes("receive_response_block_for_hash", "another block")
-def test_a_block_that_was_not_asked_for_does_not_delay_the_end_of_phase_3() -> None:
+def test_other_block_does_not_delay_the_end_of_phase_3() -> None:
     air, _ = phase_2([(A, 5)])  # phase 3 begins at 10 s
     air.agents[1].receive_message(2, 3, BlockResponse(Block(2, 1, b"other")), 13.0)
     assert air.agents[1].next_timer() == 15.0
@@ -340,7 +340,7 @@ def test_a_block_that_was_not_asked_for_does_not_delay_the_end_of_phase_3() -> N
     assert air.branches(1, "reconcile_phase_3_timer_expiration") == ["gave up"]
 
 
-def test_the_field_test_s_crash_on_a_tie_leaves_the_agent_reconciling_for_ever() -> None:
+def test_quirk_crash_on_tie_leaves_the_agent_reconciling_forever() -> None:
     air = in_phase_2(agents=3)
     agent = air.agents[1]
     agent.replace_handlers(wrong_handlers({"crash_on_tie": True}, Random(0)))
@@ -353,7 +353,7 @@ def test_the_field_test_s_crash_on_a_tie_leaves_the_agent_reconciling_for_ever()
     assert agent.next_timer() is None
 
 
-def test_the_field_test_s_early_phase_3_expiry_ends_every_reconcile_before_a_block_comes() -> None:
+def test_quirk_early_phase3_expiry_ends_reconciles_without_a_block() -> None:
     air = diverged()
     agent = air.agents[1]
     agent.replace_handlers(wrong_handlers({"early_phase3_expiry": True}, Random(0)))
@@ -367,7 +367,7 @@ def test_the_field_test_s_early_phase_3_expiry_ends_every_reconcile_before_a_blo
     assert len(agent.state.chain) == 2
 
 
-def test_the_field_test_s_stale_chain_hash_makes_an_agent_ask_for_what_it_has_just_got() -> None:
+def test_quirk_stale_chain_hash_requests_the_same_block_again() -> None:
     air = diverged(blocks_on_2=2)
     agent = air.agents[1]
     agent.replace_handlers(wrong_handlers({"stale_chain_hash": True}, Random(0)))
@@ -383,7 +383,7 @@ def test_the_field_test_s_stale_chain_hash_makes_an_agent_ask_for_what_it_has_ju
 
 
 @takes("reconcile_phase_3", "held already")
-def test_a_block_that_is_held_already_is_not_asked_for() -> None:
+def test_block_that_the_agent_holds_is_not_requested() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     air.fill_block(1)
     air.settle()
@@ -400,7 +400,7 @@ def test_a_block_that_is_held_already_is_not_asked_for() -> None:
 
 
 @takes("reconcile_finalize", "recommitted, more to come", "done")
-def test_finalize_pauses_between_commits_and_the_others_follow() -> None:
+def test_finalize_pauses_between_commits_and_other_agents_follow() -> None:
     air = Air([1, 2, 3], fate=part({1}, {2, 3}))
     for _ in range(3):
         air.fill_block(1)
@@ -431,7 +431,7 @@ def test_without_a_gap_finalize_commits_all_at_once() -> None:
 @takes("receive_request_next_in_sequence", "reconcile in progress")
 @takes("receive_request_block_for_hash", "reconcile in progress")
 @takes("reconcile_begin", "already in progress")
-def test_a_reconciling_agent_answers_nobody_and_does_not_begin_again() -> None:
+def test_reconciling_agent_answers_no_message_and_does_not_restart() -> None:
     agent = with_blocks(1)
     (block,) = agent.state.chain
     top = agent.state.chain.top_chain_hash

@@ -1,4 +1,4 @@
-"""Missions and requests in doubt: the agent of the harness answers as in the vectors."""
+"""The agent of the harness treats ambiguous missions and requests as in the vectors."""
 
 import sys
 from pathlib import Path
@@ -9,10 +9,10 @@ from ucp.features import FEATURES
 COMMAND = [sys.executable, "-P", "-m", "ucp.node"]
 
 
-def test_missions_in_doubt_are_played_or_refused(tmp_path: Path) -> None:
+def test_agent_plays_or_refuses_ambiguous_missions_as_specified(tmp_path: Path) -> None:
     assert not refusals.wrong_missions(COMMAND, [*FEATURES])
     assert not refusals.wrong_exits(COMMAND, [*FEATURES], tmp_path)
 
 
-def test_requests_in_doubt_are_answered_as_in_the_vectors(tmp_path: Path) -> None:
+def test_agent_answers_ambiguous_requests_as_in_the_vectors(tmp_path: Path) -> None:
     assert not refusals.wrong_answers(COMMAND, tmp_path)

@@ -1,4 +1,4 @@
-"""scapy's layers and the codec are the same format: each reads what the other writes, and refuses what it refuses."""
+"""The scapy layers and the codec implement the same format: both read and reject the same bytes."""
 
 import subprocess
 import sys
@@ -58,7 +58,7 @@ def crafted_events(event_data: bytes) -> list[Packet]:
 
 
 def crafted(message: Message) -> Packet:
-    """The message's layer, made from its fields by name."""
+    """Return the layer of a message, made from its fields by name."""
     fields: dict[str, Any] = {name: getattr(message, name) for name in message.WIRE}
     if "block" in fields:
         fields["block"] = crafted_block(fields["block"])
@@ -66,7 +66,7 @@ def crafted(message: Message) -> Packet:
 
 
 @given(senders, sequences, all_messages)
-def test_what_the_codec_writes_scapy_reads_field_by_field(sender: int, sequence: int, message: Message) -> None:
+def test_scapy_reads_each_field_that_the_codec_writes(sender: int, sequence: int, message: Message) -> None:
     datagram = encode(sender, sequence, message)
     packet = UCP(datagram)
     header = [packet.getfieldval(name) for name in HEADER_FIELDS]
@@ -86,7 +86,7 @@ def test_what_the_codec_writes_scapy_reads_field_by_field(sender: int, sequence:
 
 
 @given(senders, sequences, all_messages)
-def test_what_scapy_crafts_is_the_codec_s_datagram(sender: int, sequence: int, message: Message) -> None:
+def test_scapy_crafts_the_datagram_of_the_codec(sender: int, sequence: int, message: Message) -> None:
     datagram = encode(sender, sequence, message)
     assert bytes(UCP(sender=sender, sequence=sequence) / crafted(message)) == datagram
     assert bytes(UCP(sender=sender, sequence=sequence) / to_layer(message)) == datagram
@@ -105,7 +105,7 @@ def test_scapy_finds_a_message_if_and_only_if_the_codec_does(datagram: bytes) ->
 
 
 @given(event_runs, st.binary(max_size=40), st.integers(0, 1024))
-def test_events_are_read_to_the_first_that_is_none(run: bytes, noise: bytes, place: int) -> None:
+def test_scapy_reads_events_up_to_the_first_malformed_one(run: bytes, noise: bytes, place: int) -> None:
     event_data = run[:place] + noise + run[place + len(noise) :]
     events = Block(ucp.block.Block(1, 2, event_data).block_data()).events
     assert b"".join(bytes(event) for event in events) == event_data
@@ -120,7 +120,7 @@ def test_events_are_read_to_the_first_that_is_none(run: bytes, noise: bytes, pla
         ]
 
 
-def test_a_capture_shows_messages_and_what_is_left_out_is_computed(tmp_path: Path) -> None:
+def test_capture_shows_messages_and_computes_omitted_fields(tmp_path: Path) -> None:
     air = Ether(src="02:00:00:00:00:01", dst="ff:ff:ff:ff:ff:ff") / IP(src="10.77.0.1", dst="10.77.255.255") / UDP()
     events = [LoggableEvent(timestamp_us=5, event_id=1, data=b"old"), LoggableEvent(timestamp_us=9, event_id=2)]
     block = Block(agent_id=1, events=events)
@@ -142,13 +142,13 @@ def test_a_capture_shows_messages_and_what_is_left_out_is_computed(tmp_path: Pat
         message_of(read[2])
 
 
-def test_what_a_link_adds_behind_a_frame_is_no_part_of_the_message() -> None:
+def test_padding_of_a_frame_is_no_part_of_the_message() -> None:
     link = Ether(dst="ff:ff:ff:ff:ff:ff") / IP(src="10.77.0.1", dst="10.79.255.255")
     frame = bytes(link / UDP() / UCP() / RequestForBlock())
     assert message_of(Ether(frame + b"\xde\xad\xbe\xef"))[2] == ucp.messages.RequestForBlock(bytes(32))
 
 
-def test_a_rogue_may_say_anything() -> None:
+def test_scapy_crafts_invalid_fields() -> None:
     assert message_of(UCP() / BlockAddResponse(approve=1))[2] == ucp.messages.BlockAddResponse(bytes(32), True)
     top = message_of(UCP() / NextInSequenceResponse(timestamp_us=3))[2]
     assert top == ucp.messages.NextInSequenceResponse(bytes(32), None, 3)
@@ -166,7 +166,7 @@ def test_a_rogue_may_say_anything() -> None:
 
 
 @pytest.mark.parametrize("message", LAYERS)
-def test_ls_documents_each_message_under_the_thesis_s_name(message: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ls_shows_each_message_with_its_name_in_the_thesis(message: Any, capsys: pytest.CaptureFixture[str]) -> None:
     ls(LAYERS[message])
     documented = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
     assert documented == list(message.WIRE)

@@ -1,4 +1,4 @@
-"""What an agent keeps on its vehicle's disk, and how it goes on from there."""
+"""The store of an agent on disk, and its continuation after a reboot."""
 
 import errno
 import os
@@ -21,7 +21,7 @@ from ucp.trigger import BootTrigger
 
 
 class StoringAir(Air):
-    """Agent 1 keeps a store."""
+    """A mission in virtual time in which agent 1 has a store."""
 
     def __init__(self, path: Path, loss: float) -> None:
         super().__init__([1, 2, 3], uniform_latency(Random(1), loss=loss))
@@ -35,7 +35,7 @@ class StoringAir(Air):
 
 
 def a_store(path: Path, blocks: int = 5) -> AgentState:
-    """Of the agent whose store it is: it has completed and committed so many blocks, and completed one more."""
+    """Write a store whose agent has committed `blocks` blocks and completed one more. Return its state."""
     core = Core(1, INITIAL_DATA, Settings())
     store = Store(path, core)
     for number in range(blocks + 1):
@@ -52,7 +52,7 @@ def found(path: Path) -> StoredState | None:
     return Store(path, Agent(1, [1, 2], INITIAL_DATA).state).recovered
 
 
-def test_at_every_moment_the_store_holds_what_the_agent_holds(tmp_path: Path) -> None:
+def test_store_always_equals_the_state_of_the_agent(tmp_path: Path) -> None:
     air = StoringAir(tmp_path / "store", loss=0.4)
     air.generate_events(seed=1, mean_s=5.0)
     kinds = set()
@@ -66,8 +66,8 @@ def test_at_every_moment_the_store_holds_what_the_agent_holds(tmp_path: Path) ->
     assert kinds == {"chain", "deque", "stack"}
 
 
-def test_an_agent_that_boots_has_what_it_held_and_commits_what_it_had_completed() -> None:
-    """Brown-outs at any moment of a lossy mission, amid votes and reconciles: nothing is lost or doubled."""
+def test_booted_agent_has_its_blocks_and_commits_completed_ones() -> None:
+    """Brown-outs during votes and reconciles of a lossy mission lose and duplicate no block."""
     air = Air([1, 2, 3], uniform_latency(Random(2), loss=0.3))
     air.generate_events(seed=2, mean_s=5.0)
     rng = Random(3)
@@ -94,7 +94,7 @@ def test_an_agent_that_boots_has_what_it_held_and_commits_what_it_had_completed(
     )
 
 
-def test_the_first_run_after_a_boot_names_all_that_was_found() -> None:
+def test_first_run_after_a_boot_lists_all_recovered_blocks() -> None:
     agent = Agent(1, [1, 2], INITIAL_DATA)
     mine, other, waiting, popped = Block(1, 1, b"a"), Block(2, 2, b"b"), Block(1, 3, b"c"), Block(2, 1, b"d")
     agent.boot(StoredState([mine.block_hash, waiting.block_hash], [mine, other], [waiting], [popped]), 60.0)
@@ -115,7 +115,7 @@ def test_the_first_run_after_a_boot_names_all_that_was_found() -> None:
     assert agent.state.newest_block_timestamp_us == 3
 
 
-def test_wherever_the_last_write_is_torn_the_blocks_before_it_are_found(tmp_path: Path) -> None:
+def test_store_with_a_torn_last_entry_keeps_earlier_blocks(tmp_path: Path) -> None:
     path = tmp_path / "store"
     state = a_store(path)
     whole = path.read_bytes()
@@ -128,7 +128,7 @@ def test_wherever_the_last_write_is_torn_the_blocks_before_it_are_found(tmp_path
         assert (len(stored.completed), len(stored.chain), len(stored.deque)) == (5, 5, 0)
 
 
-def test_a_damaged_byte_ends_what_is_read(tmp_path: Path) -> None:
+def test_damaged_byte_ends_the_reading_of_a_store(tmp_path: Path) -> None:
     path = tmp_path / "store"
     a_store(path)
     lines = path.read_bytes().splitlines(keepends=True)
@@ -142,7 +142,7 @@ def test_a_damaged_byte_ends_what_is_read(tmp_path: Path) -> None:
         assert len(stored.chain) == number - 1
 
 
-def test_a_store_that_lost_its_end_is_good_again_from_the_first_thing_that_is_written(tmp_path: Path) -> None:
+def test_truncated_store_is_valid_after_the_next_entry(tmp_path: Path) -> None:
     path = tmp_path / "store"
     a_store(path)
     path.write_bytes(path.read_bytes()[:-10])
@@ -157,7 +157,7 @@ def test_a_store_that_lost_its_end_is_good_again_from_the_first_thing_that_is_wr
     assert not list(tmp_path.glob(".*"))
 
 
-def test_another_agent_s_store_or_another_mission_s_is_refused(tmp_path: Path) -> None:
+def test_store_of_another_agent_or_mission_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "store"
     a_store(path)
     for other in (Agent(2, [1, 2], INITIAL_DATA), Agent(1, [1, 2], b"another mission")):
@@ -165,7 +165,7 @@ def test_another_agent_s_store_or_another_mission_s_is_refused(tmp_path: Path) -
             Store(path, other.state)
 
 
-def test_a_file_that_is_no_store_is_left_alone(tmp_path: Path) -> None:
+def test_file_that_is_no_store_is_not_changed(tmp_path: Path) -> None:
     path = tmp_path / "precious"
     path.write_text("data\n")
     with pytest.raises(StoreError, match=r"precious does not begin as a store: move it away"):
@@ -175,9 +175,7 @@ def test_a_file_that_is_no_store_is_left_alone(tmp_path: Path) -> None:
     assert found(path) is None
 
 
-def test_a_full_disk_ends_the_store_and_leaves_what_was_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_ends_the_store_and_keeps_its_entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "store"
     state = a_store(path)
     before = path.read_bytes()
@@ -197,7 +195,7 @@ def test_a_full_disk_ends_the_store_and_leaves_what_was_written(
     assert found(path) == StoredState.of(state)
 
 
-def test_what_others_send_in_an_agent_s_name_does_not_make_its_blocks_later() -> None:
+def test_forged_blocks_do_not_change_the_timestamps_of_own_blocks() -> None:
     agent = Agent(1, [1, 2], b"")
     false = Block(1, 2**64 - 1, b"not mine")
     commit = CommitBlock(false, next_chain_hash(agent.state.chain.top_chain_hash, false.block_hash))

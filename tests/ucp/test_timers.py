@@ -1,11 +1,11 @@
-"""The timer counts down, can be paused and resumed, and fires once (Section 3.2)."""
+"""The timer expires once, and can be paused and resumed (Section 3.2)."""
 
 from tests.ucp.air import Air
 from ucp.timers import Timer
 from ucp.trigger import TimerTrigger
 
 
-def test_a_paused_timer_keeps_what_was_left() -> None:
+def test_paused_timer_keeps_its_remaining_time() -> None:
     timer = Timer("test")
     assert not timer.active
     timer.start(10.0, 5.0)
@@ -21,8 +21,8 @@ def test_a_paused_timer_keeps_what_was_left() -> None:
     assert not timer.active
 
 
-def test_timers_that_expired_meanwhile_are_handled_in_the_order_of_their_deadlines() -> None:
-    """A node that was held up handles a vote's end before that of a phase that was to end later, and not twice."""
+def test_expired_timers_are_handled_in_order_of_their_deadlines() -> None:
+    """A late node handles the expiry of a vote before the later expiry of a phase, each once."""
     air = Air([1, 2], fate=lambda *_: [])
     air.fill_block(1)
     agent = air.agents[1]

@@ -1,4 +1,4 @@
-"""Triggers: each kind is read from a trace's object and written as the same object."""
+"""Each kind of trigger is read from a trace and written as the same object."""
 
 from typing import Any
 
@@ -54,7 +54,7 @@ def test_triggers_of_different_kinds_differ() -> None:
     ],
     ids=str,
 )
-def test_object_that_is_no_trigger_is_unknown_and_kept(fields: dict[str, Any]) -> None:
+def test_invalid_trigger_is_kept_as_unknown_trigger(fields: dict[str, Any]) -> None:
     trigger = parse(fields)
     assert isinstance(trigger, UnknownTrigger)
     assert trigger.to_json() == fields
@@ -64,7 +64,7 @@ def test_key_beside_the_kind_is_ignored() -> None:
     assert parse({"timer": "voting", "note": 1}) == TimerTrigger("voting")
 
 
-def test_pydantic_reads_a_trigger_and_refuses_what_is_no_object() -> None:
+def test_pydantic_reads_a_trigger_and_refuses_other_values() -> None:
     adapter: TypeAdapter[Trigger] = TypeAdapter(Trigger)
     assert adapter.validate_json('{"boot": 2}') == BootTrigger(2)
     for wrong in ("[]", '"boot"', '{"boot": null}'):

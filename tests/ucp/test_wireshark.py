@@ -1,4 +1,4 @@
-"""The Wireshark dissector, run by tshark, shows each field as it is declared and refuses what the codec refuses."""
+"""The Wireshark dissector, run by tshark, shows each declared field and rejects the same datagrams as the codec."""
 
 import json
 import os
@@ -67,7 +67,7 @@ def frame(datagram: bytes) -> bytes:
 
 
 def tshark(folder: Path, frames: Sequence[bytes], *options: str, captured: int | None = None) -> str:
-    """What tshark prints of frames of which `captured` bytes were captured (None: all). Skips without tshark."""
+    """Return the output of tshark for frames with `captured` captured bytes (None: all). Skip without tshark."""
     program = require_tshark()
     capture = folder / "air.pcap"
     with RawPcapWriter(str(capture), linktype=1) as writer:
@@ -84,14 +84,14 @@ def tshark(folder: Path, frames: Sequence[bytes], *options: str, captured: int |
 
 
 def layers(folder: Path, datagrams: Sequence[bytes], captured: int | None = None) -> list[dict[str, Any]]:
-    """The dissector's tree of each datagram, `captured` bytes of its frame having been captured."""
+    """Return the dissector's tree of each datagram, with `captured` bytes of each frame."""
     options = ("-T", "json", "-J", "ucpchain", "--no-duplicate-keys")
     packets = json.loads(tshark(folder, [frame(datagram) for datagram in datagrams], *options, captured=captured))
     return [packet["_source"]["layers"]["ucpchain"] for packet in packets]
 
 
 def experts(tree: Any) -> dict[str, str]:
-    """Expert information anywhere in a tree: its name and its message."""
+    """Yield name and message of all expert information in a tree."""
     if isinstance(tree, list):
         return {name: message for part in tree for name, message in experts(part).items()}
     if not isinstance(tree, dict):
@@ -101,7 +101,7 @@ def experts(tree: Any) -> dict[str, str]:
 
 
 def shown(prefix: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Values as tshark shows them; what is left out is not shown."""
+    """Return values as tshark shows them. It does not show omitted fields."""
     text: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, Block):
@@ -134,14 +134,14 @@ def test_every_field_of_every_message_is_shown(tmp_path: Path) -> None:
         assert list(layer) == list(expected), "in the order in which they are sent"
 
 
-def test_the_list_of_packets_names_message_and_sender(tmp_path: Path) -> None:
+def test_packet_list_names_message_and_sender(tmp_path: Path) -> None:
     lines = tshark(tmp_path, [frame(datagram) for datagram in DATAGRAMS]).splitlines()
     for place, (message, line) in enumerate(zip(MESSAGES, lines, strict=True)):
         assert " UCP " in line
         assert line.endswith(f"{message.NAME} from {65535 - place}")
 
 
-def test_of_a_secured_mission_it_shows_what_is_in_clear(tmp_path: Path) -> None:
+def test_dissector_shows_the_clear_fields_of_secured_datagrams(tmp_path: Path) -> None:
     body = Revocation(3, frozenset((2, 9)), bytes(range(64))).encode()
     sealed, revokes = session(2).seal(7, CommitBlock(LOGGED, A), None, None, 1), session(1).revocation_datagram(3, body)
     for datagram, layer in zip((sealed, revokes), layers(tmp_path, (sealed, revokes)), strict=True):
@@ -173,7 +173,7 @@ def damaged(rng: Random) -> bytes:
     return bytes(kept)
 
 
-def test_what_the_codec_refuses_is_malformed_for_the_same_reason(tmp_path: Path) -> None:
+def test_dissector_gives_the_same_reasons_as_the_codec(tmp_path: Path) -> None:
     rng = Random(7)
     datagrams = [damaged(rng) for _ in range(3000)] + [rng.randbytes(rng.randint(1, 100)) for _ in range(200)]
     reasons = set()
@@ -188,7 +188,7 @@ def test_what_the_codec_refuses_is_malformed_for_the_same_reason(tmp_path: Path)
     assert len(reasons) == 10, "each of the codec's reasons, and none"
 
 
-def test_event_data_that_is_no_run_of_events_is_a_warning(tmp_path: Path) -> None:
+def test_malformed_event_data_is_a_warning(tmp_path: Path) -> None:
     event = EVENTS[0].encode()
     wrong = {
         "the event's header is cut off": event[:10],
@@ -202,11 +202,11 @@ def test_event_data_that_is_no_run_of_events_is_a_warning(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("captured", [43, 55, 56, 70, 100])
-def test_a_datagram_that_was_not_captured_whole_is_not_called_malformed(tmp_path: Path, captured: int) -> None:
+def test_truncated_capture_is_not_called_malformed(tmp_path: Path, captured: int) -> None:
     for datagram, tree in zip(DATAGRAMS, layers(tmp_path, DATAGRAMS, captured), strict=True):
         assert set(experts(tree)) == ({"ucpchain.cut_off"} if captured < len(frame(datagram)) else set())
 
 
-def test_an_empty_datagram_breaks_nothing(tmp_path: Path) -> None:
+def test_empty_datagram_causes_no_error(tmp_path: Path) -> None:
     assert len(tshark(tmp_path, [frame(b"")], "-V").splitlines()) > 1
     assert len(tshark(tmp_path, [frame(DATAGRAMS[0])], "-V", captured=42).splitlines()) > 1

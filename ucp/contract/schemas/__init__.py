@@ -1,7 +1,7 @@
 """JSON Schemas (draft 2020-12) of the JSON documents of the agent contract. `harness.json_schemas` writes the files.
 
-They say what a right agent reads and writes. Keys that they do not name are allowed wherever CONTRACT.md says that a
-reader ignores them.
+The schemas describe the input and output of a correct agent. They allow additional keys wherever CONTRACT.md requires
+readers to ignore them.
 """
 
 from collections.abc import Callable
@@ -24,9 +24,9 @@ DOCUMENTS: dict[str, Callable[[], dict[str, Any]]] = {
     "control": _control_schema.schema,
     "virtual": _virtual_schema.schema,
 }
-"""What there is a schema of, by name."""
+"""Name of a document -> function that returns its schema."""
 
 
 def generate(name: str) -> dict[str, Any]:
-    """The schema of this name."""
+    """Return the schema of a document."""
     return {"$schema": DIALECT, "title": name, **DOCUMENTS[name]()}

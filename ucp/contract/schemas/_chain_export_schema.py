@@ -1,4 +1,4 @@
-"""The chain export, `ucp-chain-export/1`."""
+"""The schema of the chain export (`ucp-chain-export/1`)."""
 
 from ucp.contract.schemas._schema_parts import (
     AGENT_ID,
@@ -15,11 +15,11 @@ from ucp.contract.schemas._schema_parts import (
 from ucp.export import SCHEMA
 
 SIGNATURE: Schema = {**BASE64, "minLength": 88, "maxLength": 88}
-"""Its maker's, 64 bytes, in a secured mission."""
+"""The signature of a block's maker in a secured mission, 64 bytes in base64."""
 
 
 def block(chain_hash: Schema) -> Schema:
-    """A block of the chain; in deque and stack it has no chain hash."""
+    """Return the schema of a block. Blocks in deque and stack have no chain hash."""
     return record(
         {
             "agent_id": AGENT_ID,
@@ -34,8 +34,8 @@ def block(chain_hash: Schema) -> Schema:
 
 
 def schema() -> Schema:
-    """The document."""
-    aside = listed(block({"type": "null"}))
+    """Return the schema of a chain export."""
+    uncommitted = listed(block({"type": "null"}))
     return record(
         {
             "schema": {"const": SCHEMA},
@@ -43,8 +43,8 @@ def schema() -> Schema:
             "exported_at_us": COUNT,
             "inception": record({"block_data": BASE64, "block_hash": HASH, "chain_hash": HASH}),
             "chain": listed(block(HASH)),
-            "blocks_to_be_committed": aside,
-            "reconcile_stack": aside,
+            "blocks_to_be_committed": uncommitted,
+            "reconcile_stack": uncommitted,
             "current_block": record({"event_data": EVENT_DATA}),
             "reconcile_in_progress": FLAG,
             "idle": FLAG,

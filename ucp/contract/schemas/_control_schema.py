@@ -1,4 +1,4 @@
-"""Requests and answers of the control socket."""
+"""The schemas of requests and answers of the control socket."""
 
 from ucp.contract.schemas._schema_parts import BASE64, COUNT, EVENT_ID, FLAG, HASH, SECONDS, Schema, record
 from ucp.mission import LATEST_EPOCH_US
@@ -13,7 +13,7 @@ REQUESTS: dict[str, Schema] = {
     "quirk": {"name": {"type": "string"}, "value": {"type": ["boolean", "number"]}},
     "revoke": {"revocation": BASE64},
 }
-"""Command -> the keys that come with it."""
+"""Command -> its further keys."""
 
 STATUS: dict[str, Schema] = {
     "started": FLAG,
@@ -44,21 +44,21 @@ REFUSED: Schema = record(
 
 
 def request(*commands: str) -> Schema:
-    """One of these commands."""
+    """Return the schema of a request with one of these commands."""
     return {"oneOf": [record({"command": {"const": command}, **REQUESTS[command]}) for command in commands]}
 
 
 def answer(command: str) -> Schema:
-    """What comes back of it."""
-    carried_out = {
+    """Return the schema of the answer to a command."""
+    success = {
         "status": record(DONE | STATUS | MAY_BE_MISSING, optional=tuple(MAY_BE_MISSING)),
         "export": record({**DONE, "path": {"type": "string"}}),
     }.get(command, record(DONE))
-    return {"anyOf": [carried_out, REFUSED]}
+    return {"anyOf": [success, REFUSED]}
 
 
 def schema() -> Schema:
-    """The document: an exchange. Each request and each answer has a definition of its own, too."""
+    """Return the schema of an exchange. Each request and each answer also has its own definition."""
     definitions: Schema = {"request": request(*REQUESTS)}
     definitions |= {f"{command}-answer": answer(command) for command in REQUESTS}
     exchanges = [

@@ -1,4 +1,4 @@
-"""The mission file, `ucp-mission/1`."""
+"""The schema of the mission file (`ucp-mission/1`)."""
 
 import dataclasses
 
@@ -24,26 +24,26 @@ def _setting(declared: Number | Choice) -> Schema:
 
 
 def settings(*, optional: bool) -> Schema:
-    """The settings, each with its default; an `optional` one may be missing."""
+    """Return the schema of the settings with their defaults. If `optional`, each setting may be missing."""
     defaults = dataclasses.asdict(Settings())
     named = {name: {**_setting(declared), "default": defaults[name]} for name, declared in DECLARED.items()}
     return record(named, optional=tuple(named) if optional else ADDED)
 
 
 def events() -> Schema:
-    """Where an agent's events come from."""
-    of_telemetry: Schema = {
+    """Return the schema of the event source."""
+    optional: Schema = {
         "mean_s": ABOVE_0 | {"maximum": MAX_MEAN_S},
         "position_interval_s": ABOVE_0,
         "log": listed({"enum": list(EVENT_KINDS)}),
         "vehicle_host": {"type": "string", "minLength": 1},
         "vehicle_port": PORT,
     }
-    return record({"source": {"enum": ["random", "mavlink", "none"]}, **of_telemetry}, optional=tuple(of_telemetry))
+    return record({"source": {"enum": ["random", "mavlink", "none"]}, **optional}, optional=tuple(optional))
 
 
 def schema() -> Schema:
-    """The document."""
+    """Return the schema of a mission file."""
     return record(
         {
             "schema": {"const": SCHEMA},

@@ -1,4 +1,4 @@
-"""Parts of which the schemas are made."""
+"""Parts that several schemas share."""
 
 from typing import Any
 
@@ -23,12 +23,15 @@ ROSTER: Schema = {"type": "array", "items": AGENT_ID, "minItems": 1}
 
 
 def record(properties: Schema, *, optional: tuple[str, ...] = (), closed: bool = False) -> Schema:
-    """A JSON object with these keys, all but the `optional` ones required; `closed`: and no others."""
+    """Return the schema of a JSON object with these keys. All except the `optional` ones are required.
+
+    If `closed`, no other keys are allowed.
+    """
     required = [name for name in properties if name not in optional]
     made: Schema = {"type": "object", "properties": properties, "required": required}
     return made | {"additionalProperties": False} if closed else made
 
 
 def listed(items: Schema) -> Schema:
-    """A list of any length."""
+    """Return the schema of a list of any length."""
     return {"type": "array", "items": items}

@@ -1,4 +1,4 @@
-"""A line of a trace, `ucp-trace/2`."""
+"""The schema of a line of a trace (`ucp-trace/2`)."""
 
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
 from ucp.contract.schemas._mission_schema import settings
@@ -33,7 +33,7 @@ DROPS = (
     "sender not on the roster",
     "block not of the roster",
 )
-"""Why a datagram is given to no handler."""
+"""Reasons why an agent drops a datagram."""
 
 SECURED_DROPS = (
     "not secured",
@@ -48,11 +48,11 @@ SECURED_DROPS = (
     "not signed by the authority",
     "known already",
 )
-"""Why, in a secured mission, besides."""
+"""Further reasons in a secured mission."""
 
 
 def header() -> Schema:
-    """The first line of a life."""
+    """Return the schema of a header, the first line of each incarnation."""
     clock = record({"epoch_us": COUNT, "speedup": {"type": "number", "exclusiveMinimum": 0}})
     return record(
         {
@@ -69,7 +69,7 @@ def header() -> Schema:
 
 
 def trigger() -> Schema:
-    """What made a handler run."""
+    """Return the schema of a trigger."""
     names = {"enum": [message.NAME for message in ON_MESSAGE]}
     kinds = (
         {"message": names, "from": AGENT_ID, "seq": COUNT},
@@ -83,7 +83,7 @@ def trigger() -> Schema:
 
 
 def handler_run() -> Schema:
-    """A handler run: the handler's number and branches are those of its name."""
+    """Return the schema of a handler run. Its algorithm and branch must belong to the handler."""
     sent = record(
         {
             "message": {"enum": [message.NAME for message in ON_MESSAGE]},
@@ -135,7 +135,7 @@ def handler_run() -> Schema:
         },
         optional=("input", "tally", "started", "sealed"),
     )
-    came = {"anyOf": [{"required": [kind]} for kind in ("message", "event", "boot")]}
+    with_input = {"anyOf": [{"required": [kind]} for kind in ("message", "event", "boot")]}
     return run | {
         "allOf": [
             *(
@@ -173,7 +173,7 @@ def handler_run() -> Schema:
                 "then": {"properties": {"handler": {"enum": [handler.name for handler in ON_LOCAL_EVENT.values()]}}},
             },
             {
-                "if": {"properties": {"trigger": came}},
+                "if": {"properties": {"trigger": with_input}},
                 "then": {"required": ["input"]},
                 "else": {"properties": {"input": False}},
             },
@@ -182,7 +182,7 @@ def handler_run() -> Schema:
 
 
 def aside() -> Schema:
-    """A line of what was given to no handler: a datagram that was dropped, or a command."""
+    """Return the schema of the lines without a handler run: dropped datagrams and commands."""
     return {
         "oneOf": [
             record({"t": SECONDS, "dropped": {"enum": [*DROPS, *SECURED_DROPS]}, "datagram": BASE64}),
@@ -192,10 +192,10 @@ def aside() -> Schema:
 
 
 def line() -> Schema:
-    """Any line."""
+    """Return the schema of any line."""
     return {"oneOf": [header(), handler_run(), *aside()["oneOf"]]}
 
 
 def schema() -> Schema:
-    """The document: a line."""
+    """Return the schema of a line."""
     return line()

@@ -1,4 +1,4 @@
-"""Lines of virtual time: each is an input and the output that answers it."""
+"""The schemas of the lines of an agent in virtual time: inputs and outputs."""
 
 from ucp.contract.schemas import _chain_export_schema, _control_schema, _mission_schema, _trace_schema
 from ucp.contract.schemas._schema_parts import BASE64, EVENT_ID, FLAG, SECONDS, TIMESTAMP, Schema, listed, record
@@ -7,11 +7,11 @@ from ucp.mission import LATEST_EPOCH_US
 EVENT_TIMESTAMP: Schema = TIMESTAMP | {"maximum": LATEST_EPOCH_US}
 
 COMMANDS = ("status", "stop_events", "reconcile", "export", "quirk", "revoke")
-"""Those of the control socket; besides there is `store`."""
+"""The commands that are also commands of the control socket. Virtual time adds `store`."""
 
 
 def inputs() -> Schema:
-    """What an agent reads."""
+    """Return the schema of an input line."""
     in_virtual_time = {
         "properties": {
             "epoch_us": {"type": "integer"},
@@ -21,7 +21,7 @@ def inputs() -> Schema:
         },
         "required": ["epoch_us"],
     }
-    life = record(
+    start = record(
         {
             "t": SECONDS,
             "mission": {"allOf": [_mission_schema.schema(), in_virtual_time]},
@@ -36,7 +36,7 @@ def inputs() -> Schema:
     keys = _control_schema.REQUESTS | {"store": {}}
     return {
         "oneOf": [
-            life,
+            start,
             record({"t": SECONDS, "datagram": BASE64}),
             record({"t": SECONDS, "event_id": EVENT_ID, "data": BASE64, "timestamp_us": EVENT_TIMESTAMP}),
             record({"t": SECONDS, "timer": {"const": True}}),
@@ -46,7 +46,7 @@ def inputs() -> Schema:
 
 
 def outputs() -> Schema:
-    """What it writes."""
+    """Return the schema of an output line."""
     stored = record({**_control_schema.DONE, "store": True})
     answers = [
         *(_control_schema.answer(command) for command in ("status", "stop_events")),
@@ -69,7 +69,7 @@ def outputs() -> Schema:
 
 
 def schema() -> Schema:
-    """The document: an input and its output, as the transcripts of `ucp/contract/vectors/missions` have them."""
+    """Return the schema of an input with its output, as in the transcripts of `ucp/contract/vectors/missions`."""
     return record({"input": {"$ref": "#/$defs/input"}, "output": {"$ref": "#/$defs/output"}}) | {
         "$defs": {"input": inputs(), "output": outputs()}
     }

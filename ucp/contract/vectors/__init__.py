@@ -23,7 +23,7 @@ DIRECTORY = Path(__file__).parent
 
 
 def _secured() -> Any:
-    from ucp.contract.vectors import _secured_vectors  # draws in cryptography, which who replays missions need not have
+    from ucp.contract.vectors import _secured_vectors  # it needs cryptography, and a replay of missions does not
 
     return _secured_vectors.vectors()
 
@@ -36,32 +36,32 @@ DOCUMENTS: dict[str, Callable[[], Any]] = {
     "refusals": refusal_vectors.vectors,
     "secured": _secured,
 }
-"""Name of a file -> what it has."""
+"""Name of a file -> function that returns its content."""
 
 MISSIONS = DIRECTORY / "missions"
 INDEX = MISSIONS / "index.json"
-"""Name of each transcript, what happens in it, and which features it needs."""
+"""The file with the name, the description and the needed features of each transcript."""
 
 
 def texts() -> dict[Path, str]:
-    """Every file and what stands in it."""
+    """Return the path and the text of each file."""
     made = {DIRECTORY / f"{name}.json": _json(vectors()) for name, vectors in DOCUMENTS.items()}
     index = {}
     for name, mission in _mission_vectors.MISSIONS.items():
         exchanges = mission().exchanges
         features = exchanges[0]["input"]["mission"]["features"]
-        index[name] = {"what": mission.__doc__, "features": features, "lines": len(exchanges)}
+        index[name] = {"what": " ".join((mission.__doc__ or "").split()), "features": features, "lines": len(exchanges)}
         made[MISSIONS / f"{name}.jsonl"] = "".join(json.dumps(exchange) + "\n" for exchange in exchanges)
     return made | {INDEX: _json(index)}
 
 
 def write_all() -> None:
-    """Write all files anew."""
+    """Write all files again."""
     for path, text in texts().items():
         path.parent.mkdir(exist_ok=True)
         path.write_text(text, encoding="ascii")
 
 
 def _json(document: Any) -> str:
-    """Bytes are in base64, as everywhere in the contract."""
+    """Return a document as JSON. Bytes are in base64, as everywhere in the contract."""
     return json.dumps(document, indent=1, default=lambda data: base64.b64encode(data).decode("ascii")) + "\n"

@@ -1,4 +1,4 @@
-"""Vectors of full blocks: events logged one after another, after which of them a block is full, and its timestamp."""
+"""Vectors of full blocks: a sequence of logged events, the events that complete a block, and the blocks."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -12,7 +12,7 @@ AGENT_ID = 7
 
 
 def _events(sizes: Iterable[int], timestamps_us: Iterable[int]) -> list[LoggableEvent]:
-    """Events of these sizes, header included."""
+    """Return events of these sizes in bytes, header included."""
     return [
         LoggableEvent(timestamp_us, 1 + number % 254, bytes([number % 256]) * (size - EVENT_HEADER_BYTES))
         for number, (size, timestamp_us) in enumerate(zip(sizes, timestamps_us, strict=True))
@@ -43,7 +43,7 @@ CASES: tuple[tuple[str, Settings, list[LoggableEvent]], ...] = (
 
 
 def vectors() -> list[dict[str, Any]]:
-    """Of each event the branch of Algorithm 1, and the block that it completes, if it does."""
+    """Return the vectors. Each event has its branch of Algorithm 1, and the block that it completes, if any."""
     return [
         {
             "what": what,

@@ -1,4 +1,4 @@
-"""Vectors of messages: each as a datagram, with all of its fields."""
+"""Vectors of messages: the datagram of each message with all of its fields."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -39,11 +39,11 @@ MESSAGES: tuple[tuple[int, int, Message], ...] = (
     (1, 13, BlockResponse(BLOCKS[0])),
     (1, 14, BlockResponse(BLOCKS[3])),
 )
-"""Sender, sequence, message."""
+"""The sender, sequence and message of each vector."""
 
 
 def vectors() -> list[dict[str, Any]]:
-    """Hashes are in hex; a field that the message leaves out is null."""
+    """Return the vectors. Hashes are in hexadecimal. A field that the message omits is null."""
     return [
         {
             "message": message.NAME,

@@ -1,4 +1,4 @@
-"""A mission told input by input, and what the agent answered: how the transcripts in `missions/` are made."""
+"""Record the transcripts in `missions/`: a story gives inputs to an agent and records its outputs."""
 
 import base64
 import json
@@ -32,10 +32,10 @@ MICROSECONDS = 1_000_000
 
 
 class Story:
-    """What a life of agent 7 is given, and what it answers. `exchanges` are the lines of the transcript.
+    """The inputs and outputs of agent 7. `exchanges` has the lines of the transcript.
 
-    Times are the agent's mission seconds; `now` is that of the last input. The others are played here: their messages
-    have sequence numbers of their own, which mean nothing to the protocol.
+    Times are mission seconds of the agent, and `now` is the time of the last input. The story plays the other agents.
+    All of them share one counter of sequence numbers, which the protocol does not use.
     """
 
     initial_data = INITIAL_DATA
@@ -52,7 +52,7 @@ class Story:
     # Inputs
 
     def begin(self, **store: Any) -> None:
-        """A life begins; with `store` from what an earlier one left."""
+        """Start an incarnation. `store` holds the data of the incarnation before."""
         self._agent: VirtualAgent | None = None
         settings = Settings().to_json() | self._settings
         mission: dict[str, Any] = {
@@ -76,61 +76,61 @@ class Story:
         self._exchange({"mission": mission, "trace": True, **self._of_life(), **store})
 
     def _of_mission(self) -> dict[str, Any]:
-        """Further keys of the mission."""
+        """Return further keys of the mission."""
         return {}
 
     def _of_life(self) -> dict[str, Any]:
-        """Further keys of the line with which a life begins."""
+        """Return further keys of the line that starts an incarnation."""
         return {}
 
     def log(self, data_bytes: int = 256, *, after_s: float = 1.0, event_id: int = 5) -> None:
-        """The vehicle logs an event, whose data is so long."""
+        """Log an event with `data_bytes` bytes of data."""
         self.now += after_s
         timestamp_us = self._epoch_us + round(self.now * MICROSECONDS)
         data = bytes((event_id + offset) % 256 for offset in range(data_bytes))
         self._exchange({"event_id": event_id, "data": in_base64(data), "timestamp_us": timestamp_us})
 
     def complete_a_block(self) -> None:
-        """Three events of the largest size are a block."""
+        """Log three events of the largest size, which fill a block."""
         for _ in range(3):
             self.log()
 
     def hear(self, sender: int, message: Message, *, after_s: float = 0.125) -> None:
-        """Another agent's message arrives."""
+        """Give the agent a message of another agent."""
         self._sequence += 1
         self.hear_datagram(self._encoded(sender, self._sequence, message), after_s=after_s)
 
     def _encoded(self, sender: int, sequence: int, message: Message) -> bytes:
-        """As it is on the air."""
+        """Return the datagram of a message of another agent."""
         return encode(sender, sequence, message)
 
     def _message(self, datagram: bytes) -> Message | None:
-        """What the agent said; None if it is no message."""
+        """Return the message in a datagram of the agent. None if it has no message."""
         return decode(datagram).message
 
     def hear_datagram(self, datagram: bytes, *, after_s: float = 0.125) -> None:
-        """Whatever the radio delivers."""
+        """Give the agent a datagram, which may be malformed."""
         self.now += after_s
         self._exchange({"datagram": in_base64(datagram)})
 
     def wait(self, *, late_s: float = 0.0) -> None:
-        """The next timer ends."""
+        """Wait for the next timer. The agent gets it `late_s` after its expiry."""
         assert self.timer is not None, "no timer runs"
         self.now = self.timer + late_s
         self._exchange({"timer": True})
 
     def wait_until(self, at_s: float) -> None:
-        """It is now so late."""
+        """Wait until mission second `at_s`, and let all timers expire that are due."""
         self.now = at_s
         self._exchange({"timer": True})
 
     def command(self, name: str, *, after_s: float = 0.5, **keys: Any) -> None:
-        """A command of the control socket, or `store`."""
+        """Give the agent a command of the control socket, or the command `store`."""
         self.now += after_s
         self._exchange({"command": name, **keys})
 
     def reboot(self, *, down_s: float = 30.0) -> None:
-        """A brown-out: the next life begins with what this one leaves."""
+        """Play a brown-out. The next incarnation starts with the store of this one."""
         self.command("store")
         line = len(self.exchanges)
         store = self.output["answer"].pop("store")
@@ -150,41 +150,44 @@ class Story:
             self.output["answer"] = {key: answer[key] for key in ("ok", *STATUS)}
         self.exchanges.append({"input": dict(given), "output": self.output})
 
-    # What came of the last input
+    # Results of the last input
 
     @property
     def timer(self) -> float | None:
-        """When the next timer ends."""
+        """The mission second at which the next timer expires."""
         ends: float | None = self.output["timer"]
         return ends
 
     @property
     def sent(self) -> list[Message]:
-        """What it broadcast last."""
-        said = (self._message(base64.b64decode(datagram)) for datagram in self.output["sent"])
-        return [message for message in said if message is not None]
+        """The messages that the agent broadcast."""
+        messages = (self._message(base64.b64decode(datagram)) for datagram in self.output["sent"])
+        return [message for message in messages if message is not None]
 
-    # Answers of others to what it asked last
+    # Answers of other agents to the last request
 
     def vote(self, *votes: tuple[int, bool]) -> None:
-        """These agents vote on the block that it has proposed last, at once."""
+        """Give the agent votes on its last proposed block, as (voter, approve)."""
         for sender, approve in votes:
             self.hear(sender, BlockAddResponse(self._last(BlockAddRequest).block_hash, approve))
 
     def contain(self, *answers: tuple[int, bool]) -> None:
-        """These agents answer its question of phase 1."""
+        """Give the agent answers to its last query of phase 1, as (responder, contained)."""
         for sender, contained in answers:
             self.hear(sender, ChainContainResponse(self._last(ChainContainQuery).chain_hash, contained))
 
     def name(self, *answers: tuple[int, Block | None], top_us: int = 0) -> None:
-        """These agents answer its question of phase 2: their next block, or that their chain ends here."""
+        """Give the agent answers to its last query of phase 2, as (responder, next block).
+
+        None stands for "Is Top Of Chain", with the timestamp `top_us`.
+        """
         for sender, block in answers:
             chain_hash = self._last(ChainHashSuccessorQuery).chain_hash
             block_hash, timestamp_us = (block.block_hash, block.timestamp_us) if block is not None else (None, top_us)
             self.hear(sender, NextInSequenceResponse(chain_hash, block_hash, timestamp_us))
 
     def _last(self, question: type[Any]) -> Any:
-        """What it sent last of this type."""
+        """Return the last message of this type that the agent sent."""
         for exchange in reversed(self.exchanges):
             for datagram in reversed(exchange["output"]["sent"]):
                 message = self._message(base64.b64decode(datagram))
@@ -193,19 +196,19 @@ class Story:
         raise AssertionError(f"it has sent no {question.__name__}")
 
     def proposed(self) -> bytes:
-        """Block hash of what it has proposed last."""
+        """Return the block hash of the last proposal."""
         block_hash: bytes = self._last(BlockAddRequest).block_hash
         return block_hash
 
 
 def others_block(agent_id: int, ordinal: int, *, at_s: float = 0.0) -> Block:
-    """A block of another agent."""
+    """Return a block of another agent."""
     timestamp_us = round(at_s * MICROSECONDS) + ordinal
     return Block(agent_id, timestamp_us, LoggableEvent(timestamp_us, ordinal, b"of another agent").encode())
 
 
 def chain_of(*blocks: Block) -> Chain:
-    """A chain of the mission that the stories are of."""
+    """Return a chain with these blocks on the inception block of the stories."""
     chain = Chain(InceptionBlock(INITIAL_DATA))
     for block in blocks:
         chain.append(block)

@@ -1,4 +1,4 @@
-"""Whole missions in virtual time. Between them they take every branch of the 20 algorithms.
+"""Whole missions in virtual time. Together they take every branch of the 20 algorithms.
 
 Each function is a mission: its name is the transcript's, and its docstring says what happens.
 """
@@ -21,13 +21,13 @@ from ucp.messages import (
 )
 
 A, B, C = 1, 28, 300
-"""The others on the roster."""
+"""The other agents on the roster."""
 STRANGE = bytes(range(32))
-"""A hash of nothing."""
+"""A hash that no block and no chain has."""
 
 
 def alone() -> Story:
-    """An agent that is alone builds blocks, proposes them, and approves them itself; a second waits for its turn."""
+    """An agent without neighbours builds two blocks. It proposes and approves one after the other."""
     story = Story(roster=(AGENT_ID,), epoch_us=1_795_258_278_064_591)
     story.complete_a_block()
     story.complete_a_block()
@@ -42,7 +42,7 @@ def alone() -> Story:
 
 
 def follow() -> Story:
-    """The agent votes on others' proposals, follows their commits, and answers their questions."""
+    """The agent votes on proposals of other agents, follows their commits, and answers their queries."""
     story = Story()
     first, second, third = others_block(A, 1, at_s=1), others_block(B, 2, at_s=2), others_block(C, 3, at_s=3)
     chain = chain_of()
@@ -72,12 +72,12 @@ def follow() -> Story:
 
 
 def first_again(block: Block) -> Block:
-    """Another block than this, though nearly the same: agents tell blocks by their hashes."""
+    """Return a block that differs slightly from this one. Agents distinguish blocks by their hashes."""
     return Block(block.agent_id, block.timestamp_us + 1, block.event_data)
 
 
 def vote() -> Story:
-    """Votes are counted once, and for the candidate only; a majority commits, and late votes count for nothing."""
+    """Votes count once, and only for the candidate. A majority commits the block, and late votes do not count."""
     story = Story()
     story.hear(A, BlockAddResponse(STRANGE, True))
     story.complete_a_block()
@@ -92,7 +92,7 @@ def vote() -> Story:
 
 
 def tied_vote() -> Story:
-    """A tie approves nothing: the agent reconciles, finds that all have its chain, and proposes once more."""
+    """A tied vote is not approved. The agent reconciles, finds that all agents have its chain, and proposes again."""
     story = Story()
     story.complete_a_block()
     story.vote((A, False))
@@ -113,7 +113,10 @@ def tied_vote() -> Story:
 
 
 def chain_changed() -> Story:
-    """A commit crosses the vote, and it votes again; the next time with too few votes: it reconciles, unheard."""
+    """A commit changes the chain during a vote.
+
+    The agent votes again without a majority, and reconciles without answers.
+    """
     story = Story()
     first, second = others_block(A, 1), others_block(B, 2)
     chain = chain_of(first)
@@ -132,7 +135,10 @@ def chain_changed() -> Story:
 
 
 def held_already() -> Story:
-    """Another commits the agent's own block, on top of its own chain: nobody in good faith does, and it is refused."""
+    """Another agent commits the agent's own block on top of its chain.
+
+    No correct agent does this. It is not followed.
+    """
     story = Story()
     story.complete_a_block()
     story.wait()
@@ -145,12 +151,15 @@ def held_already() -> Story:
 
 
 def chain_hash_on(chain_hash: bytes, block: Block) -> bytes:
-    """That of `block` if it were on top of this chain."""
+    """Return the chain hash of `block` on top of this chain."""
     return next_chain_hash(chain_hash, block.block_hash)
 
 
 def diverged() -> Story:
-    """A question shows that its chain has diverged while its vote runs. It answers nobody until it has reconciled."""
+    """A query during a vote shows that the agent's chain has diverged.
+
+    The agent answers no message until it has reconciled.
+    """
     story = Story(vote_timeout_s=10.0, phase1_timeout_s=7.5)
     mine, other = others_block(A, 1), others_block(B, 2)
     story.hear(A, CommitBlock(mine, chain_of(mine).top_chain_hash))
@@ -176,7 +185,10 @@ def diverged() -> Story:
 
 
 def outvoted() -> Story:
-    """Three blocks are popped, the majority's is fetched, one comes from the stack, the rest goes back on top."""
+    """Three blocks are popped.
+
+    One block of the majority is requested, one is on the stack, and the rest is committed again.
+    """
     story = Story()
     mutual, theirs, last = others_block(A, 1), others_block(B, 2), others_block(C, 3)
     chain = chain_of(mutual)
@@ -211,7 +223,7 @@ def outvoted() -> Story:
 
 
 def no_gap() -> Story:
-    """Without a gap the whole stack goes back in one run."""
+    """Without a finalize gap, the whole stack is committed in one run."""
     story = Story(finalize_gap_s=0)
     for ordinal in range(1, 4):
         blocks = [others_block(A, number) for number in range(1, ordinal + 1)]
@@ -226,7 +238,7 @@ def no_gap() -> Story:
 
 
 def nobody() -> Story:
-    """Nobody answers in phase 1; then in phase 2; then the block of phase 3 does not come."""
+    """No agent answers in phase 1, in a later phase 2, and in a later phase 3."""
     story = Story()
     theirs = others_block(B, 2)
     story.command("reconcile")
@@ -244,7 +256,7 @@ def nobody() -> Story:
 
 
 def at_inception() -> Story:
-    """All say that they do not contain the inception block: it is never popped."""
+    """All agents answer that they do not contain the inception block. It is never popped."""
     story = Story()
     story.command("reconcile")
     story.contain((A, False), (B, False))
@@ -254,7 +266,7 @@ def at_inception() -> Story:
 
 
 def ties() -> Story:
-    """A tie of phase 1 goes to phase 2; ties of phase 2 go to the oldest, and of the same age to the lowest hash."""
+    """A tie in phase 1 continues with phase 2. A tie in phase 2 selects the oldest block, then the lowest hash."""
     story = Story()
     old, young, top = others_block(B, 1, at_s=10), others_block(C, 2, at_s=20), others_block(A, 3, at_s=15)
     story.hear(A, CommitBlock(top, chain_of(top).top_chain_hash))
@@ -281,7 +293,7 @@ def ties() -> Story:
 
 
 def ties_read_otherwise() -> Story:
-    """With the settings `phase1_tie` pop and `phase2_tie` block."""
+    """The settings are `phase1_tie` pop and `phase2_tie` block."""
     story = Story(phase1_tie="pop", phase2_tie="block")
     first, second = others_block(A, 1, at_s=1), others_block(B, 2, at_s=2)
     story.hear(A, CommitBlock(first, chain_of(first).top_chain_hash))
@@ -300,7 +312,7 @@ def ties_read_otherwise() -> Story:
 
 
 def asks_after_commit() -> Story:
-    """With the setting `asks_after_commit`: a gap after its commits it asks, unless it reconciles by then."""
+    """The setting is `asks_after_commit`. The agent asks a gap after its commits, unless it reconciles by then."""
     story = Story(asks_after_commit=True)
     story.complete_a_block()
     story.vote((A, True))
@@ -315,7 +327,7 @@ def asks_after_commit() -> Story:
 
 
 def answer_spread() -> Story:
-    """With the setting `answer_spread_s`: each answer is sent after its own wait, all other messages at once."""
+    """The setting is `answer_spread_s`. Each answer is sent after its own wait, and all other messages at once."""
     story = Story(answer_spread_s=2.0)
     block = others_block(A, 1, at_s=1)
     chain = chain_of(block)
@@ -335,7 +347,7 @@ def answer_spread() -> Story:
 
 
 def top_needs_majority() -> Story:
-    """With the setting `top_needs_majority`: what follows is taken unless, with us, more say that nothing does."""
+    """The setting is `top_needs_majority`. "Is Top Of Chain" ends the search only if a vote would be approved."""
     story = Story(top_needs_majority=True)
     old, young = others_block(B, 1, at_s=10), others_block(C, 2, at_s=20)
     story.command("reconcile")
@@ -351,7 +363,7 @@ def top_needs_majority() -> Story:
 
 
 def votes_name_chains() -> Story:
-    """With the settings `vote_names_chain` and `changed_before_tally`."""
+    """The settings are `vote_names_chain` and `changed_before_tally`."""
     story = Story(vote_names_chain=True, changed_before_tally=True)
     first = others_block(A, 1)
     inception = chain_of().top_chain_hash
@@ -372,7 +384,7 @@ def votes_name_chains() -> Story:
 
 
 def offered_what_it_holds() -> Story:
-    """The majority names a block that is in the agent's deque, and then one that is in its chain."""
+    """The majority names a block that is in the agent's deque, and later a block that is in its chain."""
     story = Story()
     first = others_block(A, 1)
     story.hear(A, CommitBlock(first, chain_of(first).top_chain_hash))
@@ -394,7 +406,10 @@ def offered_what_it_holds() -> Story:
 
 
 def reboot() -> Story:
-    """A brown-out in the middle of a reconcile: the stack goes back on top, and the deque's front is proposed again."""
+    """A brown-out interrupts a reconcile.
+
+    The stack is committed again, and the front of the deque is proposed again.
+    """
     story = Story()
     blocks = [others_block(A, ordinal) for ordinal in range(1, 4)]
     for ordinal in range(1, 4):
@@ -422,7 +437,7 @@ def reboot() -> Story:
 
 
 def late_timers() -> Story:
-    """A clock that begins below 0, two timers that have ended when the agent gets to run, and drops among it all."""
+    """The clock begins below 0, two timers have expired when the agent runs, and datagrams are dropped in between."""
     story = Story(at_s=-3.5)
     story.hear_datagram(b"", after_s=0.0)
     story.log(256, after_s=4.0)
@@ -442,7 +457,7 @@ def late_timers() -> Story:
 
 
 def secured() -> Story:
-    """With keys, and events sealed: what is heard twice is dropped, and whoever is revoked; then it reboots."""
+    """The mission has keys and seals events. Replayed datagrams and a revoked sender are dropped. The agent reboots."""
     from ucp.contract.vectors._secured_story import SecuredStory  # needs the extra `secure`
 
     story = SecuredStory()
@@ -497,4 +512,4 @@ MISSIONS: dict[str, Callable[[], Story]] = {
         secured,
     )
 }
-"""Transcript -> mission."""
+"""Name of a transcript -> function that plays its mission."""

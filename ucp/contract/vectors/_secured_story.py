@@ -1,4 +1,4 @@
-"""A mission with keys told input by input: the peers seal what they say, and open what the agent answers."""
+"""Record a transcript of a secured mission. The other agents seal their messages and open those of the agent."""
 
 from typing import Any
 
@@ -24,33 +24,34 @@ MAX_BLOCK_BYTES = 976
 
 
 class SecuredStory(Story):
-    """As any, of a mission that is secured, and whose events are sealed."""
+    """A story of a secured mission with sealed event data."""
 
     def __init__(self) -> None:
-        assert KEYS.public.depot is not None, "it seals"
+        assert KEYS.public.depot is not None, "the mission seals event data"
         self.initial_data = seal_to(INITIAL_DATA, KEYS.public.depot)
-        self._lives = 0
+        self._incarnations = 0
         self._opener = Opener(KEYS.bundle(AGENT_ID))
         self._peers = {peer: Session(KEYS.bundle(peer), make_boot(peer, b"a chance")) for peer in ROSTER}
-        self._asked: dict[int, Request] = {}
+        self._requests: dict[int, Request] = {}
+        """Type of a request -> the agent's last request of this type."""
         super().__init__(max_block_bytes=MAX_BLOCK_BYTES)
 
     def chain(self, *blocks: Block) -> Chain:
-        """A chain of this mission."""
+        """Return a chain with these blocks on the inception block of this mission."""
         chain = Chain(InceptionBlock(self.initial_data))
         for block in blocks:
             chain.append(block)
         return chain
 
     def revoke(self, *agents: int) -> None:
-        """The authority's first revocation, by the control socket."""
+        """Give the agent the authority's first revocation as a command of the control socket."""
         authority = Ed25519PrivateKey.from_private_bytes(KEYS.authority)
         revocation = Revocation.signed(authority, KEYS.public.mission, 1, agents)
         self.command("revoke", revocation=in_base64(revocation.encode()))
-        del self.output["answer"]["revoked"]  # which an agent may leave out
+        del self.output["answer"]["revoked"]  # an agent may leave out this key
 
     def hear_again(self) -> None:
-        """The last datagram once more."""
+        """Give the agent the last datagram again."""
         inputs = (exchange["input"] for exchange in reversed(self.exchanges))
         self.now += 0.125
         self._exchange({"datagram": next(given["datagram"] for given in inputs if "datagram" in given)})
@@ -62,20 +63,20 @@ class SecuredStory(Story):
         return {"security": {"bundle": bundle_name(AGENT_ID)}}
 
     def _of_life(self) -> dict[str, Any]:
-        self._lives += 1
-        boot = make_boot(1_795_258_278_064_591 + self._lives, b"a chance")
+        self._incarnations += 1
+        boot = make_boot(1_795_258_278_064_591 + self._incarnations, b"a chance")
         return {"bundle": KEYS.bundle(AGENT_ID).to_json(), "boot": boot.hex()}
 
     def _encoded(self, sender: int, sequence: int, message: Message) -> bytes:
         code = TYPE_CODES[type(message)]
-        request = self._asked.get(REQUEST_OF[code]) if code in REQUEST_OF else None
+        request = self._requests.get(REQUEST_OF[code]) if code in REQUEST_OF else None
         signature = self._signature(message.block) if type(message) in CARRY_A_BLOCK else None  # type: ignore[union-attr]
         return self._peers[sender].seal(sequence, message, request, signature, 0)
 
     def _message(self, datagram: bytes) -> Message | None:
-        """What the agent said; its questions are what is answered next. None of a revocation."""
+        """Return the message in a datagram of the agent, and remember its request. None for a revocation."""
         if datagram[3] == REVOCATION:
             return None
         opened = self._opener.open(datagram)
-        self._asked[opened.clear.type] = Request(AGENT_ID, opened.clear.boot, opened.clear.sequence)
+        self._requests[opened.clear.type] = Request(AGENT_ID, opened.clear.boot, opened.clear.sequence)
         return opened.datagram.message

@@ -1,4 +1,4 @@
-"""Vectors of secured missions: the datagram of each message with all that it is made of, and some that are dropped."""
+"""Vectors of secured missions: the datagram of each message with its inputs, and datagrams that are dropped."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -25,19 +25,19 @@ NOW = EPOCH * KEYS.public.epoch_s
 
 
 def session(agent_id: int, keys: KeySet = KEYS) -> Session:
-    """A life of that agent in the epoch of the vectors."""
+    """Return a session of an agent in the epoch of the vectors."""
     begun = Session(keys.bundle(agent_id), BOOT)
     begun.epochs.set_clock(NOW)
     return begun
 
 
 def signature_of(block: Block) -> bytes:
-    """Its maker's."""
+    """Return the maker's signature of a block."""
     return sign_block(session(block.agent_id).private_key, KEYS.public.mission, block.block_data())
 
 
 def cases() -> Iterator[tuple[str, bytes]]:
-    """What is about a datagram, and the datagram, as they reach agent 7 one after another."""
+    """Yield each datagram after its description. They reach agent 7 in this order."""
     other = session(OTHER)
     good = other.seal(1, RequestForBlock(BLOCK_HASH), None, None, 0)
     yield "a plain one", encode(OTHER, 1, RequestForBlock(BLOCK_HASH))
@@ -63,7 +63,7 @@ def cases() -> Iterator[tuple[str, bytes]]:
 
 
 def vectors() -> dict[str, Any]:
-    """Keys are in hex, as in a bundle; datagrams in base64."""
+    """Return the vectors. Keys are in hexadecimal, as in a bundle. Datagrams are in base64."""
     receiver = SecuredAgent(session(AGENT_ID), AGENT_ID, ROSTER, b"test", tracing=True)
     dropped = []
     for what, datagram in cases():

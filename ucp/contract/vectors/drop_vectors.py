@@ -1,4 +1,4 @@
-"""Vectors of drops: what a datagram must be that no handler is given, and on the border what is handled."""
+"""Vectors of drops: datagrams that an agent must drop, and similar datagrams that it must handle."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,21 +13,21 @@ ROSTER = (1, 7, 28)
 SENDER = 28
 HASH_2 = BLOCK_HASH + CHAIN_HASH
 STRANGER = 5
-"""On nobody's roster."""
+"""An agent that is not on the roster."""
 
 
 def datagram(code: int, body: bytes, *, sender: int = SENDER, length: int | None = None) -> bytes:
-    """A datagram with this body, whatever it may be."""
+    """Return a datagram with this type and body, valid or not."""
     return HEADER.pack(MAGIC, VERSION, code, sender, 1, len(body) if length is None else length) + body
 
 
 def block(agent_id: int, data_bytes: int = 12) -> bytes:
-    """A block's data."""
+    """Return the block data of a block."""
     return agent_id.to_bytes(4, "big") + (1_000_000).to_bytes(8, "big") + b"\x01" * data_bytes
 
 
 def cases() -> Iterator[tuple[str, bytes]]:
-    """What is about a datagram, and the datagram."""
+    """Yield each datagram after its description."""
     good = datagram(1, HASH_2)
     yield "a good one", good
     yield "nothing at all", b""
@@ -78,7 +78,7 @@ def cases() -> Iterator[tuple[str, bytes]]:
 
 
 def vectors() -> dict[str, Any]:
-    """`dropped` is the reason, or null of a datagram that a handler is given."""
+    """Return the vectors. `dropped` is the reason, or null if a handler receives the datagram."""
     return {
         "agent_id": AGENT_ID,
         "roster": ROSTER,
@@ -87,7 +87,7 @@ def vectors() -> dict[str, Any]:
 
 
 def dropped(data: bytes) -> str | None:
-    """What an agent that has just begun drops it as."""
+    """Return the reason why a new agent drops the datagram. None if it handles the datagram."""
     agent = Agent(AGENT_ID, ROSTER, b"")
     agent.receive_datagram(data, 0.0)
     return next(iter(agent.dropped), None)

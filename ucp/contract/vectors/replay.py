@@ -1,8 +1,7 @@
-"""`python -m ucp.contract.vectors.replay COMMAND...`: give an agent the inputs of the transcripts, and compare what
-it answers.
+"""`python -m ucp.contract.vectors.replay COMMAND...`: play the transcripts with an agent, and compare its outputs.
 
-It is started once, as `COMMAND... --virtual`, and plays one transcript after another. What differs first in each is
-shown, with the line. Exit status 0 if nothing does, 1 if something does.
+The agent is started once, as `COMMAND... --virtual`, and plays all transcripts in turn. The program prints the first
+difference of each transcript with its line. The exit status is 0 without a difference, and 1 otherwise.
 """
 
 import json
@@ -15,16 +14,16 @@ from typing import Any
 from ucp.contract.vectors import INDEX
 
 MAY_BE_MISSING = frozenset(("tally", "started"))
-"""Keys of a line of the trace that an agent may leave out."""
+"""Keys of a trace line that an agent may leave out."""
 SHOWN = 200
 
 
 class NoAnswerError(Exception):
-    """The agent ended, or wrote what is no JSON object."""
+    """The agent ended, or its output is not a JSON object."""
 
 
 class Player:
-    """An agent in virtual time, as a program. Raises OSError if there is no such program."""
+    """An agent program in virtual time. Raises OSError if the program cannot be started."""
 
     def __init__(self, command: list[str]) -> None:
         self._process = subprocess.Popen(
@@ -38,7 +37,7 @@ class Player:
         self._process.__exit__(*error)  # type: ignore[arg-type]
 
     def give(self, given: dict[str, Any]) -> dict[str, Any]:
-        """What the agent answers. Raises NoAnswerError."""
+        """Give the agent an input, and return its answer. Raises NoAnswerError."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         try:
@@ -57,7 +56,10 @@ class Player:
 
 
 def play(player: Player, transcript: Path) -> str | None:
-    """The first difference, or why it cannot be played; None if there is neither. Raises NoAnswerError."""
+    """Play a transcript, and return the first difference, or the reason why the agent cannot play it.
+
+    None if the agent gives the expected outputs. Raises NoAnswerError.
+    """
     stores: dict[int, Any] = {}
     with transcript.open(encoding="ascii") as file:
         for number, line in enumerate(file, 1):
@@ -77,7 +79,7 @@ def play(player: Player, transcript: Path) -> str | None:
 
 
 def differences(got: Any, wanted: Any, where: str = "output") -> Iterator[tuple[str, Any, Any]]:
-    """Where they differ. What the agent says besides what is wanted of an object counts for nothing."""
+    """Yield each difference as (place, value, expected value). Additional keys of an object are no difference."""
     if isinstance(wanted, dict) and isinstance(got, dict):
         for key, value in wanted.items():
             if key in got:
@@ -99,7 +101,7 @@ def _shown(value: Any) -> str:
 
 
 def main(command: list[str]) -> int:
-    """Exit status."""
+    """Play all transcripts, and return the exit status."""
     differ = False
     with Player(command) as player:
         for name, about in json.loads(INDEX.read_text(encoding="ascii")).items():

@@ -1,4 +1,4 @@
-"""A Wireshark dissector of UCP, in Lua. `python -m ucp.contract.wireshark` says where it is."""
+"""A Wireshark dissector of UCP in Lua. `python -m ucp.contract.wireshark` prints its path."""
 
 from pathlib import Path
 
