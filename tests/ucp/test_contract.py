@@ -274,7 +274,7 @@ def test_replay_prints_the_first_difference_of_a_wrong_agent() -> None:
     assert status == 1
     assert "alone" in said
     assert "line 4: output.sent[0] is" in said
-    assert "An agent that is alone builds blocks" in said
+    assert "An agent without neighbours builds two blocks" in said
 
 
 @pytest.mark.parametrize(
