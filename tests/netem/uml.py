@@ -21,6 +21,7 @@ DEADLINE_S = os.environ.get("UCP_UML_DEADLINE_S", "1500")
 _OF_NETEM = (
     "tests/netem/test_engine.py",
     "tests/netem/test_links.py",
+    "tests/netem/test_relay.py",
     "tests/netem/test_lab.py::test_cable_can_end_in_an_existing_network",
     "tests/netem/test_lab.py::test_an_idle_lab_is_silent",
     "tests/netem/test_lab.py::test_connection_without_listener_times_out_and_delays_no_other",
