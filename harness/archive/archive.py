@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from harness.archive.bounded_file import JsonLines, Record
+from harness.archive.channel_journal import CHANNEL_FILE, ChannelLine
 from harness.archive.connectivity import NETWORK_FILE, Connectivity, Link, read_connectivity, read_link_losses
 from harness.archive.directory import PUBLIC_KEYS_FILE, ROGUE_FILE
 from harness.archive.exports import (
@@ -318,6 +319,11 @@ class RunArchive:
         """Return the recorded changes of network and faults, each as a `model`; None without a record."""
         path = self._in_directory(NETWORK_FILE)
         return [*JsonLines(path, model)] if path is not None and path.is_file() else None
+
+    def channel(self) -> list[ChannelLine] | None:
+        """Return the journal of the shared channel; None without a journal."""
+        path = self._in_directory(CHANNEL_FILE)
+        return [*JsonLines(path, ChannelLine)] if path is not None and path.is_file() else None
 
     def lag(self) -> MeasuredLag | None:
         """Return the measured lag of the machine and the agents; None without a record."""

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.archive import traces
+from harness.archive.channel_journal import CHANNEL_FILE
 from harness.archive.connectivity import NETWORK_FILE
 from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE, SUFFIX, export_paths
 from harness.archive.lag import LAG_FILE
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
 
 ROGUE_FILE = "rogue.jsonl"
-CHANNEL_FILE = "channel.jsonl"
 PUBLIC_KEYS_FILE = "public.json"
 ROGUE_CONTROL = "rogue.control"
 

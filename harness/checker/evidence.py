@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pydantic import BaseModel, ConfigDict
 
 from harness.archive.archive import RunArchive
+from harness.archive.channel_journal import ChannelLine
 from harness.archive.connectivity import Link
 from harness.archive.exports import Export, name_blocks
 from harness.archive.lag import MeasuredLag
@@ -146,6 +147,8 @@ class Evidence:
     """Mission seconds with the losses, 0 to 1, that links have from then on: first all links, then changed ones."""
     stores: dict[int, Path] = field(default_factory=dict)
     """The store of the last incarnation of each agent that has one."""
+    channel: list[ChannelLine] | None = None
+    """The journal of the shared channel. None without a journal."""
     _derived: dict[Callable[["Evidence"], Any], Any] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -367,6 +370,7 @@ def gather(archive: RunArchive) -> Evidence:
         scenario=archive.record.scenario,
         link_losses=_link_losses(archive),
         stores=archive.stores,
+        channel=archive.channel(),
     )
 
 

@@ -1,13 +1,10 @@
 """The losses on a shared channel, as `channel.jsonl` of a run has them."""
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-
-from harness.archive.directory import CHANNEL_FILE
+from harness.archive.bounded_file import JsonLines
+from harness.archive.channel_journal import CHANNEL_FILE, ChannelLine
 from harness.archive.packets.capture_reader import ListenerName
 from harness.archive.packets.transmissions import Transmission
 
@@ -17,30 +14,15 @@ ChannelLosses = Mapping[tuple[int, int], Mapping[str, list[int]]]
 DROPS = ("queue", "too_long")
 """Reasons for which a radio does not send a message."""
 
-MAX_LINE = 100_000
-Reason = Annotated[str, Field(max_length=20)]
-
-
-class _Line(BaseModel):
-    model_config = ConfigDict(strict=True)
-
-    sender: int
-    sequence: int | None
-    lost: dict[Reason, list[int]] = {}
-    dropped: Reason | None = None
-
 
 def channel_losses(runs: Iterable[Path]) -> ChannelLosses:
     """Return the losses of these run directories. Lines that cannot be read have no effect."""
-    losses: dict[tuple[int, int], dict[str, list[int]]] = {}
-    for run in runs:
-        try:
-            with (run / CHANNEL_FILE).open(encoding="utf-8", errors="replace") as file:
-                while text := file.readline(MAX_LINE):
-                    _take(losses, text)
-        except OSError:
-            continue
-    return losses
+    return {
+        (line.sender, line.sequence): {line.dropped: []} if line.dropped else line.lost
+        for run in runs
+        for line in JsonLines(run / CHANNEL_FILE, ChannelLine)
+        if line.sequence is not None
+    }
 
 
 def loss_reasons(losses: ChannelLosses, transmission: Transmission) -> dict[str, list[ListenerName]]:
@@ -50,12 +32,3 @@ def loss_reasons(losses: ChannelLosses, transmission: Transmission) -> dict[str,
         for reason, vehicles in losses.get((transmission.sender, transmission.sequence), {}).items()
     }
     return {reason: names for reason, names in named.items() if names}
-
-
-def _take(losses: dict[tuple[int, int], dict[str, list[int]]], text: str) -> None:
-    try:
-        line = _Line.model_validate(json.loads(text))
-    except (ValueError, ValidationError, RecursionError):
-        return
-    if line.sequence is not None:
-        losses[line.sender, line.sequence] = {line.dropped: []} if line.dropped else line.lost

@@ -11,6 +11,7 @@ from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.records import (
     _captures_vs_traces,
+    _channel_vs_traces,
     _conditions_vs_network,
     _counters,
     _datagrams_vs_traces,
@@ -41,6 +42,7 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
     _times.compare,
     _export_vs_store.compare,
     _losses.compare,
+    _channel_vs_traces.compare,
     _captures_vs_traces.compare_counters,
     _captures_vs_traces.compare_captures,
     _datagrams_vs_traces.find_unrecorded,

@@ -13,7 +13,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from harness.archive.directory import CHANNEL_FILE, RunDirectory
+from harness.archive.channel_journal import CHANNEL_FILE
+from harness.archive.directory import RunDirectory
 from harness.errors import MachineError
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
 from harness.play.process._channel_node import CONTROL, VALUE
