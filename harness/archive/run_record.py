@@ -4,7 +4,8 @@ The harness writes the whole record. A record that it reads may come from a kill
 edited. Therefore each key of a `RunRecord` has a default that means unknown.
 """
 
-from typing import Annotated, Any, Literal
+from collections import Counter
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -16,6 +17,8 @@ from harness.scenario.verdict_names import FURTHER_CHECKS, CharacteristicVerdict
 
 SCHEMA = "ucp-run/1"
 
+ENOUGH_ANSWERS = 20
+"""Minimum number of answers for a statement about their times."""
 TOLERATED_LATENESS_S = 0.05
 """Mission seconds. Without a channel, virtual time delivers messages after 2 to 50 ms."""
 
@@ -228,6 +231,15 @@ class ChannelLateness(_Model):
         return f"{late}{missing if self.missed or self.unsent else ''}"
 
 
+class AnswerTimes(_Model):
+    """How long agents took from the arrival of a question to their answer, in mission seconds."""
+
+    count: int
+    median_s: float
+    p95_s: float
+    """One in twenty answers took longer."""
+
+
 class ChannelRecord(_Model):
     """Frames on a radio channel that all vehicles shared. `model` has the preset and all figures of the radio."""
 
@@ -245,6 +257,17 @@ class ChannelRecord(_Model):
     """Share of each interval in which at least one frame was on the channel, from mission second 0 on."""
     lateness: ChannelLateness | None = None
     """null in virtual time, where each message arrives at its exact time."""
+    answers: AnswerTimes | None = None
+    """null in virtual time, where agents answer at once."""
+
+    FRAMES: ClassVar[str] = "frames"
+
+    def counts(self) -> Counter[tuple[str, int]]:
+        """Return the number of frames as (FRAMES, 0), and the losses as (reason, vehicle)."""
+        counts = Counter({(self.FRAMES, 0): self.frames})
+        for reason, by_vehicle in (*self.lost.items(), *self.dropped.items()):
+            counts.update({(reason, int(vehicle)): count for vehicle, count in by_vehicle.items()})
+        return counts
 
     def total(self, reason: str) -> int:
         """Return the number of frames or messages lost for this reason."""
@@ -490,6 +513,20 @@ class RunRecord(JudgedRecord):
         """The IDs of all agents in the record, ascending, also of agents without files."""
         requested = self.scenario.roster if self.scenario else ()
         return sorted({*self.roster, *requested, *map(int, self.agents), *map(int, self.vehicles)})
+
+    def late_answers(self) -> str | None:
+        """Return a sentence if agents took longer for their answers than the shared channel assumes; else None."""
+        answers = self.channel.answers if self.channel else None
+        model = self.scenario.network.channel if self.scenario else None
+        if self.scenario is None or model is None or answers is None or answers.count < ENOUGH_ANSWERS:
+            return None
+        if answers.p95_s <= model.processing_s + self.scenario.settings.answer_spread_s:
+            return None
+        return (
+            f"One in twenty answers left its agent {answers.p95_s:.2g} s or more after the question arrived, but "
+            f"`processing_s` is {model.processing_s:g} s, so fewer answers collided than with a processor for each "
+            "agent"
+        )
 
     @property
     def judgements(self) -> dict[str, CharacteristicRecord | JudgementRecord]:

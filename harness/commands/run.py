@@ -268,6 +268,8 @@ def _show_end(console: Console, finished: Run) -> None:
         complain(
             f"this machine was too slow for the channel. {channel.lateness.in_words()}: choose a smaller --speedup"
         )
+    if late_answers := finished.record.late_answers():
+        complain(f"{late_answers}: choose a smaller --speedup, fewer agents, or a greater `processing_s`")
     late = finished.timer_lag
     if late is not None and not late.tolerable:
         lateness = f"one in twenty vote timers expired {late.late_s:.1f} or more mission seconds late"

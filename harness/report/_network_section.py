@@ -84,6 +84,8 @@ def channel(record: RunRecord) -> list[str]:
     if (late := found.lateness) is not None:
         too_slow = "" if late.tolerable else " The machine was too slow: repeat the run with a smaller speedup."
         sentences.append(f"{late.in_words()}, in mission time.{too_slow}")
+    if late_answers := record.late_answers():
+        sentences.append(f"{late_answers}.")
     return sentences
 
 

@@ -31,13 +31,38 @@ from netem.relay import Heard, Relay
 from ucp.clock import MissionClock
 from ucp.control import Command, CommandError, ControlServer
 from ucp.loop import Loop, Timer
-from ucp.messages import HEADER, MAGIC
+from ucp.messages import (
+    HEADER,
+    MAGIC,
+    TYPE_CODES,
+    BlockAddRequest,
+    BlockAddResponse,
+    BlockResponse,
+    ChainContainQuery,
+    ChainContainResponse,
+    ChainHashSuccessorQuery,
+    NextInSequenceResponse,
+    RequestForBlock,
+)
 
 CONTROL = "channel.control"
 VALUE = "channel.value"
 """File with a large value of a command or an answer."""
 
 NANOSECONDS = 1e9
+KEPT_QUESTIONS = 10_000
+TYPE_AT = 3
+"""Place of the type code in a datagram."""
+ANSWER_TO = {
+    TYPE_CODES[question]: TYPE_CODES[answer]
+    for question, answer in (
+        (BlockAddRequest, BlockAddResponse),
+        (ChainContainQuery, ChainContainResponse),
+        (ChainHashSuccessorQuery, NextInSequenceResponse),
+        (RequestForBlock, BlockResponse),
+    )
+}
+"""Type code of a question -> type code of its answers."""
 
 
 class ChannelNode:
@@ -50,6 +75,7 @@ class ChannelNode:
         self._channel: LiveChannel | None = None
         self._relay: Relay | None = None
         self._lateness = Lateness()
+        self._answers = AnswerTimes()
         self._timer: Timer | None = None
         self._loop = Loop(selector=selectors.SelectSelector())
         self._journal = journal.open("a", encoding="utf-8")
@@ -84,7 +110,9 @@ class ChannelNode:
                 relay.deliver(vehicle, frame)
             except OSError:
                 self._lateness.unsent += 1
-            self._lateness.add(at_s, clock.now())
+            delivered_s = clock.now()
+            self._lateness.add(at_s, delivered_s)
+            self._answers.delivered(frame, vehicle, delivered_s)
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -96,6 +124,7 @@ class ChannelNode:
         if data is None:
             channel.pass_by(at_s, heard.vehicle, heard.frame)
         else:
+            self._answers.sent(heard, data, at_s)
             channel.send(at_s, heard.vehicle, heard.frame, len(data), _sequence(data, heard.vehicle))
 
     def _write(self, line: dict[str, Any]) -> None:
@@ -120,15 +149,16 @@ class ChannelNode:
     def _move(self, request: dict[str, Any]) -> dict[str, Any]:
         coordinates = iter(request["places"])
         places = [Place(*triple) for triple in zip(coordinates, coordinates, coordinates, strict=True)]
-        channel = self._started()
-        channel.move(places, self._clock.now())
-        self._turn()
+        if self._relay is not None:
+            self._started().move(places, self._clock.now())
+            self._turn()
         return {}
 
     def _apply(self, request: dict[str, Any]) -> dict[str, Any]:
         conditions = NetworkConditions.from_json(json.loads((self._directory / VALUE).read_text(encoding="utf-8")))
-        self._started().apply(conditions, self._clock.now())
-        self._turn()
+        if self._relay is not None:
+            self._started().apply(conditions, self._clock.now())
+            self._turn()
         return {}
 
     def _clear(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -145,7 +175,7 @@ class ChannelNode:
         if self._relay is not None:
             self._lateness.missed = self._relay.count_missed()
         self._journal.flush()
-        totals = {**self._started().totals.to_json(), **self._lateness.to_json()}
+        totals = {**self._started().totals.to_json(), **self._lateness.to_json(), **self._answers.to_json()}
         (self._directory / VALUE).write_text(json.dumps(totals), encoding="utf-8")
         return {}
 
@@ -182,8 +212,7 @@ class Lateness:
         return {
             "lateness": {
                 "deliveries": len(ordered),
-                "median_s": round(ordered[len(ordered) // 2], 6) if ordered else 0.0,
-                "p95_s": round(ordered[len(ordered) * 95 // 100], 6) if ordered else 0.0,
+                **_quantiles(ordered),
                 "most_s": round(ordered[-1], 6) if ordered else 0.0,
                 "by_interval_s": [round(late_s, 4) for late_s in self._most],
                 "missed": self.missed,
@@ -191,6 +220,47 @@ class Lateness:
                 "processor_s": round(used.ru_utime + used.ru_stime, 3),
             }
         }
+
+
+class AnswerTimes:
+    """How long agents take from the delivery of a question to their answer, in mission seconds.
+
+    In virtual time, an agent answers at once, and `processing_s` follows. A process first waits for a processor. If
+    many agents share few processors, they answer one after another, and fewer answers collide.
+    """
+
+    def __init__(self) -> None:
+        self._all = array("f")
+        self._question: dict[bytes, int] = {}
+        """Frame of a question -> type code of its answers. Only the latest questions are kept."""
+        self._asked_s: dict[tuple[int, int], float] = {}
+        """(Vehicle, type code of an answer) -> when the vehicle got the latest question."""
+
+    def sent(self, heard: Heard, data: bytes, at_s: float) -> None:
+        """Note that a vehicle sent this datagram."""
+        code = data[TYPE_AT] if len(data) > TYPE_AT else None
+        if code in ANSWER_TO:
+            self._question[heard.frame] = ANSWER_TO[code]
+            if len(self._question) > KEPT_QUESTIONS:
+                del self._question[next(iter(self._question))]
+        elif code is not None and (asked_s := self._asked_s.pop((heard.vehicle, code), None)) is not None:
+            self._all.append(max(0.0, at_s - asked_s))
+
+    def delivered(self, frame: bytes, vehicle: int, now: float) -> None:
+        """Note that a vehicle got this frame."""
+        answer = self._question.get(frame)
+        if answer is not None:
+            self._asked_s[vehicle, answer] = now
+
+    def to_json(self) -> dict[str, Any]:
+        return {"answers": {"count": len(self._all), **_quantiles(sorted(self._all))}}
+
+
+def _quantiles(ordered: list[float]) -> dict[str, float]:
+    """Return the median and the quantile of 95 % of values in ascending order; 0 without values."""
+    count = len(ordered)
+    shares = {"median_s": count // 2, "p95_s": count * 95 // 100}
+    return {name: round(ordered[index], 6) if ordered else 0.0 for name, index in shares.items()}
 
 
 def _sequence(data: bytes, vehicle: int) -> int | None:

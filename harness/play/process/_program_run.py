@@ -494,6 +494,7 @@ class ProgramRun:
         if self._channel is None:
             return
         try:
+            await self._channel.clear()
             self.played.channel = await self._channel.totals()
         except MachineError as error:
             if self.played.outcome == "completed":

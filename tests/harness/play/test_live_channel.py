@@ -5,11 +5,14 @@ from typing import Any
 
 import pytest
 
-from harness.play.process._channel_node import Lateness
+from harness.play.process._channel_node import AnswerTimes, Lateness
 from harness.play.process._live_channel import LiveChannel
 from netem.channel import PRESETS
 from netem.conditions import Delay, LinkConditions, NetworkConditions
+from netem.frames import udp_broadcast
 from netem.radio import Place
+from netem.relay import Heard
+from ucp.messages import PORT, BlockAddRequest, BlockAddResponse, Message, encode
 
 DATA_BYTES = 47
 RADIO = replace(PRESETS["wifi_1"], shadowing_db=0.0)
@@ -126,3 +129,23 @@ def test_lateness_has_quantiles_and_intervals() -> None:
     assert figures["p95_s"] == pytest.approx(0.095, abs=1e-4)
     assert figures["most_s"] == pytest.approx(0.099, abs=1e-4)
     assert figures["by_interval_s"] == [0.049, 0.099]
+
+
+def heard(vehicle: int, message: Message) -> tuple[Heard, bytes]:
+    """Return a broadcast of this message, and its data."""
+    data = encode(vehicle, 7, message)
+    return Heard(vehicle, 0, bytes(10) + udp_broadcast(vehicle, PORT, data)), data
+
+
+def test_answer_times_are_measured_from_the_delivery_of_the_question() -> None:
+    times = AnswerTimes()
+    question, asked = heard(1, BlockAddRequest(bytes(32), bytes(32)))
+    answer, answered = heard(2, BlockAddResponse(bytes(32), True))
+    times.sent(answer, answered, 0.5)
+    times.sent(question, asked, 1.0)
+    times.delivered(question.frame, 2, 1.1)
+    times.delivered(answer.frame, 2, 1.15)
+    times.sent(answer, answered, 1.3)
+    times.sent(answer, answered, 1.6)
+    assert times.to_json() == {"answers": {"count": 1, "median_s": pytest.approx(0.2), "p95_s": pytest.approx(0.2)}}
+    assert heard(2, BlockAddResponse(bytes(32), True))[0].udp_data(PORT) == answered
