@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from harness.archive.run_record import FaultRecord, JudgedRecord
 from harness.archive.traces import Header, Trace
 from harness.checker import Evidence
-from harness.checker._agreement import had_a_chance
+from harness.checker._agreement import find_agents_with_chance
 from harness.play.backend import agent_seed
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario
@@ -151,8 +151,8 @@ def test_reconcile_ended_by_a_brown_out_counts_as_no_chance_to_agree() -> None:
     record = JudgedRecord.model_validate({"roster": [1], "network": connected})
     header = Header(agent_id=1, roster=[1], settings={}, clock={})
     without_boot, with_boot = Trace(header, runs), Trace(header, runs, starts=[1])
-    assert had_a_chance(Evidence({}, {1: without_boot}, record), {1}) == {1}
-    assert had_a_chance(Evidence({}, {1: with_boot}, record), {1}) == set()
+    assert find_agents_with_chance(Evidence({}, {1: without_boot}, record), {1}) == {1}
+    assert find_agents_with_chance(Evidence({}, {1: with_boot}, record), {1}) == set()
 
 
 def run_of(t: float, *, handler: str, algorithm: int, branch: str, reconciling: bool) -> HandlerRun:
