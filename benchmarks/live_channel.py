@@ -1,9 +1,9 @@
 """Measure the process of a shared channel in real time: `python -m benchmarks.live_channel [--agents 5 20 50]`.
 
 Each row is one run with processes and embedded vehicles. The processor time is that of the channel process alone, as a
-share of one core over the mission. The lateness is that of its deliveries, in mission seconds. Agents that wait for a
-processor answer later, so fewer answers collide than in virtual time: the last column has the share of lost copies in
-both.
+share of one core over the mission. The lateness is that of its deliveries, in mission time. Agents that wait for a
+processor answer later, so fewer answers collide than in virtual time. The last columns have the time from a question to
+its answer, and the share of lost copies, in virtual time in parentheses.
 """
 
 import argparse
@@ -25,7 +25,7 @@ def scenario(agents: int, duration_s: float, speedup: float, preset: str) -> Sce
             "duration_s": duration_s,
             "speedup": speedup,
             "vehicles": {"kind": "embedded"},
-            "events": {"source": "random", "mean_s": 20},
+            "events": {"source": "random", "mean_s": 10},
             "network": {"channel": {"preset": preset}},
         }
     )
@@ -38,7 +38,9 @@ def main() -> None:
     parser.add_argument("--speedups", type=float, nargs="+", default=[1.0, 10.0], help="speedups")
     parser.add_argument("--preset", default="wifi_6", help="preset of the channel")
     arguments = parser.parse_args()
-    print_row("agents", "speedup", "frames", "deliveries", "core", "late, median", "late, 95 %", "lost copies")
+    print_row(
+        "agents", "speedup", "frames", "deliveries", "core", "late, median", "late, 95 %", "answer, 95 %", "lost copies"
+    )
     for agents in arguments.agents:
         for speedup in arguments.speedups:
             row(scenario(agents, arguments.duration, speedup, arguments.preset))
@@ -59,6 +61,7 @@ def row(asked: Scenario) -> None:
         f"{late.processor_s / wall_s:.1%}",
         f"{1000 * late.median_s:.2f} ms",
         f"{1000 * late.p95_s:.2f} ms",
+        "-" if channel.answers is None else f"{1000 * channel.answers.p95_s:.0f} ms",
         f"{lost(channel, asked):.1%} ({lost(virtual, asked):.1%})",
     )
 

@@ -7,6 +7,8 @@ show only what might work.
 from __future__ import annotations
 
 import asyncio
+import os
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +42,7 @@ def examine() -> list[LabRequirement]:
         log = Path(folder, "lab.log")
         tried = {name: _try(name, log) for name in ("netem", "nftables")}
         chosen = _try(None, log)
+        channel = [_shared_channel(log)] if isinstance(chosen, str) else []
     broken = next((e for e in tried.values() if isinstance(e, LabError) and getattr(e, "stage", "") != "engine"), None)
     if broken is not None:
         reason = str(getattr(broken, "reason", broken))
@@ -55,7 +58,26 @@ def examine() -> list[LabRequirement]:
         requirements.append(LabRequirement("engine", True, f"{chosen}, the first that works of netem and nftables"))
     else:
         requirements.append(LabRequirement("engine", False, str(chosen), getattr(chosen, "way_out", "")))
-    return requirements
+    return [*requirements, *channel]
+
+
+def _shared_channel(log: Path) -> LabRequirement:
+    """Examine whether the kernel hands over broadcasts to a process, for a radio channel in real time."""
+
+    async def attempt() -> str | None:
+        async with await Lab.open((1, 2), log=log) as lab:
+            argv = [sys.executable, "-P", "-m", "netem.relay", *map(str, lab.vehicles)]
+            output = log.with_name("relay.log")
+            relay = await lab.spawn(None, argv, cwd=log.parent, env=dict(os.environ), stdout=output, stderr=output)
+            return None if await relay.wait() == 0 else output.read_text().strip()
+
+    try:
+        problem = asyncio.run(attempt())
+    except LabError as error:
+        problem = str(error)
+    detail = problem or "works with processes and containers, in real time"
+    way_out = "Play the channel in virtual time: --backend sim." if problem else ""
+    return LabRequirement("shared channel", problem is None, detail, way_out, needed=False)
 
 
 def _try(engine: Literal["netem", "nftables"] | None, log: Path) -> str | LabError:

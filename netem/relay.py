@@ -5,6 +5,8 @@
     for heard in relay.take(): ...  each broadcast of a vehicle, with the time at which the kernel got it
     relay.deliver(2, heard.frame)
 
+`python -m netem.relay 1 2 3` opens and closes a relay, to examine whether the kernel supports it.
+
 A radio channel decides when each vehicle gets a broadcast, and which vehicles lose it. A queue of the kernel at one
 port cannot do this. The relay uses two features that every bridge has. A port flag (`bcast_flood`, bridge(8)) keeps
 broadcasts away from the vehicles. A packet socket (packet(7)) gets each broadcast before the bridge handles it, and
@@ -21,6 +23,7 @@ import contextlib
 import mmap
 import socket
 import struct
+import sys
 import time
 from array import array
 from collections.abc import Iterator, Sequence
@@ -31,6 +34,7 @@ from netem._fabric import BRIDGE
 from netem._fabric_requests import flood_broadcasts
 from netem._netlink import Netlink
 from netem._tc_requests import RELAYED
+from netem.errors import NetlinkError
 
 # linux/if_packet.h, linux/filter.h, asm-generic/socket.h
 _SOL_PACKET = 263
@@ -175,3 +179,16 @@ def _attach_filter(packets: socket.socket, bridge: int) -> None:
     instructions = array("Q", b"".join(struct.pack("=HBBI", *instruction) for instruction in program))
     address, _ = instructions.buffer_info()
     packets.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(instructions), address))
+
+
+def main() -> None:
+    try:
+        relay = Relay([int(vehicle) for vehicle in sys.argv[1:]])
+        relay.open()
+        relay.close()
+    except (OSError, NetlinkError) as error:
+        sys.exit(f"the kernel does not hand over broadcasts: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -8,7 +8,7 @@ capture/7.pcapng    all frames that vehicle 7 sent or received, if captures were
 network.jsonl       each change of conditions as the kernel applied it, and the kernel's counters at the end
 tracks.jsonl        positions of the vehicles, in metres north, east and up from the centre of the field
 replay.yaml         the scenario with the changes that the user made by hand (harness.play.interventions)
-channel.jsonl       each message on a shared channel, and the vehicles that lost it
+channel.jsonl       each message on a shared channel, and the vehicles that lost it (channel.log: its process)
 rogue.jsonl         datagrams that the rogue node sent, if the timeline injects any; rogue.log is its output
 lag.jsonl           delays of programs that the machine woke late, and the load of each agent (harness.archive.lag)
 lab.log             output of the lab

@@ -31,7 +31,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         lost = unknown = 0
         for run in trace.runs:
             trigger = run.trigger
-            if not isinstance(trigger, MessageTrigger) or run.t >= ends_s or evidence.injected.may_be(trigger):
+            if not isinstance(trigger, MessageTrigger) or run.t >= ends_s or evidence.injected.may_include(trigger):
                 continue
             if len(evidence.incarnations.get(trigger.sender, ())) != 1:
                 continue
