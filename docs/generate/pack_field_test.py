@@ -1,4 +1,4 @@
-"""Plays scenarios/field_test_2020.yaml, breaks what came home as field data is broken, and packs it.
+"""Play pack_field_test.yaml, damage the records as field data is damaged, and pack them.
 
     python docs/generate/pack_field_test.py docs/field_test_2020.tar.xz
 
@@ -16,14 +16,14 @@ from harness.play.progress import Silent
 from harness.run.run import run
 from harness.scenario import Scenario, load_scenario
 
-SCENARIO = Path(__file__).parents[2] / "scenarios/field_test_2020.yaml"
+SCENARIO = Path(__file__).with_suffix(".yaml")
 SEED = 76
 HOVER_TEST = {"name": "Hover test in the morning", "agents": [10, 28, 32, 118, 120, 122], "duration_s": 120}
 NOTES = "Camp Roberts, 2nd UCP test. Wind 250/8. 122 landed first, batteries swapped at 14:40.\n"
 
 
 def broken() -> dict[str, bytes]:
-    """What was copied from six vehicles, by file name."""
+    """Return the files that were copied from six vehicles, by file name."""
     with tempfile.TemporaryDirectory() as scratch:
         flight = _flown(load_scenario(SCENARIO), Path(scratch) / "flight")
         before = _flown(Scenario.model_validate(HOVER_TEST), Path(scratch) / "before")
