@@ -84,6 +84,8 @@ def table(record: Consolidation) -> str:
 
 def flight_logs(record: Consolidation) -> list[MatchedLog]:
     """Return the flight logs of vehicles, with their agents."""
+    if not record.collected.flight_logs:
+        return []  # the events of all blocks need not be decoded
     logged = {track.agent_id: track.fixes for track in tracks(record)}
     return match_logs(record.collected.flight_logs, {agent: logged.get(agent, []) for agent in record.header.roster})
 

@@ -268,7 +268,7 @@ def rogue(run: Simulated, seed: int) -> None:
 
 
 def field_test_2020(run: Simulated, seed: int) -> None:
-    """Section 4.3 and Figure 4.7 of the thesis, with both bugs of the field test, and the departures in the scenario."""
+    """Section 4.3 and Figure 4.7 of the thesis, with both bugs, and the departures that the scenario lists."""
     whole = chains(run)[10]
     assert chains(run)[28] == whole
     for agent in (32, 122):
