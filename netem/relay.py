@@ -88,12 +88,16 @@ class Heard:
 
 
 class Relay:
-    """The broadcasts of these vehicles, from `open` to `close`. Raises OSError if the kernel lacks packet sockets."""
+    """The broadcasts to these vehicles, from `open` to `close`. Raises OSError if the kernel lacks packet sockets.
 
-    def __init__(self, vehicles: Sequence[int]) -> None:
+    `others` are further vehicles of the lab. The relay takes their broadcasts too, but the switch still floods the
+    broadcasts of all vehicles to them.
+    """
+
+    def __init__(self, vehicles: Sequence[int], others: Sequence[int] = ()) -> None:
         self.missed = 0
         """Broadcasts that did not fit into the buffer, at the last call of `count_missed`."""
-        self._ports = {socket.if_nametoindex(addresses.port(vehicle)): vehicle for vehicle in vehicles}
+        self._ports = {socket.if_nametoindex(addresses.port(vehicle)): vehicle for vehicle in (*vehicles, *others)}
         self._next = 0
         self._input = _socket(_ETH_P_ALL)
         self._input.setsockopt(_SOL_PACKET, _VERSION, _TPACKET_V2)

@@ -20,7 +20,7 @@ RELAY = f"""
 import json, select, signal
 from netem.relay import Relay
 
-relay = Relay([1, 2, 3])
+relay = Relay([1, 2, 3], [4])
 relay.open()
 ended = []
 signal.signal(signal.SIGTERM, lambda *_: ended.append(1))
@@ -39,8 +39,9 @@ print(json.dumps(heard), flush=True)
 
 
 async def relayed(folder: Path, engine: str, conditions: NetworkConditions) -> dict[str, Any]:
-    """Broadcast from vehicle 1 through a relay that delivers to vehicle 3 only, then without the relay."""
-    async with await Lab.open([1, 2, 3], engine=engine, log=folder / "lab.log") as lab:  # type: ignore[arg-type]
+    """Broadcast from vehicle 1 through a relay that delivers to vehicle 3 only, then without it. Vehicle 4 is no vehicle
+    of the relay."""
+    async with await Lab.open([1, 2, 3, 4], engine=engine, log=folder / "lab.log") as lab:  # type: ignore[arg-type]
         await lab.apply(conditions)
         air, output = Air(lab, folder), folder / "relay.log"
         relay = await lab.spawn(
@@ -55,7 +56,7 @@ async def relayed(folder: Path, engine: str, conditions: NetworkConditions) -> d
             while "ready" not in output.read_text():
                 assert relay.returncode is None, output.read_text()
                 await asyncio.sleep(0.01)
-        listeners = {vehicle: await air.start_ready(vehicle, "receive", PORT) for vehicle in (2, 3)}
+        listeners = {vehicle: await air.start_ready(vehicle, "receive", PORT) for vehicle in (2, 3, 4)}
         sender = await air.start(1, "broadcast", PORT, PACKETS, 0, lab.broadcast)
         assert await asyncio.wait_for(sender.process.wait(), DEADLINE_S) == 0
         await relay.send_signal(15)
@@ -70,6 +71,7 @@ def test_relay_alone_delivers_broadcasts_while_it_is_open(engine: str, tmp_path:
     found = asyncio.run(relayed(tmp_path, engine, NetworkConditions()))
     assert found["got"][3]["numbers"] == list(range(2 * PACKETS))
     assert found["got"][2]["numbers"] == list(range(PACKETS, 2 * PACKETS))
+    assert found["got"][4]["numbers"] == list(range(2 * PACKETS))
     assert found["got"][3]["corrupt"] == 0
     assert found["heard"] == [[1, 12]] * PACKETS
 

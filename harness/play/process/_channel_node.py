@@ -74,6 +74,7 @@ class ChannelNode:
         self._clock = MissionClock(1.0)
         self._channel: LiveChannel | None = None
         self._relay: Relay | None = None
+        self._roster: tuple[int, ...] = ()
         self._lateness = Lateness()
         self._answers = AnswerTimes()
         self._timer: Timer | None = None
@@ -104,6 +105,9 @@ class ChannelNode:
             return
         now, now_ns = clock.now(), time.monotonic_ns()
         for heard in relay.take():
+            if heard.vehicle not in self._roster:
+                self._deliver_to_all(relay, heard)
+                continue
             self._take(channel, heard, max(0.0, now - (now_ns - heard.at_ns) / NANOSECONDS * clock.speedup))
         for at_s, _, vehicle, frame in channel.advance(now):
             try:
@@ -127,19 +131,24 @@ class ChannelNode:
             self._answers.sent(heard, data, at_s)
             channel.send(at_s, heard.vehicle, heard.frame, len(data), _sequence(data, heard.vehicle))
 
+    def _deliver_to_all(self, relay: Relay, heard: Heard) -> None:
+        """Deliver a broadcast of a rogue node at once. It does not use the channel."""
+        for vehicle in self._roster:
+            relay.deliver(vehicle, heard.frame)
+
     def _write(self, line: dict[str, Any]) -> None:
         self._journal.write(json.dumps(line, separators=(",", ":")) + "\n")
 
     # Commands of the control socket. Only the harness sends them.
 
     def _start(self, request: dict[str, Any]) -> dict[str, Any]:
-        roster = request["roster"]
+        self._roster = roster = tuple(request["roster"])
         radio = dataclasses.replace(PRESETS[request["preset"]], **request["figures"])
         self._channel = LiveChannel(roster, radio, request["processing_s"], request["seed"], self._write)
         self._clock = MissionClock(request["speedup"])
         self._clock.start(request["epoch_us"])
         try:
-            self._relay = Relay(roster)
+            self._relay = Relay(roster, request["others"])
             self._relay.open()
         except (OSError, NetemError) as error:
             raise CommandError(f"the kernel does not hand over broadcasts: {error}") from None

@@ -75,6 +75,7 @@ class ChannelProcess:
         await self._ask(
             "start",
             roster=roster,
+            others=[self._scenario.rogue] if self._scenario.rogue else [],
             preset=self._model.preset,
             figures=figures,
             processing_s=self._model.processing_s,
