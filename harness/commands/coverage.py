@@ -33,7 +33,7 @@ def coverage_command(
 ) -> None:
     """Report the share of all local states that runs reached.
 
-    The state space of `prove` within the given bounds counts as all.
+    All local states are those that `prove` finds within the given bounds.
     """
     reached = Reached()
     settings: dict[str, Any] | None = None

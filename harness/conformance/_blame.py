@@ -166,7 +166,7 @@ class BlameEvidence:
 
 
 def _took_another_decision(observation: Observation) -> ExpectedRun | None:
-    """Return the run of the expired timer, if all unexpected messages follow from another decision of its handler."""
+    """Return the handler run of the expired timer, if another decision of it explains all unexpected messages."""
     first, *then = observation.outcome.runs
     if first.handler not in BEGINNING_OF_COUNT or not observation.unexpected:
         return None

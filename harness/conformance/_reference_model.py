@@ -38,7 +38,7 @@ class PeerDatagram:
 
 
 @dataclass(frozen=True)
-class LogEvent:
+class LoggedEvent:
     """The agent logs an event."""
 
     data: bytes
@@ -56,7 +56,7 @@ class ControlCommand:
     name: str
 
 
-Action = PeerDatagram | LogEvent | TimerExpiry | ControlCommand
+Action = PeerDatagram | LoggedEvent | TimerExpiry | ControlCommand
 
 
 @dataclass(frozen=True)
@@ -118,17 +118,17 @@ class ReferenceModel:
         self._sequence += 1
         return PeerDatagram(sender, message, encode(sender, self._sequence, message))
 
-    def event(self) -> LogEvent:
+    def event(self) -> LoggedEvent:
         """Return a new event. With the settings of `VARIANTS` each event fills a block."""
         self.logged += 1
-        return LogEvent(b"event %d" % self.logged)
+        return LoggedEvent(b"event %d" % self.logged)
 
     def feed(self, action: Action, now: float, timestamp_us: int = 0) -> ExpectedOutcome:
         """Give the reference an input. `timestamp_us` is the timestamp that the agent under test gave to an event."""
         match action:
             case PeerDatagram():
                 self.agent.receive_datagram(action.data, now)
-            case LogEvent():
+            case LoggedEvent():
                 self.agent.add_event(LoggableEvent(timestamp_us, EVENT_ID, action.data), now)
             case TimerExpiry():
                 self.agent.handle_timer(now)

@@ -34,7 +34,7 @@ from harness.conformance._reference_model import (
     Action,
     ControlCommand,
     ExpectedOutcome,
-    LogEvent,
+    LoggedEvent,
     ModelSnapshot,
     PeerDatagram,
     ReferenceModel,
@@ -197,7 +197,7 @@ class UdpAgent(AgentUnderTest):
         except (AgentEndedError, AgentRefusedError) as error:
             wrong.append(str(error))
             ended = _end(error)
-        if isinstance(action, LogEvent):
+        if isinstance(action, LoggedEvent):
             outcome, problems = log_same_block(model, action, began, waiting)
             wrong += problems
         else:
@@ -288,7 +288,7 @@ class UdpAgent(AgentUnderTest):
                 self.peer_socket.send(action.data)
             case ControlCommand():
                 await self.process.ask(action.name)
-            case LogEvent():
+            case LoggedEvent():
                 data = base64.b64encode(action.data).decode("ascii")
                 await self.process.ask("log", event_id=EVENT_ID, data=data)
                 export = await self.process.export()
@@ -368,7 +368,7 @@ def _expire(model: ReferenceModel, now: float) -> list[bytes]:
 
 
 def log_same_block(
-    model: ReferenceModel, action: LogEvent, now: float, waiting: list[Any]
+    model: ReferenceModel, action: LoggedEvent, now: float, waiting: list[Any]
 ) -> tuple[ExpectedOutcome, list[str]]:
     """Give the reference the event with the timestamp of the agent, so that both complete the same block.
 

@@ -17,7 +17,7 @@ from harness.conformance._reference_model import (
     Action,
     ControlCommand,
     ExpectedOutcome,
-    LogEvent,
+    LoggedEvent,
     PeerDatagram,
     ReferenceModel,
     TimerExpiry,
@@ -99,7 +99,7 @@ def given_line(action: Action, now: float, timestamp_us: int) -> dict[str, Any]:
     match action:
         case PeerDatagram():
             return {"t": now, "datagram": base64.b64encode(action.data).decode("ascii")}
-        case LogEvent():
+        case LoggedEvent():
             data = base64.b64encode(action.data).decode("ascii")
             return {"t": now, "event_id": EVENT_ID, "data": data, "timestamp_us": timestamp_us}
         case ControlCommand():
@@ -111,7 +111,7 @@ def _input_text(action: Action, names: KnownNames) -> str:
     match action:
         case PeerDatagram():
             return f"{datagram_text(action.data, names)} of agent {action.sender}"
-        case LogEvent():
+        case LoggedEvent():
             return "an event that fills a block"
         case ControlCommand():
             return f"the command {action.name}"

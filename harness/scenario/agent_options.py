@@ -125,7 +125,7 @@ def _agents(ids: list[int]) -> str:
     return f"agents {', '.join(others)} and {last}" if others else f"agent {last}"
 
 
-class Security(Model):
+class SecurityOptions(Model):
     """A secured mission. Agents seal each datagram, refuse forged and repeated ones, and sign their blocks."""
 
     keys: Annotated[str, Field(min_length=1, max_length=4000)] = "fresh"
@@ -191,7 +191,7 @@ class ScriptedEvent(Model):
         return self
 
 
-class Events(Model):
+class EventOptions(Model):
     """The source of the events that agents log."""
 
     source: Literal["mavlink", "random", "scripted"] = "mavlink"
@@ -207,7 +207,7 @@ class Events(Model):
     """Events to log. It needs `source: scripted`."""
 
     @model_validator(mode="after")
-    def _script_is_played(self) -> "Events":
+    def _script_is_played(self) -> "EventOptions":
         if self.script and self.source != "scripted":
             raise ValueError(f"`script` needs `source: scripted`, not {self.source}")
         return self
@@ -217,7 +217,7 @@ MIN_MEMORY_MIB = 6
 """Docker refuses a container with a lower limit."""
 
 
-class Docker(Model):
+class DockerOptions(Model):
     """Image and limits of containers. Each limit applies to one container. Other backends ignore these keys."""
 
     image: Annotated[str, Field(min_length=1, max_length=255)] | None = None

@@ -70,7 +70,7 @@ def _known_number(key: Any) -> int:
     return number
 
 
-class Range(Model):
+class NumberRange(Model):
     """A range of numbers. Needs `min`, `max`, or both. A single number is short for a range from it to itself."""
 
     min: Number | None = None
@@ -79,7 +79,7 @@ class Range(Model):
     """Highest allowed value."""
 
     @model_validator(mode="after")
-    def _check_values(self) -> "Range":
+    def _check_values(self) -> "NumberRange":
         if self.min is None and self.max is None:
             raise ValueError("needs `min` or `max`")
         if self.min is not None and self.max is not None and self.min > self.max:
@@ -99,14 +99,14 @@ class Range(Model):
 
 def _exactly(value: Any) -> Any:
     """Return the range from a number to itself, or the value unchanged if it is a range."""
-    if isinstance(value, Mapping | Range):
+    if isinstance(value, Mapping | NumberRange):
         return value
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError("should be a number, or {min: number, max: number}")
     return {"min": value, "max": value}
 
 
-Count = Annotated[Range, BeforeValidator(_exactly)]
+Count = Annotated[NumberRange, BeforeValidator(_exactly)]
 
 
 class CommonBlocks(Model):

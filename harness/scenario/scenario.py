@@ -10,11 +10,11 @@ from pydantic import Field, field_validator, model_validator
 from harness.scenario._network import NetworkModel
 from harness.scenario.agent_options import (
     AgentCommand,
-    Docker,
-    Events,
+    DockerOptions,
+    EventOptions,
     QuirkOfAgents,
     QuirkValues,
-    Security,
+    SecurityOptions,
     Stagger,
     check_quirks,
     quirks_of_agent,
@@ -46,14 +46,14 @@ MAX_DURATION_S = 31 * 86400
 MAX_INITIAL_DATA = 64 * 1024
 
 
-class Settle(Model):
+class SettlePhase(Model):
     """The time after the mission in which agents finish their votes and reconciles."""
 
     limit_s: Seconds = 1800.0
     """Maximum number of mission seconds. The run ends earlier when all agents are idle."""
 
 
-class Clock(Model):
+class AgentClock(Model):
     """The clock of one agent. At mission second t it shows `offset_s` + (1 + `drift`) * t seconds."""
 
     offset_s: Annotated[float, Field(ge=-1e10, le=1e10)] = 0.0
@@ -89,7 +89,7 @@ class Scenario(Model):
     """Changes of the network, faults of agents, and injected messages, each at one instant."""
     schedule: Annotated[list[Schedule], Field(max_length=100)] = []
     """Ramps and repeated changes of the network."""
-    events: Events = Events()
+    events: EventOptions = EventOptions()
     """Source of the events that agents log."""
     vehicles: Vehicles = Vehicles()
     """Vehicles that carry the agents: ArduPilot, embedded vehicles, or none."""
@@ -98,18 +98,18 @@ class Scenario(Model):
     agent_command: AgentCommand = None
     """Any program that follows ucp/contract/CONTRACT.md, with its arguments. A list is the command of all agents. A
     mapping has one command per agent ID, and the other agents are reference agents. Default: reference agents."""
-    docker: Docker = Docker()
+    docker: DockerOptions = DockerOptions()
     """Image and resource limits of containers. Only the backend `docker` uses them."""
     settings: Settings = Settings()
     """Timers and sizes of the agents, and their readings of ambiguous passages of the thesis."""
     stagger: Stagger = {}
     """Mission seconds by which a timer of each agent is longer than that of the agent with the next lower ID. Each
     agent receives its own durations in its mission file."""
-    security: Security | None = None
+    security: SecurityOptions | None = None
     """Keys of a secured mission. Without them agents accept every datagram."""
     quirks: QuirkValues = {}
     """Mistakes that all agents, or the listed agents, make on purpose. `ucp.quirks` declares them."""
-    clocks: dict[VehicleKey, Clock] = {}
+    clocks: dict[VehicleKey, AgentClock] = {}
     """Clocks of agents, by agent ID. Other agents have an exact clock. In virtual time only."""
     fates: Annotated[list[Fate], Field(max_length=100_000)] = []
     """Scripted delivery or loss of single messages. In virtual time only."""
@@ -122,7 +122,7 @@ class Scenario(Model):
     initial_data: Annotated[Data, Field(max_length=MAX_INITIAL_DATA)] | None = None
     """Data of the inception block (BD_0), in base64, at most 65536 characters. By default each run has its own data. In
     virtual time it follows from `name` and seed."""
-    settle: Settle = Settle()
+    settle: SettlePhase = SettlePhase()
     """Time after the mission in which agents may finish."""
     final_reconcile: bool = False
     """True if the run ends with perfect network conditions, under which one agent after another reconciles."""
@@ -149,7 +149,7 @@ class Scenario(Model):
 
     def secured(self) -> "Scenario":
         """Return the scenario with fresh keys, or unchanged if it has keys."""
-        return self if self.security else self.model_copy(update={"security": Security()})
+        return self if self.security else self.model_copy(update={"security": SecurityOptions()})
 
     def settings_of(self, agent_id: int) -> Settings:
         """Return the settings in the mission file of this agent."""

@@ -47,7 +47,7 @@ NETWORK_KEYS = ("loss", "partition", "heal", "network")
 """Keys of an entry that change the network."""
 
 
-class _Entry(NetworkDisturbance):
+class _TimelineEntryBase(NetworkDisturbance):
     """One change at one instant. An entry needs `at_s` and exactly one kind of change.
 
     A change of the network is `loss`, `partition`, `heal` or `network`. A fault, such as `kill`, has a list of agents.
@@ -144,9 +144,11 @@ def _keys_of_faults() -> dict[str, Any]:
 
 
 if TYPE_CHECKING:  # a type checker does not run the code that makes the class
-    TimelineEntry = _Entry
+    TimelineEntry = _TimelineEntryBase
 else:
-    TimelineEntry = create_model("TimelineEntry", __base__=_Entry, __doc__=_Entry.__doc__, **_keys_of_faults())
+    TimelineEntry = create_model(
+        "TimelineEntry", __base__=_TimelineEntryBase, __doc__=_TimelineEntryBase.__doc__, **_keys_of_faults()
+    )
 
 
 MAX_STEPS = 10_000
@@ -218,7 +220,7 @@ def _values(end: NetworkValues) -> Iterator[tuple[Scope, str, Any]]:
     return ((scope, key, value) for scope, keys in end.items() for key, value in keys.items())
 
 
-class Repeated(NetworkDisturbance):
+class RepeatedChange(NetworkDisturbance):
     """A temporary change of the network. Needs at least one key."""
 
     partition: Groups | None = None
@@ -227,7 +229,7 @@ class Repeated(NetworkDisturbance):
     """Delay in mission seconds, 0 to 60."""
 
     @model_validator(mode="after")
-    def _check_values(self) -> "Repeated":
+    def _check_values(self) -> "RepeatedChange":
         if all(value is None for value in (self.loss, self.delay, self.partition, self.network)):
             raise ValueError("needs at least one of `loss`, `delay`, `partition` or `network`")
         if self.delay is not None and self.network is not None and self.network.delay is not None:
@@ -247,7 +249,7 @@ class Schedule(Model):
 
     ramp: Ramp | None = None
     """A change in equal steps from one value to another. After the end, the last value stays."""
-    repeat: Repeated | None = None
+    repeat: RepeatedChange | None = None
     """A change that starts every `every_s` and ends after `for_s`."""
     nemesis: Nemesis | None = None
     """A random change that starts every `every_s` and ends after `for_s`. `halves` splits the swarm into two random

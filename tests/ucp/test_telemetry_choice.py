@@ -13,7 +13,7 @@ import pytest
 from harness.archive.exports import read_export
 from harness.errors import ScenarioError
 from harness.scenario import load_scenario
-from harness.scenario.agent_options import Events
+from harness.scenario.agent_options import EventOptions
 from tests.ucp.test_node import AgentUnderTest, mission
 from tests.ucp.test_telemetry import frames, heartbeat, text
 from ucp.events import decode_events
@@ -40,7 +40,7 @@ def test_mission_file_with_a_wrong_selection_is_rejected(log: Any) -> None:
         parse_log(log=log)
 
 
-def load(tmp_path: Path, **events: Any) -> Events:
+def load(tmp_path: Path, **events: Any) -> EventOptions:
     path = tmp_path / "scenario.yaml"
     path.write_text(json.dumps({"name": "x", "events": {"source": "mavlink", **events}}))
     return load_scenario(path).events

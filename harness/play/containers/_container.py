@@ -16,7 +16,7 @@ from docker.types import LogConfig, Mount
 
 from harness.play.containers._images import Image
 from harness.play.containers.docker_engine import Engine
-from harness.scenario.agent_options import Docker
+from harness.scenario.agent_options import DockerOptions
 from netem.lab import in_words
 
 STDOUT, STDERR = 1, 2
@@ -177,7 +177,12 @@ INIT = 1
 
 
 def recipe(
-    api: docker.APIClient, image: Image, argv: Sequence[str], kept: Sequence[Path], network_mode: str, limits: Docker
+    api: docker.APIClient,
+    image: Image,
+    argv: Sequence[str],
+    kept: Sequence[Path],
+    network_mode: str,
+    limits: DockerOptions,
 ) -> dict[str, Any]:
     """Return keywords for the SDK's create_container.
 
@@ -206,7 +211,7 @@ def recipe(
     }
 
 
-def _limits(limits_asked: Docker) -> dict[str, Any]:
+def _limits(limits_asked: DockerOptions) -> dict[str, Any]:
     limits: dict[str, Any] = {}
     if limits_asked.memory_mib is not None:
         limits["mem_limit"] = limits["memswap_limit"] = limits_asked.memory_mib * MEBIBYTE

@@ -30,7 +30,7 @@ from harness.play.containers.ownership import remove
 from harness.play.process._run_lab import Role
 from harness.play.process.process_preflight import network_needs
 from harness.scenario import Scenario
-from harness.scenario.agent_options import Docker
+from harness.scenario.agent_options import DockerOptions
 from netem.conditions import NetworkConditions
 from netem.engine import Applied
 from netem.errors import SpawnError
@@ -119,7 +119,7 @@ class ContainerLab:
             raise error
 
     async def _hold(self, vehicle: int, image: Image) -> None:
-        name, identity = await self._create(vehicle, "network", image, _images.idle_command(), "none", Docker())
+        name, identity = await self._create(vehicle, "network", image, _images.idle_command(), "none", DockerOptions())
         self._holders[identity] = vehicle
         await self._start(name, identity)
 
@@ -225,7 +225,14 @@ class ContainerLab:
             await self.close()
 
     async def _create(
-        self, vehicle: int, role: str, image: Image, argv: Sequence[str], network: str, limits: Docker, **settings: Any
+        self,
+        vehicle: int,
+        role: str,
+        image: Image,
+        argv: Sequence[str],
+        network: str,
+        limits: DockerOptions,
+        **settings: Any,
     ) -> tuple[str, str]:
         """Create a container. Return its name and ID."""
         self._incarnations[vehicle, role] += 1

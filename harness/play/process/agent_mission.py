@@ -5,7 +5,7 @@ from typing import Any
 
 from harness.play.backend import agent_seed
 from harness.scenario import Scenario
-from harness.scenario.agent_options import Events
+from harness.scenario.agent_options import EventOptions
 from sitl.vehicle import AGENT_PORT
 from ucp.features import CONTRACT, needed_features
 from ucp.messages import PORT
@@ -65,7 +65,7 @@ def mission_file(
     return document | {"features": needed_features(document)}
 
 
-def _source(events: Events, with_vehicle: bool) -> str:
+def _source(events: EventOptions, with_vehicle: bool) -> str:
     """Return the event source. The harness sends scripted events by the command `log`, so their source is "none".
 
     An agent without a vehicle draws its events at random.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from harness.play.simulation._simulated_agent import VirtualAgent
 from harness.play.simulation.air import ScheduledInput
-from harness.scenario.scenario import Clock
+from harness.scenario.scenario import AgentClock
 from ucp.clock import MICROSECONDS
 from ucp.events import RandomEvents
 from ucp.state import AgentState
@@ -31,7 +31,7 @@ class Incarnation:
 
     agent: VirtualAgent
     source: RandomEvents
-    clock: Clock | None
+    clock: AgentClock | None
     """None if the clock shows mission time."""
     started_at: float
     state: AgentState | None = None

@@ -1,4 +1,4 @@
-"""A fault: what happens to agents and their vehicles at an instant, as a value.
+"""The base class of all faults. A fault changes agents or their vehicles at one mission second.
 
 The class of a fault holds everything about it: its name in YAML, in records and in pytest, the states of an agent
 before and after it, its effect on agents, vehicles and data, the calls to the backend, and the texts of the report.

@@ -7,7 +7,7 @@ from harness.play.progress import Silent
 from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario, load_scenario
-from harness.scenario.agent_options import Security
+from harness.scenario.agent_options import SecurityOptions
 from tests.harness.virtual import scenario
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -19,7 +19,7 @@ def dropped(run: Simulated) -> set[str]:
 
 
 def secured(plain: Scenario) -> Scenario:
-    return plain.model_copy(update={"security": Security()})
+    return plain.model_copy(update={"security": SecurityOptions()})
 
 
 def test_omitted_deliveries_change_no_secured_agent() -> None:
