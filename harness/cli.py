@@ -98,6 +98,11 @@ COMMANDS = {
         "harness.commands.reconstruct:reconstruct_command",
         "Make a scenario that reproduces a recorded flight.",
     ),
+    "calibrate": CommandEntry(
+        "field",
+        "harness.commands.calibrate:calibrate_command",
+        "Fit the radio of a scenario to the records of a flight.",
+    ),
     "matrix": CommandEntry(
         "many", "harness.commands.matrix:matrix_command", "Play a scenario over loss rates, swarm sizes and many seeds."
     ),

@@ -1,0 +1,5 @@
+"""Calibration: from the records and flight logs of a flight to the radio of a scenario.
+
+`_delivery_model.py` has the model and its fit. `_attempts.py` and `_positions.py` read the records. `calibration.py`
+validates the fit and makes the scenario.
+"""

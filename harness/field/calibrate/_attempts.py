@@ -1,0 +1,155 @@
+"""The attempts to deliver a message, from captures or traces, with the distance of the vehicles at that time.
+
+A capture shows each frame of its vehicle, so captures are preferred. A trace shows the messages that its agent handled.
+An agent in virtual time is not given messages without effect, so only some types count there, and only while the agent
+does not reconcile. Messages are matched by sender, type and sequence number, not by time. The clock of the sender
+determines the time of an attempt.
+"""
+
+from bisect import bisect_left, bisect_right
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+from harness.archive.packets.capture_files import read_captures
+from harness.archive.packets.transmissions import join
+from harness.archive.traces import Trace
+from harness.checker.records.contradiction import in_virtual_time
+from harness.errors import CaptureError
+from harness.field.calibrate._delivery_model import Attempt
+from harness.field.calibrate._positions import Positions
+from harness.field.ingest import Flight
+from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
+from ucp.trigger import MessageTrigger
+
+ON_AIR_S = 0.005
+"""Two messages whose sending differs by at most this time count as on the air at the same time."""
+_NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, CommitBlock, ChainContainQuery))
+
+
+class _Sent(NamedTuple):
+    """A message and its known receivers."""
+
+    at_s: float
+    sender: int
+    reached: frozenset[int]
+    lost: frozenset[int]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """The attempts, their source, and a sentence for each part that cannot be used."""
+
+    attempts: list[Attempt]
+    source: str
+    problems: list[str]
+
+
+def observe(flight: Flight, positions: Positions, epoch_us: int) -> Observed:
+    """Return all attempts between vehicles with known positions."""
+    problems: list[str] = []
+    source, sent = "captures", _from_captures(flight, epoch_us, problems)
+    if not any(message.reached or message.lost for message in sent):
+        source, sent = "traces", [*_from_traces(flight.traces, problems)]
+    sent.sort(key=lambda message: message.at_s)
+    attempts, unknown = [], 0
+    times = [message.at_s for message in sent]
+    for message in sent:
+        others = _others(sent, times, message)
+        for receiver in sorted(message.reached | message.lost):
+            distance_m = positions.distance_m(message.sender, receiver, message.at_s)
+            if distance_m is None:
+                unknown += 1
+                continue
+            delivered = receiver in message.reached
+            attempts.append(Attempt(message.at_s, message.sender, receiver, distance_m, delivered, others))
+    if unknown:
+        total = unknown + len(attempts)
+        problems.append(f"{unknown} of {total} messages are left out, because a position is unknown at their time")
+    return Observed(attempts, source, problems)
+
+
+def _others(sent: Sequence[_Sent], times: Sequence[float], message: _Sent) -> int:
+    first, last = bisect_left(times, message.at_s - ON_AIR_S), bisect_right(times, message.at_s + ON_AIR_S)
+    return min(3, sum(other.sender != message.sender for other in sent[first : min(last, first + 50)]))
+
+
+def _from_captures(flight: Flight, epoch_us: int, problems: list[str]) -> list[_Sent]:
+    paths = [*flight.captures.values(), *flight.more_captures]
+    if len(paths) < 2:
+        return []
+    try:
+        captures = read_captures(paths)
+    except CaptureError as error:
+        problems.append(str(error))
+        return []
+    problems += captures.errors
+    shift_s = 0.0 if captures.clock.of_run else (captures.clock.epoch_ns / 1000 - epoch_us) / 1e6
+    return [
+        _Sent(
+            transmission.at_s + shift_s,
+            transmission.sender,
+            frozenset(name for name in transmission.reached if isinstance(name, int)),
+            frozenset(name for name in transmission.lost_by if isinstance(name, int)),
+        )
+        for transmission in join(captures)
+        if transmission.origin == "captured"
+    ]
+
+
+def _from_traces(traces: dict[int, Trace], problems: list[str]) -> Iterator[_Sent]:
+    for agent_id, trace in traces.items():
+        if trace.jumps:
+            problems.append(f"agent {agent_id}: its clock jumps, so the messages that it sent after that are left out")
+    receivers = {agent_id: _Receiver(trace) for agent_id, trace in traces.items()}
+    for sender, trace in traces.items():
+        for run in trace.runs[: trace.jumps[0]] if trace.jumps else trace.runs:
+            for message in run.sent:
+                reached: set[int] = set()
+                lost: set[int] = set()
+                for agent_id, receiver in receivers.items():
+                    if agent_id == sender or not receiver.is_ready(message.message, run.t):
+                        continue
+                    (reached if receiver.takes((sender, message.message, message.seq)) else lost).add(agent_id)
+                yield _Sent(run.t, sender, frozenset(reached), frozenset(lost))
+
+
+class _Receiver:
+    """The messages that an agent handled, and the times at which its trace shows every message."""
+
+    def __init__(self, trace: Trace) -> None:
+        triggers = (run.trigger for run in trace.runs)
+        self._handled = Counter(
+            (trigger.sender, trigger.message, trigger.sequence)
+            for trigger in triggers
+            if isinstance(trigger, MessageTrigger)
+        )
+        self._virtual = in_virtual_time(trace)
+        bounds = sorted({0, *trace.starts, *(gap.position for gap in trace.gaps), len(trace.runs)})
+        self._spans = [
+            (min(trace.runs[first].t, trace.runs[last - 1].t), max(trace.runs[first].t, trace.runs[last - 1].t))
+            for first, last in pairwise(bounds)
+        ]
+        self._times = [run.t for run in trace.runs]
+        self._reconciling = [run.state.reconciling for run in trace.runs]
+
+    def is_ready(self, message: str, at_s: float) -> bool:
+        if not any(first_s <= at_s <= last_s for first_s, last_s in self._spans):
+            return False
+        if not self._virtual:
+            return True
+        place = bisect_right(self._times, at_s + 0.06)
+        around = self._reconciling[max(0, bisect_right(self._times, at_s) - 1) : place]
+        return message in _NEVER_WITHHELD and not any(around)
+
+    def takes(self, key: tuple[int, str, int]) -> bool:
+        """Return whether the message was handled, each time only once."""
+        self._handled[key] -= 1
+        return self._handled[key] >= 0
+
+
+def pairs_of(attempts: Iterable[Attempt]) -> list[frozenset[int]]:
+    """Return the links with attempts, in order of their vehicles."""
+    return sorted({attempt.link for attempt in attempts}, key=sorted)

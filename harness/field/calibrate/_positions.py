@@ -1,0 +1,168 @@
+"""The positions of the vehicles over mission time: from `tracks.jsonl` of a run, flight logs, or logged events.
+
+For each vehicle, the first of these sources counts. A flight log belongs to the agent with the vehicle's MAVLink system
+ID. Only records with GPS time are used, because the clocks of the autopilot and of the computer have no relation to
+mission time. Between two positions a vehicle flies straight. A longer gap than MAX_GAP_S has no positions.
+"""
+
+import math
+from bisect import bisect_right
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from harness.archive.bounded_file import BoundedFile
+from harness.archive.tracks import TRACKS_FILE, Fix, between, read_tracks
+from harness.errors import FieldError
+from harness.field.flight_logs import FlightLog, flight_log_kind, read_flight_log
+from harness.field.ingest import Flight
+from harness.report.logbook.positions import track_of
+from ucp.events import LoggableEvent, MalformedEventsError, decode_events
+
+MAX_GAP_S = 30.0
+_MARGIN_S = 5.0
+_METRES_PER_DEGREE = 111_195.0
+_FARTHEST_M = 200_000.0
+_BEGINNING_BYTES = 4096
+
+Place = tuple[float, float, float, float]
+"""Mission seconds, degrees north, degrees east, metres above mean sea level."""
+
+
+@dataclass
+class Positions:
+    """The tracks in metres, by vehicle. `sources` names the source of each track."""
+
+    tracks: dict[int, list[Fix]]
+    sources: dict[int, str]
+    logs: list[FlightLog] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+    def at(self, vehicle: int, at_s: float) -> Fix | None:
+        """Return the position at a mission second. None if it is unknown."""
+        track = self.tracks.get(vehicle)
+        if not track or not track[0].at_s - _MARGIN_S <= at_s <= track[-1].at_s + _MARGIN_S:
+            return None
+        after = bisect_right(track, at_s, key=lambda fix: fix.at_s)
+        if after == 0 or after == len(track):
+            return track[0 if after == 0 else -1]
+        if track[after].at_s - track[after - 1].at_s > MAX_GAP_S:
+            return None
+        return between(track[after - 1], track[after], at_s)
+
+    def distance_m(self, one: int, other: int, at_s: float) -> float | None:
+        """Return the distance of two vehicles in three dimensions. None if a position is unknown."""
+        first, second = self.at(one, at_s), self.at(other, at_s)
+        if first is None or second is None:
+            return None
+        return math.dist(first[1:], second[1:])
+
+
+def find_positions(paths: Iterable[Path], flight: Flight, vehicles: Collection[int], epoch_us: int) -> Positions:
+    """Return the positions of `vehicles`. A vehicle without any has no track."""
+    positions = Positions({}, {})
+    log_paths: list[Path] = []
+    for path in _files(paths):
+        if path.name == TRACKS_FILE and not positions.tracks:
+            tracks = read_tracks(path, vehicles)
+            positions.problems += tracks.problems
+            positions.tracks |= tracks.by_vehicle
+            positions.sources |= dict.fromkeys(tracks.by_vehicle, TRACKS_FILE)
+        elif path.suffix.lower() in (".bin", ".tlog") and _is_log(path):
+            log_paths.append(path)
+    missing = set(vehicles) - positions.tracks.keys()
+    places: dict[int, list[Place]] = {}
+    for path in log_paths:
+        _add_log(positions, path, missing, epoch_us, places)
+    _add_events(positions, flight, missing - places.keys(), epoch_us, places)
+    _project(positions, places)
+    return positions
+
+
+def _files(paths: Iterable[Path]) -> list[Path]:
+    return sorted(
+        {file for path in paths for file in ([path] if path.is_file() else path.rglob("*")) if file.is_file()}
+    )
+
+
+def _is_log(path: Path) -> bool:
+    try:
+        with BoundedFile(path) as file:
+            return flight_log_kind(path, file.peek(_BEGINNING_BYTES)[:_BEGINNING_BYTES]) is not None
+    except OSError:
+        return False
+
+
+def _add_log(
+    positions: Positions, path: Path, vehicles: Collection[int], epoch_us: int, places: dict[int, list[Place]]
+) -> None:
+    try:
+        log = read_flight_log(path)
+    except FieldError as error:
+        positions.problems.append(str(error))
+        return
+    positions.logs.append(log)
+    positions.problems += [f"{path}: {problem}" for problem in log.problems]
+    for vehicle in log.vehicles:
+        if vehicle.vehicle is None:
+            positions.problems.append(
+                f"{path}: it does not have the vehicle's system ID, so its positions are not used"
+            )
+        elif vehicle.vehicle in vehicles and vehicle.vehicle not in places:
+            known = [
+                ((position.utc_us - epoch_us) / 1e6, *position[2:5])
+                for position in vehicle.positions
+                if position.utc_us is not None
+            ]
+            if len(known) < len(vehicle.positions):
+                left_out = len(vehicle.positions) - len(known)
+                positions.problems.append(f"{path}: {left_out} positions have no GPS time and are not used")
+            if known:
+                places[vehicle.vehicle] = known
+                positions.sources[vehicle.vehicle] = path.name
+
+
+def _add_events(
+    positions: Positions, flight: Flight, vehicles: Collection[int], epoch_us: int, places: dict[int, list[Place]]
+) -> None:
+    logged: dict[int, dict[tuple[int, bytes], LoggableEvent]] = {}
+    for export in flight.exports.values():
+        for block in export.blocks():
+            try:
+                for event in decode_events(block.event_bytes):
+                    logged.setdefault(block.agent_id, {})[event.timestamp_us, event.data] = event
+            except MalformedEventsError:
+                continue
+    for vehicle in vehicles:
+        track = track_of(vehicle, ((event, "") for event in logged.get(vehicle, {}).values()))
+        if track.fixes:
+            places[vehicle] = [
+                ((at_us - epoch_us) / 1e6, position.lat_e7 / 1e7, position.lon_e7 / 1e7, position.alt_mm / 1000)
+                for at_us, position in track.fixes
+            ]
+            positions.sources[vehicle] = "logged events"
+
+
+def _project(positions: Positions, places: dict[int, list[Place]]) -> None:
+    """Convert degrees to metres north and east of the median position."""
+    if not places:
+        return
+    lat, lon = (_median([place[axis] for each in places.values() for place in each]) for axis in (1, 2))
+    east = _METRES_PER_DEGREE * max(0.01, math.cos(math.radians(lat)))
+    for vehicle, track in places.items():
+        fixes = [
+            Fix(at_s, (north - lat) * _METRES_PER_DEGREE, ((there - lon + 180) % 360 - 180) * east, alt_m)
+            for at_s, north, there, alt_m in sorted(track)
+        ]
+        near = [fix for fix in fixes if math.hypot(fix.north_m, fix.east_m) <= _FARTHEST_M]
+        if len(near) < len(fixes):
+            positions.problems.append(
+                f"vehicle {vehicle}: {len(fixes) - len(near)} positions are more than {_FARTHEST_M / 1000:.0f} km away "
+                "from the others and are left out"
+            )
+        if near:
+            positions.tracks[vehicle] = near
+
+
+def _median(values: Sequence[float]) -> float:
+    return sorted(values)[len(values) // 2]
