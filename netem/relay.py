@@ -130,11 +130,9 @@ class Relay:
         self._input.close()
 
     def _flood(self, on: bool) -> None:
-        netlink = Netlink()
-        with contextlib.closing(netlink):
-            netlink.send(
-                [flood_broadcasts(addresses.port(vehicle), index, on) for index, vehicle in self._ports.items()]
-            )
+        ports = [(addresses.port(vehicle), index) for index, vehicle in self._ports.items() if vehicle in self._outputs]
+        with contextlib.closing(Netlink()) as netlink:
+            netlink.send([flood_broadcasts(port, index, on) for port, index in ports])
 
     def take(self) -> Iterator[Heard]:
         """Yield the broadcasts that wait, in the order in which the kernel got them."""

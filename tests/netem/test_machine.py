@@ -183,7 +183,8 @@ def test_missing_engine_is_refused_with_the_remedy() -> None:
 @pytest.mark.lab
 def test_doctor_finds_what_a_lab_finds() -> None:
     findings = {finding.name: finding for finding in examine()}
-    assert [*findings] == ["namespaces", "network", "netem", "nftables", "engine"]
+    assert [*findings] == ["namespaces", "network", "netem", "nftables", "engine", "shared channel"]
+    assert findings["shared channel"].ok
     assert all(finding.ok for finding in findings.values() if finding.needed)
     for engine in ("netem", "nftables"):
         assert findings[engine].ok == (unavailable(engine) is None)

@@ -39,8 +39,10 @@ print(json.dumps(heard), flush=True)
 
 
 async def relayed(folder: Path, engine: str, conditions: NetworkConditions) -> dict[str, Any]:
-    """Broadcast from vehicle 1 through a relay that delivers to vehicle 3 only, then without it. Vehicle 4 is no vehicle
-    of the relay."""
+    """Broadcast from vehicle 1 through a relay that delivers to vehicle 3 only, then without the relay.
+
+    Vehicle 4 does not belong to the relay.
+    """
     async with await Lab.open([1, 2, 3, 4], engine=engine, log=folder / "lab.log") as lab:  # type: ignore[arg-type]
         await lab.apply(conditions)
         air, output = Air(lab, folder), folder / "relay.log"
