@@ -99,15 +99,17 @@ def _in_words(change: Change) -> str:
 
 
 def _compare_settings(evidence: Evidence, scenario: Scenario) -> Iterator[Contradiction]:
-    """The settings in the header of each trace are those of the scenario."""
+    """The header of each trace has all settings, with the values of the scenario."""
     for agent_id, trace in evidence.traces.items():
         if agent_id not in scenario.roster:
             continue
         asked = scenario.settings_of(agent_id)
         for name in NUMBERS | CHOICES:
             value = getattr(asked, name)
-            default = getattr(USUAL, name) if name in ADDED else value
-            recorded = trace.header.settings.get(name, default)
+            if name not in trace.header.settings and name not in ADDED:
+                yield of_agent(agent_id, f"the header of its trace lacks the setting {name}")
+                continue
+            recorded = trace.header.settings.get(name, getattr(USUAL, name))
             if recorded != value:
                 yield of_agent(
                     agent_id, f"its trace has {name} {recorded}, but by the scenario in run.json it is {value}"

@@ -188,6 +188,11 @@ def test_message_handled_before_it_was_sent_is_found(directory: Path) -> None:
     assert "before it was sent at" in details(result)
 
 
+def test_header_without_a_setting_is_found(directory: Path) -> None:
+    edit_lines(trace(directory, 2), lambda lines: lines[0]["settings"].pop("vote_timeout_s"))
+    assert "the header of its trace lacks the setting vote_timeout_s" in details(judged(directory))
+
+
 def test_differing_settings_are_found(directory: Path) -> None:
     edit_lines(trace(directory, 2), lambda lines: lines[0]["settings"].update(vote_timeout_s=11))
     assert "settings.vote_timeout_s" in details(judged(directory))
