@@ -14,6 +14,7 @@ from harness.field.reconstruct._inferring import infer
 from harness.field.reconstruct._other_records import OtherRecords
 from harness.field.reconstruct._rehearsal import ProtocolDeviation, Rehearsal, Tolerance, rehearse, same_sent
 from harness.field.reconstruct._timetable import Timetable
+from harness.play.core_version import edited_files
 from harness.run.simulate import Simulated
 from ucp.quirks import QUIRKS
 from ucp.trace import HandlerRun
@@ -145,16 +146,21 @@ class SoloRehearsals:
         agent_id = header.agent_id
         incarnations, problem = inputs_by_incarnation(self._flight.traces[agent_id], header, self._other_records)
         rehearsal = rehearse(header, incarnations)
+        as_recorded = rehearsal.matches_exactly and rehearsal.deviation is None
+        finding = None if as_recorded else self._first_finding(agent_id)
+        if (at := rehearsal.deviation) is not None and finding is None and (edited := edited_files()):
+            self.why[agent_id] = (
+                f"is played up to trace line {at.line}: its record follows the protocol there, but the agent core was "
+                f"edited ({', '.join(edited)})"
+            )
+            return rehearsal
         if rehearsal.deviation is not None:
             explained = self._explain_by_quirk(header, incarnations, rehearsal.deviation)
             rehearsal = explained or self._explain_by_tolerance(header, incarnations) or rehearsal
-        elif not rehearsal.matches_exactly and (words := self._first_finding(agent_id)):
-            self._remarks.append(f"agent {agent_id} deviates without effect: {words}")
+        elif finding is not None:
+            self._remarks.append(f"agent {agent_id} deviates without effect: {finding}")
         if (deviation := rehearsal.deviation) is not None:
-            words = (
-                self._first_finding(agent_id)
-                or f"trace line {deviation.line}, t={deviation.at_s:g} s: it {deviation.description}"
-            )
+            words = finding or f"trace line {deviation.line}, t={deviation.at_s:g} s: it {deviation.description}"
             self.why[agent_id] = f"deviates from the protocol, and is played up to trace line {deviation.line}: {words}"
         elif problem is not None:
             rehearsal.truncated = True

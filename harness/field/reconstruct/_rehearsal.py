@@ -1,9 +1,10 @@
 """Rehearse one agent alone, to find how far its record follows the protocol.
 
-The reference core, or a core with a known quirk, plays each recorded input at its recorded time. The resulting handler
-runs must equal the recorded ones. In this way the first deviation of an agent is known before a whole flight is
-simulated. The rehearsal also determines which datagrams had an effect, which timers were started, and which datagrams
-were sent.
+The agent core, or a core with a known quirk, plays each recorded input at its recorded time. The resulting handler
+runs must equal the recorded ones. The reference cannot play: the scenario needs agents, and known quirks exist only
+for the core. It judges, however: `_comparing` names a deviation from the protocol by the step judge, which uses it.
+In this way the first deviation of an agent is known before a whole flight is simulated. The rehearsal also determines
+which datagrams had an effect, which timers were started, and which datagrams were sent.
 """
 
 import base64

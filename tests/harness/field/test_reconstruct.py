@@ -15,6 +15,7 @@ from harness.run.simulate import simulate
 from harness.scenario import load_scenario
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of
+from tests.harness.proof.edited_core import Bug, edited, with_core
 from ucp.messages import decode, encode
 from ucp.trace import in_base64
 
@@ -123,6 +124,15 @@ def test_wrong_agent_is_explained_by_a_quirk_or_its_first_deviation(tmp_path: Pa
     parted = reconstruct_from(field_records(tmp_path / "home2", flown(tmp_path / "run2", quirks=ignoring)))
     assert parted.problems == []
     assert any("agent 2 did not react to" in remark and "receive_commit_block" in remark for remark in parted.remarks)
+
+
+def test_edited_core_is_named_if_a_right_record_does_not_play(tmp_path: Path) -> None:
+    home = field_records(tmp_path / "home", flown(tmp_path / "run", agents=3, duration_s=100))
+    right = "approve = message.chain_hash == core.chain.top_chain_hash"
+    core = edited(tmp_path, Bug("commit.py", right, right.replace("==", "!=")))
+    done = with_core(core, "reconstruct", home, "-o", "again.yaml", cwd=tmp_path)
+    assert "its record follows the protocol there, but the agent core was edited (ucp/commit.py)" in done.stdout
+    assert "deviates from the protocol" not in done.stdout
 
 
 def test_unknown_deviation_ends_the_play_of_its_agent(tmp_path: Path) -> None:

@@ -34,13 +34,17 @@ def edited(directory: Path, *bugs: Bug) -> Path:
     return directory
 
 
+def environment(core: Path) -> dict[str, str]:
+    """Return the environment of a process that imports the core in the directory `core`."""
+    return {**os.environ, "PYTHONPATH": f"{core}{os.pathsep}{ROOT}", "PYTHONDONTWRITEBYTECODE": "1"}
+
+
 def with_core(core: Path, *arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run `ucp-harness` with the core in the directory `core`."""
-    environment = {**os.environ, "PYTHONPATH": f"{core}{os.pathsep}{ROOT}", "PYTHONDONTWRITEBYTECODE": "1"}
     return subprocess.run(
         [sys.executable, "-P", "-m", "harness.cli", *map(str, arguments)],
         cwd=cwd,
-        env=environment,
+        env=environment(core),
         capture_output=True,
         text=True,
         timeout=LIMIT_S,
