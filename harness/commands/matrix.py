@@ -76,7 +76,7 @@ def matrix_command(
         _compare_with_variant(request, load_variant(variant), directory, spread, as_json)
     finished = matrix.run_matrix(request, directory, spread, covers=coverage)
     if baseline is not None:
-        finished = compare_with(finished, baseline, str(against))
+        finished = compare_with(finished, baseline)
     earlier = None
     if nights_directory is not None:
         nights_of_matrix.keep(finished.record, nights_directory)

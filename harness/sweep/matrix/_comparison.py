@@ -1,31 +1,60 @@
-"""Compare the cells of a matrix with those of an earlier night: which figures changed by more than chance explains?
+"""Compare the cells of a matrix with those of an earlier night, the baseline.
 
-A figure changed if its two 95 % intervals do not overlap. The metric states which direction is worse.
+In virtual time, equal code gives equal runs, so two nights differ only where the code differs. The runs of a cell are
+therefore compared in pairs with the same seed. A figure changed if the interval of the mean difference of the pairs
+does not contain 0. The intervals are wide enough that, without a real change, 95 % of the nights have no changed figure
+at all: each of m compared figures has an interval of 1 - 0.05 / m (Bonferroni).
+
+With processes, each run differs, so pairs mean nothing. There a figure changed if its two 95 % intervals do not
+overlap.
+
+The metric states which direction is worse.
 """
 
 from collections.abc import Iterator, Sequence
 
 from pydantic import BaseModel
 
-from harness.sweep.matrix._cell import AtPoint, Cell
-from harness.sweep.matrix._estimate import BY_NAME, Estimate
+from harness.play.backends import BACKENDS
+from harness.sweep.matrix._cell import AtPoint, Cell, Run
+from harness.sweep.matrix._estimate import BY_NAME, CONFIDENCE, Estimate, Metric, estimate_mean
+from harness.sweep.matrix._matrix_file import Point
 
 
 class Change(AtPoint):
-    """A changed figure: `metric` was `before` and is `now`. The two 95 % intervals do not overlap."""
+    """A changed figure: `metric` was `before` and is `now`.
+
+    `difference` is the mean difference of the runs with the same seed, with its corrected interval. It is null if the
+    runs are not compared in pairs.
+    """
 
     metric: str
     before: Estimate
     now: Estimate
     worse: bool
+    difference: Estimate | None = None
+
+
+class ChangedRuns(AtPoint):
+    """The seeds of the runs of a cell in virtual time that differ from the baseline, of `pairs` compared runs."""
+
+    pairs: int
+    seeds: list[int]
 
 
 class Comparison(BaseModel):
-    """The comparison with an earlier matrix, which started at `started_at`. `baseline` is its matrix.json."""
+    """The comparison with an earlier matrix. `baseline` is its matrix.json, and `cells` the number of compared cells.
+
+    `started_at` is its start, and null if this version of the harness cannot read the file.
+    """
 
     baseline: str
-    started_at: str
+    started_at: str | None = None
+    cells: int = 0
     changes: list[Change]
+    changed_runs: list[ChangedRuns] = []
+    not_compared: list[str] = []
+    """A sentence for each difference of the two matrices because of which cells are not compared."""
 
     @property
     def regressions(self) -> list[Change]:
@@ -38,15 +67,65 @@ def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
     for cell in now:
         if cell.point not in earlier:
             continue
-        figures_before = earlier[cell.point].estimates
-        for metric in BY_NAME.values():
-            if metric.name not in figures_before or metric.name not in cell.estimates:
-                continue
-            was, is_now = figures_before[metric.name], cell.estimates[metric.name]
+        for metric, was, is_now in _both(earlier[cell.point], cell):
             direction = _moved(was, is_now)
             if direction and metric.worse:
                 worse = direction == metric.worse
                 yield Change(**cell.point._asdict(), metric=metric.name, before=was, now=is_now, worse=worse)
+
+
+def compare_pairs(
+    before: Sequence[Cell], now: Sequence[Cell], runs_before: Sequence[Run], runs_now: Sequence[Run]
+) -> tuple[list[Change], list[ChangedRuns]]:
+    """Compare the runs of equal seeds in the cells that both matrices have."""
+    earlier = {cell.point: cell for cell in before}
+    runs = {run.task: run for run in runs_before}
+    pairs: dict[Point, list[tuple[Run, Run]]] = {}
+    for run in runs_now:
+        if run.task in runs and run.point in earlier:
+            pairs.setdefault(run.point, []).append((runs[run.task], run))
+    compared = [
+        (cell.point, metric, was, is_now, _differences(metric, pairs[cell.point]))
+        for cell in now
+        if cell.point in pairs
+        for metric, was, is_now in _both(earlier[cell.point], cell)
+        if metric.worse
+    ]
+    confidence = 1 - (1 - CONFIDENCE) / max(1, len(compared))
+    changes = []
+    for point, metric, was, is_now, differences in compared:
+        difference = estimate_mean(differences, confidence)
+        if difference.low is None or difference.high is None or difference.low <= 0 <= difference.high:
+            continue
+        worse = (difference.low > 0) == (metric.worse == "higher")
+        changes.append(
+            Change(**point._asdict(), metric=metric.name, before=was, now=is_now, worse=worse, difference=difference)
+        )
+    changed = [
+        ChangedRuns(
+            **point._asdict(),
+            pairs=len(its_pairs),
+            seeds=[run.seed for was, run in its_pairs if (was.figures, was.verdicts) != (run.figures, run.verdicts)],
+        )
+        for point, its_pairs in pairs.items()
+    ]
+    return changes, [each for each in changed if each.seeds]
+
+
+def is_paired(point: Point) -> bool:
+    """Return true if equal code gives equal runs at this point."""
+    return BACKENDS[point.backend].plays_in_memory
+
+
+def _both(before: Cell, now: Cell) -> Iterator[tuple[Metric, Estimate, Estimate]]:
+    for metric in BY_NAME.values():
+        if metric.name in before.estimates and metric.name in now.estimates:
+            yield metric, before.estimates[metric.name], now.estimates[metric.name]
+
+
+def _differences(metric: Metric, pairs: Sequence[tuple[Run, Run]]) -> list[float]:
+    values = [(metric.of(was.figures), metric.of(run.figures)) for was, run in pairs]
+    return [after - before for before, after in values if before is not None and after is not None]
 
 
 def _moved(before: Estimate, now: Estimate) -> str | None:

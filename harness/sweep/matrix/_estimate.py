@@ -30,12 +30,12 @@ class Estimate(BaseModel):
     high: float | None = None
 
 
-def estimate_mean(values: Sequence[float]) -> Estimate:
+def estimate_mean(values: Sequence[float], confidence: float = CONFIDENCE) -> Estimate:
     n = len(values)
     if n < 2:
         return Estimate(n=n, mean=values[0] if values else None)
     mean = fmean(values)
-    margin = student_quantile((1 + CONFIDENCE) / 2, n - 1) * stdev(values) / math.sqrt(n)
+    margin = student_quantile((1 + confidence) / 2, n - 1) * stdev(values) / math.sqrt(n)
     return Estimate(n=n, mean=mean, low=mean - margin, high=mean + margin)
 
 

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
 from harness.errors import CANNOT_HERE, INCOMPLETE, INTERRUPTED, VIOLATED
-from harness.sweep.matrix._cell import AtPoint, Cell
+from harness.sweep.matrix._cell import AtPoint, Cell, Run
 from harness.sweep.matrix._comparison import Comparison
 from harness.sweep.matrix._growth import Growth
 from harness.sweep.matrix._matrix_coverage import MatrixCoverage
@@ -47,6 +47,8 @@ class MatrixRecord(BaseModel):
     unsupported: list[RunWithoutResult] = []
     """Runs in which an agent did not support a needed feature."""
     against: Comparison | None = None
+    results: list[Run] = []
+    """The judged runs in virtual time. A later night compares its runs with them, in pairs with the same seed."""
     tried: MatrixCoverage | None = None
     """Coverage of the protocol by the runs, if requested."""
     growths: list[Growth] = []

@@ -16,12 +16,13 @@ from harness.scenario import Scenario
 from harness.sweep.matrix._cell import Run, sum_up
 from harness.sweep.matrix._cell_play import Judge, Player, simulated
 from harness.sweep.matrix._cluster import cluster
-from harness.sweep.matrix._comparison import Comparison, compare
+from harness.sweep.matrix._comparison import Comparison, compare, compare_pairs, is_paired
 from harness.sweep.matrix._growth import growths
 from harness.sweep.matrix._matrix_coverage import CoverageTally
 from harness.sweep.matrix._matrix_file import Matrix, Point, Task
 from harness.sweep.matrix._results_file import Results, opened
 from harness.sweep.matrix.matrix_record import MatrixRecord, RunWithoutResult
+from harness.sweep.matrix.nights import Baseline
 
 Outcomes = Iterator[tuple[Task, Run | FailedTask]]
 Spread = Callable[[Sequence[Task], Callable[[Task], Run]], AbstractContextManager[Outcomes]]
@@ -108,6 +109,7 @@ def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge,
         wall_s=round(time.monotonic() - started, 1),
         outcome="interrupted" if interrupted else "completed",
         cells=cells,
+        results=[run for run in runs if run.judged and is_paired(run.point)],
         failed=[_without_result(run, run.failed) for run in runs if run.failed is not None],
         unsupported=[_without_result(run, run.unsupported) for run in runs if run.unsupported is not None],
         tried=None if tally is None else tally.tried(matrix, len(runs)),
@@ -116,10 +118,29 @@ def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge,
     return Finished(record, runs)
 
 
-def compare_with(finished: Finished, baseline: MatrixRecord, path: str) -> Finished:
-    """Add the changes since the matrix `baseline`, which was read from `path`."""
-    changes = list(compare(baseline.cells, finished.record.cells))
-    comparison = Comparison(baseline=path, started_at=baseline.started_at, changes=changes)
+def compare_with(finished: Finished, baseline: Baseline) -> Finished:
+    """Add the changes since `baseline`."""
+    if baseline.record is None:
+        comparison = Comparison(baseline=str(baseline.path), changes=[], not_compared=baseline.not_compared)
+        return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
+    comparable = [cell for cell in baseline.record.cells if cell.point in baseline.points]
+    with_runs = {run.point for run in baseline.record.results}
+    paired = {cell.point for cell in comparable if is_paired(cell.point) and cell.point in with_runs}
+    changes = list(compare([cell for cell in comparable if cell.point not in paired], finished.record.cells))
+    changes_in_pairs, changed_runs = compare_pairs(
+        [cell for cell in comparable if cell.point in paired],
+        finished.record.cells,
+        baseline.record.results,
+        finished.record.results,
+    )
+    comparison = Comparison(
+        baseline=str(baseline.path),
+        started_at=baseline.record.started_at,
+        cells=len(baseline.points),
+        changes=[*changes_in_pairs, *changes],
+        changed_runs=changed_runs,
+        not_compared=baseline.not_compared,
+    )
     return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
 
 

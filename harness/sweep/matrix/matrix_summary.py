@@ -11,6 +11,7 @@ from harness.sweep.matrix._matrix_coverage import MatrixCoverage
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import (
     axes,
+    changed_runs,
     explanation,
     improvements,
     say_finished,
@@ -26,7 +27,8 @@ from harness.sweep.matrix.matrix_table import (
 def to_markdown(record: MatrixRecord) -> str:
     lines = [f"## {escaped(record.matrix.name)}", "", f"**{verdict(record)}**", "", *_table(record), ""]
     lines += [explanation(record) + unjudged(record), ""]
-    if findings := [*troubles_of_all(record), *unsupported_of_all(record), *improvements(record)]:
+    compared = [*improvements(record), *changed_runs(record)]
+    if findings := [*troubles_of_all(record), *unsupported_of_all(record), *compared]:
         lines += [*(f"- {escaped(sentence)}" for sentence in findings), ""]
     if record.tried is not None:
         lines += [*map(escaped, describe_coverage(record.tried)), ""]
@@ -67,10 +69,12 @@ def verdict(record: MatrixRecord) -> str:
         parts.append(f"{len(record.failed)} failed")
     if record.unsupported:
         parts.append(f"{len(record.unsupported)} not supported")
-    if record.against:
+    if record.against and record.against.cells and record.against.started_at is not None:
         worse = len(record.against.regressions)
         which = f"{worse} figures are worse" if worse > 1 else f"{worse or 'no'} figure is worse"
         parts.append(f"{which} than on {text.started(record.against.started_at)}")
+    if record.against and record.against.not_compared:
+        parts.append("not all cells are compared" if record.against.cells else "not compared with the baseline")
     return "; ".join(parts)
 
 

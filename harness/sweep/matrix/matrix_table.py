@@ -28,8 +28,9 @@ def render(record: MatrixRecord) -> RenderableType:
     notes = (Text(note, style="red") for note in troubles_of_all(record))
     lacking = (Text(note, style="yellow") for note in unsupported_of_all(record))
     better = (Text(note, style="green") for note in improvements(record))
+    changed = (Text(note, style="yellow") for note in changed_runs(record))
     explained = Text(explanation(record) + unjudged(record), style="dim")
-    return Group(*parts, explained, *_growth_table.render(record), *notes, *lacking, *better)
+    return Group(*parts, explained, *_growth_table.render(record), *notes, *lacking, *better, *changed)
 
 
 def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
@@ -176,10 +177,38 @@ def improvements(record: MatrixRecord) -> Iterable[str]:
             yield f"{name_of(record.matrix, change.point)}: {_say_change(change)}"
 
 
+def changed_runs(record: MatrixRecord) -> Iterable[str]:
+    """Yield a sentence for each cell with runs that differ from the baseline, and for each reason not to compare."""
+    if record.against is None:
+        return
+    for changed in record.against.changed_runs:
+        seeds = ", ".join(map(str, changed.seeds[:NAMED])) + (", \u2026" if len(changed.seeds) > NAMED else "")
+        plural = "s" if len(changed.seeds) > 1 else ""
+        yield (
+            f"{name_of(record.matrix, changed.point)}: {len(changed.seeds)} of {changed.pairs} runs differ from the "
+            f"baseline, seed{plural} {seeds}"
+        )
+    yield from record.against.not_compared
+
+
 def _say_change(change: Change) -> str:
     metric = BY_NAME[change.metric]
     became = "worse" if change.worse else "better"
+    if change.difference is not None:
+        means = f"{say_mean(metric, change.now)}, was {say_mean(metric, change.before)}"
+        return f"{metric.label} {became}: {means}; {_say_difference(change)}"
     return f"{metric.label} {became}: {say(metric, change.now)}, was {say(metric, change.before)}"
+
+
+def _say_difference(change: Change) -> str:
+    """Format the mean difference of the pairs with its interval, in percent of the value before if it has one."""
+    metric, difference, before = BY_NAME[change.metric], change.difference, change.before.mean
+    assert difference is not None, "the change is one of pairs"
+    factor, unit = (1.0, "") if metric.unit == "number" else (100.0, "\u00a0points")
+    if metric.unit == "number" and before:
+        factor, unit = 100 / before, "\u00a0%"
+    mean, low, high = (factor * (value or 0.0) for value in (difference.mean, difference.low, difference.high))
+    return f"{mean:+.3g}{unit} in {difference.n} pairs ({low:+.3g} to {high:+.3g})"
 
 
 def say_finished(cell: Cell) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,26 +10,90 @@ from typing import Any
 from pydantic import ValidationError
 
 from harness.errors import MachineError, RunDirectoryError, ScenarioError
-from harness.sweep.matrix._matrix_file import Matrix
+from harness.sweep.matrix._matrix_file import Matrix, Point
 from harness.sweep.matrix.matrix_record import SCHEMA, MatrixRecord
 from ucp.agent_files import write_json_atomically
 from ucp.short_value import shown
 
+MAX_REASONS = 10
+"""Maximum number of differences of two matrices that are named."""
 _IRRELEVANT_KEYS: Any = {"name": True, "about": True, "keep": True, "scenario": {"name", "about"}}
 
 
-def load_baseline(path: Path, matrix: Matrix) -> MatrixRecord:
-    """Load a night for a comparison.
+class OtherVersionError(ScenarioError):
+    """A matrix.json that this version of the harness cannot read."""
 
-    Raises ScenarioError if the file is unsuitable (see `load_night`), or if the matrix has only one seed.
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """An earlier night, for a comparison with the cells at `points`. `not_compared` says why others are left out.
+
+    `record` is None if another version of the harness wrote the file and this version cannot read it.
+    """
+
+    path: Path
+    record: MatrixRecord | None
+    points: frozenset[Point]
+    not_compared: list[str]
+
+
+def load_baseline(path: Path, matrix: Matrix) -> Baseline:
+    """Load a night for a comparison. It may be of another matrix, and then some cells are not compared.
+
+    Raises ScenarioError if the file is no finished record of a matrix, or if the matrix has only one seed.
     """
     if len(matrix.seed_list) < 2:
         raise ScenarioError("--against compares 95 % intervals, which one seed has not: give the matrix more `seeds`")
-    return load_night(path, matrix)
+    try:
+        record = _load(path)
+    except OtherVersionError as error:
+        return Baseline(path, None, frozenset(), [f"{error}, so no cell is compared"])
+    if record.matrix.traces != matrix.traces:
+        reason = f"`traces` was {shown(record.matrix.traces)} and is {shown(matrix.traces)}, so no cell is compared"
+        return Baseline(path, record, frozenset(), [reason])
+    earlier = frozenset(record.matrix.points)
+    points: set[Point] = set()
+    reasons: dict[str, None] = {}
+    for point in matrix.points:
+        if point not in earlier:
+            reasons["the baseline lacks some cells, which are not compared"] = None
+            continue
+        differing = [*_differing(_scenario_at(record.matrix, point), _scenario_at(matrix, point), "scenario")]
+        if not differing:
+            points.add(point)
+        reasons |= dict.fromkeys(f"{each}, so the baseline is not compared" for each in differing)
+    return Baseline(path, record, frozenset(points), [*reasons][:MAX_REASONS])
+
+
+def _scenario_at(matrix: Matrix, point: Point) -> Any:
+    return matrix.scenario_at(point).model_dump(mode="json", exclude={"name", "about"})
+
+
+def _differing(before: Any, now: Any, key: str) -> Iterator[str]:
+    """Yield a clause for each key whose value differs."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for name in dict.fromkeys((*before, *now)):
+            yield from _differing(before.get(name), now.get(name), f"{key}.{name}")
+    elif before != now:
+        yield f"`{key}` was {shown(before)} and is {shown(now)}"
 
 
 def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
     """Load matrix.json. Raises ScenarioError if it is not the finished record of the same matrix."""
+    record = _load(path)
+    before, now = (side.model_dump(mode="json", exclude=_IRRELEVANT_KEYS) for side in (record.matrix, matrix))
+    differing = [f"`{key}`" for key in now if before[key] != now[key]]
+    if differing:
+        verb = "differs" if len(differing) == 1 else "differ"
+        raise ScenarioError(f"{path} is of another matrix: {', '.join(differing)} {verb}, so nothing can be compared")
+    return record
+
+
+def _load(path: Path) -> MatrixRecord:
+    """Load matrix.json. Raises ScenarioError if it is not the finished record of a matrix.
+
+    Raises OtherVersionError if it has the schema, but not its keys.
+    """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -43,14 +108,7 @@ def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
         record = MatrixRecord.model_validate(document)
     except ValidationError as error:
         place = ".".join(map(str, error.errors()[0]["loc"]))
-        raise ScenarioError(
-            f"{path} says of itself that it is a {SCHEMA}, but its `{place}` is not: make one with this version"
-        ) from None
-    before, now = (side.model_dump(mode="json", exclude=_IRRELEVANT_KEYS) for side in (record.matrix, matrix))
-    differing = [f"`{key}`" for key in now if before[key] != now[key]]
-    if differing:
-        verb = "differs" if len(differing) == 1 else "differ"
-        raise ScenarioError(f"{path} is of another matrix: {', '.join(differing)} {verb}, so nothing can be compared")
+        raise OtherVersionError(f"{path}: this version of the harness cannot read its `{place}`") from None
     if record.outcome != "completed":
         raise ScenarioError(f"{path} is of a matrix that was {record.outcome}: finish it, or take another night's")
     return record
@@ -93,7 +151,7 @@ def keep(record: MatrixRecord, directory: Path) -> None:
         return
     path = directory / f"{re.sub('[^0-9TZ]', '', record.started_at)}.json"
     try:
-        write_json_atomically(path, record.to_json())
+        write_json_atomically(path, record.model_copy(update={"results": []}).to_json())
     except OSError as error:
         raise MachineError(f"{path} cannot be written: {error.strerror}") from None
 

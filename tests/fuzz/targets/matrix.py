@@ -38,7 +38,7 @@ def _matrix(directory: Path, data: bytes) -> None:
 def _night(directory: Path, data: bytes) -> None:
     path = directory / "matrix.json"
     path.write_bytes(data)
-    night = load_baseline(path, matrix())
+    night = load_baseline(path, matrix()).record
     night.to_json()
     list(compare(night.cells, night.cells))
 

@@ -15,7 +15,15 @@ from harness.sweep.matrix._matrix_picture import draw, series_of
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_run import Finished
 from harness.sweep.matrix.matrix_summary import describe_coverage, verdict
-from harness.sweep.matrix.matrix_table import explanation, improvements, name_of, say_lengths, troubles, unjudged
+from harness.sweep.matrix.matrix_table import (
+    changed_runs,
+    explanation,
+    improvements,
+    name_of,
+    say_lengths,
+    troubles,
+    unjudged,
+)
 from harness.sweep.matrix.nights import Nights
 from harness.sweep.matrix.report import _heatmap, _trend
 from harness.sweep.matrix.report._drilldown import drilldown
@@ -51,7 +59,7 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
             for cell in record.cells
             for sentence in troubles(record, cell)
         ],
-        improvements=list(improvements(record)),
+        improvements=[*improvements(record), *changed_runs(record)],
         heatmaps=[_heatmap.heatmap(record, figure) for figure in shown],
         shades=range(_heatmap.SHADES),
         cells=drilldown(finished, directory),

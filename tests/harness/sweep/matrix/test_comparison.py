@@ -8,13 +8,14 @@ import pytest
 
 from harness.checker import Result
 from harness.errors import ScenarioError
+from harness.present.text import escaped
 from harness.scenario import Scenario
 from harness.sweep.matrix import Finished, MatrixRecord, matrix_outputs
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._comparison import compare
 from harness.sweep.matrix._estimate import BY_NAME, Estimate
 from harness.sweep.matrix.matrix_run import compare_with
-from harness.sweep.matrix.nights import load_baseline
+from harness.sweep.matrix.nights import keep, load_baseline
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 
 WORSE = {
@@ -87,7 +88,7 @@ def night(directory: Path, **keys: Any) -> Path:
 def tonight(baseline: Path, judged: Any = judge) -> Finished:
     asked = matrix(seeds=[1, 3, 4])
     record = load_baseline(baseline, asked)
-    return compare_with(played(asked, 1, judged), record, str(baseline))
+    return compare_with(played(asked, 1, judged), record)
 
 
 def test_the_same_night_again_is_no_regression(tmp_path: Path) -> None:
@@ -104,7 +105,7 @@ def test_worse_figure_fails_the_night_and_is_reported_everywhere(tmp_path: Path)
     read = MatrixRecord.model_validate_json((tmp_path / "matrix.json").read_text())
     assert read == finished.record
     assert [(change.loss, change.metric) for change in read.against.regressions] == [(0.5, "reconciles")]  # type: ignore[union-attr]
-    sentence = "reconciles worse: 42.7 (\u00b13.8), was 12.7 (\u00b13.8)"
+    sentence = "reconciles worse: 42.7, was 12.7; +237\u00a0% in 3 pairs (+237 to +237)"
     assert f'message="{sentence}"' in (tmp_path / "junit.xml").read_text()
     summary = (tmp_path / "summary.md").read_text()
     assert f"- 50\u00a0% loss: {sentence}\n" in summary
@@ -126,17 +127,90 @@ def test_changed_names_do_not_prevent_a_comparison(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("keys", "sentence"),
+    ("keys", "sentence", "compared"),
     [
-        ({"loss": (0.0, 0.4)}, "is of another matrix: `loss` differs, so nothing can be compared"),
-        ({"seeds": 5, "agents": [5]}, "is of another matrix: `seeds`, `agents` differ"),
-        ({"scenario": {"agents": 5, "duration_s": 60}}, "is of another matrix: `scenario` differs"),
+        ({"loss": (0.0, 0.4)}, "the baseline lacks some cells, which are not compared", 1),
+        ({"agents": [3]}, "the baseline lacks some cells, which are not compared", 0),
+        (
+            {"scenario": {"agents": 5, "duration_s": 90}},
+            "`scenario.duration_s` was 90.0 and is 1200.0, so the baseline is not compared",
+            0,
+        ),
+        ({"traces": False}, "`traces` was False and is True, so no cell is compared", 0),
     ],
 )
-def test_another_matrix_is_refused(tmp_path: Path, keys: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ScenarioError) as told:
-        tonight(night(tmp_path / "before", **keys))
-    assert sentence in str(told.value)
+def test_cells_that_differ_are_named_and_not_compared(
+    tmp_path: Path, keys: dict[str, Any], sentence: str, compared: int
+) -> None:
+    before = night(tmp_path / "before", **keys)
+    assert len(load_baseline(before, matrix(seeds=[1, 3, 4])).points) == compared
+    finished = tonight(before, busier)
+    assert finished.record.against is not None
+    assert finished.record.against.not_compared == [sentence]
+    assert finished.record.exit_status == 0
+    matrix_outputs.write(finished, tmp_path)
+    summary = (tmp_path / "summary.md").read_text()
+    assert f"- {escaped(sentence)}\n" in summary
+    assert ("not all cells are compared" if compared else "not compared with the baseline") in summary
+    assert ("worse than" in summary) == bool(compared)
+
+
+def test_baseline_of_another_version_is_named_and_not_compared(tmp_path: Path) -> None:
+    path = tmp_path / "baseline.json"
+    path.write_text('{"schema": "ucp-matrix/1"}')
+    finished = tonight(path)
+    assert finished.record.against is not None
+    sentence = f"{path}: this version of the harness cannot read its `matrix`, so no cell is compared"
+    assert finished.record.against.not_compared == [sentence]
+    matrix_outputs.write(finished, tmp_path)
+    assert f"- {escaped(sentence)}\n" in (tmp_path / "summary.md").read_text()
+
+
+def rarely_busier(scenario: Scenario, seed: int) -> Result:
+    """Judge as `judge` does, with one reconcile more for seed 3."""
+    result = judge(scenario, seed)
+    result.figures["reconciles"] += seed == 3  # type: ignore[operator]
+    return result
+
+
+def test_single_changed_run_is_named_and_no_regression(tmp_path: Path) -> None:
+    finished = tonight(night(tmp_path / "before"), rarely_busier)
+    record = finished.record
+    assert record.against is not None
+    assert [(changed.loss, changed.pairs, changed.seeds) for changed in record.against.changed_runs] == [
+        (0.0, 3, [3]),
+        (0.5, 3, [3]),
+    ]
+    assert not record.against.changes
+    assert record.exit_status == 0
+    matrix_outputs.write(finished, tmp_path)
+    assert "1 of 3 runs differ from the baseline, seed 3" in (tmp_path / "report.html").read_text()
+
+
+def slightly_busier(scenario: Scenario, seed: int) -> Result:
+    """Judge as `judge` does, with one or two reconciles more, which is less than the seeds differ."""
+    result = judge(scenario, seed)
+    result.figures["reconciles"] += 1 + seed % 2  # type: ignore[operator]
+    return result
+
+
+def test_pairs_show_a_change_that_is_smaller_than_the_spread_of_the_seeds(tmp_path: Path) -> None:
+    seeds = list(range(20))
+    before = night(tmp_path / "before", seeds=seeds)
+    asked = matrix(seeds=seeds)
+    now = played(asked, 1, slightly_busier)
+    record = compare_with(now, load_baseline(before, asked)).record
+    assert record.against is not None
+    assert {change.metric for change in record.against.regressions} == {"reconciles"}
+    assert not list(compare(MatrixRecord.model_validate_json(before.read_text()).cells, now.record.cells))
+
+
+def test_kept_nights_have_no_single_runs(tmp_path: Path) -> None:
+    record = played(matrix(), 1, judge).record
+    assert record.results
+    keep(record, tmp_path)
+    (kept,) = tmp_path.iterdir()
+    assert json.loads(kept.read_text())["results"] == []
 
 
 @pytest.mark.parametrize(
@@ -146,7 +220,6 @@ def test_another_matrix_is_refused(tmp_path: Path, keys: dict[str, Any], sentenc
         ("", "is not JSON: an earlier night is its matrix.json"),
         ("[]", "names no schema: an earlier night is its matrix.json, whose schema is ucp-matrix/1"),
         ('{"schema": "ucp-run/1"}', "has schema 'ucp-run/1': an earlier night is its matrix.json"),
-        ('{"schema": "ucp-matrix/1"}', "says of itself that it is a ucp-matrix/1, but its `matrix` is not"),
     ],
 )
 def test_invalid_baseline_is_refused(tmp_path: Path, content: str | None, sentence: str) -> None:

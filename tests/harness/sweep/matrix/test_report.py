@@ -15,7 +15,7 @@ from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._cell_play import directory_name
 from harness.sweep.matrix._cell_scenarios import scenario_file, write_scenarios
 from harness.sweep.matrix.matrix_run import compare_with
-from harness.sweep.matrix.nights import Nights
+from harness.sweep.matrix.nights import Baseline, Nights
 from harness.sweep.matrix.report import _drilldown, _heatmap, _trend, to_html
 from harness.sweep.matrix.report._heatmap import known_figures
 from tests.harness.command import harness
@@ -65,8 +65,10 @@ def test_violations_and_failures_are_marked_for_every_figure() -> None:
 def test_a_figure_that_became_worse_is_marked_where_it_is_shown() -> None:
     finished = played(matrix(), 1, judge)
     baseline = json.loads(json.dumps(finished.record.to_json()))
-    baseline["cells"][1]["estimates"]["reconciles"] = {"n": 4, "mean": 1.0, "low": 0.5, "high": 1.5}
-    finished = compare_with(finished, MatrixRecord.model_validate(baseline), "before.json")
+    for run in baseline["results"]:
+        run["figures"]["reconciles"] -= 5 * (run["loss"] == 0.5)
+    record = MatrixRecord.model_validate(baseline)
+    finished = compare_with(finished, Baseline(Path("before.json"), record, frozenset(matrix().points), []))
     assert [mark.text for mark in tiles(finished, "reconciles")["#loss-0.5-agents-5-sim"].marks] == [
         "1 violated",
         "worse",
