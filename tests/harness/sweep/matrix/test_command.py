@@ -113,7 +113,9 @@ def test_against_compares_with_an_earlier_night(tmp_path: Path) -> None:
     baseline.write_text(json.dumps(record))
     worse = harness("matrix", asked, "--against", baseline, "--out", tmp_path / "worse")
     assert worse.returncode == 1
-    assert "100 % loss: copies mean worse: 1, was 2; -50 % in 3 pairs (-50 to -50)" in worse.stdout.replace("\u00a0", " ")
+    assert "100 % loss: copies mean worse: 1, was 2; -50 % in 3 pairs (-50 to -50)" in worse.stdout.replace(
+        "\u00a0", " "
+    )
     other = harness("matrix", written(tmp_path, loss=[0.5]), "--against", baseline, "--out", tmp_path / "other")
     assert other.returncode == 0
     assert "the baseline lacks some cells, which are not compared" in other.stdout
