@@ -15,6 +15,7 @@ from harness.field.calibrate._positions import Positions, find_positions
 from harness.field.calibrate._signal import SignalFit, fit_signal
 from harness.field.ingest import ingest_files
 from harness.scenario import Scenario
+from netem.channel import PRESETS
 from netem.radio import LogDistance
 
 TRAINING_SHARE = 2 / 3
@@ -125,8 +126,11 @@ class Calibration:
         if self.validation:
             yield self.validation.sentence
 
-    def network(self) -> dict[str, Any]:
-        """Return the section `network` of a scenario."""
+    def network(self, preset: str | None = None) -> dict[str, Any]:
+        """Return the section `network` of a scenario: a radio, or the shared channel of a preset.
+
+        A channel computes the losses by other messages itself, so its constant loss is only the floor.
+        """
         if self.fit is None:
             delivered = sum(attempt.delivered for attempt in self.attempts)
             return {"loss": round(1 - delivered / len(self.attempts), 4)} if self.attempts else {}
@@ -134,6 +138,15 @@ class Calibration:
         mean_load = sum(attempt.others for attempt in self.attempts) / len(self.attempts)
         loss = 1 - (1 - model.floor) * math.exp(-model.load * mean_load)
         shadowing_db = self.exponent * model.spread * 10 / math.log(10)
+        if preset is not None:
+            channel = PRESETS[preset]
+            default = LogDistance(self.exponent, shadowing_db, 0.0, channel.sensitivity_dbm, channel.frequency_hz)
+            fitted = {
+                "exponent": round(self.exponent, 4),
+                "shadowing_db": round(shadowing_db, 4),
+                "power_dbm": round(-default.margin_db(model.range_m), 4),
+            }
+            return {"loss": round(min(model.floor, _MAX_LOSS), 4), "channel": {"preset": preset, **fitted}}
         default = LogDistance(exponent=self.exponent, shadowing_db=shadowing_db)
         power_dbm = default.power_dbm - default.margin_db(model.range_m)
         return {
@@ -147,13 +160,13 @@ class Calibration:
             },
         }
 
-    def scenario(self, name: str) -> dict[str, Any]:
+    def scenario(self, name: str, preset: str | None = None) -> dict[str, Any]:
         """Return a scenario with the fitted network. It has no flight plans, because only the network is fitted."""
         document = {
             "name": name,
             "agents": self.roster,
             "duration_s": max(60, round(self.duration_s)),
-            "network": self.network(),
+            "network": self.network(preset),
         }
         Scenario.model_validate(document)
         return document
@@ -184,7 +197,6 @@ class Calibration:
                 }
                 for link in self.links
             ],
-            "network": self.network(),
             "problems": self.problems,
         }
 

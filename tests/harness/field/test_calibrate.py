@@ -13,6 +13,7 @@ from harness.errors import FieldError
 from harness.field.calibrate._delivery_model import Attempt, DeliveryModel, fit, student
 from harness.field.calibrate.calibration import Calibration, calibrate, model_of, validate
 from harness.scenario import Scenario
+from harness.scenario.load import load_scenario
 from netem.radio import LogDistance
 from tests.harness.command import harness
 from tests.harness.field import flight_log_files as files
@@ -272,3 +273,17 @@ def test_flight_at_one_distance_gets_one_loss(tmp_path: Path, flown: tuple[Path,
     assert calibration.fit is None
     assert [*calibration.network()] == ["loss"]
     assert any("the range cannot be estimated" in sentence for sentence in calibration.sentences())
+
+
+def test_channel_has_the_fitted_range(flown: tuple[Path, Calibration, DeliveryModel], tmp_path: Path) -> None:
+    out = tmp_path / "fitted.yaml"
+    assert harness("calibrate", flown[0], "-o", out, "--channel", "lora_sf7").returncode == 0
+    network = load_scenario(out).network
+    assert network.channel is not None
+    radio = network.channel.radio()
+    figures = radio.exponent, radio.shadowing_db, radio.power_dbm, radio.sensitivity_dbm, radio.frequency_hz
+    assert flown[1].fit is not None
+    assert model_of(LogDistance(*figures)).range_m == pytest.approx(flown[1].fit.model.range_m, rel=1e-3)
+    refused = harness("calibrate", flown[0], "-o", tmp_path / "other.yaml", "--channel", "wifi")
+    assert refused.returncode == 2
+    assert "--channel: 'wifi' is no preset; use one of wifi_1" in refused.stderr
