@@ -14,6 +14,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from statistics import median
 from typing import Protocol
 
@@ -21,6 +22,8 @@ from harness.field.flight_logs._records import FlightLog, Position, VehicleLog
 
 MAX_PLACES = 500
 """Maximum number of positions of an agent that vote."""
+MAX_ASIDE_M = 3.0
+"""Maximum distance of a logged position from the track in the flight log. Vehicles may fly side by side."""
 _CELL_DEG = 1e-4
 """Size of a cell in degrees of latitude, about eleven metres."""
 _PAUSE_US = 5_000_000
@@ -164,21 +167,33 @@ def _vote(positions: Sequence[Position], fixes: Fixes) -> _Vote | None:
 
 
 def _visits(near: list[tuple[int, Position]], fix: LoggedPosition) -> Iterator[int]:
-    """Yield the time at which each short visit came nearest to a place."""
+    """Yield the time at which each short visit passed a place, if it came within MAX_ASIDE_M."""
     near.sort(key=lambda timed: timed[0])
     visit: list[tuple[int, Position]] = []
     for index, timed in enumerate(near):
         visit.append(timed)
         if index + 1 == len(near) or near[index + 1][0] - timed[0] > _PAUSE_US:
             if visit[-1][0] - visit[0][0] <= _MAX_VISIT_US:
-                yield min(visit, key=lambda passed: _degrees(passed[1], fix))[0]
+                aside_m, at_us = min(_passage(*legs, fix) for legs in pairwise([visit[0], *visit]))
+                if aside_m <= MAX_ASIDE_M:
+                    yield round(at_us)
             visit = []
 
 
-def _degrees(position: Position, fix: LoggedPosition) -> float:
-    """Return a distance that grows with the true one."""
-    east = (position.lon_deg - fix.lon_e7 / 1e7) * math.cos(math.radians(position.lat_deg))
-    return math.hypot(position.lat_deg - fix.lat_e7 / 1e7, east)
+def _passage(before: tuple[int, Position], after: tuple[int, Position], fix: LoggedPosition) -> tuple[float, float]:
+    """Return the smallest distance, in metres, of the line between two positions from a place, and its time."""
+    begin, end = _metres(before[1], fix), _metres(after[1], fix)
+    along = (end[0] - begin[0], end[1] - begin[1])
+    length = along[0] ** 2 + along[1] ** 2
+    share = min(1.0, max(0.0, -(begin[0] * along[0] + begin[1] * along[1]) / length)) if length else 0.0
+    aside_m = math.hypot(begin[0] + share * along[0], begin[1] + share * along[1])
+    return aside_m, before[0] + share * (after[0] - before[0])
+
+
+def _metres(position: Position, fix: LoggedPosition) -> tuple[float, float]:
+    """Return metres north and east of a place."""
+    east_deg = (position.lon_deg - fix.lon_e7 / 1e7) * math.cos(math.radians(position.lat_deg))
+    return (position.lat_deg - fix.lat_e7 / 1e7) * _METRES_PER_DEGREE, east_deg * _METRES_PER_DEGREE
 
 
 def _cell(lat_deg: float, lon_deg: float) -> tuple[int, int]:

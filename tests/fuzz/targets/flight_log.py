@@ -6,9 +6,21 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from harness.errors import HarnessError
+from harness.field.depot.record_outputs import flown_tracks
 from harness.field.flight_logs import read_flight_log
+from harness.field.flight_logs._matching import match_logs
+from harness.field.flight_logs._summary import changes, in_words
+from harness.report.logbook.positions import RoundedPosition
 from tests.fuzz.finding import require, sound
 from tests.harness.field import flight_log_files as files
+
+FIXES = [
+    (
+        files.BOOT_UTC_US + (5 + second) * 1_000_000,
+        RoundedPosition(round((files.LAT_DEG + second * 10 / 111_320) * 1e7), round(files.LON_DEG * 1e7), 130_000),
+    )
+    for second in range(0, 20, 4)
+]
 
 
 def run(data: bytes) -> None:
@@ -22,6 +34,11 @@ def run(data: bytes) -> None:
             return
     for problem in log.problems:
         sound(problem)
+    for match in match_logs([log], {7: FIXES}):
+        sound(in_words(match))
+        for change in changes(match):
+            sound(change.words)
+        flown_tracks([match])
     for vehicle in log.vehicles:
         sound(repr(vehicle.latest_parameters())[:1000])
         for position in vehicle.positions:

@@ -59,7 +59,14 @@ def test_positions_decide_before_the_system_id(tmp_path: Path) -> None:
     agents = {7: fixes(east_deg=0.002), 32: fixes()}
     match = matched(tmp_path / "1.bin", agents)
     assert (match.vehicle.vehicle, match.agent_id) == (7, 32)
-    assert match.clock_ahead_s == pytest.approx(AHEAD_S, abs=0.6)
+    assert match.clock_ahead_s == pytest.approx(AHEAD_S, abs=0.1)
+
+
+def test_vehicle_ten_metres_beside_is_another_one(tmp_path: Path) -> None:
+    agents = {32: fixes(east_deg=0.00013), 33: fixes()}
+    assert matched(tmp_path / "1.bin", agents).agent_id == 33
+    del agents[33]
+    assert matched(tmp_path / "2.bin", agents).agent_id is None
 
 
 def test_positions_match_a_telemetry_log(tmp_path: Path) -> None:
