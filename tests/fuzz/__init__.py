@@ -1,11 +1,11 @@
-"""Hostile input for all that reads any: mutated at random, or under coverage guidance where `atheris` is installed.
+"""Fuzz tests of all readers of external input. With `atheris`, coverage guides the mutations; without, they are random.
 
-finding.py     what no reader may do
-targets/       one for each reader: bytes go in, and what may not happen is an exception
-mutations.py   damages files as the field does
-corpus.py      the inputs that are kept, in tests/corpus
-execute.py     an input through a target, within bounds
-guided.py      one target under coverage guidance
-__main__.py    `python -m tests.fuzz`: all targets, for as long as one likes
-keep.py        makes tests/corpus anew
+finding.py     the conditions that every reader must meet
+targets/       one module for each reader, which gives it the bytes of an input
+mutations.py   random damage of inputs
+corpus.py      the stored inputs in tests/corpus
+execute.py     run a target with an input, within limits of time and memory
+guided.py      fuzz one target with coverage guidance
+__main__.py    `python -m tests.fuzz`: fuzz all targets for a given time
+keep.py        select the inputs in tests/corpus again
 """

@@ -1,8 +1,8 @@
-"""`python -m tests.fuzz [TARGET ...] [--seconds 60] [--random]`: hostile input for all that reads any.
+"""`python -m tests.fuzz [TARGET ...] [--seconds 60] [--random]`: give hostile input to all readers.
 
-Each target for so many seconds, under coverage guidance if `atheris` is installed (`pip install -e '.[test,fuzz]'`).
-Without it, and with `--random`, the kept inputs are mutated at random. New inputs that cover more are kept in .fuzz
-from one time to the next, and inputs that fail in .fuzz/failures; the exit status is then 1.
+`--seconds` is the time for each target. If `atheris` is installed (`pip install -e '.[test,fuzz]'`), coverage guides
+the mutations. Without it, or with `--random`, the stored inputs are mutated at random. New inputs that cover more code
+are stored in .fuzz for the next call. Failing inputs are stored in .fuzz/failures, and the exit status is then 1.
 """
 
 import argparse
@@ -27,7 +27,7 @@ FAILURES = GROWN / "failures"
 MOST_BYTES = 65536
 MOST_MIB = 1024
 PATIENCE_S = 300
-"""So much longer than asked may the start take, on a machine that is busy, and the last input."""
+"""Additional seconds for the start and the last input of a target, on a busy machine."""
 
 
 def main() -> int:
@@ -49,7 +49,10 @@ def main() -> int:
 
 
 def _guided(name: str, seconds: int) -> bool:
-    """Whether nothing fails. It is a process of its own: libFuzzer ends the one that it is in."""
+    """Fuzz a target with coverage guidance, in a new process, because libFuzzer ends its process.
+
+    Return whether no input fails.
+    """
     grown = GROWN / name
     grown.mkdir(exist_ok=True)
     log = GROWN / f"{name}.log"
@@ -76,7 +79,7 @@ def _guided(name: str, seconds: int) -> bool:
 
 
 def _where_it_hangs(running: "subprocess.Popen[bytes]") -> None:
-    """Into its log; the input that it is at is kept, as of one that crashes."""
+    """Make a hanging process write its stack into its log, and its input into the failures. Then kill it."""
     for number in (signal.SIGUSR1, signal.SIGABRT):
         running.send_signal(number)
         time.sleep(1)
@@ -85,7 +88,7 @@ def _where_it_hangs(running: "subprocess.Popen[bytes]") -> None:
 
 
 def _at_random(name: str, seconds: int) -> bool:
-    """Whether nothing fails."""
+    """Fuzz a target with random mutations. Return whether no input fails."""
     target, kept = named(name), [path.read_bytes() for path in files_of(name)]
     began, inputs, problem = time.monotonic(), 0, ""
     for data in mutated(kept, seed=time.time_ns()):

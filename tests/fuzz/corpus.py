@@ -1,4 +1,4 @@
-"""The inputs that are kept, a folder for each target: what once failed, as `regression-...`, and what covers most."""
+"""The stored inputs, in a folder for each target: former failures as `regression-NAME`, and inputs that cover most."""
 
 from pathlib import Path
 
@@ -9,6 +9,6 @@ MOST_BYTES = 500_000
 
 
 def files_of(name: str) -> list[Path]:
-    """Those of a target; none if it has none yet."""
+    """Return the stored inputs of a target. Empty if it has none yet."""
     folder = FOLDER / name
     return sorted(path for path in folder.iterdir()) if folder.is_dir() else []

@@ -1,4 +1,4 @@
-"""What no reader may do with any input: raise anything but its own error, take long or much, ramble, or lie."""
+"""The conditions that every reader must meet for any input: limits of time and memory, and sound error messages."""
 
 import resource
 import signal
@@ -13,12 +13,12 @@ LONGEST_SENTENCE = 2000
 
 
 class FailedError(AssertionError):
-    """A reader did what none may do with any input."""
+    """A reader violated a condition."""
 
 
 @contextmanager
 def bounded() -> Iterator[None]:
-    """Raises FailedError if it takes too long, or too much memory."""
+    """Raise FailedError if the block takes longer than MOST_S, or more memory than MOST_GROWTH_BYTES."""
 
     def too_long(signal_number: int, frame: FrameType | None) -> None:
         raise FailedError(f"took more than {MOST_S} s")
@@ -37,7 +37,7 @@ def bounded() -> Iterator[None]:
 
 
 def sound(sentence: str) -> None:
-    """A sentence for people is one line, is not endless, and is no traceback."""
+    """Raise FailedError unless an error message is one short line without a traceback."""
     require(len(sentence) < LONGEST_SENTENCE, f"a sentence of {len(sentence)} characters: {sentence[:200]}")
     require("\n" not in sentence, f"more than a sentence: {sentence[:200]}")
     require("Traceback" not in sentence, f"a traceback: {sentence[:200]}")

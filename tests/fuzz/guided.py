@@ -1,7 +1,7 @@
-"""One target under coverage guidance: `python -m tests.fuzz.guided [--blind] TARGET [libFuzzer's options] FOLDER...`
+"""Fuzz a target with coverage guidance: `python -m tests.fuzz.guided [--blind] TARGET [libFuzzer's options] FOLDER...`
 
-Half of the mutations are libFuzzer's, half those of `tests.fuzz.mutations`. `--blind` mutates the kept inputs at random
-and learns nothing from what that covers: to compare. An input that fails stays in the file that is named last.
+Half of the mutations are libFuzzer's, and half are those of `tests.fuzz.mutations`. For comparison, `--blind` mutates
+the stored inputs at random, and ignores the coverage. libFuzzer prints the path of a failing input last.
 """
 
 import faulthandler

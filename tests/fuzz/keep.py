@@ -1,7 +1,7 @@
-"""`python -m tests.fuzz.keep [TARGET ...]`: makes tests/corpus anew: seeds, what `python -m tests.fuzz` has grown in
-.fuzz, and what was kept, of these the few that take the most ways through the code, and all regressions.
+"""`python -m tests.fuzz.keep [TARGET ...]`: select the inputs in tests/corpus again.
 
-A way is a line of the project that runs after another. What covers more of them comes first, then what is smaller.
+The candidates are the seeds, the inputs that `python -m tests.fuzz` left in .fuzz, and the stored inputs. The
+selection covers the most pairs of successive lines of the project. Smaller inputs are preferred. All regressions stay.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ from tests.fuzz.targets.home import run_of_three
 MOST_FILES = 11
 MOST_BYTES = 45_000
 MOST_BYTES_EACH = 40_000
-"""Of a target."""
+"""Maximum number and sizes of the selected inputs of a target."""
 _PROJECT = tuple(str(Path(__file__).parents[2] / room) for room in ("ucp", "harness", "netem", "sitl"))
 
 Way = tuple[str, int, int]
@@ -51,7 +51,7 @@ def _keep(name: str, flown: Path) -> list[bytes]:
 
 
 def _best(ways: dict[bytes, frozenset[Way]]) -> Iterator[bytes]:
-    """Greedily, within the bounds."""
+    """Yield the selected inputs: always the one that covers the most new pairs of lines, within the limits."""
     covered: set[Way] = set()
     left = MOST_BYTES
     for _ in range(MOST_FILES):

@@ -1,4 +1,4 @@
-"""Damages files as the field, a careless hand or a hostile one does; the same seed, the same damage."""
+"""Random damage of files, as the field, a careless user or an attacker causes it. A seed determines it."""
 
 import json
 import random
@@ -17,7 +17,7 @@ _RAW = (
     *("NaN", "Infinity", "-Infinity", "1e999", "9" * 5000, "0" * 5000, "01", "1.", "'a'", "undefined", "\\", '"'),
     *("[" * _DEEP, '{"a":' * _DEEP, "[" * 200 + "]" * 200, '"\\ud800"', '"\\u0000"', "{", "}", ",", ",,", "\t", "\x00"),
 )
-"""What stands in the place of a value that json would not write."""
+"""Texts in place of a JSON value that Python's json module would not write."""
 
 
 def flip_bits(content: bytes, chance: random.Random) -> bytes:
@@ -56,14 +56,14 @@ def repeat_a_part(content: bytes, chance: random.Random) -> bytes:
 
 
 def set_bytes(content: bytes, chance: random.Random) -> bytes:
-    """Where a binary format has its lengths."""
+    """Overwrite some bytes with extreme numbers, which may be the lengths of a binary format."""
     place = chance.randrange(len(content) + 1)
     value = chance.choice((b"\0\0\0\0", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\0\x40", b"\1\0\0\0" * 2))
     return content[:place] + value + content[place + len(value) :]
 
 
 def move_lines(content: bytes, chance: random.Random) -> bytes:
-    """Lines that are there twice, exchanged, missing, or joined."""
+    """Repeat, exchange, remove or join lines."""
     lines = content.splitlines(keepends=True)
     if not lines:
         return content

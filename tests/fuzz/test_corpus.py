@@ -1,4 +1,4 @@
-"""Every input that is kept, through its target, and a few that are mutated: `make fuzz` gives them by the million."""
+"""Run each target with its stored inputs and a few mutated ones. `make fuzz` tries millions of mutated inputs."""
 
 from itertools import islice
 

@@ -1,31 +1,32 @@
-"""The targets by name; each is a module with `run`, which takes an input, and `seeds`, valid inputs to begin with.
+"""The targets by name. Each is a module with the functions `run`, which reads an input, and `seeds`, for valid inputs.
 
-datagram    what arrives on the port: codec, scapy's layers, events in a block
-agent       an agent driven by a program: what liars send, timers, events, reboots, in any state
-store       what a brown-out left on the disk
-mission     the mission file
-control     the control socket of an agent that runs
-answer      what somebody's agent answers on its control socket
-virtual     the lines that an agent is given in virtual time
-foreign     the lines that an agent of somebody's answers there, and what becomes of the run
-telemetry   MAVLink from the vehicle, and what is said of its events
-by_hand     what a run that goes on is asked
+datagram    a datagram on the port: codec, scapy's layers, events in a block
+agent       an agent in any state, with forged messages, timers, events and reboots
+store       a store after a brown-out
+mission     a mission file
+control     requests on the control socket of an agent
+answer      answers of an agent on its control socket
+virtual     the input lines of an agent in virtual time
+foreign     the answer lines of a foreign agent in virtual time, and the run with this agent
+telemetry   MAVLink of a vehicle, and the text of its events
+by_hand     requests to an active run
 scenario    a scenario in YAML: read, written, and a short one played
-story       a story's file
-trace       a trace of either version, by itself, among others and in its run; `events`, what was logged beside it
+story       a story file
+trace       a trace of either version, alone, among others, and in its run
+events      a log of events next to a trace
 export      a chain export
 run_record  run.json
-network     network.jsonl, the record of who could reach whom
-tracks      tracks.jsonl, where the vehicles were
+network     network.jsonl, the conditions between vehicles
+tracks      tracks.jsonl, the positions of vehicles
 capture     pcapng and pcap
 flight_log  DataFlash and telemetry logs of vehicles
-csv         records of others in CSV
-bag         ROS bags of both versions, by any storage and packing
-packed      a trace that gzip packed
+csv         records of other implementations in CSV
+bag         ROS bags of both versions, with any storage and compression
+packed      a trace that gzip compressed
 depot       exports, mission files and manifests at the depot
-matrix      a matrix, an earlier night's record, results
-secured     an agent with keys driven by a program: others with keys and without, the authority, in any epoch and life
-signed      a secured run's export with signatures, or its public keys
+matrix      a matrix file, the record of an earlier night, and results
+secured     an agent with keys, in any epoch and incarnation, with messages of senders with and without keys
+signed      the export of a secured run with signatures, or its public keys
 keys        bundles, public and private keys, revocations
 """
 
@@ -43,13 +44,13 @@ NAMES = (
 
 
 class Target(Protocol):
-    """One reader, and all that stands on it."""
+    """A reader of external input, with the code that uses its result."""
 
     def run(self, data: bytes) -> None:
-        """Raises FailedError, or whatever else, if the reader does what none may do with any input."""
+        """Give the input to the reader. Raises FailedError or another exception if the reader violates a condition."""
 
     def seeds(self, flown: Path) -> Iterator[bytes]:
-        """Valid inputs; `flown` is the directory of a run in virtual time."""
+        """Yield valid inputs. `flown` is the directory of a run in virtual time."""
 
 
 def named(name: str) -> Target:
