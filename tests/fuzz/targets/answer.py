@@ -1,4 +1,4 @@
-"""What somebody's agent answers on its control socket: a sentence says what is wrong with it, or it is its status."""
+"""An answer of an agent on its control socket. The reader accepts it as a status, or refuses it in one sentence."""
 
 import asyncio
 import json

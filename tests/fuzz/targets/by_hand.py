@@ -1,6 +1,6 @@
-"""What a run that goes on is asked by hand: whatever comes, each line has an answer, and what was done is played again.
+"""Requests to an active run. Each line gets an answer, and the recorded scenario plays the same events again.
 
-The mission is one in virtual time that stands still but for what is asked; then it goes on to its end.
+The mission is in virtual time. It pauses between the requests, and then continues to its end.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ from tests.fuzz.finding import require, sound
 
 MOST_LINES = 20
 LONGEST_LINE = 60_000
-"""What is longer ends the conversation."""
+"""A longer line ends the connection."""
 ASKED = Scenario.model_validate({"name": "asked", "agents": 3, "duration_s": 60, "network": {"loss": 0.1}})
 
 

@@ -50,7 +50,7 @@ def _same_again(frames: list[Frame], path: Path) -> None:
 
 
 def _show(paths: list[Path]) -> None:
-    """As `ucp-harness packets` does."""
+    """Format the capture as `ucp-harness packets` does."""
     captures = read_captures(paths)
     for sentence in (*captures.errors, *captures.problems):
         sound(sentence)

@@ -1,4 +1,4 @@
-"""The control socket of an agent that runs: whatever a client sends, each line gets one, and it lives."""
+"""The control socket of a running agent. Each line of a client gets an answer, and the agent continues to run."""
 
 import json
 import os

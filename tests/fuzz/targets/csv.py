@@ -1,4 +1,4 @@
-"""Records of others in CSV."""
+"""Records of other implementations in CSV."""
 
 from collections.abc import Iterator
 from itertools import islice

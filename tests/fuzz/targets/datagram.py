@@ -1,4 +1,4 @@
-"""What arrives on the port: accepted is what its own writer makes, byte for byte, and scapy reads the same."""
+"""A datagram on the port. The encoder reproduces an accepted datagram byte for byte, and scapy reads the same."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -57,7 +57,7 @@ def _run(data: bytes) -> None:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """A datagram of each type."""
+    """Yield a datagram of each type."""
     types: dict[int, bytes] = {}
     for capture in sorted((flown / "capture").iterdir()):
         for frame in CaptureFile(capture):

@@ -1,4 +1,4 @@
-"""A file that a vehicle brought to the depot, a chain export, mission file or manifest: consolidated, and compared."""
+"""A chain export, mission file or manifest at the depot. It is consolidated and compared."""
 
 import json
 from collections.abc import Iterator

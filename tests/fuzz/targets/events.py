@@ -1,4 +1,4 @@
-"""Events that somebody beside an agent took down (`ucp-events/1`)."""
+"""A log of events, written outside the agent (`ucp-events/1`)."""
 
 import json
 from collections.abc import Iterator

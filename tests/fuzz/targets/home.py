@@ -1,7 +1,7 @@
-"""What came home from the field, through all that reads such files: no traceback, and what is not used is named.
+"""Files from the field, and all code that reads them: it raises no traceback, and reports each unused file.
 
-A file is sorted out, alone and beside sound ones, imported, replayed if it is a trace, and read from the archive of the
-run that it is of. What costs more is done with some inputs only, always the same.
+A file is ingested alone and together with undamaged files. It is imported, replayed if it is a trace, and read from the
+archive of its run. Slow steps are done for a part of the inputs, which depends on the input alone.
 """
 
 import zlib
@@ -50,18 +50,18 @@ def _first_blocks(capture: bytes) -> bytes:
 
 @cache
 def _place() -> TemporaryDirectory[str]:
-    """It goes when the process does."""
+    """Return a temporary directory that exists until the end of the process."""
     return TemporaryDirectory(prefix="fuzz-")
 
 
 @cache
 def sound_run() -> Path:
-    """One in this process, whose files are exchanged and put back."""
+    """Return the run of this process. A target replaces one of its files, and restores the file at its end."""
     return run_of_three(Path(_place().name) / "run")
 
 
 def came_home(name: str, data: bytes) -> None:
-    """A file of this name and content."""
+    """Ingest and import a file with this name and content."""
     lot = zlib.crc32(data)
     with TemporaryDirectory() as directory:
         path = Path(directory) / name
@@ -76,7 +76,7 @@ def came_home(name: str, data: bytes) -> None:
 
 
 def in_its_run(place: str, data: bytes) -> None:
-    """A run of which the file at `place` has this content."""
+    """Read a run whose file at `place` has this content."""
     run = sound_run()
     path = run / place
     whole = path.read_bytes() if path.exists() else None
@@ -91,7 +91,7 @@ def in_its_run(place: str, data: bytes) -> None:
 
 
 def _named(path: Path, result: IngestResult) -> None:
-    """Whatever is not used is said."""
+    """Require a sentence for each unused file or line."""
     for sentence in result.sentences():
         sound(sentence)
     dropped = bool(result.left_out)
@@ -109,7 +109,7 @@ def _named(path: Path, result: IngestResult) -> None:
 
 
 def _among_others(path: Path) -> None:
-    """A damaged file takes nothing away from the sound ones beside it."""
+    """Require that undamaged files are used in spite of a damaged file."""
     result = ingest_files([sound_run(), path])
     for sentence in result.sentences():
         sound(sentence)
@@ -118,7 +118,7 @@ def _among_others(path: Path) -> None:
 
 
 def _check(out: Path) -> None:
-    """What was imported is judged, or not: without a traceback."""
+    """Judge the imported records, or refuse them in one sentence."""
     try:
         result = checker.check(checker.gather(RunArchive(out)))
     except HarnessError as error:  # captures alone are not judged
@@ -129,7 +129,7 @@ def _check(out: Path) -> None:
 
 
 def _import(path: Path, out: Path) -> bool:
-    """Whether anything came of it."""
+    """Import the file. Return whether a part of it was usable."""
     try:
         record = import_records([path], [CsvAdapter(), RosBag()], out)
     except HarnessError as error:

@@ -1,4 +1,4 @@
-"""The mission file: refused in a sentence, or written and read the same, and an agent can fly it."""
+"""A mission file. It is refused in one sentence, or a writer reproduces it, and an agent can play the mission."""
 
 import base64
 import dataclasses
@@ -38,13 +38,13 @@ def run(data: bytes) -> None:
 
 
 def _written(mission: Mission) -> dict[str, Any]:
-    """The mission as a file has it."""
+    """Return the mission in the form of a mission file."""
     document = dataclasses.asdict(mission)
     return {**document, "schema": SCHEMA, "initial_data": base64.b64encode(mission.initial_data).decode()}
 
 
 def _fly(mission: Mission) -> None:
-    """What ucp.node does with it first."""
+    """Use the mission as `ucp.node` does at its start."""
     lots = Random(mission.seed)
     mission.events.vehicle_host.encode("idna")
     agent = Agent(
@@ -60,7 +60,7 @@ def _fly(mission: Mission) -> None:
     its_clock = {"epoch_us": mission.epoch_us or 0, "speedup": mission.speedup}
     line = header_line(mission.agent_id, list(mission.roster), mission.initial_data, settings, its_clock)
     checked(HEADER.validate_json(line))
-    if mission.events.mean_s < 1e4:  # else nothing happens for hours
+    if mission.events.mean_s < 1e4:  # with a larger mean, no event occurs for hours
         RandomEvents(lots, mission.events.mean_s).next()
     TelemetryEvents(mission.events.position_interval_s, lots, mission.events.log)
     clock.wall_s(mission.settings.vote_timeout_s)

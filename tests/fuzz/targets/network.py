@@ -1,4 +1,4 @@
-"""network.jsonl, the record of a network's conditions and of what happened to agents."""
+"""network.jsonl, the record of network conditions and of faults."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A trace that gzip packed."""
+"""A trace that gzip compressed."""
 
 import gzip
 from collections.abc import Iterator

@@ -78,7 +78,7 @@ def run(data: bytes) -> None:
 
 
 def _short(scenario: Scenario) -> bool:
-    """Whether it is played in a moment, and starts no program that an input names."""
+    """Return whether a run of the scenario is fast, and starts no program that the input names."""
     entries = len(scenario.events.script) + len(scenario.timeline) + len(scenario.datagrams) + len(scenario.fates)
     injects = any(entry.injection for entry in scenario.timeline)
     return (
@@ -94,7 +94,7 @@ def _short(scenario: Scenario) -> bool:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """What comes along with the harness, and a short one that names every list."""
+    """Yield the scenarios of the library, and a short one with every list."""
     for scenario in sorted(LIBRARY.glob("*.yaml")):
         if scenario.stat().st_size < LARGEST_SEED:
             yield scenario.read_bytes()

@@ -23,7 +23,7 @@ _KEYS = KeySet.derived(bytes(32), [1], seals=True)
 
 @cache
 def _place() -> TemporaryDirectory[str]:
-    """It goes when the process does."""
+    """Return a temporary directory that exists until the end of the process."""
     return TemporaryDirectory(prefix="fuzz-")
 
 

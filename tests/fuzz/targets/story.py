@@ -1,4 +1,4 @@
-"""A story's file: refused in a sentence, or its text without answers is read as the same story."""
+"""A story file. It is refused in one sentence, or its text without answers is the same story again."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""MAVLink from the vehicle, in pieces: every event that it makes fits a block, and can be said in words."""
+"""MAVLink of a vehicle, in pieces. Each resulting event fits into a block, and has a description in words."""
 
 from collections.abc import Iterator
 from pathlib import Path

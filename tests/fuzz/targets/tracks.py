@@ -1,4 +1,4 @@
-"""tracks.jsonl: where the vehicles were."""
+"""tracks.jsonl, the positions of the vehicles."""
 
 import json
 from collections.abc import Iterator
