@@ -165,6 +165,17 @@ def test_lost_bytes_take_only_their_messages_along(tmp_path: Path, name: str) ->
         assert any("are no whole message and are skipped" in problem for problem in log.problems)
 
 
+def test_message_with_lost_bytes_gives_no_false_position(tmp_path: Path) -> None:
+    messages = [*files.flight_messages()]
+    where = [number for number, each in enumerate(messages) if each[2] == files.DEFINITIONS["POS"][0]][30]
+    whole = messages[where]
+    messages[where] = whole[:15] + whole[19:]  # without the longitude, the next four bytes are a longitude as well
+    (vehicle,) = read(tmp_path, "1.bin", files.dataflash_file(messages)).vehicles
+
+    assert len(vehicle.positions) == 59
+    assert {position.lon_deg for position in vehicle.positions} == {files.LON_DEG}
+
+
 @pytest.mark.parametrize("name", WRITERS)
 def test_damaged_log_raises_nothing_but_its_own_error(tmp_path: Path, name: str) -> None:
     rng, data = Random(name), WRITERS[name]()[:6000]
