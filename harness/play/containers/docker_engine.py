@@ -94,7 +94,7 @@ class Engine:
         return await self.in_thread(partial(self.do, what, call, *args, **kwargs))
 
     async def in_thread(self, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run a call in a thread. It continues if the waiting task is cancelled: see `settle`."""
+        """Run a call in a thread. If the waiting task is cancelled, the call goes on, and `settle` waits for it."""
         future = self._threads.submit(partial(call, *args, **kwargs))
         self._pending.add(future)
         future.add_done_callback(self._pending.discard)

@@ -127,7 +127,7 @@ def progress_line(console: Console) -> Iterator[Callable[[str], None]]:
 
 
 def render(engines: Sequence[EngineMeasurement]) -> RenderableType:
-    """Return a table for each engine with a row for each question, and the machine's own lateness."""
+    """Return a table for each engine. It has a row for each measured condition, and the lateness of the machine."""
     return Group(*(part for measured in engines for part in (_table(measured), Text(_lateness(measured), style="dim"))))
 
 

@@ -85,7 +85,7 @@ class _OpenQuery:
     question: Question
     log: _AnswerLog
     since: "ScheduledInput"
-    heard: set[int] = field(default_factory=set)
+    answered_by: set[int] = field(default_factory=set)
     """Senders whose answers the agent has received."""
     answers_seen: int = 0
     """Number of answers that existed at the last call of `take_answers`."""
@@ -338,7 +338,7 @@ class VirtualAir:
 
         They have arrived since the agent's query. Only the first answer of each sender counts.
         """
-        heard = []
+        new = []
         now, rank, _, _ = self.position
         for query in self.open_queries[number].values():
             log = query.log
@@ -348,18 +348,18 @@ class VirtualAir:
                 continue
             query.answers_seen, query.next_at = log.answer_count, NEVER
             for sender, flights in log.answers.items():
-                if sender in query.heard:
+                if sender in query.answered_by:
                     continue
                 first = self._earliest(flights, number, query.since)
                 if first is None:
                     continue
                 if first[0] < now or (first[0] == now and first[1] < rank):
-                    query.heard.add(sender)
-                    heard.append(first)
+                    query.answered_by.add(sender)
+                    new.append(first)
                 elif first[0] < query.next_at:
                     query.next_at = first[0]
-        heard.sort()
-        return heard
+        new.sort()
+        return new
 
     def close_ended_queries(self, number: int, state: AgentState) -> None:
         """Close the queries of an agent that ended together with a timer."""

@@ -28,7 +28,7 @@ STUDY = Study(NetworkConditions(), (Question(1, 4, "loss 0.15", "lost", 0.15, lo
 
 
 def losing(*shares: float) -> Observer:
-    """Loses such shares, one stream after the other."""
+    """Return an observer that loses these shares: the first share in the first stream, and so on."""
     streams = iter(shares)
 
     def observe(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:

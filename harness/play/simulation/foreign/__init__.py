@@ -1,4 +1,4 @@
-"""Agents of other programs in virtual time: they read inputs as lines, and write answers as lines.
+"""Foreign agents in virtual time. They are programs that read inputs as lines and write answers as lines.
 
 `_virtual_program` starts a program and exchanges lines with it, within a limit of wall time. `_answer` parses an
 answer. `_foreign_agent` lets the simulation drive one incarnation as it drives its own agents, and `_foreign_secured`

@@ -49,26 +49,26 @@ class Answer:
 def read_answer(line: bytes, *, tracing: bool) -> Answer:
     """Parse a line. Raises AnswerError, LacksError or RefusedError."""
     try:
-        said = from_json(line, allow_inf_nan=False)
+        document = from_json(line, allow_inf_nan=False)
     except ValueError as error:
         raise AnswerError(f"with a line that is not JSON ({error}): {shown(line)}") from None
-    if not isinstance(said, dict):
+    if not isinstance(document, dict):
         raise AnswerError(f"with a line that is not a JSON object: {shown(line)}")
-    if "error" in said:
-        kind = LacksError if said.get("unsupported") is True else RefusedError
-        raise kind(str(said["error"])[:500])
-    sent = said.get("sent")
+    if "error" in document:
+        kind = LacksError if document.get("unsupported") is True else RefusedError
+        raise kind(str(document["error"])[:500])
+    sent = document.get("sent")
     if not isinstance(sent, list):
         raise AnswerError(f"without a list `sent`: {shown(line)}")
     if len(sent) > MAX_SENT:
         raise AnswerError(f"with {len(sent)} datagrams at once: at most {MAX_SENT} are allowed for an input")
-    timer = said.get("timer", math.nan)
+    timer = document.get("timer", math.nan)
     if timer is not None and (type(timer) not in (int, float) or not -LATEST_S <= timer <= LATEST_S):
-        what = f"with the timer {shown(timer)}, not" if "timer" in said else "without"
+        what = f"with the timer {shown(timer)}, not" if "timer" in document else "without"
         raise AnswerError(f"{what} a number of mission seconds, or null, as `timer`")
-    answer = Answer([_datagram(text) for text in sent], timer, command_answer=said.get("answer"))
+    answer = Answer([_datagram(text) for text in sent], timer, command_answer=document.get("answer"))
     if tracing:
-        trace = said.get("trace")
+        trace = document.get("trace")
         if not isinstance(trace, list):
             raise AnswerError("without the list `trace`, which its mission requires")
         answer.trace = list(_entries(trace))

@@ -171,9 +171,9 @@ class ForeignAgent:
         sent, self._sent = self._sent, []
         outgoing: list[AgentOutput] = []
         for _, datagram in sent:
-            said = datagram.content
-            if isinstance(said, Datagram) and said.sender == self.agent_id:
-                outgoing.append((said.sequence, said.message, datagram))
+            content = datagram.content
+            if isinstance(content, Datagram) and content.sender == self.agent_id:
+                outgoing.append((content.sequence, content.message, datagram))
             else:
                 outgoing.append((0, None, datagram))
         return outgoing
@@ -281,8 +281,8 @@ class ForeignAgent:
         program = self._program
         try:
             program.write(given)
-            said = program.read()
-            answer = read_answer(said, tracing=self._tracing)
+            line_read = program.read()
+            answer = read_answer(line_read, tracing=self._tracing)
         except ProgramFailedError as error:
             if error.status in NO_VIRTUAL_TIME and not self.record.exchanges:
                 raise self._start_error(error.status) from None
@@ -293,7 +293,7 @@ class ForeignAgent:
             raise self._lacks_error(last_line(str(error))) from None
         except RefusedError as error:
             raise self._failure("crashed", f"refused {what} at {now:g} s: {last_line(str(error))}") from None
-        self.record.add(given, said)
+        self.record.add(given, line_read)
         self._now = max(now, self._now)
         return answer
 

@@ -41,9 +41,9 @@ class SecuredForeignAgent(ForeignAgent):
             except MalformedDatagramError:
                 yield OutgoingDatagram(data)
                 continue
-            said = opened.datagram
-            is_its_own = said.sender == self.agent_id
-            yield OutgoingDatagram(data, said.sequence, said.message if is_its_own else None, opened.recorded)
+            content = opened.datagram
+            is_own = content.sender == self.agent_id
+            yield OutgoingDatagram(data, content.sequence, content.message if is_own else None, opened.recorded)
 
     def revoke(self, body: bytes, now: float) -> None:
         """Give the agent a revocation by the authority of the keys."""

@@ -154,10 +154,10 @@ class LineProgram:
             if not events:
                 raise ProgramFailedError("hung", f"did not read its input within {ANSWER_LIMIT_S:g} s")
             if self._out in events:
-                heard = os.read(self._out, CHUNK_BYTES)
-                self._received += heard
-                if not heard or len(self._received) > MAX_ANSWER_BYTES:
-                    raise self._end_error() if not heard else ProgramFailedError("crashed", "writes without end")
+                output = os.read(self._out, CHUNK_BYTES)
+                self._received += output
+                if not output or len(self._received) > MAX_ANSWER_BYTES:
+                    raise self._end_error() if not output else ProgramFailedError("crashed", "writes without end")
             if self._in in events:
                 with suppress(BlockingIOError):
                     try:
@@ -239,8 +239,8 @@ def _die_with_parent() -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _shown(said: bytes) -> str:
-    text = said.split(b"\n")[0].decode(errors="replace")
+def _shown(output: bytes) -> str:
+    text = output.split(b"\n")[0].decode(errors="replace")
     return repr(text[:60] + ("..." if len(text) > 60 else ""))
 
 
