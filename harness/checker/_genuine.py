@@ -111,7 +111,7 @@ def check(evidence: Evidence) -> Judgement:
                 detail = f"holds block {name} of agent {block.agent_id}, which is not on the roster"
             elif wrong_signature:
                 detail = f"holds block {name}, {wrong_signature}"
-            elif block.agent_id not in known:
+            elif block.agent_id not in known or _may_be_of_earlier_incarnation(evidence, block):
                 if not signatures:
                     unknown.add(block.agent_id)
                 continue
@@ -141,6 +141,17 @@ def check(evidence: Evidence) -> Judgement:
     if not signatures and any(block.signature for export in evidence.exports.values() for block in export.blocks()):
         reason += "; the signatures were not checked, because public.json is missing next to the exports"
     return Judgement(NAME, "holds", reason)
+
+
+def _may_be_of_earlier_incarnation(evidence: Evidence, block: ExportedBlock) -> bool:
+    """Return true if the agent of a block holds this block, and its records do not show all its incarnations.
+
+    An agent that lost its data and restarted holds its earlier blocks, but its export does not list them as completed.
+    """
+    trace, export = evidence.traces.get(block.agent_id), evidence.exports.get(block.agent_id)
+    if evidence.record is not None or (trace is not None and not trace.problem) or export is None:
+        return False
+    return any(held.block_hash == block.block_hash for held in export.blocks())
 
 
 def _describe_arrival(trace: Trace | None, block_hash: str) -> str:

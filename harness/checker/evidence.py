@@ -25,6 +25,7 @@ from harness.archive.run_record import AgentRecord, Counters, JudgedRecord
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import Kind, UnknownNames, first_unknown, unknown_names
 from harness.checker._trace_replay import Incarnation, replay
+from harness.checker.judgement import Judgement
 from harness.checker.reference.state import State
 from harness.checker.sent_times import sent_at, spread_of
 from harness.errors import RunDirectoryError
@@ -145,6 +146,10 @@ class Evidence:
     """The recorded scenario. None without a record, and for a run in memory, whose scenario nothing can alter."""
     link_losses: list[tuple[float, dict[Link, float]]] = field(default_factory=list)
     """Mission seconds with the losses, 0 to 1, that links have from then on: first all links, then changed ones."""
+    from_field: bool = False
+    """True for files without the record of a run. Nothing counts the lines of their traces, so lines may be missing."""
+    steps: Judgement | None = None
+    """The judgement on the steps, if it was made before. Else None."""
     stores: dict[int, Path] = field(default_factory=dict)
     """The store of the last incarnation of each agent that has one."""
     channel: list[ChannelLine] | None = None

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 FINDING = 1
 MAX_FINDINGS_SHOWN = 20
 RECORD_SUFFIX = ".jsonl"
+NO_MAP = "no vehicle logged a position, so there is no map: --kml and --geojson write no file"
 
 
 def consolidate_command(
@@ -125,7 +126,8 @@ def _tracks(record: Consolidation) -> list[Track]:
 
 def _maps(tracks: list[Track], forms: dict[Path | None, Callable[[Iterable[Track]], str]]) -> Iterator[str]:
     if not tracks:
-        raise ExportError("no vehicle logged a position, so there is no map: leave out --kml and --geojson")
+        yield NO_MAP
+        return
     for path, form in forms.items():
         if path is not None:
             write_new(path, [form(tracks)])

@@ -19,6 +19,8 @@ from harness.checker import stored_verdict
 from harness.checker.survival import survival
 from harness.commands.terminal import complain, print_json, show_programs, show_result, show_survival
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, MachineError, RunDirectoryError
+from harness.field.ingest import ingest_files
+from harness.field.replay.field_evidence import field_evidence
 from harness.report.agent_programs import programs
 from harness.report.live.server_process import require_packages
 from harness.run.provenance import differing_versions, same_judge, versions
@@ -64,6 +66,9 @@ def check_command(
     """
     archive = RunArchive(*paths)
     evidence = checker.gather(archive)
+    directories = [path for path in paths if path.is_dir()]
+    if not archive.recorded and evidence.traces and directories:
+        evidence = field_evidence(evidence, ingest_files(directories).largest())
     result, survived = checker.check(evidence), survival(evidence)
     stored = [*stored_verdict.differences(archive.record, result, survived)]
     differing = differing_versions(archive.record.versions, versions()) if archive.record.versions else []

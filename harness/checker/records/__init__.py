@@ -49,6 +49,10 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
     _datagrams_vs_traces.find_unread,
 )
 
+NEEDS_ALL_LINES = (_heard_vs_sent.compare,)
+"""Comparisons that need complete traces. A restarted agent numbers its messages again, and its first incarnation may
+be missing."""
+
 
 @dataclass(frozen=True)
 class Examination:
@@ -67,9 +71,15 @@ class Examination:
 
 def cross_examine(evidence: Evidence) -> Examination:
     """Run all comparisons in their order."""
-    contradictions = [contradiction for compare in COMPARISONS for contradiction in compare(evidence)]
+    comparisons = [compare for compare in COMPARISONS if not evidence.from_field or compare not in NEEDS_ALL_LINES]
+    contradictions = [contradiction for compare in comparisons for contradiction in compare(evidence)]
+    if evidence.from_field:
+        lacking = [contradiction for contradiction in contradictions if contradiction.short]
+        contradictions = [contradiction for contradiction in contradictions if not contradiction.short]
+    else:
+        lacking = contradictions
     short = {agent_id: trace.problem for agent_id, trace in evidence.traces.items() if trace.problem}
-    for contradiction in contradictions:
+    for contradiction in lacking:
         if contradiction.short:
             short.setdefault(contradiction.finding.agent_id, contradiction.finding.detail)
     for agent_id in _agents_without_known_end(evidence):

@@ -29,6 +29,8 @@ NAME = "every step"
 
 def check(evidence: Evidence) -> Judgement:
     """Return `deviates` for any difference, `not applicable` if a step cannot be judged, else `as specified`."""
+    if evidence.steps is not None:
+        return evidence.steps
     blocks = Blocks(block for export in evidence.exports.values() for block in export.blocks())
     deviations: list[Deviation] = []
     timers = JudgedTimers()
@@ -55,7 +57,7 @@ def check(evidence: Evidence) -> Judgement:
         lost += [follower.lost for follower in followers if follower.lost]
         steps += len(trace.runs)
     if deviations:
-        return _deviates(evidence, deviations, steps, lost)
+        return deviates(evidence, deviations, steps, lost)
     for agent_id in sorted(set(evidence.roster or evidence.exports) - set(evidence.traces)):
         unjudged[agent_id] = "there is no trace"
     for agent_id, words in evidence.unknown.items():
@@ -117,7 +119,8 @@ def wrongly_dropped(header: CheckedHeader, line: int, aside: DroppedDatagram | C
     return Deviation(header.agent_id, line, aside.t, ON_MESSAGE[type(message)].name, what)
 
 
-def _deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost: list[str]) -> Judgement:
+def deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost: list[str]) -> Judgement:
+    """Return the judgement for these deviations in a number of steps. `lost` has reasons why others were not judged."""
     deviations.sort(key=lambda deviation: (deviation.t, deviation.agent_id, deviation.line))
     first_unknown: dict[tuple[int, str | None], Deviation] = {}
     for deviation in deviations:

@@ -7,6 +7,7 @@ of the judged agent, so that one mistake does not cause further differences.
 import math
 from collections.abc import Callable, Iterable
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from harness.archive.traces import Trace
@@ -21,7 +22,7 @@ from harness.checker.recorded_inputs import (
 )
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_TIMER
-from harness.checker.reference.state import Handler, State
+from harness.checker.reference.state import Handler, State, Timer
 from harness.checker.steps._adopting_core import Before
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.implementation import REFERENCE, Implementation
@@ -139,6 +140,7 @@ class Follower:
                 self._overdue(line, run.t, now)
         else:
             self._ran[run.handler] = line, run.t
+        due = self._due(run, now) if self._none_ends_before < now - self._header.early_s else ()
         heard = trigger if isinstance(trigger, MessageTrigger) else None
         may_touch_timers = heard is None or run.handler in TOUCH_A_TIMER
         before = core.before(run) if may_touch_timers else None
@@ -172,7 +174,8 @@ class Follower:
                 return
             expected = self._expected(run, handler, branch)
             deviation = Deviation(self._header.agent_id, line, run.t, run.handler, run=run, expected=expected)
-            self.deviations.append(deviation)
+            if not self._callback_is_lost(line, run, due) or not _differ_only_in_idle(run, expected):
+                self.deviations.append(deviation)
         self._began = True
         self._adopt(line, run, before)
 
@@ -185,6 +188,59 @@ class Follower:
     def state(self) -> State:
         """The present state of the reference. The caller must not change it."""
         return self._core
+
+    @property
+    def roster(self) -> frozenset[int]:
+        return self._header.roster
+
+    def mission_s(self, local_s: float) -> float:
+        """Return the mission second at which the agent's clock shows this time."""
+        return (local_s - self._header.offset_s) / self._header.rate
+
+    def block(self, block_hash: str) -> Block:
+        """Return a block on record. Raises NotOnRecordError."""
+        return self._blocks.get(block_hash)
+
+    # Lines that may be lost
+
+    def play_lost_message(self, sender: int, message: Message, at_s: float) -> bool:
+        """Handle a message that no line shows. Return whether its line could be lost: it changed no block."""
+        return self._play_lost(self._on_message[type(message)], at_s, sender, message)
+
+    def play_lost_expiry(self, timer_name: str, at_s: float) -> bool:
+        """End a timer whose line is lost. Return whether it was due, and its line could be lost."""
+        timer = self._timers[timer_name]
+        if timer.deadline is None or timer.deadline > self._header.local(at_s) + self._header.early_s:
+            return False
+        timer.stop()
+        return self._play_lost(self._implementation.on_timer[timer_name], at_s)
+
+    def play_lost_local_event(self, at_s: float) -> bool:
+        """Run the handler of the next triggered event. Return whether there was one, and its line could be lost."""
+        if not self._core.triggered:
+            return False
+        event, _ = self._core.triggered.popleft()
+        return self._play_lost(self._implementation.on_local_event[event], at_s)
+
+    def stop_timer(self, timer_name: str) -> None:
+        """Stop a timer whose handler never ran."""
+        self._timers[timer_name].stop()
+        self._none_ends_before = self._soonest_end()
+
+    def _play_lost(self, handler: Handler, at_s: float, *inputs: Any) -> bool:
+        core = self._core
+        core.now = self._header.local(at_s)
+        core.running = handler
+        self._state = None
+        try:
+            handler.run(core, *inputs)
+        except (AssertionError, ValueError, KeyError, IndexError):
+            return False
+        is_hidden = not core.changes
+        core.step_is_over()
+        self._ran[handler.name] = 0, at_s
+        self._none_ends_before = self._soonest_end()
+        return is_hidden
 
     def copy(self) -> "Follower":
         """Return an independent copy without the differences so far."""
@@ -267,6 +323,29 @@ class Follower:
                     self._differ(line, at_s, ON_TIMER[timer.name].name, what)
                     timer.stop()
         self._none_ends_before = self._soonest_end()
+
+    def _due(self, run: HandlerRun, now: float) -> list[Timer]:
+        """Return the timers that are due, and whose handlers have not run."""
+        due_before = now - self._header.early_s
+        return [
+            timer
+            for timer in self._core.timers
+            if timer.deadline is not None and timer.deadline < due_before and ON_TIMER[timer.name].name != run.handler
+        ]
+
+    def _callback_is_lost(self, line: int, run: HandlerRun, due: Iterable[Timer]) -> bool:
+        """Report timers that no longer run according to the agent, although they were due and their handlers never ran.
+
+        The lost callback is the cause of the differences that follow. Returns whether there is one.
+        """
+        is_lost = False
+        for timer in due:
+            if timer.deadline is not None and (run.state.idle or timer.name in (run.started or {})):
+                due_s = self.mission_s(timer.deadline)
+                what = f"it did not run, although the {timer.name} timer was due at t={due_s:g} s"
+                self._differ(line, run.t, ON_TIMER[timer.name].name, what)
+                is_lost = True
+        return is_lost
 
     def _after_a_pause(self, deadline: float) -> str:
         """Return the handler that paused the phase 3 timer since its start, for the end of a sentence."""
@@ -448,6 +527,12 @@ class Follower:
 
     def _differ(self, line: int, at_s: float, handler: str, what: str) -> None:
         self.deviations.append(Deviation(self._header.agent_id, line, at_s, handler, what))
+
+
+def _differ_only_in_idle(run: HandlerRun, expected: HandlerRun) -> bool:
+    alike = replace(expected, started=run.started if not expected.started and not run.started else expected.started)
+    alike.state = replace(expected.state, idle=run.state.idle)
+    return replace(alike, input=run.input, sealed=run.sealed) == run
 
 
 def _triggered_by(run: HandlerRun) -> str | None:

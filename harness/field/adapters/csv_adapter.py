@@ -16,6 +16,7 @@ quote in it is never closed.
 import base64
 import binascii
 import csv
+import re
 from collections import deque
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
@@ -123,8 +124,13 @@ def _rows(file: BoundedFile) -> Iterator[tuple[int, str]]:
             read_ahead.extendleft(reversed(row[1:]))
 
 
+_KIND_CELL = re.compile(
+    rf"""(?:^|[{"".join(_SEPARATORS)}])\s*"?(?:{"|".join(KINDS)})"?\s*[{"".join(_SEPARATORS)}]""", re.IGNORECASE
+)
+
+
 def _starts_like_a_row(line: str) -> bool:
-    return any(f"{separator}{kind}{separator}" in line[:100] for kind in KINDS for separator in _SEPARATORS)
+    return _KIND_CELL.search(line[:100]) is not None
 
 
 def _line(file: BoundedFile) -> str:

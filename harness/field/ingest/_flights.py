@@ -23,6 +23,7 @@ from harness.field.ingest._ingest import Flight, Omission, Remark
 from harness.field.ingest._trace_incarnations import TraceIncarnation
 from ucp.block import InceptionBlock
 from ucp.events import LoggableEvent
+from ucp.trigger import TimerTrigger
 
 
 class _Mission(NamedTuple):
@@ -234,6 +235,7 @@ def _add_without_header(
     clock = header_owner.header.clock
     if not own_incarnations:
         clock = {key: clock[key] for key in ("epoch_us", "speedup") if key in clock}
+        clock["drift"] = _drift(incarnation)
     incarnation.header = header_owner.header.model_copy(update={"agent_id": agent_id, "clock": clock})
     kept = next(split_into_flights([*own_incarnations, incarnation], left_out))
     if incarnation in kept:
@@ -248,6 +250,23 @@ def _add_without_header(
         )
     best.incarnations[agent_id] = kept
     best.hashes |= hashes
+
+
+MAX_DRIFT = 0.05
+
+
+def _drift(incarnation: TraceIncarnation) -> float:
+    """Return the drift of an agent's clock, by the timer that expired soonest for its duration. 0 without timers."""
+    started: dict[str, tuple[float, float]] = {}
+    drifts = []
+    for run in incarnation.runs:
+        if isinstance(run.trigger, TimerTrigger) and run.trigger.timer in started:
+            started_s, duration_s = started.pop(run.trigger.timer)
+            if run.t > started_s:
+                drifts.append(duration_s / (run.t - started_s) - 1)
+        started.update({timer: (run.t, duration_s) for timer, duration_s in (run.started or {}).items()})
+    drift = max(drifts, default=0.0)
+    return drift if abs(drift) <= MAX_DRIFT else 0.0
 
 
 # Exports and captures

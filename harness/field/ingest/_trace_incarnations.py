@@ -7,6 +7,7 @@ within one.
 import base64
 import binascii
 import re
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -16,6 +17,7 @@ from harness.archive.bounded_file import BoundedFile
 from harness.archive.history import LATEST_S
 from harness.archive.traces import MAX_LINE_BYTES, Gap, Header, parse_gap, parse_line
 from harness.field.ingest._ingest import Omission
+from harness.field.ingest._line_order import in_order
 from ucp.messages import HEADER as DATAGRAM_HEADER
 from ucp.messages import MAGIC
 from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun
@@ -95,6 +97,21 @@ class TraceIncarnation:
             last = self.gaps.pop()
             lines, lost_bytes = lines + last.lines, lost_bytes + last.lost_bytes
         self.gaps.append(Gap(position, lines, lost_bytes))
+
+    def put_in_order(self) -> Iterator[Omission]:
+        """Put swapped lines in order, and drop repeated ones. Yields a sentence for each place."""
+        order, places = in_order(self.runs)
+        if not places:
+            return
+        for place in places:
+            lines = self.run_lines[place.first], self.run_lines[place.last]
+            what = place.why if lines[0] == lines[1] else f"{place.why} (up to {self.counts} {lines[1]})"
+            yield Omission(self.path, what, lines[0], self.counts)
+        kept = sorted(order)
+        self.asides = [(bisect_left(kept, position), aside) for position, aside in self.asides]
+        self.gaps = [gap._replace(position=bisect_left(kept, gap.position)) for gap in self.gaps]
+        self.runs, self.run_lines = [self.runs[n] for n in order], [self.run_lines[n] for n in order]
+        self.jumps = jumps_in(self.runs)
 
 
 def _jumps(before: HandlerRun, after: HandlerRun) -> bool:
@@ -230,6 +247,12 @@ class TraceReader:
         """Return the incarnations. If there are any, the damage is added to `left_out`."""
         incarnations = [life for life in self.incarnations if life.runs or life.asides or life.header]
         left_out += self._left_out() if incarnations else ()
+        places = [place for incarnation in incarnations for place in incarnation.put_in_order()]
+        left_out += places[:_MAX_LISTED]
+        if len(places) > _MAX_LISTED:
+            left_out.append(
+                Omission(self.path, f"{len(places) - _MAX_LISTED} more places have lines in the wrong order")
+            )
         return incarnations
 
     def _left_out(self) -> Iterator[Omission]:
@@ -272,11 +295,19 @@ def _parse(line: bytes) -> Header | Entry | None:
         return None
     try:
         entry = parse_line(line)
-        if isinstance(entry, Header):
-            base64.b64decode(entry.initial_data or "", validate=True)
+        for text in _texts_in_base64(entry):
+            base64.b64decode(text, validate=True)
     except ValueError:
         return None
     return entry
+
+
+def _texts_in_base64(entry: Header | Entry) -> Iterator[str]:
+    if isinstance(entry, Header):
+        yield entry.initial_data or ""
+    elif isinstance(entry, HandlerRun):
+        yield from (record.text for record in (entry.input, entry.sealed) if record is not None)
+        yield from (sent.datagram.text for sent in entry.sent if sent.datagram is not None)
 
 
 def _recover_tail(text: bytes) -> tuple[int, Header | Entry] | None:

@@ -58,13 +58,15 @@ Cause = EventLogged | DatagramReceived | TimerExpired | ReconcileRequested | Boo
 class Input:
     """An input of an agent. `at_s` is the time on the agent's own clock. `line` is the line of its trace, from 1.
 
-    `runs` are the handler runs that it caused, including those of local events.
+    `runs` are the handler runs that it caused, including those of local events. If the record `is_partial`, some of
+    them may be lost.
     """
 
     at_s: float
     line: int
     cause: Cause
     runs: list[HandlerRun] = field(default_factory=list)
+    is_partial: bool = False
 
 
 class MissingInputs(Protocol):

@@ -14,6 +14,8 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
+from harness.field.replay._peer_messages import Delivery
+
 MIN_RATE, MAX_RATE = 0.55, 1.8
 """Limits of a plausible clock rate."""
 SEARCH_STEPS = 100
@@ -45,16 +47,6 @@ class ClockLine:
 
 
 Point = tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Delivery:
-    """A message with its times of sending and reception, each on the clock of the agent there."""
-
-    sender: int
-    receiver: int
-    sent_s: float
-    received_s: float
 
 
 def estimate(

@@ -5,14 +5,21 @@ from dataclasses import dataclass
 from itertools import zip_longest
 
 from harness.archive.traces import Trace
-from harness.checker import Evidence, steps
 from harness.checker.judgement import agents
 from harness.checker.steps.trace_header import CheckedHeader
 from harness.field.ingest import Flight
 from harness.field.reconstruct._agent_inputs import Input, inputs_by_incarnation
 from harness.field.reconstruct._inferring import infer
+from harness.field.reconstruct._judged_trace import JudgedTrace
 from harness.field.reconstruct._other_records import OtherRecords
-from harness.field.reconstruct._rehearsal import ProtocolDeviation, Rehearsal, Tolerance, rehearse, same_sent
+from harness.field.reconstruct._rehearsal import (
+    Incarnations,
+    ProtocolDeviation,
+    Rehearsal,
+    Tolerance,
+    rehearse,
+    same_sent,
+)
 from harness.field.reconstruct._timetable import Timetable
 from harness.play.core_version import edited_files
 from harness.run.simulate import Simulated
@@ -104,7 +111,11 @@ def _in_words(step: PlayedStep | None) -> str:
     return ", ".join(filter(None, words))
 
 
-Incarnations = Sequence[Sequence[Input]]
+EARLY_TIMERS = "timers of agent {agent_id} expired too early by its clock, as if the clock had been set back"
+
+
+RecordedInputs = Sequence[Sequence[Input]]
+"""The recorded inputs of each incarnation."""
 
 
 class SoloRehearsals:
@@ -145,27 +156,79 @@ class SoloRehearsals:
     def _by_trace(self, header: CheckedHeader) -> Rehearsal:
         agent_id = header.agent_id
         incarnations, problem = inputs_by_incarnation(self._flight.traces[agent_id], header, self._other_records)
-        rehearsal = rehearse(header, incarnations)
-        as_recorded = rehearsal.matches_exactly and rehearsal.deviation is None
-        finding = None if as_recorded else self._first_finding(agent_id)
-        if (at := rehearsal.deviation) is not None and finding is None and (edited := edited_files()):
+        whole = rehearse(header, incarnations)
+        if problem is not None and whole.deviation is None:
+            whole.truncated = True
+            self.why[agent_id] = f"can be played only in part: {problem}"
+        if problem is not None or (whole.deviation is None and whole.matches_exactly and self._leads_to_export(whole)):
+            return whole
+        judged = JudgedTrace(self._flight, agent_id)
+        if judged.deviations:
+            return self._explain_deviations(header, incarnations, judged, whole)
+        if whole.deviation is None and self._leads_to_export(whole):
+            return whole
+        if (at := whole.deviation) is not None and not judged.lost and (edited := edited_files()):
             self.why[agent_id] = (
                 f"is played up to trace line {at.line}: its record follows the protocol there, but the agent core was "
                 f"edited ({', '.join(edited)})"
             )
-            return rehearsal
-        if rehearsal.deviation is not None:
-            explained = self._explain_by_quirk(header, incarnations, rehearsal.deviation)
-            rehearsal = explained or self._explain_by_tolerance(header, incarnations) or rehearsal
-        elif finding is not None:
+            return whole
+        return self._play_around_lost_lines(header, incarnations, judged, whole)
+
+    def _leads_to_export(self, rehearsal: Rehearsal) -> bool:
+        export = self._flight.exports.get(rehearsal.agent_id)
+        return export is None or rehearsal.chain == list(export.chain_of_block_hashes)
+
+    def _explain_deviations(
+        self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: Rehearsal
+    ) -> Rehearsal:
+        """Explain the deviations of an agent by a known mistake, if possible. Otherwise play up to the first one."""
+        agent_id, finding = header.agent_id, judged.first_finding
+        parts: Incarnations = judged.with_known_states(incarnations) if judged.lost else incarnations
+        in_parts = rehearse(header, parts) if judged.lost else whole
+        if in_parts.deviation is None:
             self._remarks.append(f"agent {agent_id} deviates without effect: {finding}")
-        if (deviation := rehearsal.deviation) is not None:
-            words = finding or f"trace line {deviation.line}, t={deviation.at_s:g} s: it {deviation.description}"
-            self.why[agent_id] = f"deviates from the protocol, and is played up to trace line {deviation.line}: {words}"
-        elif problem is not None:
-            rehearsal.truncated = True
-            self.why[agent_id] = f"can be played only in part: {problem}"
-        return rehearsal
+            self._note_lost(in_parts, judged)
+            return in_parts
+        explained = self._explain_by_quirk(header, parts, in_parts.deviation) or self._explain_by_tolerance(
+            header, incarnations
+        )
+        if explained is not None:
+            self._note_lost(explained, judged)
+            return explained
+        line = in_parts.deviation.line
+        self.why[agent_id] = f"deviates from the protocol, and is played up to trace line {line}: {finding}"
+        return in_parts
+
+    def _play_around_lost_lines(
+        self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: Rehearsal
+    ) -> Rehearsal:
+        """Play the trace of an agent without deviations. Lost lines are replaced by inferred inputs if possible."""
+        agent_id = header.agent_id
+        early = rehearse(header, incarnations, tolerance=Tolerance(early_timers=True)) if whole.deviation else whole
+        if early.deviation is None and self._leads_to_export(early):
+            self._remarks.append(EARLY_TIMERS.format(agent_id=agent_id))
+            return early
+        around = rehearse(header, judged.with_known_states(incarnations))
+        if around.deviation is None and around.stopped is None:
+            self._note_lost(around, judged)
+            return around
+        best = max((whole, around), key=lambda rehearsal: len(rehearsal.played) - rehearsal.inferred)
+        why = best.stopped or next(iter(judged.lost), "the inputs after it lead to another course than recorded")
+        best.truncated = True
+        last = max((played.input.line for played in best.played), default=1)
+        self.why[agent_id] = f"is played up to trace line {last}, and the lost inputs cannot be inferred: {why}"
+        return best
+
+    def _note_lost(self, rehearsal: Rehearsal, judged: JudgedTrace) -> None:
+        if rehearsal.stopped is not None:
+            self.why[rehearsal.agent_id] = f"is played in part, and lost inputs cannot be inferred: {rehearsal.stopped}"
+        elif rehearsal.inferred:
+            why = next(iter(judged.lost), "its trace ends before its export")
+            self._remarks.append(
+                f"{rehearsal.inferred} inputs of agent {rehearsal.agent_id} are inferred from its later blocks, "
+                f"because lines of its trace are not on record: {why}"
+            )
 
     def _by_capture(self, header: CheckedHeader, by_trace: Rehearsal | None) -> Rehearsal | None:
         """Return the rehearsal that explains more inputs: `by_trace`, or one by the capture if it is needed."""
@@ -193,18 +256,27 @@ class SoloRehearsals:
         Quirks of the handlers that ran at the deviation are tried first.
         """
         explaining: dict[str, Rehearsal] = {}
-        deterministic = (quirk for quirk in QUIRKS.values() if not quirk.chance)
+        deterministic = [quirk for quirk in QUIRKS.values() if not quirk.chance]
         for quirk in sorted(deterministic, key=lambda quirk: at.algorithms.isdisjoint(quirk.algorithms)):
             rehearsal = rehearse(header, incarnations, {quirk.name: True})
-            if rehearsal.deviation is None:
+            if rehearsal.deviation is None and rehearsal.stopped is None:
                 explaining[quirk.name] = rehearsal
-                if rehearsal.matches_exactly:
-                    break
-        if not explaining:
+        exact = [name for name, rehearsal in explaining.items() if rehearsal.matches_exactly]
+        names = exact or [*explaining]
+        if not names:
             return None
-        name = max(explaining, key=lambda name: explaining[name].matches_exactly)
-        self._remarks.append(f"agent {header.agent_id} behaves as with {name}: {QUIRKS[name].sentence}")
-        return explaining[name]
+        agent = f"agent {header.agent_id}"
+        if len(names) == 1:
+            self._remarks.append(f"{agent} behaves as with {names[0]}: {QUIRKS[names[0]].sentence}")
+            self._remarks.append(
+                f"{names[0]} is the only one of {len(deterministic)} known mistakes that explains {agent}"
+            )
+        else:
+            self._remarks.append(
+                f"{agent} deviates, and {len(names)} known mistakes explain its record equally well: "
+                f"{', '.join(names)}; the scenario has the first"
+            )
+        return explaining[names[0]]
 
     def _explain_by_tolerance(self, header: CheckedHeader, incarnations: Incarnations) -> Rehearsal | None:
         """Return a rehearsal that tolerates ignored messages or early timers, if the chain is then as recorded."""
@@ -220,11 +292,6 @@ class SoloRehearsals:
             return ignoring
         early = rehearse(header, incarnations, tolerance=Tolerance(early_timers=True))
         if early.deviation is None:
-            self._remarks.append(f"timers of {agent} expired too early by its clock, as if the clock had been set back")
+            self._remarks.append(EARLY_TIMERS.format(agent_id=header.agent_id))
             return early
         return None
-
-    def _first_finding(self, agent_id: int) -> str | None:
-        """Return the first deviation that the step judge finds in the trace, as a sentence. None if it finds none."""
-        judgement = steps.check(Evidence(self._flight.exports, {agent_id: self._flight.traces[agent_id]}))
-        return next((finding.detail for finding in judgement.evidence if finding.agent_id == agent_id), None)

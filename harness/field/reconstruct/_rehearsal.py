@@ -24,11 +24,12 @@ from harness.field.reconstruct._agent_inputs import (
     ReconcileRequested,
     TimerExpired,
 )
+from harness.field.reconstruct._bridging import Bridge, KnownState
 from harness.play.simulation.fate_script import LateTimers, RunningTimer
 from ucp.agent import Agent, drop_reason
 from ucp.block import next_chain_hash
 from ucp.interest import MATTERS, ONLY_COUNTED
-from ucp.messages import CommitBlock, MalformedDatagramError, decode, encode
+from ucp.messages import CommitBlock, MalformedDatagramError, Message, decode, encode
 from ucp.quirks import Quirks, wrong_handlers
 from ucp.store import StoredState
 from ucp.trace import Entry, HandlerRun, SentMessage
@@ -99,6 +100,10 @@ class Rehearsal:
     """True if branches and tallies are equal to the recorded ones, too."""
     ignored: list[Input] = field(default_factory=list)
     """Messages that the agent ignored although they should have had an effect. They are not played."""
+    inferred: int = 0
+    """Number of inputs that were inferred in place of lost lines."""
+    stopped: str | None = None
+    """The reason why lines were lost, if the state after them could not be reached. The rehearsal ends there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,9 +114,13 @@ class Tolerance:
     ignoring: bool = False
 
 
+Incarnations = Sequence[Sequence[Input | KnownState]]
+"""The inputs of each incarnation. A known state stands for lost inputs, which lead to this state."""
+
+
 def rehearse(
     header: CheckedHeader,
-    incarnations: Sequence[Sequence[Input]],
+    incarnations: "Incarnations",
     quirks: Quirks | None = None,
     tolerance: Tolerance | None = None,
 ) -> Rehearsal:
@@ -123,6 +132,12 @@ def rehearse(
     for incarnation, inputs in enumerate(incarnations):
         rehearsed = _IncarnationRehearsal(header, rehearsal, incarnation, timers, tolerance)
         for index, recorded_input in enumerate(inputs):
+            if isinstance(recorded_input, KnownState):
+                if not rehearsed.bridge(recorded_input):
+                    rehearsal.stopped = recorded_input.why
+                    rehearsal.truncated = True
+                    break
+                continue
             is_last = incarnation == len(incarnations) - 1 and index == len(inputs) - 1
             if deviation := rehearsed.play(index, recorded_input, stored, is_last=is_last):
                 rehearsal.deviation = deviation
@@ -130,7 +145,7 @@ def rehearse(
         agent = rehearsed.agent
         rehearsal.running_at_end.append(rehearsed.running_at_end())
         rehearsal.chain = [block.block_hash.hex() for block in agent.state.chain]
-        if rehearsal.deviation:
+        if rehearsal.deviation or rehearsal.stopped:
             break
         stored = StoredState.of(agent.state)
     return rehearsal
@@ -162,6 +177,28 @@ class _IncarnationRehearsal:
         """Return the running timers."""
         return [*self._running_timers.values()]
 
+    def bridge(self, known: KnownState) -> bool:
+        """Infer and play inputs until the agent is in this state. Returns whether it is."""
+        bridge = Bridge(self.agent, known)
+        sent: list[Message] = []
+        while (cause := bridge.next(sent)) is not None:
+            state = self.agent.state
+            deadlines = [timer.deadline for timer in state.timers if timer.deadline is not None]
+            at_s = max(state.now, min(deadlines, default=0.0)) if isinstance(cause, TimerExpired) else state.now
+            expired = self._timers.running.get(cause.name) if isinstance(cause, TimerExpired) else None
+            inferred = Input(at_s, 0, cause)
+            if self._feed(inferred, None) is not None:
+                return False
+            inferred.runs = [entry for entry in self.agent.trace() if isinstance(entry, HandlerRun)]
+            numbered = self.agent.messages_to_send()
+            sent = [message for _, message in numbered]
+            datagrams = [encode(self.agent.agent_id, *each) for each in numbered]
+            played = PlayedInput(self._incarnation, inferred, datagrams, matters=True)
+            self._follow_timers(played, expired)
+            self._rehearsal.played.append(played)
+            self._rehearsal.inferred += 1
+        return bridge.reached
+
     def play(
         self, index: int, recorded_input: Input, stored: StoredState | None, *, is_last: bool
     ) -> ProtocolDeviation | None:
@@ -182,11 +219,11 @@ class _IncarnationRehearsal:
         problem = self._feed(recorded_input, stored if index == 0 else None) if matters else None
         entries = self.agent.trace()
         if (
-            is_last
+            (is_last or recorded_input.is_partial)
             and len(recorded_input.runs) < len(entries)
             and not _difference(recorded_input.runs, entries[: len(recorded_input.runs)])
         ):
-            self._rehearsal.truncated = True
+            self._rehearsal.truncated |= is_last
             recorded_input.runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
         problem = problem or _difference(recorded_input.runs, entries)
         if problem is not None:

@@ -1,8 +1,10 @@
 """The record of one agent for a replay: its lines in order, and the other records of the flight."""
 
+import base64
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,14 +14,12 @@ from harness.archive.exports import Export
 from harness.archive.run_record import JudgedRecord
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
+from harness.checker.lost_lines import lost_lines
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import FieldError
 from ucp.clock import MICROSECONDS
 from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
-
-MAX_JUMPS, MAX_JUMP_SHARE = 3, 0.1
-"""Limits for jumps in an agent's sequence numbers: their number, and their share. An agent with more jumps numbers
-its messages in its own way, so a jump does not prove that lines are missing."""
+from ucp.trigger import MessageTrigger
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +63,8 @@ class Record:
         self.problems = problems
         self.agent_id = trace.header.agent_id
         self.incarnations = len(trace.starts) + 1
+        self.doubts: dict[int, str] | None = None
+        """Positions at which damage to a single line explains a deviation, with the reason. None until it is tried."""
         if not trace.header.has_inputs:
             raise FieldError(
                 f"{path}: it has the version ucp-trace/1, which lacks received messages; agents must write ucp-trace/2"
@@ -85,27 +87,37 @@ class Record:
 
     @cached_property
     def unrecorded(self) -> dict[int, str]:
-        """Positions at which lines may be missing without a trace, with the reason.
+        """Positions of entries that lost lines may explain, with the reason, such as "lines are missing ..."."""
+        lost = {} if self.is_counted else lost_lines(self.trace)
+        of_runs = [position for position, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
+        return {of_runs[position]: why for position, why in lost.items()}
 
-        A jump in the sequence numbers of sent messages shows that lines are missing, somewhere after the last sent
-        message. If an agent's numbers jump often, it numbers its messages in its own way, and no line counts as
-        missing.
-        """
-        unrecorded: dict[int, str] = {}
-        incarnation, expected, sent_at = 0, None, 0
-        sendings = jumps = 0
-        for position, entry in enumerate(self.entries):
-            if entry.incarnation != incarnation or entry.gap is not None:
-                incarnation, expected = entry.incarnation, None
-            if isinstance(entry.content, HandlerRun) and entry.content.sent:
-                first = entry.content.sent[0].seq
-                sendings += 1
-                if expected is not None and expected < first:
-                    jumps += 1
-                    why = f"lines are missing (no line has its message{_numbers(expected, first - 1)})"
-                    unrecorded.update(dict.fromkeys(range(sent_at, position + 1), why))
-                expected, sent_at = entry.content.sent[-1].seq + 1, position + 1
-        return unrecorded if jumps <= max(MAX_JUMPS, sendings * MAX_JUMP_SHARE) else {}
+    @property
+    def is_counted(self) -> bool:
+        """True if the record of the run proves that no line is missing: the agent had counted its handler runs."""
+        run = self.flight.record
+        recorded = run.agents.get(str(self.agent_id)) if run is not None else None
+        counts = recorded.handler_runs if recorded is not None else []
+        counted = [count.counted for count in counts if count is not None]
+        return bool(counted) and len(counted) == self.incarnations and sum(counted) <= len(self.trace.runs)
+
+    def datagrams(self, sender: int, sequence: int) -> list[bytes]:
+        """Return the datagrams of a sender with this number, as the traces of other agents sent or received them."""
+        return self._datagrams.get((sender, sequence), [])
+
+    @cached_property
+    def _datagrams(self) -> dict[tuple[int, int], list[bytes]]:
+        found: dict[tuple[int, int], list[bytes]] = {}
+        for agent_id, trace in self.flight.traces.items():
+            for run in trace.runs if agent_id != self.agent_id else ():
+                records = [((agent_id, sent.seq), sent.datagram) for sent in run.sent]
+                if isinstance(run.trigger, MessageTrigger) and run.trigger.sender == self.agent_id:
+                    records.append(((self.agent_id, run.trigger.sequence), run.input))
+                for key, datagram in records:
+                    if datagram is not None:
+                        with suppress(ValueError):
+                            found.setdefault(key, []).append(base64.b64decode(datagram.text, validate=True))
+        return found
 
     @property
     def end_s(self) -> float:
@@ -122,6 +134,11 @@ class Record:
             return None
         if self.flight.record is not None:
             return self.flight.record.end_of(self.agent_id)
+        last = next((entry.content for entry in reversed(self.entries) if isinstance(entry.content, HandlerRun)), None)
+        if last is None or last.state.top != self.flight.exports[self.agent_id].top_chain_hash:
+            return None  # The last lines are lost.
+        if any(gap.position == len(self.trace.runs) for gap in self.trace.gaps):
+            return None
         epoch_us = self.trace.header.clock.get("epoch_us")
         if not isinstance(epoch_us, int):
             return None
@@ -160,10 +177,6 @@ def _entries(trace: Trace) -> Iterator[Entry]:
             position += 1
     for _, (line, aside) in asides:
         yield Entry(line, len(trace.starts) + 1, aside)
-
-
-def _numbers(first: int, last: int) -> str:
-    return f" {first}" if first == last else f"s {first} to {last}"
 
 
 def _missing(lines: int) -> str:

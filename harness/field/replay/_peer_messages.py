@@ -1,13 +1,23 @@
 """The messages between the agent of a record and one other agent, as both records contain them."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from harness.archive.traces import Trace
-from harness.field.reconstruct._clock_offsets import Delivery
 from harness.field.replay._agent_record import Record
 from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """A message with its times of sending and reception, each on the clock of the agent there."""
+
+    sender: int
+    receiver: int
+    sent_s: float
+    received_s: float
 
 
 class PeerMessage(NamedTuple):

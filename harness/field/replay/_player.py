@@ -5,8 +5,10 @@ inverse of each handler.
 """
 
 from bisect import bisect_left
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from copy import copy
 from dataclasses import dataclass, field
+from itertools import islice
 
 from harness.archive.vocabulary import IGNORED_KINDS, first_unknown, unknown_names
 from harness.checker.reference.algorithms import ON_TIMER
@@ -15,6 +17,7 @@ from harness.checker.steps import wrongly_dropped
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, OptionalParts
 from harness.checker.steps.implementation import REFERENCE, Implementation
+from harness.checker.steps.single_line import LINES_AFTER, damage_that_explains
 from harness.field.replay._agent_record import Entry, Record
 from harness.field.replay._resumption import ClockSet, Resumption
 from harness.field.replay.replay_names import RecordedBlocks
@@ -22,6 +25,11 @@ from ucp.trace import HandlerRun
 
 CHECKPOINT_STEPS = 1000
 """Number of steps between checkpoints. Going back plays half of them on average, which takes some milliseconds."""
+
+MAX_DOUBTS = 3
+"""Maximum number of places in a record at which a damaged line is a better explanation than a mistake of the agent."""
+MAX_TRIED = 20
+"""Maximum number of deviations for which damage is tried as an explanation."""
 
 _OF_TIMERS = frozenset(handler.name for handler in ON_TIMER.values())
 
@@ -81,6 +89,8 @@ class Player:
         self._blocks = RecordedBlocks(record)
         self._clock_set = ClockSet(record)
         self._resumption = Resumption(record, self._blocks)
+        self.resumed_at: int | None = None
+        """The position after the last entry at which the state became known again. None if there was none."""
         self._follower, self._incarnation = self._new_follower(), 1
         self._checkpoints = {0: _Checkpoint(self._follower.copy(), 1, self.result.copy())}
 
@@ -174,6 +184,7 @@ class Player:
                     f"; continues after line {entry.line}, where the agent was idle with a recorded chain"
                 )
                 self._follower = new_follower
+                self.resumed_at = self.position + 1
             return
         unknown = unknown_names([run]) if self._unknown else {}
         if unknown:
@@ -203,12 +214,60 @@ class Player:
         """Return a reason for the deviations other than the agent, such as missing lines. None if there is none."""
         if (why := self.record.unrecorded.get(self.position)) is not None:
             return f"{why},"
-        if any(deviation.run is None and deviation.handler in _OF_TIMERS for deviation in deviations):
-            return self._clock_set.shift_near(self.position)
-        return None
+        of_timers = any(deviation.run is None and deviation.handler in _OF_TIMERS for deviation in deviations)
+        shift = self._clock_set.shift_near(self.position) if of_timers else None
+        return shift or self._doubt(deviations)
+
+    def _doubt(self, deviations: list[Deviation]) -> str | None:
+        """Return the damage to a single line that explains the deviations as well as a mistake. None if there is none.
+
+        It is a coincidence at most a few times in a record. If it explains more places, the deviations count.
+        """
+        if self.record.is_counted:
+            return None
+        if self.record.doubts is None:
+            doubting = _DoubtingPlayer(self.record)
+            doubting.to_end()
+            found = {position: why for position, why in doubting.found.items() if why is not None}
+            self.record.doubts = found if len(found) <= MAX_DOUBTS else {}
+        return self.record.doubts.get(self.position)
 
     def _new_follower(self) -> Follower:
         return Follower(self.record.header, self._parts, self._blocks, self.record.was_paused, self._implementation)
+
+
+class _DoubtingPlayer(Player):
+    """A player that tries at each deviation whether damage to a single line explains it."""
+
+    def __init__(self, record: Record) -> None:
+        super().__init__(record)
+        self.found: dict[int, str | None] = {}
+        """The positions of deviations, each with the damage that explains it, or None."""
+
+    def _doubt(self, deviations: list[Deviation]) -> str | None:
+        if self.position not in self.found:
+            if len(self.found) > MAX_TRIED or sum(why is not None for why in self.found.values()) > MAX_DOUBTS:
+                return None
+            before = copy(self)
+            before.to(self.position, replay=True)
+            entry = self.entries[self.position]
+            assert isinstance(entry.content, HandlerRun)
+            line, following = (entry.line, entry.content), list(islice(self._following(), LINES_AFTER))
+            damage = damage_that_explains(before._follower, deviations[0], line, following, self.record.datagrams)
+            self.found[self.position] = damage and f"perhaps {damage} (otherwise: {deviations[0].sentence(_short)}),"
+        return self.found[self.position]
+
+    def _following(self) -> Iterator[tuple[int, HandlerRun]]:
+        """Yield the handler runs after this entry, up to the next place at which lines are missing."""
+        for position, entry in enumerate(self.entries[self.position + 1 :], self.position + 1):
+            if entry.gap is not None or entry.incarnation != self._incarnation or position in self.record.unrecorded:
+                return
+            if isinstance(entry.content, HandlerRun):
+                yield entry.line, entry.content
+
+
+def _short(block_hash: str) -> str:
+    return block_hash[:12]
 
 
 def _later_than(entries: Iterable[Entry], until_s: float) -> int:

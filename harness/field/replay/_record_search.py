@@ -71,7 +71,7 @@ class _DirectoryRecords:
         return next(own_flights, Flight(None)).traces
 
 
-class _IngestedRecords:
+class IngestedRecords:
     """The records of a flight that was ingested before."""
 
     record = None
@@ -195,7 +195,7 @@ def _open_ingested(path: Path, agent_id: int | None, sources: Sequence[Path]) ->
                 f"{path}: agent {agent} has {len(agent_flights)} flights; the one with the most files is played"
             )
         flight_records = run_records or (
-            _IngestedRecords(agent_flights[0])
+            IngestedRecords(agent_flights[0])
             if path.is_dir() and path in sources
             else _DirectoryRecords(trace, file.parent)
         )

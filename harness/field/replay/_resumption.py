@@ -22,7 +22,7 @@ from harness.field.replay.replay_names import RecordedBlocks
 from ucp.block import HASH_BYTES, Block, InceptionBlock, next_chain_hash
 from ucp.events import MalformedEventsError
 from ucp.trace import HandlerRun
-from ucp.trigger import EventTrigger
+from ucp.trigger import EventTrigger, LocalTrigger
 
 _ChainSteps = dict[bytes, tuple[bytes, str]]
 """Chain hash -> the chain hash before it, and the block between both."""
@@ -44,6 +44,9 @@ class Resumption:
             return False
         state = run.state
         if not state.idle or state.reconciling or state.deque or state.stack:
+            return False
+        _, following = next(self._following_runs(position), (None, None))
+        if following is not None and isinstance(following.trigger, LocalTrigger):
             return False
         try:
             chain = self._chain(state.top, self._own_steps)

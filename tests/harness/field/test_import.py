@@ -1,5 +1,7 @@
 """Import of foreign records: nothing is invented, and each omission is reported."""
 
+import csv
+import json
 import re
 import shutil
 import sqlite3
@@ -15,6 +17,9 @@ from harness.archive.packets.capture_files import capture_files, read_captures
 from harness.archive.traces import read_trace
 from harness.errors import FieldError, MachineError
 from harness.field.adapters import import_records
+from harness.field.adapters.adapter import TraceLine
+from harness.field.adapters.bags._decompression import RawMessage
+from harness.field.adapters.bags._sqlite import items as sqlite_items
 from harness.field.adapters.csv_adapter import CsvAdapter
 from harness.field.adapters.imported_records import ImportRecord
 from harness.field.adapters.rosbag_adapter import RosBag
@@ -120,6 +125,34 @@ def test_messages_after_damage_in_a_bag_are_used(run: Path, tmp_path: Path, writ
     assert sum(agent.handler_runs for agent in record.flights[0].agents.values()) > 230
     traces = ingest_files([tmp_path / "out"]).largest().traces.values()
     assert any(trace.gaps for trace in traces)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_truncated_sqlite_bag_has_every_message_up_to_its_end(tmp_path: Path, share: float) -> None:
+    long = flown(tmp_path / "run", agents=5, duration_s=900)
+    (path,) = write_bag2(tmp_path / "bag", of_run(long)).glob("*.db3")
+    messages = sum(1 for _ in of_run(long))
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    read = [item for item in sqlite_items(path, tmp_path) if isinstance(item, RawMessage)]
+    assert share - 0.03 < len(read) / messages < share + 0.03
+
+
+def test_missing_quote_in_csv_damages_only_its_row(run: Path, tmp_path: Path) -> None:
+    """Each cell is quoted, and the JSON in a cell extends over several lines."""
+    path = tmp_path / "records.csv"
+    items = [*of_run(run, ("trace",))]
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, quoting=csv.QUOTE_ALL)
+        writer.writerow(["time_s", "agent", "kind", "event", "data"])
+        for item in items:
+            writer.writerow(["1790000000", item.agent, item.kind, "", json.dumps(json.loads(item.data), indent=1)])
+    text = path.read_text()
+    begins = [match.start() for match in re.finditer('"1790000000"', text)]
+    place = text.rindex('"', 0, begins[len(begins) // 2])
+    path.write_text(text[:place] + text[place + 1 :])
+    rows = [row for row in CsvAdapter().observations(path) if isinstance(row, TraceLine)]
+    assert len(rows) == len(items) - 1
 
 
 def test_last_messages_are_read_from_the_sqlite_journal(run: Path, tmp_path: Path) -> None:

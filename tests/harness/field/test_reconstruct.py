@@ -3,6 +3,7 @@
 import base64
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from harness.scenario import load_scenario
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of
 from tests.harness.proof.edited_core import Bug, edited, with_core
-from ucp.messages import decode, encode
+from ucp.messages import BlockAddResponse, decode, encode
 from ucp.trace import in_base64
 
 FIELD: dict[str, Any] = {
@@ -103,14 +104,14 @@ def test_messages_of_an_unrecorded_agent_are_sent_separately(tmp_path: Path) -> 
     assert any("agent 118 not played" in remark for remark in reconstruction.remarks)
 
 
-def test_inputs_after_a_truncated_trace_are_reported_as_unknown(tmp_path: Path) -> None:
+def test_inputs_after_a_truncated_trace_are_inferred_from_the_export(tmp_path: Path) -> None:
     directory = field_records(tmp_path / "home", flown(tmp_path / "run", **FIELD))
     trace = directory / "118.trace.jsonl"
     lines = trace.read_bytes().splitlines(keepends=True)
     trace.write_bytes(b"".join(lines[: len(lines) // 2]))
     reconstruction = reconstruct_from(directory)
-    assert reconstruction.reproduced == [10, 28, 32, 120]
-    assert "agent 118 is played up to the end of its trace" in reconstruction.problems[0]
+    assert reconstruction.problems == []
+    assert any("inputs of agent 118 are inferred" in remark for remark in reconstruction.remarks)
 
 
 def test_wrong_agent_is_explained_by_a_quirk_or_its_first_deviation(tmp_path: Path) -> None:
@@ -139,13 +140,17 @@ def test_unknown_deviation_ends_the_play_of_its_agent(tmp_path: Path) -> None:
     directory = field_records(tmp_path / "home", flown(tmp_path / "run", events={"source": "random", "mean_s": 5}))
     trace = directory / "2.trace.jsonl"
     lines = [json.loads(line) for line in trace.read_text().splitlines()]
-    number = next(n for n, line in enumerate(lines) if n > 20 and line.get("branch") == "full")
-    del lines[number]["changes"][-1]
+    number = next(n for n, line in enumerate(lines) if n > 20 and line.get("branch") == "approve")
+    sent = lines[number]["sent"][0]
+    datagram = decode(base64.b64decode(sent["datagram"]))
+    assert isinstance(datagram.message, BlockAddResponse)
+    vote = encode(2, sent["seq"], replace(datagram.message, approve=False))
+    lines[number]["branch"], sent["datagram"] = "disapprove", base64.b64encode(vote).decode()
     trace.write_text("".join(json.dumps(line) + "\n" for line in lines))
     reconstruction = reconstruct_from(directory)
     assert reconstruction.reproduced == [1, 3]
     assert "agent 2 deviates from the protocol, and is played up to trace line" in reconstruction.problems[0]
-    assert "build_data_block" in reconstruction.problems[0]
+    assert "receive_request_add_block" in reconstruction.problems[0]
     assert {datagram["source"] for datagram in reconstruction.document["datagrams"]} == {2}
 
 
@@ -183,8 +188,13 @@ def test_command_prints_the_reproduced_part(tmp_path: Path) -> None:
     trace = trace_of(run, 2)
     trace.write_bytes(trace.read_bytes()[:20_000])
     cut = harness("reconstruct", run, "-o", tmp_path / "cut.yaml")
-    assert cut.returncode == 1
-    assert cut.stdout.startswith("reproduces 2 of 3 chains: agent 2 is played up to the end of its trace")
+    assert cut.returncode == 0
+    assert "inputs of agent 2 are inferred" in cut.stdout
+    (run / "agents" / "2.chain.json").unlink()
+    trace.unlink()
+    gone = harness("reconstruct", run, "-o", tmp_path / "gone.yaml")
+    assert gone.returncode == 0
+    assert "agent 2 not played" in gone.stdout
 
 
 def test_exports_and_captures_suffice_without_traces(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from harness.field.adapters.bags._decompression import (
     Item,
     RawMessage,
 )
+from harness.field.adapters.bags._sqlite_pages import FILE_HEADER_BYTES, SqlitePages
 
 MAGIC = b"SQLite format 3\0"
 JOURNAL = "-wal"
@@ -39,11 +40,44 @@ def items(path: Path, scratch: Path) -> Iterator[Item]:
         path, mode = copy, "mode=rw"
     else:
         mode = "mode=ro&immutable=1"
+    if mode != "mode=rw" and (pages := _pages_of_truncated(path)) is not None:
+        yield from _rows_in_pages(pages)
+        return
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True)) as database:
             yield from _rows(database)
     except sqlite3.Error as error:
         yield Damage(f"its database cannot be read: {error}")
+
+
+def _pages_of_truncated(path: Path) -> SqlitePages | None:
+    """Return the pages of a file that is shorter than its header says. None for any other file."""
+    with path.open("rb") as file:
+        header = file.read(FILE_HEADER_BYTES)
+        if len(header) < FILE_HEADER_BYTES:
+            return None
+        page_bytes = int.from_bytes(header[16:18], "big")
+        full_bytes = int.from_bytes(header[28:32], "big") * (65536 if page_bytes == 1 else page_bytes)
+        size = path.stat().st_size
+        return SqlitePages(header + file.read(MAX_FILE_BYTES)) if size < min(full_bytes, MAX_FILE_BYTES) else None
+
+
+def _rows_in_pages(pages: SqlitePages) -> Iterator[Item]:
+    """Yield the messages in the pages, in the order of recording, and the damage at the end."""
+    topics: dict[Any, tuple[str, str]] = {}
+    messages: dict[int, list[Any]] = {}
+    for number, values in pages.rows():
+        match values:
+            case [None, str(name), str(kind), str(), *_]:
+                topics[number] = name, kind
+            case [None, int(), int(), bytes()]:
+                messages.setdefault(number, values)
+    if not topics:
+        yield Damage("its database is truncated, and the list of topics is lost")
+        return
+    for _, (_, topic, time_ns, data) in sorted(messages.items()):
+        yield _item(topics, topic, time_ns, data)
+    yield Damage("its database is truncated: later messages cannot be read")
 
 
 def _rows(database: sqlite3.Connection) -> Iterator[Item]:

@@ -1,0 +1,493 @@
+"""Damage the records of flights of right agents in many ways, and count the false accusations of the commands.
+
+    python -m benchmarks.field_damage [--simulated N] [--processes N] [--first NUMBER] [--only KIND]
+
+Each flight is damaged once in each way of `DAMAGES`. `reconstruct`, `replay`, `check` and `consolidate` then read the
+damaged files. The agents are right, so each accusation is false. The benchmark prints each accusation and each
+traceback with the number of its flight. With any of them, the exit status is 1.
+"""
+
+import argparse
+import asyncio
+import re
+import shutil
+import sys
+import time
+import traceback
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from harness.archive.archive import RunArchive
+from harness.archive.directory import RunDirectory
+from harness.archive.exports import Export, read_export
+from harness.backend_names import BackendName
+from harness.checker import check, gather
+from harness.errors import HarnessError
+from harness.field.depot.collected_exports import collect_exports
+from harness.field.depot.consolidation import consolidate
+from harness.field.ingest import ingest_files
+from harness.field.reconstruct import reconstruct
+from harness.field.replay import Player, open_records
+from harness.field.replay.field_evidence import field_evidence
+from harness.play.backends import BACKENDS
+from harness.play.mission import play_on
+from harness.play.progress import Silent
+from harness.run.parallel import FailedTask, sweep
+from harness.scenario import Scenario
+from ucp.quirks import QUIRKS
+
+JOBS = 2
+BLOCK_BYTES = 4096
+
+
+class NotPossibleError(Exception):
+    """The files of this flight cannot be damaged in this way."""
+
+
+# Damage
+
+Damage = Callable[[Path, Random], None]
+"""A function that damages the files in a directory."""
+
+
+def _lines(path: Path) -> list[bytes]:
+    return path.read_bytes().splitlines(keepends=True)
+
+
+def _a_trace(home: Path, draw: Random, least_lines: int = 20) -> Path:
+    traces = [path for path in sorted(home.glob("*.trace.jsonl")) if path.read_bytes().count(b"\n") >= least_lines]
+    if not traces:
+        raise NotPossibleError
+    return draw.choice(traces)
+
+
+def nothing(home: Path, draw: Random) -> None:
+    """Leave the files as they are."""
+
+
+def cut_line_out(home: Path, draw: Random) -> None:
+    path = _a_trace(home, draw)
+    lines = _lines(path)
+    del lines[draw.randrange(1, len(lines))]
+    path.write_bytes(b"".join(lines))
+
+
+def cut_lines_out_of_each_trace(home: Path, draw: Random) -> None:
+    for path in sorted(home.glob("*.trace.jsonl")):
+        lines = _lines(path)
+        for _ in range(min(3, len(lines) - 1)):
+            del lines[draw.randrange(1, len(lines))]
+        path.write_bytes(b"".join(lines))
+
+
+def zero_line(home: Path, draw: Random) -> None:
+    path = _a_trace(home, draw)
+    lines = _lines(path)
+    number = draw.randrange(1, len(lines))
+    lines[number] = b"\0" * (len(lines[number]) - 1) + b"\n"
+    path.write_bytes(b"".join(lines))
+
+
+def cut_tail(home: Path, draw: Random) -> None:
+    path = _a_trace(home, draw)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * draw.uniform(0.3, 0.98))])
+
+
+def cut_head(home: Path, draw: Random) -> None:
+    path = _a_trace(home, draw)
+    data = path.read_bytes()
+    path.write_bytes(data[int(len(data) * draw.uniform(0.02, 0.5)) :])
+
+
+def flip_byte(home: Path, draw: Random) -> None:
+    path = _a_trace(home, draw)
+    data = bytearray(path.read_bytes())
+    data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+    path.write_bytes(data)
+
+
+def swap_lines(home: Path, draw: Random) -> None:
+    path = _a_trace(home, draw)
+    lines = _lines(path)
+    number = draw.randrange(1, len(lines) - 1)
+    lines[number], lines[number + 1] = lines[number + 1], lines[number]
+    path.write_bytes(b"".join(lines))
+
+
+def repeat_lines(home: Path, draw: Random) -> None:
+    path = _a_trace(home, draw)
+    lines = _lines(path)
+    start = draw.randrange(1, len(lines))
+    end = min(len(lines), start + draw.choice([1, 1, 5, 50]))
+    path.write_bytes(b"".join([*lines[:end], *lines[start:end], *lines[end:]]))
+
+
+def _a_block(data: bytes, draw: Random) -> tuple[int, int]:
+    blocks = len(data) // BLOCK_BYTES
+    if not blocks:
+        raise NotPossibleError
+    begin = BLOCK_BYTES * draw.randrange(blocks)
+    return begin, begin + BLOCK_BYTES
+
+
+def zero_block(home: Path, draw: Random) -> None:
+    path = _a_trace(home, draw)
+    data = path.read_bytes()
+    begin, end = _a_block(data, draw)
+    path.write_bytes(data[:begin] + bytes(BLOCK_BYTES) + data[end:])
+
+
+def cut_block_out(home: Path, draw: Random) -> None:
+    path = _a_trace(home, draw)
+    data = path.read_bytes()
+    begin, end = _a_block(data, draw)
+    path.write_bytes(data[:begin] + data[end:])
+
+
+def fill_disk(home: Path, draw: Random) -> None:
+    """Cut out a long part, from the middle of a line to the beginning of another."""
+    path = _a_trace(home, draw)
+    lines = _lines(path)
+    begin = draw.randrange(1, len(lines) // 2)
+    end = draw.randrange(begin + 1, min(len(lines), begin + len(lines) // 4))
+    path.write_bytes(b"".join([*lines[:begin], lines[begin][: len(lines[begin]) // 2], *lines[end:]]))
+
+
+def lose_trace(home: Path, draw: Random) -> None:
+    _a_trace(home, draw).unlink()
+
+
+def lose_export(home: Path, draw: Random) -> None:
+    draw.choice(sorted(home.glob("*.chain.json"))).unlink()
+
+
+def lose_agent(home: Path, draw: Random) -> None:
+    agent = _a_trace(home, draw).name.partition(".")[0]
+    for path in home.glob(f"{agent}.*"):
+        path.unlink()
+
+
+def lose_incarnation(home: Path, draw: Random) -> None:
+    """Cut out one incarnation of a restarted agent."""
+    for path in sorted(home.glob("*.trace.jsonl")):
+        lines = _lines(path)
+        starts = [number for number, line in enumerate(lines) if b'"schema"' in line]
+        if len(starts) > 1:
+            lost = draw.randrange(len(starts))
+            del lines[starts[lost] : [*starts, len(lines)][lost + 1]]
+            path.write_bytes(b"".join(lines))
+            return
+    raise NotPossibleError
+
+
+def _keep(home: Path, *suffixes: str) -> None:
+    if ".pcapng" in suffixes and not [*home.glob("*.pcapng")]:
+        raise NotPossibleError
+    for path in home.iterdir():
+        if not path.name.endswith(suffixes):
+            path.unlink()
+
+
+def captures_only(home: Path, draw: Random) -> None:
+    _keep(home, ".pcapng")
+
+
+def exports_only(home: Path, draw: Random) -> None:
+    _keep(home, ".chain.json")
+
+
+def exports_and_captures_only(home: Path, draw: Random) -> None:
+    _keep(home, ".chain.json", ".pcapng")
+
+
+def cut_export(home: Path, draw: Random) -> None:
+    path = draw.choice(sorted(home.glob("*.chain.json")))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * draw.uniform(0.1, 0.95))])
+
+
+def cut_capture(home: Path, draw: Random) -> None:
+    """Leave exports and captures, one of them cut."""
+    _keep(home, ".chain.json", ".pcapng")
+    path = draw.choice(sorted(home.glob("*.pcapng")))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * draw.uniform(0.3, 0.95))])
+
+
+DAMAGES: dict[str, Damage] = {
+    "undamaged": nothing,
+    "line cut out": cut_line_out,
+    "three lines cut out of each trace": cut_lines_out_of_each_trace,
+    "line zeroed": zero_line,
+    "tail cut": cut_tail,
+    "head cut": cut_head,
+    "byte flipped": flip_byte,
+    "two lines swapped": swap_lines,
+    "lines repeated": repeat_lines,
+    "4 KiB zeroed": zero_block,
+    "4 KiB cut out": cut_block_out,
+    "disk full in the middle": fill_disk,
+    "trace missing": lose_trace,
+    "export missing": lose_export,
+    "agent missing": lose_agent,
+    "incarnation missing": lose_incarnation,
+    "captures only": captures_only,
+    "exports only": exports_only,
+    "exports and captures only": exports_and_captures_only,
+    "export cut": cut_export,
+    "capture cut, no traces": cut_capture,
+}
+
+
+# Flights
+
+
+def scenario(number: int, backend: BackendName, quirk: str | None = None) -> Scenario:
+    """Return the scenario of a flight: loss, faults, and either clocks that drift or captures."""
+    draw = Random(f"field damage {number}")
+    agents = draw.choice([3, 4, 5, 6])
+    duration_s = 300.0
+    struck, at_s = draw.randint(1, agents), draw.randint(60, 150)
+    back_s = at_s + draw.randint(10, 90)
+    faults: list[list[dict[str, Any]]] = [
+        [],
+        [{"at_s": at_s, "kill": [struck]}],
+        [{"at_s": at_s, "kill": [struck]}, {"at_s": back_s, "restart": [struck]}],
+        [{"at_s": at_s, "reboot": [struck], "down_s": 10, "disk": "kept"}],
+        [{"at_s": at_s, "reboot": [struck], "down_s": 10, "disk": "lost"}],
+        [{"at_s": at_s, "pause": [struck]}, {"at_s": back_s, "resume": [struck]}],
+    ]
+    timeline = draw.choice(faults)
+    if draw.random() < 0.5:
+        apart = draw.sample(range(1, agents + 1), draw.randint(1, agents - 1))
+        timeline = [{"at_s": 30.5, "partition": [sorted(apart)], "for_s": 100}, *timeline]
+    capture = number % 2 == 1
+    document: dict[str, Any] = {
+        "name": f"damaged flight {number}",
+        "agents": agents,
+        "duration_s": duration_s,
+        "network": {"loss": draw.choice([0.0, 0.1, 0.25, 0.4])},
+        "events": {"source": "random", "mean_s": draw.choice([4.0, 8.0, 15.0])},
+        "timeline": timeline,
+        "capture": capture,
+        "final_reconcile": draw.random() < 0.7,
+    }
+    if draw.random() < 0.3:
+        document["settings"] = draw.choice(
+            [{"vote_names_chain": True}, {"finalize_gap_s": 0}, {"max_block_bytes": 512}]
+        )
+    if backend == "process":
+        document |= {"speedup": 20, "vehicles": {"kind": "none"}, "settle": {"limit_s": 300}}
+    if not capture or backend == "process":
+        document["clocks"] = {
+            agent: {"offset_s": draw.uniform(0, 100), "drift": draw.choice([1e-5, 1e-3, 1e-2]) * draw.uniform(-1, 1)}
+            for agent in range(1, agents + 1)
+        }
+    if quirk is not None:
+        document["quirks"] = {quirk: {"agents": [struck]} if not QUIRKS[quirk].chance else {str(struck): 0.5}}
+    return Scenario.model_validate(document)
+
+
+def bring_home(asked: Scenario, number: int, backend: BackendName, run: Path, home: Path) -> dict[int, Export]:
+    """Play a flight and copy the files of its vehicles to `home`. Returns the exports."""
+    opening = BACKENDS[backend].open(asked, number, RunDirectory(run), Silent(), asyncio.Event())
+    asyncio.run(play_on(opening, asked))
+    home.mkdir()
+    for path in [*(run / "agents").glob("*.trace.jsonl"), *(run / "agents").glob("*.chain.json")]:
+        shutil.copy(path, home)
+    for path in (run / "capture").glob("*.pcapng") if (run / "capture").is_dir() else ():
+        shutil.copy(path, home)
+    return {export.agent_id: export for export in map(read_export, home.glob("*.chain.json"))}
+
+
+# The commands
+
+ACCUSATION = re.compile(
+    r"deviates|behaves (only )?as with|did not react|expired too early|does not do what", re.IGNORECASE
+)
+"""A text of `reconstruct` that blames an agent."""
+
+
+@dataclass(frozen=True)
+class Undamaged:
+    """The facts about a flight: the undamaged exports, and the verdicts of `check` on the undamaged files."""
+
+    chains: dict[int, Export]
+    wrong: tuple[str, ...]
+
+
+@dataclass
+class Concluded:
+    """The conclusions from one set of files.
+
+    `accusations` has a sentence for each statement that an agent is wrong, and `reasons` for each chain that
+    `reconstruct` declares impossible.
+    """
+
+    damage: str
+    chains: int = 0
+    """Number of agents with a trace or an export in the damaged files."""
+    reproduced: int = 0
+    differs: str | None = None
+    """The first difference between the simulation and the records, if any."""
+    unusable: bool = False
+    reasons: list[str] = field(default_factory=list)
+    accusations: list[str] = field(default_factory=list)
+    tracebacks: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+def run_reconstruct(home: Path, concluded: Concluded, whole: Undamaged) -> None:
+    made = reconstruct(ingest_files([home]).largest(), "again")
+    concluded.chains = len(made.agents)
+    concluded.reproduced = len(made.reproduced)
+    concluded.differs = made.difference.sentence if made.difference else None
+    concluded.reasons = [f"agent {agent.agent_id} {agent.why}" for agent in made.agents if agent.why]
+    for sentence in [*concluded.reasons, *made.remarks]:
+        if ACCUSATION.search(sentence):
+            concluded.accusations.append(f"reconstruct: {sentence}")
+    for agent_id in made.reproduced:
+        export, played = whole.chains.get(agent_id), made.simulated.evidence.exports.get(agent_id)
+        if not (home / f"{agent_id}.chain.json").exists() or not export or not played or "export" in concluded.damage:
+            continue
+        if export.chain_of_block_hashes != played.chain_of_block_hashes:
+            concluded.accusations.append(f"reconstruct: claims the chain of agent {agent_id}, which differs")
+
+
+def run_replay(home: Path, concluded: Concluded, whole: Undamaged) -> None:
+    for record in open_records(home):
+        for deviation in Player(record).to_end().deviations:
+            sentence = deviation.sentence(lambda block: block[:8])
+            concluded.accusations.append(f"replay: agent {record.agent_id}: {sentence}")
+
+
+def run_check(home: Path, concluded: Concluded, whole: Undamaged) -> None:
+    evidence = gather(RunArchive(home))
+    if evidence.traces:
+        evidence = field_evidence(evidence, ingest_files([home]).largest())
+    result = check(evidence)
+    for key in result.wrong:
+        if key in whole.wrong:
+            continue
+        judgement = result.judgements[key]
+        detail = judgement.evidence[0].detail if judgement.evidence else ""
+        concluded.accusations.append(f"check: {key} {judgement.verdict}: {judgement.reason}: {detail}")
+
+
+def run_consolidate(home: Path, concluded: Concluded, whole: Undamaged) -> None:
+    consolidate(collect_exports([home]))
+
+
+Command = Callable[[Path, Concluded, Undamaged], None]
+COMMANDS: tuple[Command, ...] = (run_reconstruct, run_replay, run_check, run_consolidate)
+
+
+def conclude(home: Path, damage: str, whole: Undamaged, commands: Sequence[Command] | None = None) -> Concluded:
+    """Run the commands, all by default, on the files."""
+    concluded = Concluded(damage)
+    for command in COMMANDS if commands is None else commands:
+        try:
+            command(home, concluded, whole)
+        except HarnessError:
+            concluded.unusable |= command is run_reconstruct
+        except Exception:
+            concluded.tracebacks.append(f"{command.__name__}: {traceback.format_exc()}")
+    return concluded
+
+
+def fly(number: int, backend: BackendName, only: str | None = None, quirk: str | None = None) -> list[Concluded]:
+    """Play a flight, and damage its files in all ways that are possible."""
+    asked = scenario(number, backend, quirk)
+    found = []
+    with TemporaryDirectory(prefix="field-damage-") as kept:
+        whole = Path(kept) / "whole"
+        chains = bring_home(asked, number, backend, Path(kept) / "run", whole)
+        undamaged = Undamaged(chains, check(RunArchive(whole)).wrong)
+        for name, damage in DAMAGES.items():
+            if only is not None and only not in name:
+                continue
+            home = Path(kept) / "home"
+            shutil.copytree(whole, home)
+            try:
+                damage(home, Random(f"{number} {name}"))
+                began = time.monotonic()
+                concluded = conclude(home, name, undamaged)
+                concluded.seconds = time.monotonic() - began
+                found.append(concluded)
+            except NotPossibleError:
+                pass
+            shutil.rmtree(home)
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.field_damage",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--simulated", type=int, default=30, help="number of flights in virtual time")
+    parser.add_argument("--processes", type=int, default=0, help="number of flights with processes")
+    parser.add_argument("--first", type=int, default=0, help="number of the first flight")
+    parser.add_argument("--only", help="damage only in ways whose name contains this text")
+    asked = parser.parse_args()
+    found: list[Concluded] = []
+    numbers = range(asked.first, asked.first + asked.simulated)
+    with sweep(numbers, lambda number: fly(number, "sim", asked.only), JOBS, what="flights") as outcomes:
+        for number, outcome in outcomes:
+            _take_down(found, number, outcome)
+    for number in range(asked.first, asked.first + asked.processes):
+        _take_down(found, number, fly(number, "process", asked.only))
+    _show(found)
+    return 1 if any(one.accusations or one.tracebacks for one in found) else 0
+
+
+def _write(sentence: str) -> None:
+    sys.stdout.write(sentence + "\n")
+    sys.stdout.flush()
+
+
+def _take_down(found: list[Concluded], number: int, outcome: list[Concluded] | FailedTask) -> None:
+    if isinstance(outcome, FailedTask):
+        _write(f"flight {number}: {outcome.reason}")
+        return
+    found += outcome
+    for one in outcome:
+        where = f"flight {number}, {one.damage}"
+        for sentence in [*one.accusations, *one.tracebacks]:
+            _write(f"{where}: ✘ {sentence[:600]}")
+        for sentence in [*one.reasons, *([one.differs] if one.differs else [])]:
+            _write(f"{where}: - {sentence[:300]}")
+
+
+def _show(found: list[Concluded]) -> None:
+    by_damage: dict[str, list[Concluded]] = defaultdict(list)
+    for one in found:
+        by_damage[one.damage].append(one)
+    _write(
+        "| damage | files of | chains | reproduced | declared impossible | differing steps | accused | tracebacks | s |"
+    )
+    _write("|---|--:|--:|--:|--:|--:|--:|--:|--:|")
+    for name in DAMAGES:
+        if not (of_kind := by_damage.get(name)):
+            continue
+        cells = [
+            len(of_kind),
+            sum(one.chains for one in of_kind),
+            sum(one.reproduced for one in of_kind),
+            sum(len(one.reasons) for one in of_kind),
+            sum(one.differs is not None for one in of_kind),
+            sum(bool(one.accusations) for one in of_kind),
+            sum(bool(one.tracebacks) for one in of_kind),
+        ]
+        _write(f"| {name} | {' | '.join(map(str, cells))} | {sum(one.seconds for one in of_kind) / len(of_kind):.2f} |")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,208 @@
+"""Find out whether damage to one line of a trace explains a difference from the reference.
+
+A file from the field may lack a line, or have a damaged line that still reads as a line. Then the difference proves no
+mistake of the agent. Three kinds of damage are tried:
+
+- One character of the line is wrong.
+- The line and the next one are in the wrong order.
+- The line before is missing: a handler run that changed no block, so no state shows it.
+
+An explanation counts only if the reference then agrees with the lines that follow.
+"""
+
+import base64
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from copy import copy
+
+from harness.checker.recorded_inputs import NotOnRecordError, decoded, event_of
+from harness.checker.reference.state import State
+from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.follower import LOGS, Follower
+from ucp.events import MalformedEventsError, decode_events
+from ucp.messages import (
+    BlockAddResponse,
+    ChainContainResponse,
+    MalformedDatagramError,
+    Message,
+    NextInSequenceResponse,
+    encode,
+)
+from ucp.trace import HandlerRun, RecordedBytes
+from ucp.trigger import MessageTrigger
+
+Line = tuple[int, HandlerRun]
+"""A handler run with its line number."""
+Datagrams = Callable[[int, int], list[bytes]]
+"""A function that returns the datagrams of a sender with a sequence number, according to other records."""
+LINES_AFTER = 8
+"""Number of lines after the difference with which the explanation must agree."""
+MAX_LOCAL = 4
+"""Maximum number of handlers that one lost line may trigger in turn."""
+
+
+def damage_that_explains(
+    before: Follower, deviation: Deviation, line: Line, following: Sequence[Line], datagrams: Datagrams
+) -> str | None:
+    """Return the damage that explains the difference, such as "a line is missing". None if there is none.
+
+    `before` is a follower in the state before the line. It stays unchanged.
+    """
+    following = following[:LINES_AFTER]
+    if _is_one_character_off(before, deviation, line, following, datagrams):
+        return "one character of the line is damaged"
+    if following and _agrees(before.copy(), [following[0], line, *following[1:]]):
+        return "two lines are in the wrong order"
+    if (damage := _damage_to_events(before, line[1])) is not None:
+        return damage
+    if _is_malformed(line[1]):
+        return "the line is damaged"
+    for trial in _with_a_line_more(before, line[1]):
+        if _agrees(trial, [line, *following]):
+            return "a line is missing"
+    return None
+
+
+def _agrees(follower: Follower, lines: Sequence[Line]) -> bool:
+    for number, run in lines:
+        follower.follow(number, run)
+        if follower.deviations or follower.lost:
+            return False
+    return True
+
+
+# One damaged character
+
+
+def _is_one_character_off(
+    before: Follower, deviation: Deviation, line: Line, following: Sequence[Line], datagrams: Datagrams
+) -> bool:
+    number, run = line
+    text = run.to_line()
+    return any(
+        _differ_in_one_character(text, other.to_line()) and _agrees(before.copy(), [(number, other), *following])
+        for other in _as_it_may_have_been(before, deviation, run, datagrams)
+    )
+
+
+def _as_it_may_have_been(
+    before: Follower, deviation: Deviation, run: HandlerRun, datagrams: Datagrams
+) -> Iterator[HandlerRun]:
+    if deviation.expected is not None and deviation.run is run and not _was_received(before, run, datagrams):
+        other = copy(deviation.expected)
+        other.input, other.sealed, other.started = run.input, run.sealed, other.started or None
+        yield other
+    if isinstance(run.trigger, MessageTrigger):
+        try:
+            sender, sequence, message = decoded(run.input)
+            other = copy(run)
+            other.trigger = MessageTrigger(message.NAME, sender, sequence)
+            yield other
+        except MalformedDatagramError:
+            pass
+        texts = [base64.b64encode(data).decode() for data in datagrams(run.trigger.sender, run.trigger.sequence)]
+        texts += [
+            base64.b64encode(encode(run.trigger.sender, run.trigger.sequence, message)).decode()
+            for message in _answers(before.state, run)
+        ]
+        for text in texts:
+            other = copy(run)
+            other.input = RecordedBytes(text)
+            yield other
+    for timer in before.state.timers:
+        if timer.deadline is not None:
+            deadline_s = before.mission_s(timer.deadline)
+            for digits in (3, 4, 5, 6):
+                other = copy(run)
+                other.t = round(deadline_s, digits)
+                yield other
+
+
+def _was_received(before: Follower, run: HandlerRun, datagrams: Datagrams) -> bool:
+    """Return whether another agent received a message of the run as this line has it. Then the line is not damaged."""
+    for sent in run.sent:
+        if sent.datagram is not None:
+            with suppress(ValueError):
+                data = base64.b64decode(sent.datagram.text, validate=True)
+                if data in datagrams(before.state.agent_id, sent.seq):
+                    return True
+    return False
+
+
+def _differ_in_one_character(text: str, other: str) -> bool:
+    return len(text) == len(other) and sum(ours != theirs for ours, theirs in zip(text, other, strict=True)) == 1
+
+
+def _is_malformed(run: HandlerRun) -> bool:
+    if isinstance(run.trigger, MessageTrigger):
+        try:
+            decoded(run.input)
+        except MalformedDatagramError:
+            return True
+    return False
+
+
+# A missing line
+
+
+def _damage_to_events(before: Follower, run: HandlerRun) -> str | None:
+    """Compare the events of the block that the run completed with the logged ones. Return damage that explains them."""
+    completed = next((block_hash for operation, block_hash in run.changes if operation == "complete"), None)
+    if run.handler != LOGS or completed is None:
+        return None
+    try:
+        logged = Counter([*decode_events(bytes(before.state.current_block)), event_of(run.input)])
+        events = Counter(decode_events(before.block(completed).event_data))
+    except (NotOnRecordError, MalformedEventsError):
+        return None
+    if logged < events:
+        return "a line is missing (its block has an event that no line logs)"
+    pairs = [*zip((logged - events).elements(), (events - logged).elements(), strict=False)]
+    if pairs and all(
+        _differ_in_one_character(*(base64.b64encode(event.encode()).decode() for event in pair)) for pair in pairs
+    ):
+        return "one character of a line is damaged (its block has another event than the line logs)"
+    return None
+
+
+def _with_a_line_more(before: Follower, run: HandlerRun) -> Iterator[Follower]:
+    """Yield followers in the states that one lost line may have led to, with the handlers that it triggered."""
+    trial = before.copy()
+    for _ in range(MAX_LOCAL):
+        if not trial.play_lost_local_event(run.t):
+            break
+        yield trial.copy()
+    for timer in before.state.timers:
+        trial = before.copy()
+        if trial.play_lost_expiry(timer.name, run.t):
+            yield trial.copy()
+            for _ in range(MAX_LOCAL):
+                if not trial.play_lost_local_event(run.t):
+                    break
+                yield trial.copy()
+    for message in _answers(before.state, run):
+        for sender in sorted(before.roster - {before.state.agent_id}):
+            trial = before.copy()
+            if trial.play_lost_message(sender, message, run.t):
+                yield trial
+
+
+def _answers(state: State, run: HandlerRun) -> Iterator[Message]:
+    """Yield the possible answers to the question that the agent has asked."""
+    top = state.chain.top_chain_hash
+    if state.voting_timer.active and state.candidate_block is not None:
+        named = state.top_chain_hash_at_initiation if state.settings.vote_names_chain else None
+        for approve in (True, False):
+            yield BlockAddResponse(state.candidate_block.block_hash, approve, named)
+    if state.phase_one_timer.active:
+        for contained in (True, False):
+            yield ChainContainResponse(top, contained)
+    if state.phase_two_timer.active:
+        candidates = {block_hash: counted[1] for block_hash, counted in state.reconcile_response_dictionary.items()}
+        for block_hash, counted in (run.tally or {}).items():
+            with suppress(ValueError):
+                candidates[bytes.fromhex(block_hash)] = counted[-1] if isinstance(counted, list) else 0
+        for candidate, timestamp_us in candidates.items():
+            with suppress(ValueError, TypeError):
+                yield NextInSequenceResponse(top, candidate or None, timestamp_us)

@@ -1,0 +1,148 @@
+"""Lead an agent over lost lines: infer inputs after which it is in the next state that its record shows.
+
+The lost inputs are unknown, but their result is not: a chain, and the events in the current block. The inference plays
+the other agents of a swarm that already holds this chain. They answer each question of the agent, approve its blocks in
+the order of the chain, and send it the blocks that it lacks. The events come from the agent's own later blocks. The
+agent itself is the rehearsed core, so the scenario can play the same inputs.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from harness.field.reconstruct._agent_inputs import (
+    Cause,
+    DatagramReceived,
+    EventLogged,
+    ReconcileRequested,
+    TimerExpired,
+)
+from ucp.agent import Agent
+from ucp.block import Block, next_chain_hash
+from ucp.events import LoggableEvent, MalformedEventsError, decode_events
+from ucp.messages import (
+    BlockAddRequest,
+    BlockAddResponse,
+    BlockResponse,
+    ChainContainQuery,
+    ChainContainResponse,
+    ChainHashSuccessorQuery,
+    CommitBlock,
+    Message,
+    NextInSequenceResponse,
+    RequestForBlock,
+    encode,
+)
+
+FIRST_SEQUENCE = 0xF000_0000
+"""Sequence number of the first inferred message. Agents never send that many messages."""
+STEPS_PER_BLOCK = 200
+"""Maximum number of inferred inputs for each block of the chain."""
+
+
+@dataclass(frozen=True)
+class KnownState:
+    """The state of an idle agent after lost lines. `why` is the reason why the lines before are not on record.
+
+    `current_block` is None if it is empty, or its content has no later effect.
+    """
+
+    chain: tuple[Block, ...]
+    current_block: bytes | None
+    why: str
+
+
+class Bridge:
+    """The inputs that lead an agent to a known state, one after another. `reached` is true at the end of success."""
+
+    def __init__(self, agent: Agent, known: KnownState) -> None:
+        self.reached = False
+        self._agent = agent
+        self._known = known
+        self._peers = sorted(agent.roster - {agent.agent_id})
+        self._answers: deque[tuple[int, Message]] = deque()
+        self._sequence = FIRST_SEQUENCE
+        self._events: deque[LoggableEvent] = deque()
+        self._left = STEPS_PER_BLOCK * (len(known.chain) + 1)
+        top = agent.state.chain.inception.chain_hash
+        self._chain_hashes = [top]
+        for block in known.chain:
+            top = next_chain_hash(top, block.block_hash)
+            self._chain_hashes.append(top)
+
+    def next(self, sent: Iterable[Message]) -> Cause | None:
+        """Return the next input, after the agent has sent these messages. None at the end."""
+        self._left -= 1
+        if self._left < 0 or not self._peers:
+            return None
+        for message in sent:
+            self._answer(message)
+        if self._answers:
+            sender, message = self._answers.popleft()
+            return self._datagram(sender, message)
+        state = self._agent.state
+        running = [timer for timer in state.timers if timer.deadline is not None]
+        if running:
+            return TimerExpired(min(running, key=lambda timer: timer.deadline or 0.0).name)
+        if self._events:
+            return EventLogged(self._events.popleft())
+        return self._for_an_idle_agent() if state.idle else None
+
+    def _for_an_idle_agent(self) -> Cause | None:
+        state, chain = self._agent.state, self._known.chain
+        held = len(state.chain)
+        if held > len(chain) or self._chain_hashes[held] != state.chain.top_chain_hash:
+            return ReconcileRequested()
+        if held == len(chain):
+            wanted = self._known.current_block
+            self.reached = wanted is None or bytes(state.current_block) == wanted
+            return None if wanted is None or self.reached else self._log(wanted)
+        block = chain[held]
+        if block.agent_id == self._agent.agent_id and block.block_hash not in state.completed:
+            logged = self._log(block.event_data)
+            if logged is not None:
+                return logged
+        owner = block.agent_id if block.agent_id in self._peers else self._peers[0]
+        return self._datagram(owner, CommitBlock(block, self._chain_hashes[held + 1]))
+
+    def _log(self, event_data: bytes) -> Cause | None:
+        """Return the first of the events that the current block lacks. None if there is none, or it has others."""
+        logged = bytes(self._agent.state.current_block)
+        if not event_data.startswith(logged):
+            return None
+        try:
+            self._events.extend(decode_events(event_data[len(logged) :]))
+        except MalformedEventsError:
+            return None
+        return EventLogged(self._events.popleft()) if self._events else None
+
+    def _datagram(self, sender: int, message: Message) -> Cause:
+        self._sequence += 1
+        return DatagramReceived(encode(sender, self._sequence, message))
+
+    def _answer(self, message: Message) -> None:
+        """Answer a question as agents that hold the known chain do."""
+        answer: Message
+        known = {chain_hash: height for height, chain_hash in enumerate(self._chain_hashes)}
+        chain = self._known.chain
+        match message:
+            case BlockAddRequest(block_hash, chain_hash):
+                height = known.get(chain_hash, len(chain))
+                approve = height < len(chain) and chain[height].block_hash == block_hash
+                named = chain_hash if self._agent.state.settings.vote_names_chain else None
+                answer = BlockAddResponse(block_hash, approve, named)
+            case ChainContainQuery(chain_hash):
+                answer = ChainContainResponse(chain_hash, chain_hash in known)
+            case ChainHashSuccessorQuery(chain_hash) if chain_hash in known:
+                height = known[chain_hash]
+                following = chain[height] if height < len(chain) else None
+                timestamp_us = (following or chain[-1]).timestamp_us if chain else 0
+                answer = NextInSequenceResponse(chain_hash, following.block_hash if following else None, timestamp_us)
+            case RequestForBlock(block_hash):
+                block = next((block for block in chain if block.block_hash == block_hash), None)
+                if block is not None:
+                    self._answers.append((self._peers[0], BlockResponse(block)))
+                return
+            case _:
+                return
+        self._answers.extend((peer, answer) for peer in self._peers)

@@ -1,0 +1,87 @@
+"""Judge the records of a flight without the record of a run: lines of a trace may be missing.
+
+Each trace is judged as `replay` judges it. The other checks read a trace only up to the first place at which lines are
+missing.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from harness.archive.traces import Trace
+from harness.checker import Evidence, steps
+from harness.checker.judgement import Judgement
+from harness.checker.lost_lines import lost_lines
+from harness.checker.steps.deviation import Deviation
+from harness.errors import FieldError
+from harness.field.ingest import Flight
+from harness.field.replay._agent_record import Record
+from harness.field.replay._player import Player
+from harness.field.replay._record_search import IngestedRecords
+from ucp.trigger import MessageTrigger
+
+
+def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
+    """Return the evidence with the traces of a flight in place of its own."""
+    traces = {agent_id: _up_to_loss(trace) for agent_id, trace in flight.traces.items()}
+    for agent_id, number in _unrecorded_messages(traces):
+        traces[agent_id].problem = f"it lacks message {number}, which another agent received"
+    for agent_id, export in evidence.exports.items():
+        trace = traces.get(agent_id)
+        if trace is not None and not trace.problem and trace.runs and trace.runs[-1].state.top != export.top_chain_hash:
+            trace.problem = "it ends before the export"
+    judged = replace(evidence, traces=traces, from_field=True)
+    return replace(judged, steps=_judge_steps(judged, flight))
+
+
+def _up_to_loss(trace: Trace) -> Trace:
+    """Return the part of a trace before the first place at which lines are missing, with the reason as its problem."""
+    lost = lost_lines(trace)
+    lost |= {gap.position: "lines are damaged" for gap in trace.gaps}
+    lost |= dict.fromkeys(trace.jumps, "the clock of the agent was set")
+    if trace.cut_off:
+        lost.setdefault(len(trace.runs), "it ends in the middle of a line")
+    if not lost:
+        return replace(trace)
+    end = min(lost)
+    return Trace(
+        trace.header,
+        trace.runs[:end],
+        [start for start in trace.starts if start <= end],
+        [(position, aside) for position, aside in trace.asides if position < end],
+        problem=f"{lost[end]}; the part before is read",
+    )
+
+
+def _unrecorded_messages(traces: Mapping[int, Trace]) -> Iterator[tuple[int, int]]:
+    """Yield senders with the number of a message that another agent received, but that their own trace lacks."""
+    sent = {agent_id: {each.seq for run in trace.runs for each in run.sent} for agent_id, trace in traces.items()}
+    for trace in traces.values():
+        for run in trace.runs:
+            trigger = run.trigger
+            if not isinstance(trigger, MessageTrigger) or traces.get(trigger.sender, trace).problem:
+                continue
+            if trigger.sequence not in sent.get(trigger.sender, (trigger.sequence,)):
+                yield trigger.sender, trigger.sequence
+
+
+def _judge_steps(evidence: Evidence, flight: Flight) -> Judgement:
+    deviations: list[Deviation] = []
+    judged, unjudged, lost = 0, 0, list[str]()
+    for agent_id, trace in flight.traces.items():
+        try:
+            result = Player(Record(Path(), "", trace, IngestedRecords(flight), [])).to_end()
+        except FieldError as error:
+            lost.append(f"the trace of agent {agent_id} cannot be judged: {str(error).removeprefix('.: ')}")
+            continue
+        deviations += result.deviations
+        judged, unjudged = judged + result.steps, unjudged + result.unjudged
+        lost += [f"agent {agent_id}: {sentence}" for sentence in result.lost]
+    if deviations:
+        return steps.deviates(evidence, deviations, judged, [])
+    untraced = sorted({*(evidence.roster or ()), *evidence.exports} - {*flight.traces})
+    lost += [f"there is no trace of agent {agent_id}" for agent_id in untraced]
+    if lost or not judged:
+        found = f"{judged} handler runs follow Algorithms 1 to 20, and {unjudged} could not be judged"
+        return Judgement(steps.NAME, "not applicable", "; ".join([found, *lost[:1]]))
+    return Judgement(steps.NAME, "as specified", f"{judged} handler runs, each following Algorithms 1 to 20")

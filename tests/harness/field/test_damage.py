@@ -1,0 +1,124 @@
+"""Damaged records of right agents lead to no accusation, no traceback, and true reasons."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from benchmarks.field_damage import DAMAGES, Undamaged, bring_home, conclude
+from harness.archive.archive import RunArchive
+from harness.archive.traces import read_trace
+from harness.checker import check
+from harness.checker.lost_lines import lost_lines
+from harness.checker.steps.trace_header import checked
+from harness.field.ingest import ingest_files
+from harness.field.replay import Player, open_record
+from tests.harness.field.flights import flown, trace_of
+from tests.harness.virtual import scenario
+from ucp.agent import Agent
+from ucp.events import LoggableEvent
+
+FLIGHT: dict[str, Any] = {
+    "agents": 3,
+    "duration_s": 200,
+    "network": {"loss": 0.2},
+    "events": {"source": "random", "mean_s": 8},
+    "timeline": [{"at_s": 80, "kill": [2]}, {"at_s": 110, "restart": [2]}],
+    "capture": True,
+}
+KINDS = (
+    "three lines cut out of each trace",
+    "line zeroed",
+    "head cut",
+    "byte flipped",
+    "two lines swapped",
+    "lines repeated",
+    "disk full in the middle",
+    "incarnation missing",
+    "exports and captures only",
+)
+"""Some of the kinds of damage. The benchmark has all of them."""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Undamaged]]:
+    kept = tmp_path_factory.mktemp("damage")
+    chains = bring_home(scenario(**FLIGHT), 1, "sim", kept / "run", kept / "home")
+    yield kept / "home", Undamaged(chains, check(RunArchive(kept / "home")).wrong)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_damage_causes_no_accusation(name: str, whole: tuple[Path, Undamaged], tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    shutil.copytree(whole[0], home)
+    DAMAGES[name](home, Random(name))
+    concluded = conclude(home, name, whole[1])
+    assert concluded.accusations == []
+    assert concluded.tracebacks == []
+
+
+def _without(path: Path, *numbers: int) -> Path:
+    """Cut lines out of a trace, counted from 1, and move it away from its run."""
+    lines = path.read_bytes().splitlines(keepends=True)
+    moved = path.parent.parent.parent / path.name
+    moved.write_bytes(b"".join(line for number, line in enumerate(lines, 1) if number not in numbers))
+    return moved
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return flown(tmp_path_factory.mktemp("damage") / "run")
+
+
+def test_lost_lines_show_in_sequence_numbers_triggers_and_states(run: Path) -> None:
+    trace = read_trace(trace_of(run, 1))
+    assert trace is not None
+    assert lost_lines(trace) == {}
+    reasons = set()
+    for position in range(len(trace.runs) - 1):
+        kept = trace.runs[:position] + trace.runs[position + 1 :]
+        shorter = type(trace)(trace.header, kept)
+        reasons |= {why.partition(" (")[2].split()[1] for why in lost_lines(shorter).values()}
+    assert reasons == {"line"}
+
+
+def test_replay_of_trace_without_any_one_line_finds_no_deviation(run: Path) -> None:
+    path = trace_of(run, 1)
+    lines = len(path.read_bytes().splitlines())
+    for number in range(2, min(lines, 60), 3):
+        found = Player(open_record(_without(path, number))).to_end()
+        assert [deviation.sentence(str) for deviation in found.deviations] == [], number
+
+
+def test_ingest_reads_swapped_and_repeated_lines_once_and_in_order(run: Path, tmp_path: Path) -> None:
+    lines = trace_of(run, 1).read_bytes().splitlines(keepends=True)
+    (tmp_path / "1.trace.jsonl").write_bytes(b"".join([*lines[:20], *lines[10:20], *lines[20:]]))
+    flight = ingest_files([tmp_path]).largest()
+    whole = read_trace(trace_of(run, 1))
+    assert whole is not None
+    assert flight.traces[1].runs == whole.runs
+
+
+def test_lost_timer_callback_is_named_before_its_effects(run: Path, tmp_path: Path) -> None:
+    """The voting timer of an agent stops without its handler. The next event finds the agent idle."""
+    trace = read_trace(trace_of(run, 1))
+    assert trace is not None
+    header = checked(trace.header)
+    agent = Agent(1, header.roster, header.initial_data, header.settings)
+    number = 0
+    while agent.state.idle:
+        number += 1
+        agent.add_event(LoggableEvent(number, 1, bytes(200)), float(number))
+    agent.state.voting_timer.stop()
+    agent.add_event(LoggableEvent(100, 1, bytes(200)), number + header.settings.vote_timeout_s + 0.5)
+    lines = [trace.header.to_line(), *(entry.to_line() for entry in agent.trace())]
+    (tmp_path / "1.trace.jsonl").write_text("".join(lines))
+    found = Player(open_record(tmp_path)).to_end()
+    assert found.first is not None
+    assert "Algorithm 5, vote_timer_expiration: it did not run, although the voting timer was due at" in (
+        found.first.sentence(str)
+    )
+    assert len(found.deviations) == 1
