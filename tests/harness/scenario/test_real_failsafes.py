@@ -14,7 +14,7 @@ PLAN = [{"take_off": 30}, {"go_to": [400, 100]}, {"loiter_s": 300}, {"land": Tru
 
 
 @pytest.mark.ardupilot
-def test_copters_return_without_station_or_remote_control_and_outside_of_the_fence(tmp_path: Path) -> None:
+def test_copter_returns_without_station_or_rc_and_outside_the_fence(tmp_path: Path) -> None:
     directory = os.environ.get("ARDUPILOT_SITL")
     if directory is None or not (Path(directory) / "arducopter").exists():
         pytest.skip("no ArduPilot: set ARDUPILOT_SITL to the directory that holds an arducopter")

@@ -258,7 +258,7 @@ def test_receiver_may_remove_the_rate_of_the_network(tmp_path: Path) -> None:
     )
 
 
-def test_a_scenario_as_resolved_means_the_same_when_read_again(tmp_path: Path) -> None:
+def test_resolved_scenario_survives_writing_and_reading(tmp_path: Path) -> None:
     text = (
         "{loss: {p: 0.1, r: 0.2}, rate: 9600, receivers: {3: {delay: 1, rate: none}},"
         " links: [{from: 1, to: 3, loss: 0.9, both: true}]}"

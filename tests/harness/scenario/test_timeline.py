@@ -212,7 +212,7 @@ def test_link_with_full_loss_is_silent_in_virtual_time() -> None:
     assert {one.verdict for one in simulated.result.characteristics.values()} == {"holds"}
 
 
-def test_a_scenario_as_resolved_means_the_same_when_read_again() -> None:
+def test_resolved_scenario_survives_writing_and_reading() -> None:
     one = scenario(
         timeline=[{"at_s": 9, "network": {**ONE_WAY, "receivers": {3: {"rate": "none"}}}, "for_s": 5}],
         schedule=[{"ramp": {"network": [{"loss": 0}, {"loss": 1}]}}],
