@@ -44,7 +44,7 @@ from collections.abc import Container, Iterable, Sequence
 from typing import Any
 
 from ucp import commit, reconcile
-from ucp.answer_spread import Outgoing, WaitingAnswers
+from ucp._answer_spread import Outgoing, WaitingAnswers
 from ucp.block import MAX_AGENT_ID
 from ucp.core import Core, Seal
 from ucp.events import LoggableEvent

@@ -24,10 +24,10 @@ from harness.archive.packets.capture_files import DIRECTORY, Captures, capture_f
 from harness.archive.run_record import AgentRecord, Counters, JudgedRecord
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import Kind, UnknownNames, first_unknown, unknown_names
+from harness.checker._sent_times import sent_at, spread_of
 from harness.checker._trace_replay import Incarnation, replay
 from harness.checker.judgement import Judgement
 from harness.checker.reference.state import State
-from harness.checker.sent_times import sent_at, spread_of
 from harness.errors import RunDirectoryError
 from harness.play.rogue.rogue_line import OF_NO_INJECTION
 from harness.play.variant import VariantError, variant_in_use

@@ -19,7 +19,7 @@ import ucp
 FILES = (
     "_dataclass",
     "agent",
-    "answer_spread",
+    "_answer_spread",
     "block",
     "chain",
     "commit",

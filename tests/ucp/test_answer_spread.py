@@ -2,10 +2,10 @@
 
 import pytest
 
-from harness.checker.sent_times import sent_at
+from harness.checker._sent_times import sent_at
 from harness.scenario import Scenario
+from ucp._answer_spread import answer_wait_s
 from ucp.agent import Agent
-from ucp.answer_spread import answer_wait_s
 from ucp.block import Block
 from ucp.messages import BlockAddRequest, BlockAddResponse, ChainContainQuery, decode, encode
 from ucp.settings import Settings

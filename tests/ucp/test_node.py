@@ -32,7 +32,7 @@ NEEDED = {
     *("agent", "block", "chain", "clock", "commit", "control", "core", "_dataclass", "events", "export", "features"),
     *(
         "agent_files",
-        "answer_spread",
+        "_answer_spread",
         "handler",
         "loop",
         "messages",

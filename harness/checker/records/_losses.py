@@ -21,11 +21,11 @@ from dataclasses import dataclass
 from math import exp, inf, log
 
 from harness.archive.connectivity import Link
+from harness.checker._sent_times import sent_at, spread_of
 from harness.checker.evidence import Evidence
 from harness.checker.records._captures_vs_traces import COUNTS_DATAGRAMS
 from harness.checker.records._handled_vs_faults import stopped
 from harness.checker.records.contradiction import Contradiction, in_virtual_time, of_agent, slack_s
-from harness.checker.sent_times import sent_at, spread_of
 from harness.scenario.changes import RANGE
 from harness.scenario.faults.fault import SAME_TIME_S
 from netem.link import GilbertElliott, LinkConditions

@@ -39,6 +39,8 @@ def _night(directory: Path, data: bytes) -> None:
     path = directory / "matrix.json"
     path.write_bytes(data)
     night = load_baseline(path, matrix()).record
+    if night is None:
+        return
     night.to_json()
     list(compare(night.cells, night.cells))
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
+from harness.checker._sent_times import ANSWERS
 from harness.checker.evidence import Evidence
-from harness.checker.sent_times import ANSWERS
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from netem.medium import LATENCY
@@ -47,7 +47,7 @@ def test_answers_arrive_after_their_wait() -> None:
 
 
 def test_judge_finds_answers_that_do_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ucp.answer_spread.answer_wait_s", lambda datagram, spread_s: 0.0)
+    monkeypatch.setattr("ucp._answer_spread.answer_wait_s", lambda datagram, spread_s: 0.0)
     records = simulate(Scenario.model_validate(QUIET), 1, tracing=True).result.beside["records"]
     assert records.verdict == "contradict"
     assert "before it was sent" in records.evidence[0].detail
