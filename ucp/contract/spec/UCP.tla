@@ -279,10 +279,10 @@ ReconcileFinalize(a) ==
     IF a.reconcileStack = <<>>
     THEN Trigger([a EXCEPT !.reconcileInProgress = FALSE], "Process Next Deque Block")
     ELSE LET committed == Commit([a EXCEPT !.reconcileStack = Front(@)], Last(a.reconcileStack))
-             told == NetworkSend(committed, CommitBlock(committed))
-         IN IF told.reconcileStack # <<>> /\ Duration(a.id, "finalize gap") > 0
-            THEN Start(told, "finalize gap")
-            ELSE ReconcileFinalize(told)
+             announced == NetworkSend(committed, CommitBlock(committed))
+         IN IF announced.reconcileStack # <<>> /\ Duration(a.id, "finalize gap") > 0
+            THEN Start(announced, "finalize gap")
+            ELSE ReconcileFinalize(announced)
 
 ---------------------------------------------------------------------------
 (* 3.6 What triggers which handler                                         *)

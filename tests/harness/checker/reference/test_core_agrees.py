@@ -13,73 +13,14 @@ from harness.checker.reference.reference_agent import ReferenceAgent
 from harness.checker.reference.state import Settings as ReferenceSettings
 from harness.proof._proof import prove
 from harness.proof.bounds import Bounds
+from tests.harness.checker.reference.random_inputs import LIFE, ROSTER, Inputs
 from ucp.agent import Agent
-from ucp.block import Block, next_chain_hash
-from ucp.events import LoggableEvent
-from ucp.messages import (
-    BlockAddRequest,
-    BlockAddResponse,
-    BlockResponse,
-    ChainContainQuery,
-    ChainContainResponse,
-    ChainHashSuccessorQuery,
-    CommitBlock,
-    Message,
-    NextInSequenceResponse,
-    RequestForBlock,
-)
 from ucp.settings import ALTERNATIVES, Settings
 from ucp.store import StoredState
 from ucp.trace import HandlerRun
 
-ROSTER = range(1, 6)
 INPUTS = 2_500
 """Random inputs for each of 40 seeds."""
-LIFE = 250
-"""Inputs until the agent reboots with its store, or starts again with another agent's settings."""
-
-
-class Inputs:
-    """Draws inputs that fit the state of an agent, nearly fit it, or do not fit it at all."""
-
-    def __init__(self, rng: Random) -> None:
-        self.rng = rng
-        self.blocks = [Block(rng.choice(ROSTER), rng.randrange(1_000), rng.randbytes(4)) for _ in range(12)]
-        self.heard: list[Message] = []
-
-    def message(self, agent: Agent) -> Message:
-        rng, state = self.rng, agent.state
-        if self.heard and rng.random() < 0.1:
-            return rng.choice(self.heard)
-        held = [*state.chain, *state.blocks_to_be_committed, *state.reconcile_stack]
-        block = rng.choice(held if held and rng.random() < 0.5 else self.blocks)
-        top = state.chain.top_chain_hash
-        below = [state.chain.inception.chain_hash, *(chain_hash for _, chain_hash in state.chain.with_chain_hashes())]
-        chain_hash = rng.choice((top, top, rng.choice(below), rng.choice(self.blocks).block_hash))
-        asked = state.majority_response_block_hash
-        wanted = next((each for each in (*held, *self.blocks) if each.block_hash == asked), block)
-        candidate = state.candidate_block.block_hash if state.candidate_block else block.block_hash
-        named = rng.choice((None, state.top_chain_hash_at_initiation, chain_hash))
-        yes = rng.random() < 0.5
-        message: Message = rng.choice(
-            (
-                BlockAddRequest(block.block_hash, chain_hash),
-                BlockAddResponse(rng.choice((candidate, block.block_hash)), yes, named or None),
-                CommitBlock(block, next_chain_hash(chain_hash, block.block_hash)),
-                ChainContainQuery(chain_hash),
-                ChainContainResponse(chain_hash, yes),
-                ChainHashSuccessorQuery(chain_hash),
-                NextInSequenceResponse(chain_hash, block.block_hash if yes else None, block.timestamp_us),
-                RequestForBlock(block.block_hash),
-                BlockResponse(rng.choice((wanted, block))),
-            )
-        )
-        self.heard.append(message)
-        return message
-
-    def event(self) -> LoggableEvent:
-        rng = self.rng
-        return LoggableEvent(rng.randrange(1_000), rng.randint(1, 254), bytes(rng.choice((0, 40, 256))))
 
 
 def settings_for(rng: Random) -> Settings:
@@ -111,23 +52,10 @@ def test_core_and_reference_agree_on_random_inputs_in_random_states(seed: int) -
             if stored is not None:
                 core.boot(stored, now)
                 reference.boot(stored, now)
-        draw, ends = rng.random(), core.next_timer()
-        assert reference.next_timer() == ends
-        if draw < 0.08 and ends is not None:
-            now = max(now, ends)
-            core.handle_timer(now)
-            reference.handle_timer(now)
-        elif draw < 0.12:
-            event = inputs.event()
-            core.add_event(event, now)
-            reference.add_event(event, now)
-        elif draw < 0.13:
-            core.begin_reconcile(now)
-            reference.begin_reconcile(now)
-        else:
-            sender, message = rng.choice(ROSTER), inputs.message(core)
-            core.receive_message(sender, number, message, now)
-            reference.receive_message(sender, number, message, now)
+        assert reference.next_timer() == core.next_timer()
+        now, give = inputs.draw(core, number, now)
+        give(core)
+        give(reference)
         did, should = runs_of(core), runs_of(reference)
         assert did == should, f"input {number}"
         steps += len(did)

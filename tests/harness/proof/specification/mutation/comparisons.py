@@ -1,0 +1,219 @@
+"""Comparisons of the agent core with the specification, each of which can be repeated with an edited specification."""
+
+import functools
+import re
+import shutil
+import subprocess
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+from typing import Any, Protocol
+
+from harness.archive.traces import Header, Trace
+from harness.proof.bounds import Bounds
+from harness.proof.graph._exploration import explore
+from harness.proof.model._global_states import Swarm
+from harness.proof.specification import Recorded, _spec_states, _tlc, _validate
+from harness.proof.specification._second_opinion import _config
+from tests.harness.checker.reference.random_inputs import LIFE, ROSTER, Inputs
+from ucp.agent import Agent
+from ucp.events import EVENT_HEADER_BYTES, MAX_EVENT_BYTES
+from ucp.settings import Settings
+from ucp.store import StoredState
+from ucp.trace import SCHEMA, HandlerRun, in_base64
+
+NO_GAP = {"finalize_gap_s": 0}
+READINGS = {"vote_names_chain": True, "changed_before_tally": True, "phase1_tie": "pop", "phase2_tie": "block"}
+"""The settings of the protocol that the specification has, all different from their defaults."""
+MOST_STEPS = 20
+"""Steps of an edited specification for each state of the core. The correct specification has at most five."""
+NO_VALUE = "no value"
+"""The difference of a specification for which TLC stops, for example at the first element of an empty sequence."""
+INVALID = re.compile(r"\*\*\* (?:Parse )?Error|Parsing or semantic analysis failed")
+"""How TLC starts a sentence about a text that is no specification."""
+
+
+class Comparison(Protocol):
+    """A comparison, with a name for tables."""
+
+    @property
+    def name(self) -> str: ...
+
+    def prepare(self) -> None:
+        """Compute the results of the core, which all comparisons share."""
+
+    def differences(self, specifications: Sequence[str]) -> list[str | None]:
+        """Return how each of these specifications of one agent differs from the core. None if it does not."""
+
+
+@dataclass(frozen=True)
+class States:
+    """The states that TLC finds within bounds, compared with those that the prover finds."""
+
+    bounds: Bounds
+
+    @property
+    def name(self) -> str:
+        bounds = self.bounds
+        words = [f"{bounds.agents} agents, {bounds.blocks} block{'s' * (bounds.blocks > 1)}, {bounds.network}"]
+        words += [] if bounds.crossing else ["no crossing"]
+        words += [] if bounds.timers_any else ["timers by duration"]
+        return ", ".join([*words, *_settings_words(bounds.settings)])
+
+    @functools.cached_property
+    def real(self) -> set[_spec_states.Plain]:
+        """The states of the agent core."""
+        graph = explore(Swarm(self.bounds), most_bytes=8e9, most_s=float("inf"))
+        assert graph.ended == "complete", f"{self.name}: {graph.ended}"
+        return set(_spec_states.real(graph))
+
+    def prepare(self) -> None:
+        assert self.real
+
+    def differences(self, specifications: Sequence[str]) -> list[str | None]:
+        found: dict[int, str] = {}
+        while True:
+            waiting = [number for number in range(1, len(specifications) + 1) if number not in found]
+            states = _explored(self.bounds, {number: specifications[number - 1] for number in waiting}, len(self.real))
+            if not isinstance(states, int):
+                break
+            found[states] = NO_VALUE
+        for number in waiting:
+            of_edit = states.get(number, [])
+            if self.bounds.timers_any and len(of_edit) != len(self.real):
+                found[number] = "fewer states" if len(of_edit) < len(self.real) else "more states"
+            elif {tuple(map(_spec_states._of_record, _spec_states._value(text))) for text in of_edit} != self.real:
+                found[number] = "other states"
+        return [found.get(number) for number in range(1, len(specifications) + 1)]
+
+
+def _explored(bounds: Bounds, specifications: Mapping[int, str], states: int) -> dict[int, list[str]] | int:
+    """Let TLC explore several specifications at once, because it takes longer to start than to explore one.
+
+    Return the states that it finds for each number, as text, or the number of a specification for which it stops. It
+    explores no more than `MOST_STEPS` times `states` steps of each.
+    """
+    swarm = (_tlc.MODULES / "Swarm.tla").read_text("utf-8")
+    config = _config(bounds).partition("INVARIANTS")[0]
+    names = re.findall(r"^  (\w+) =", config, re.MULTILINE)
+    numbers = ", ".join(map(str, specifications))
+
+    def each(step: str) -> str:
+        return "\n".join(f"  \\/ edit = {number} /\\ S{number}!{step}" for number in specifications)
+
+    batch = (
+        f"---- MODULE Batch ----\nEXTENDS Integers, TLC\nCONSTANTS {', '.join(names)}\nVARIABLES edit, swarm\n"
+        + "\n".join(f"S{number} == INSTANCE Swarm{number}" for number in specifications)
+        + f"\nASSUME \\A number \\in {{{numbers}}} : TLCSet(number, 0)"
+        + f"\nBegin == edit \\in {{{numbers}}} /\\ (\n{each('Init')})\nNext == edit' = edit /\\ (\n{each('Instant')})"
+        + "\nSpec == Begin /\\ [][Next]_<<edit, swarm>>"
+        + f"\nFew == TLCSet(edit, TLCGet(edit) + 1) /\\ TLCGet(edit) <= {MOST_STEPS * states + 100}\n====\n"
+    )
+    with tempfile.TemporaryDirectory(prefix="ucp-edited-spec-") as name:
+        folder = Path(name)
+        (folder / "Batch.tla").write_text(batch)
+        (folder / "Batch.cfg").write_text(config + "CONSTRAINT Few\n")
+        for number, text in specifications.items():
+            (folder / f"UCP{number}.tla").write_text(text.replace("MODULE UCP ", f"MODULE UCP{number} "))
+            own = swarm.replace("MODULE Swarm ", f"MODULE Swarm{number} ").replace(
+                "INSTANCE UCP ", f"INSTANCE UCP{number} "
+            )
+            (folder / f"Swarm{number}.tla").write_text(own)
+        call = [*_tlc.command(), "-dump", "dot", "all", "Batch"]
+        done = subprocess.run(call, cwd=folder, capture_output=True, text=True, errors="replace", check=False)
+        if "states left on queue" not in done.stdout or "\nError:" in done.stdout:
+            stopped = re.findall(r"\bedit = (\d+)|in (?:Swarm|UCP)(\d+)", done.stdout)
+            if not stopped or INVALID.search(done.stdout):
+                raise ValueError(f"an edited text is no specification: {done.stdout[-2000:]}")
+            return int("".join(stopped[-1]))
+        found: dict[int, list[str]] = defaultdict(list)
+        with (folder / "all.dot").open() as lines:
+            for line in lines:
+                if node := _spec_states._NODE.match(line):
+                    text = node[1].replace("\\n", " ").replace('\\"', '"').replace("\\\\", "\\")
+                    number = re.search(r"edit = (\d+)", text)
+                    assert number is not None, text
+                    found[int(number[1])].append(re.split(r"swarm = ", text)[1].split("/\\ edit")[0])
+        return found
+
+
+@dataclass(frozen=True)
+class RandomInputs:
+    """The steps of an agent with random inputs, compared with the steps that the specification allows."""
+
+    inputs: int
+    settings: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def name(self) -> str:
+        return ", ".join([f"{self.inputs:,} random inputs", *_settings_words(dict(self.settings))])
+
+    @functools.cached_property
+    def recorded(self) -> list[Recorded]:
+        """The trace of the agent core."""
+        return [Recorded("random inputs", [random_trace(0, self.inputs, dict(self.settings))])]
+
+    def prepare(self) -> None:
+        assert self.recorded
+
+    def differences(self, specifications: Sequence[str]) -> list[str | None]:
+        return [self._difference(specification) for specification in specifications]
+
+    def _difference(self, specification: str) -> str | None:
+        [(constants, batch)] = _validate._batches(self.recorded, _validate.Validation())
+        assert not any(life.unread for life in batch.lives)
+        try:
+            with _modules_with(specification):
+                return "other steps" if _validate._rejected(constants, batch) else None
+        except _tlc.CheckerError as error:
+            if INVALID.search(str(error)):
+                raise ValueError(f"the edited text is no specification: {error}") from None
+            return NO_VALUE
+
+
+def _settings_words(settings: Mapping[str, Any]) -> list[str]:
+    words = ["no gap"] if settings.get("finalize_gap_s") == 0 else []
+    return words + (["other readings"] if READINGS.items() <= settings.items() else [])
+
+
+@contextmanager
+def _modules_with(specification: str) -> Iterator[None]:
+    """Let TLC read this specification of one agent in place of the one of the repository."""
+    before = _tlc.MODULES
+    with tempfile.TemporaryDirectory(prefix="ucp-edited-spec-") as name:
+        for path in before.glob("*.tla"):
+            shutil.copy(path, name)
+        (Path(name) / "UCP.tla").write_text(specification, "utf-8")
+        _tlc.MODULES = Path(name)
+        try:
+            yield
+        finally:
+            _tlc.MODULES = before
+
+
+def random_trace(seed: int, count: int, settings: dict[str, Any]) -> Trace:
+    """Return the trace of an agent that gets `count` random inputs, in incarnations of LIFE inputs each."""
+    rng, now = Random(seed), 0.0
+    inputs = Inputs(rng, newest_us=4)
+    sizes = {"max_block_bytes": MAX_EVENT_BYTES + 2 * EVENT_HEADER_BYTES + 40}
+    used = Settings(**{**sizes, **settings})
+    header = {"agent_id": 1, "roster": list(ROSTER), "settings": used.to_json(), "clock": {"epoch_us": 0}}
+    trace = Trace(Header(**{"schema": SCHEMA, **header, "initial_data": in_base64(b"mission")}))
+    stored: StoredState | None = None
+    for number in range(count):
+        if number % LIFE == 0:
+            agent = Agent(1, ROSTER, b"mission", used)
+            if stored is not None:
+                trace.starts.append(len(trace.runs))
+                agent.boot(stored, now)
+        now, give = inputs.draw(agent, number, now)
+        give(agent)
+        trace.runs += [entry for entry in agent.trace() if isinstance(entry, HandlerRun)]
+        agent.messages_to_send()
+        stored = StoredState.of(agent.state)
+        now += rng.choice((0.0, 0.01, 0.4))
+    return trace

@@ -1,0 +1,142 @@
+"""The comparisons from the cheapest to the most expensive, and the first ones that find each mistake."""
+
+import hashlib
+import json
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from harness.proof.bounds import Bounds, Network
+from harness.proof.specification import _tlc
+from harness.run.parallel import FailedTask, cores, sweep
+from tests.harness.proof.specification.mutation.comparisons import NO_GAP, READINGS, Comparison, RandomInputs, States
+from tests.harness.proof.specification.mutation.edits import Edit, edits, specification
+from ucp.agent_files import write_atomically
+
+SCORE_FILE = Path(__file__).with_name("score.json")
+PAGE = Path(__file__).parents[5] / "docs" / "explanation" / "specification.md"
+BEGIN, END = "<!-- score: begin -->", "<!-- score: end -->"
+
+
+def _states(agents: int, blocks: int, network: Network, settings: Mapping[str, Any] = {}, **keys: Any) -> States:
+    keys = {"timers_any": True, "reduced": False, **keys}
+    return States(Bounds(agents, blocks, network, settings=settings, **keys))
+
+
+COMPARISONS: tuple[Comparison, ...] = (
+    _states(2, 1, "lossy"),
+    _states(2, 2, "lossless"),
+    _states(2, 2, "lossy"),
+    _states(2, 3, "lossless"),
+    _states(3, 2, "lossless"),
+    _states(3, 2, "lossless", READINGS),
+    _states(2, 3, "lossless", NO_GAP, timers_any=False),
+    _states(3, 3, "lossless", crossing=False),
+    RandomInputs(2_500),
+    RandomInputs(2_500, tuple(READINGS.items())),
+    RandomInputs(2_500, tuple(NO_GAP.items())),
+    _states(3, 3, "lossless"),
+    _states(2, 3, "lossy"),
+)
+"""All comparisons, in the order in which they are tried: states from the cheapest bounds on, steps, large bounds."""
+BATCH = 16
+"""Number of edited specifications in one comparison."""
+
+
+class Found(NamedTuple):
+    """The result for one mistake: the first comparison that finds it, and the difference. None if none does."""
+
+    text: str
+    """The digest of the edited specification."""
+    by: str | None = None
+    difference: str | None = None
+    missed_by: tuple[str, ...] = ()
+    """Comparisons that do not find it."""
+
+
+def digest(edit: Edit) -> str:
+    """Return a digest of the edited specification without comments, and of the specification of the swarm."""
+    texts = edit.applied(specification()), (_tlc.MODULES / "Swarm.tla").read_text("utf-8")
+    code = [" ".join(re.sub(r"\(\*.*?\*\)|\\\*[^\n]*", "", text, flags=re.DOTALL).split()) for text in texts]
+    return hashlib.sha256("\n".join(code).encode()).hexdigest()[:16]
+
+
+def stored() -> dict[str, Found]:
+    """Return the results of `score.json` by the name of the edit."""
+    if not SCORE_FILE.exists():
+        return {}
+    results = json.loads(SCORE_FILE.read_text("utf-8"))
+    return {
+        name: Found(text, by, difference, tuple(missed)) for name, (text, by, difference, missed) in results.items()
+    }
+
+
+def store(results: Mapping[str, Found]) -> None:
+    """Write `score.json`, one line for each edit, in the order of the edits."""
+    lines = [f"{json.dumps(edit.name)}: {json.dumps(results[edit.name])}" for edit in edits() if edit.name in results]
+    write_atomically(SCORE_FILE, "{\n" + ",\n".join(lines) + "\n}\n")
+
+
+def main() -> int:
+    """Find each mistake that has no valid result yet, and store the results."""
+    valid = stored()
+    results = {edit.name: Found(digest(edit)) for edit in edits()}
+    results |= {name: valid[name] for name, new in results.items() if name in valid and valid[name].text == new.text}
+    jobs = int(sys.argv[1]) if len(sys.argv) > 1 else cores()
+    for comparison in COMPARISONS:
+        _find(comparison, results, jobs)
+    store(results)
+    write_page()
+    return 0
+
+
+def _find(comparison: Comparison, results: dict[str, Found], jobs: int) -> None:
+    """Compare the core with each specification whose mistake is not found yet, and note the differences."""
+    name = comparison.name
+    waiting = [edit for edit in edits() if (found := results[edit.name]).by is None and name not in found.missed_by]
+    if not waiting:
+        return
+    comparison.prepare()
+    batches = [waiting[start : start + BATCH] for start in range(0, len(waiting), BATCH)]
+
+    def compare(batch: Sequence[Edit]) -> list[str | None]:
+        return comparison.differences([edit.applied(specification()) for edit in batch])
+
+    with sweep(batches, compare, jobs, what=name, in_order=False) as outcomes:
+        for batch, outcome in outcomes:
+            if isinstance(outcome, FailedTask):
+                raise RuntimeError(f"{name}: {outcome.reason}")
+            for edit, difference in zip(batch, outcome, strict=True):
+                found = results[edit.name]
+                if difference is None:
+                    results[edit.name] = found._replace(missed_by=(*found.missed_by, name))
+                else:
+                    results[edit.name] = found._replace(by=name, difference=difference)
+            store(results)
+
+
+def tables() -> str:
+    """Return the tables of the page: the mistakes of each Algorithm, and the comparisons that find them first."""
+    results = stored()
+    lines = ["| Algorithm | mistakes | found | not found so far |", "|--:|--:|--:|--:|"]
+    for algorithm, group in groupby(edits(), lambda edit: edit.algorithm):
+        found = [results[edit.name].by is not None for edit in group]
+        lines.append(f"| {algorithm or 'shared text'} | {len(found)} | {sum(found)} | {len(found) - sum(found)} |")
+    found = [result.by is not None for result in results.values()]
+    lines.append(f"| all | {len(found)} | {sum(found)} | {len(found) - sum(found)} |")
+    lines += ["", "| comparison | mistakes tried | found |", "|---|--:|--:|"]
+    for comparison in COMPARISONS:
+        finds = sum(result.by == comparison.name for result in results.values())
+        tried = finds + sum(comparison.name in result.missed_by for result in results.values())
+        lines.append(f"| {comparison.name} | {tried} | {finds} |")
+    return "\n".join(lines) + "\n"
+
+
+def write_page() -> None:
+    """Put the tables into the page."""
+    head, _, rest = PAGE.read_text("utf-8").partition(BEGIN)
+    _, _, tail = rest.partition(END)
+    write_atomically(PAGE, f"{head}{BEGIN}\n{tables()}\n{END}{tail}")
