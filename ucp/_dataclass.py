@@ -69,7 +69,7 @@ def _options(content: dict[str, Any], name: str) -> _Options:
 
 
 def _methods(fields: dict[str, _Options], *, frozen: bool, eq: bool, then: bool) -> dict[str, Any]:
-    """Return the methods that are generated from the fields. `then` calls a further method of the class."""
+    """Return the methods that are generated from the fields. If `then`, `__init__` calls `__post_init__`."""
     parameters, assignments = [], []
     given: dict[str, Any] = {"_set": object.__setattr__}
     for name, options in fields.items():

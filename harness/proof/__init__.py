@@ -1,12 +1,12 @@
 """Proof by exhaustion: explore every state that a small swarm can reach within bounds. See docs/explanation/proof.md.
 
-The agents in a state are real agents (`ucp.agent`), so a proof is about the code that runs. `bounds` says how large the
-swarm is and what the network may do. The sub-packages answer one question each:
+The agents in a state are real agents (`ucp.agent`), so a proof is about the code that runs. `bounds` has the size of
+the swarm and the behaviour of the network. The sub-packages:
 
-- `model`: which states follow a state. Equal behaviour makes equal states, which keeps the graph small.
+- `model`: the successors of a state. Local states with equal behaviour are equal, which keeps the graph small.
 - `graph`: all reachable states, breadth first, on all cores.
-- `questions`: what the whole graph shows: livelocks, ways to one chain, and the number of further votes.
-- `attacker`: what the holder of one vehicle's keys can send.
+- `questions`: properties of the whole graph: livelocks, paths to one chain, and the number of further votes.
+- `attacker`: the messages that the holder of one vehicle's keys can send.
 - `examples`: a path through the graph as a scenario that the simulation plays.
 - `coverage`: the share of these states that runs have reached.
 - `specification`: the same bounds in TLA+, as a second opinion.

@@ -1,4 +1,4 @@
-"""How far it is, and how it ended."""
+"""The progress of an exploration, its final figures, and its limits of memory and time."""
 
 import resource
 import sys
@@ -8,18 +8,18 @@ from pathlib import Path
 from typing import Literal
 
 LOOK_EVERY = 200
-"""States between two looks at memory, clock and whoever watches."""
+"""Number of states between two reports of the progress."""
 LOOK_EVERY_S = 0.1
-"""Seconds between two such looks, where it is not states that are looked at."""
+"""Minimum time in seconds between two checks of memory and time in `Budget.check`."""
 _STATM = Path("/proc/self/statm")
 Ended = Literal["complete", "flaw", "memory", "time", "interrupted"]
 
 
 @dataclass(frozen=True)
 class Progress:
-    """States known, of these looked at, ways between them, how many instants from the beginning.
+    """The known states, the explored ones of them, the transitions, and the depth in instants.
 
-    `asked` is what the whole graph is asked, once there are no other states.
+    `asked` is the present question to the whole graph, after all states are explored.
     """
 
     states: int
@@ -32,10 +32,10 @@ class Progress:
 
 @dataclass(frozen=True)
 class Figures:
-    """What was looked at: all but `steps` and the seconds is the same on any number of cores.
+    """The size of an exploration. All figures except `steps` and the times are the same on any number of cores.
 
-    `local_states` and `zones` are those that occur in states. `steps` is how many steps the real agent computed, in all
-    processes. `seconds` are of the clock on the wall, `processor_s` of all processes.
+    `local_states` and `zones` count those that occur in states. `steps` is the number of steps that real agents
+    computed in all processes. `seconds` is wall time, and `processor_s` is the processor time of all processes.
     """
 
     states: int
@@ -50,7 +50,7 @@ class Figures:
 
 
 class GivenUpError(Exception):
-    """A bound of memory or time was reached."""
+    """The limit of memory or time was reached."""
 
     def __init__(self, ended: Ended) -> None:
         super().__init__(ended)
@@ -58,7 +58,7 @@ class GivenUpError(Exception):
 
 
 class Budget:
-    """So much memory, and so much time from now on, in seconds."""
+    """The limits of an exploration: memory in bytes, and time in seconds from now."""
 
     def __init__(self, most_bytes: float, most_s: float) -> None:
         self._began = time.monotonic()
@@ -71,15 +71,15 @@ class Budget:
         return time.monotonic() - self._began
 
     def ended(self, elsewhere_bytes: float = 0.0) -> Ended | None:
-        """By what it is used up; other processes have taken `elsewhere_bytes`."""
+        """Return the limit that is reached, or None. Other processes use `elsewhere_bytes` of memory."""
         if memory_bytes() + elsewhere_bytes > self._most_bytes:
             return "memory"
         return "time" if self.seconds > self._most_s else None
 
     def check(self, elsewhere_bytes: float = 0.0) -> bool:
-        """Whether it looked; to be called again and again, for it mostly does not.
+        """Check the limits, at most once per LOOK_EVERY_S. Return whether they were checked.
 
-        Raises GivenUpError if it is used up.
+        Raises GivenUpError if a limit is reached.
         """
         seconds = self.seconds
         if seconds < self._next_look_s:
@@ -91,7 +91,7 @@ class Budget:
 
 
 def memory_bytes() -> int:
-    """What this process has taken: proc_pid_statm(5). Where there is no such file, what it has ever taken."""
+    """Return the memory of this process in bytes (proc_pid_statm(5)). Without this file, return its peak."""
     try:
         return int(_STATM.read_text().split()[1]) * resource.getpagesize()
     except OSError:

@@ -13,7 +13,7 @@ from harness.proof.bounds import Bounds, BoundsError
 from harness.proof.examples._example import Example, keep, play
 from harness.proof.examples._path_script import NO_CLOCKS, Script
 from harness.proof.graph._exploration import Graph, explore
-from harness.proof.graph._workers import Crew
+from harness.proof.graph._workers import Workers
 from harness.proof.model._any_sender import collect
 from harness.proof.model._flaws import Flaw
 from harness.proof.model._global_states import AGENTS, ZONE, Swarm
@@ -241,8 +241,8 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Pr
     if found.flaw is not None:
         limits = replace(limits, most_s=min(RUN_LOOKED_FOR_S, limits.most_s - found.seconds))
         swarm = Swarm(_with_instants(bounds))
-        with Crew(swarm, limits.cores) as crew:
-            graph = explore(swarm, **limits.of_exploring, crew=crew, watch=watch)
+        with Workers(swarm, limits.cores) as workers:
+            graph = explore(swarm, **limits.of_exploring, workers=workers, watch=watch)
         if graph.flawed is not None and graph.flaw is not None and graph.flaw.kind == found.flaw.kind:
             proof.example = _example(graph, graph.flawed, graph.flaw.sentence, path, name)
     return proof
@@ -263,29 +263,29 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
     name, path = _claimed(bounds, out)
     began_s = time.process_time()
     swarm = Swarm(bounds)
-    with Crew(swarm, limits.cores) as crew:
-        graph = explore(swarm, **limits.of_exploring, crew=crew, watch=watch)
+    with Workers(swarm, limits.cores) as workers:
+        graph = explore(swarm, **limits.of_exploring, workers=workers, watch=watch)
         figures = Figures(
             len(graph.states),
             graph.looked_at,
             graph.transitions,
             len({local for state in graph.states for local in state[AGENTS:]}),
-            swarm.local.steps + graph.crew_steps,
+            swarm.local.steps + graph.workers_steps,
             len({state[ZONE] for state in graph.states}),
             graph.depth,
             round(graph.seconds, 3),
-            round(time.process_time() - began_s + graph.crew_s, 3),
+            round(time.process_time() - began_s + graph.workers_s, 3),
         )
         proof = Proof(bounds, figures, graph.ended, graph.flaw)
         if proof.complete:
             budget = Budget(limits.most_bytes, limits.most_s - graph.seconds)
 
             def asked_now(asked: str) -> None:
-                if budget.check(crew.memory_bytes):
+                if budget.check(workers.memory_bytes):
                     watch(graph.progress(graph.seconds + budget.seconds, asked))
 
             try:
-                proof.liveness = liveness.look(graph, asked_now, crew)
+                proof.liveness = liveness.look(graph, asked_now, workers)
             except GivenUpError as given_up:
                 proof.whole_ended = given_up.ended
             except KeyboardInterrupt:
@@ -295,7 +295,7 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
 
 
 def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
-    """Write what was found as scenarios: the first to `path`."""
+    """Write the findings as scenarios, the first one to `path`."""
     live = proof.liveness
     ways_round = live.cycles if live is not None else cycles(graph) if proof.ended in ("memory", "time") else []
     for key, number in graph.shown.items():

@@ -1,4 +1,4 @@
-"""What was proven, for people; nothing "holds" of which not everything was looked at."""
+"""The result of a proof as text. A property "holds" only if all states were explored."""
 
 from collections.abc import Iterator
 
@@ -52,7 +52,7 @@ def in_words(proof: Proof) -> Iterator[str]:
 
 
 def _tighter(bounds: Bounds) -> list[str]:
-    """Options that leave less to look at."""
+    """Return options that make the state space smaller."""
     if bounds.network == "any" or bounds.timers_any:
         return []
     options = ["--losses 1"] if bounds.network == "lossy" and bounds.losses is None else []

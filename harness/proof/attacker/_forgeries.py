@@ -1,7 +1,8 @@
-"""All that a captor can say to an agent, up to what the agent can tell apart: of each kind one message.
+"""The messages that an attacker can send to an agent: one of each kind that the agent can distinguish.
 
-What handlers ask of a message is whether a hash in it is one that they hold, which of two timestamps is the older, and
-yes or no. docs/explanation/proof.md says why these messages are enough; a test holds random ones to them.
+Handlers check only whether they hold a hash of the message, which of two timestamps is older, and yes or no.
+docs/explanation/proof.md explains why these messages are enough. A test compares their effects with those of random
+messages.
 """
 
 from collections.abc import Iterable, Iterator
@@ -24,8 +25,12 @@ from ucp.messages import (
 from ucp.state import AgentState
 
 
-class Asked(NamedTuple):
-    """What an agent waits for: votes on a block for a chain, and in a reconcile answers about a chain or a block."""
+class PendingQuestions(NamedTuple):
+    """The answers that an agent waits for.
+
+    `vote` is the block and the chain hash of its proposal. The other fields are the chain hash or block hash of its
+    query in phases 1, 2 and 3.
+    """
 
     vote: tuple[bytes, bytes] | None = None
     contains: bytes | None = None
@@ -34,19 +39,19 @@ class Asked(NamedTuple):
 
 
 class Material(NamedTuple):
-    """Of what a captor can speak: blocks that it can send, hashes of blocks, what others wait for, and times."""
+    """The contents of an attacker's messages: blocks, block hashes, questions of other agents, and timestamps."""
 
     blocks: frozenset[Block]
     named: frozenset[bytes]
-    others: frozenset[Asked]
+    others: frozenset[PendingQuestions]
     times_us: tuple[int, ...]
 
 
-def asked(state: AgentState) -> Asked:
-    """What this agent waits for."""
+def asked(state: AgentState) -> PendingQuestions:
+    """Return the answers that an agent waits for."""
     candidate, top = state.candidate_block, state.chain.top_chain_hash
     voting = state.voting_timer.active and candidate is not None
-    return Asked(
+    return PendingQuestions(
         (candidate.block_hash, state.top_chain_hash_at_initiation) if voting and candidate is not None else None,
         top if state.phase_one_timer.active else None,
         top if state.phase_two_timer.active else None,
@@ -54,8 +59,8 @@ def asked(state: AgentState) -> Asked:
     )
 
 
-def letters(state: AgentState, captor: int, material: Material) -> Iterator[Message]:
-    """What `captor` can say to the agent that makes any difference to it, or to those who hear its answer."""
+def forgeries(state: AgentState, captor: int, material: Material) -> Iterator[Message]:
+    """Yield the messages of `captor` that can affect the agent, or affect other agents through its answer."""
     yield from _answers(state, captor, material)
     if not state.reconcile_in_progress:
         yield from _commits(state, material.blocks)
@@ -64,7 +69,7 @@ def letters(state: AgentState, captor: int, material: Material) -> Iterator[Mess
 
 
 def _answers(state: AgentState, captor: int, material: Material) -> Iterator[Message]:
-    """To what the agent itself has asked; nobody is counted twice."""
+    """Yield answers to the agent's own questions. An agent counts each responder once."""
     waits = asked(state)
     if waits.vote is not None and captor not in state.voters:
         block_hash, chain_hash = waits.vote
@@ -85,14 +90,14 @@ def _answers(state: AgentState, captor: int, material: Material) -> Iterator[Mes
 
 
 def _commits(state: AgentState, blocks: Iterable[Block]) -> Iterator[Message]:
-    """Of every block that the agent does not hold, on top of its chain."""
+    """Yield a Commit Block for each block that the agent does not hold, on top of its chain."""
     for block in sorted(blocks, key=lambda block: block.block_hash):
         if not state.holds(block.block_hash):
             yield CommitBlock(block, next_chain_hash(state.chain.top_chain_hash, block.block_hash))
 
 
-def _questions(state: AgentState, others: Iterable[Asked]) -> Iterator[Message]:
-    """To which the agent's answer is one for which somebody else waits."""
+def _questions(state: AgentState, others: Iterable[PendingQuestions]) -> Iterator[Message]:
+    """Yield questions to which the agent gives an answer that another agent waits for."""
     chain = state.chain
     for waits in sorted(others, key=repr):
         if waits.vote is not None:

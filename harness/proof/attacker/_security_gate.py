@@ -1,6 +1,6 @@
-"""The real gate of secured missions: agents behind keys, and what is sealed by whoever has a vehicle's bundle.
+"""Secured agents, and datagrams that an attacker seals with the bundle of a captured vehicle.
 
-Nothing is said here about what gets through: `ucp.secure` opens each datagram, and hands it on or drops it.
+`ucp.secure` decides which datagrams an agent accepts. This module makes no assumption about it.
 """
 
 from collections.abc import Iterable, Iterator
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from ucp.secure.session import Session
 
 BOOT = b"in a proof".ljust(16, b"\0")
-CAPTORS_BOOT = b"later than that".ljust(16, b"\0")
-"""The captor says to have begun after all others, so that the vehicle itself is not heard any more."""
+ATTACKERS_BOOT = b"later than that".ljust(16, b"\0")
+"""The boot of the attacker. It is later than all other boots, so agents drop datagrams of the vehicle itself."""
 
 
-class Gate:
-    """The keys of `roster`; those of vehicle `captured` are in the hands of somebody. Raises MachineError."""
+class SecurityGate:
+    """The keys of a mission. The attacker has those of vehicle `captured`. Raises MachineError without cryptography."""
 
     def __init__(self, roster: Iterable[int], captured: int) -> None:
         try:
@@ -33,10 +33,10 @@ class Gate:
         self._captured = captured
         self._sequence = 0
         self._mouths: dict[int, Session] = {}
-        """By the sender in whose name it speaks."""
+        """Sender -> session in which the attacker sends in the sender's name."""
 
     def agent(self, agent_id: int, *arguments: Any, revoked: bool = False, **options: Any) -> Agent:
-        """An agent behind keys; all other arguments are Agent's. If `revoked` it knows that the vehicle's keys are."""
+        """Return a secured agent. The other arguments are those of Agent. If `revoked`, it knows the revocation."""
         from ucp.secure.secured_agent import SecuredAgent
         from ucp.secure.session import Session
 
@@ -46,10 +46,11 @@ class Gate:
         return agent
 
     def sealed(self, message: Message, now: float, *, sender: int | None = None, genuine: bool = False) -> bytes:
-        """A new datagram that says this, in the captured vehicle's name or in that of `sender`.
+        """Return a new datagram with this message, in the name of the captured vehicle or of `sender`.
 
-        A block in it is signed by its maker if it is `genuine`, as whoever heard it has its signature; else with the
-        only key that there is. An answer names a question that nobody has heard of: of those no newer one is known.
+        A `genuine` block has its maker's signature, which the attacker received with the block. Any other block is
+        signed with the captured key. An answer names a request that no agent has received, so no agent knows a newer
+        one.
         """
         from ucp.secure.block_signature import sign_block
         from ucp.secure.sealed_datagrams import Request
@@ -59,7 +60,7 @@ class Gate:
         sender = sender or self._captured
         if sender not in self._mouths:
             bundle = replace(self._keys.bundle(self._captured), agent_id=sender)
-            self._mouths[sender] = Session(bundle, CAPTORS_BOOT)
+            self._mouths[sender] = Session(bundle, ATTACKERS_BOOT)
         session = self._mouths[sender]
         session.epochs.set_clock(now)
         signature = None
@@ -67,11 +68,14 @@ class Gate:
             block = message.block  # type: ignore[union-attr]
             signer = self._key(block.agent_id if genuine else self._captured)
             signature = sign_block(signer, session.mission, block.block_data())
-        request = Request(self._captured, CAPTORS_BOOT, self._sequence)
+        request = Request(self._captured, ATTACKERS_BOOT, self._sequence)
         return session.seal(self._sequence, message, request, signature, 0)
 
     def forged(self, message: Message, receiver: int, now: float) -> Iterator[bytes]:
-        """The same in the name of another, and with a block in the receiver's own name: its keys are nobody's."""
+        """Yield forgeries of the message: in the name of another vehicle, and with a block in the receiver's name.
+
+        The attacker has the keys of neither.
+        """
         another = next((member for member in self._roster if member not in (receiver, self._captured)), None)
         if another is not None:
             yield self.sealed(message, now, sender=another)

@@ -1,4 +1,4 @@
-"""A captor's message as an entry of a scenario's timeline: block and chain by name, ages as mission seconds."""
+"""Write the messages of an attacker as entries of a scenario's timeline, with names of blocks and mission seconds."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -13,29 +13,29 @@ from ucp.messages import CommitBlock, Message, NextInSequenceResponse, block_nam
 Document = dict[str, Any]
 
 
-class Wording:
-    """What the blocks and chains of one way are called. In the captured vehicle's name its captor `made` blocks."""
+class AttackEntries:
+    """The timeline entries of one path, with the names of its blocks. The attacker `made` blocks, by block hash."""
 
     def __init__(self, local: LocalStates, captured: int, made: Mapping[bytes, Block]) -> None:
         self._local = local
         self._captured = captured
         self._made = made
         self._lies: list[tuple[Document, Message]] = []
-        """The entries, and what they say."""
+        """The entries and their messages."""
         self._names: dict[bytes, str] = {}
         self._chains: dict[bytes, tuple[bytes, ...]] = {}
         self._count: Counter[int] = Counter()
         self._completed_s = [0.0]
-        """When each block was completed; the first is the inception block."""
+        """Mission second of the completion of each block, after that of the inception block."""
 
     def completed(self, agent_id: int, ordinal: int, at_s: float) -> None:
-        """An agent has completed a block, the `ordinal`th of all."""
+        """Record that an agent completed a block. `ordinal` is its number among all blocks."""
         self._count[agent_id] += 1
         self._names[self._local.blocks.completed_by(agent_id, ordinal)] = f"{agent_id}.{self._count[agent_id]}"
         self._completed_s.append(at_s)
 
     def sees(self, local: int) -> None:
-        """An agent has come to this state."""
+        """Record the chains of an agent in this state."""
         chain = self._local.state(local).chain
         below: tuple[bytes, ...] = ()
         self._chains[chain.inception.chain_hash] = below
@@ -43,9 +43,9 @@ class Wording:
             below = self._chains[chain_hash] = (*below, block.block_hash)
 
     def lie(self, receiver: int, number: int, at_s: float) -> list[Document]:
-        """The captor says this, and the receiver hears it: an entry, which is filled in when it is worded.
+        """Add a message of the attacker. Return its entry in a list; `word` completes it later.
 
-        None if it is what another has just heard.
+        If the last message was the same at the same time, its entry gets the receiver, and the list is empty.
         """
         message = self._local.messages[number]
         if self._lies and (self._lies[-1][0]["at_s"], self._lies[-1][1]) == (at_s, message):
@@ -56,7 +56,7 @@ class Wording:
         return [entry]
 
     def word(self) -> None:
-        """The whole way is known: fill in all entries."""
+        """Complete all entries, at the end of the path."""
         for entry, message in self._lies:
             entry["lie"] |= self._said(message)
 
@@ -79,7 +79,7 @@ class Wording:
         return said
 
     def _below(self, commit: CommitBlock) -> bytes:
-        """The chain hash of what its block goes on top of."""
+        """Return the chain hash of the chain on which a Commit Block puts its block."""
         return next(
             (below for below in self._chains if next_chain_hash(below, commit.block.block_hash) == commit.chain_hash),
             NOBODYS,
@@ -93,7 +93,10 @@ class Wording:
         return MADE + second.rstrip("0").rstrip(".")
 
     def _second(self, timestamp_us: int) -> float:
-        """A time between those at which blocks were completed, as it is on this way; later than all is later still."""
+        """Return the mission second on this path for a timestamp that lies between those of completed blocks.
+
+        A timestamp after all blocks gives a mission second after the last completion.
+        """
         ordinal, part = divmod(timestamp_us, MICROSECONDS)
         last = len(self._completed_s) - 1
         if ordinal >= last:

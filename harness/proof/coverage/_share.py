@@ -17,7 +17,7 @@ from harness.proof.model._shape import Held, Shape, shape_of
 
 @dataclass
 class Existing:
-    """Numbers of the local states, and of the pairs, that there are within `bounds`; all, if `ended` is "complete"."""
+    """The numbers of local states and of pairs that exist within `bounds`. They are all if `ended` is "complete"."""
 
     bounds: Bounds
     states: set[int]
@@ -26,7 +26,7 @@ class Existing:
 
 
 def existing(bounds: Bounds, *, most_bytes: float = 4e9, most_s: float = float("inf")) -> Existing:
-    """All that exists, or what memory and time allow to see of it."""
+    """Return all local states and pairs within the bounds, or those found within the limits of memory and time."""
     there = Existing(bounds, set(), set())
     if bounds.network == "any":
         collected = collect(bounds, most_bytes=most_bytes, most_s=most_s, keep=lambda local: _add(there, local))
@@ -61,7 +61,7 @@ SCHEMA = "ucp-coverage/1"
 
 @dataclass(frozen=True)
 class Share:
-    """`reached` of `exist`; `beyond` were reached that do not exist within the bounds."""
+    """The number of existing things that were `reached`, and the number that were reached outside the bounds."""
 
     reached: int
     exist: int
@@ -74,14 +74,14 @@ class Share:
 
     @property
     def percent(self) -> str:
-        """ "35 %"; never 100 % or 0 % of what is neither."""
+        """The share as text, for example "35 %". It is 100 % or 0 % only if it is exactly that."""
         if self.reached == self.exist:
             return "100 %"
         share = 100 * self.reached / self.exist
         return f"{min(max(share, 0.1), 99.9):.1f} %" if share < 1 or share > 99 else f"{share:.0f} %"
 
     def in_words(self, what: str) -> str:
-        """ "199 of 568 local states (35 %), 12 beyond the bounds"."""
+        """Return text such as "199 of 568 local states (35 %), 12 beyond the bounds"."""
         return f"{self.reached:,} of {self.exist:,} {what} ({self.percent}), {self.beyond:,} beyond the bounds"
 
     def to_json(self) -> dict[str, int]:
@@ -89,12 +89,12 @@ class Share:
 
 
 def not_taken(reached: Reached) -> list[Branch]:
-    """The branches of the contract that no run has taken."""
+    """Return the branches of the contract that no run has taken."""
     return [branch for branch in BRANCHES if not reached.branches[branch]]
 
 
 def to_json(reached: Reached, there: Existing | None) -> dict[str, Any]:
-    """`there` is what the share is of; without it there is none."""
+    """Return the document. It has shares of the states in `there`, if given."""
     missing = not_taken(reached)
     document = {
         "schema": SCHEMA,
@@ -127,7 +127,7 @@ def to_json(reached: Reached, there: Existing | None) -> dict[str, Any]:
 
 
 def in_words(reached: Reached, there: Existing | None) -> Iterator[str]:
-    """A few lines."""
+    """Yield a few lines about the coverage."""
     yield (
         f"{reached.steps:,} handler runs: {len(reached.states):,} local states, {len(reached.pairs):,} pairs of one "
         f"with an input"

@@ -1,7 +1,7 @@
 """Local states, inputs and branches that runs reached, collected while a simulated run is judged.
 
-The steps of an agent are those that the step judge's reference core follows (`harness.checker.steps`): agents of
-another make count as ours do, and recorded runs as simulated ones.
+The reference core of the step judge (`harness.checker.steps`) follows the steps of each agent. Foreign agents and
+recorded runs therefore count like our agents and simulated runs.
 """
 
 from collections import Counter
@@ -21,33 +21,33 @@ from ucp.trace import HandlerRun
 from ucp.trigger import EventTrigger, LocalTrigger, MessageTrigger, TimerTrigger
 
 Branch = tuple[str, str]
-"""A handler, and a branch of it."""
+"""A handler and one of its branches."""
 
 BRANCHES: tuple[Branch, ...] = tuple(
     (name, branch) for name, handler in HANDLERS.items() for branch in handler.branches
 )
-"""All that there are in the contract."""
+"""All branches of the contract."""
 
 MOST = 2_000_000
-"""So many local states, or pairs, are kept: more would take all memory."""
+"""Maximum number of local states, and of pairs. More would need too much memory."""
 KEPT = 20_000
-"""So much that agents held is kept, with what was worked out of it."""
+"""Maximum number of cached `Held` objects."""
 
 
 @dataclass
 class Reached:
-    """Numbers of local states, and of pairs of one and an input that changes something there or is answered."""
+    """The reached local states, and the reached pairs of a local state and an input that changes it or is answered."""
 
     states: set[int] = field(default_factory=set)
     pairs: set[int] = field(default_factory=set)
     branches: Counter[Branch] = field(default_factory=Counter)
     steps: int = 0
-    """Handler runs that were followed."""
+    """Number of handler runs that were followed."""
     untold: str | None = None
-    """Why not everything that agents did is known."""
+    """The reason why some steps are unknown. None if all are known."""
 
     def add(self, other: "Reached") -> None:
-        """All that the other has."""
+        """Add the states, pairs and branches of another object."""
         for mine, its in ((self.states, other.states), (self.pairs, other.pairs)):
             if len(mine) < MOST:
                 mine |= its
@@ -59,7 +59,7 @@ class Reached:
 
 
 class Watcher:
-    """Is shown each step that is followed, and takes down what is reached. `reached` may be taken away at any time."""
+    """Records the reached states, pairs and branches of each followed step. `reached` may be replaced at any time."""
 
     def __init__(self) -> None:
         self.reached = Reached()
@@ -71,7 +71,7 @@ class Watcher:
         self._answers = False
 
     def step(self, state: State, run: HandlerRun | None) -> None:
-        """An agent is in this state after this handler has run; None where a life begins."""
+        """Record the state of an agent after a handler run. `run` is None at the start of an incarnation."""
         reached = self.reached
         if run is None:
             self._held_before = None
@@ -107,7 +107,7 @@ class Watcher:
 
 
 def _given(run: HandlerRun | None, held: Held) -> tuple[Any, ...] | None:
-    """The input, as it is to the agent that held this; None of one that no bounds have."""
+    """Return the shape of an input for an agent that held these blocks. None for an input outside all bounds."""
     if run is None:
         return None
     trigger = run.trigger
@@ -119,7 +119,7 @@ def _given(run: HandlerRun | None, held: Held) -> tuple[Any, ...] | None:
 
 
 def reached_in(evidence: Evidence) -> Reached:
-    """What the agents of a run came to, by their traces."""
+    """Return the states, pairs and branches that the agents of a run reached, from their traces."""
     watcher = Watcher()
     evidence.watch = watcher.step
     judgement = check(evidence)
@@ -129,7 +129,7 @@ def reached_in(evidence: Evidence) -> Reached:
 
 
 def simulate_watched(scenario: Scenario, seed: int, watch: Watch, **options: Any) -> Simulated:
-    """As `simulate` with traces; everything is delivered, so that branches in which nothing happens are seen, too."""
+    """Simulate with traces, and deliver messages without effect too, so that branches without effect are recorded."""
     return simulate_in_memory(_Watched(watch), scenario, seed, deliver_all=True, **options)
 
 

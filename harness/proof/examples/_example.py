@@ -1,4 +1,4 @@
-"""A way through the graph, played by the simulation and written as a scenario."""
+"""A path through the graph, played by the simulation and written as a scenario."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,13 +23,13 @@ Document = dict[str, Any]
 
 @dataclass(frozen=True)
 class Example:
-    """A way to something that was found, as a scenario in `path`; `judged` is what is bad about its simulated run."""
+    """A path to a finding as a scenario in `path`. `judged` has the bad judgements of its simulated run."""
 
     path: Path
     instants: int
     judged: dict[str, Judgement]
     chains: int
-    """How many there were in the end."""
+    """Number of different chains at the end of the run."""
 
     @property
     def replay(self) -> str:
@@ -50,7 +50,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Played:
-    """A simulated run: what is bad about it, and the cycle that it ends in, if it does."""
+    """A simulated run: its bad judgements, and the cycle at its end, if there is one."""
 
     document: Document
     judged: dict[str, Judgement]
@@ -72,7 +72,7 @@ def _bad(result: Result) -> dict[str, Judgement]:
 
 
 def keep(played: Played, path: Path, bounds: Bounds, instants: int, sentences: Sequence[str]) -> Example:
-    """Write it to `path`; `sentences` say what it is."""
+    """Write a played scenario to `path`, with `sentences` as its comment."""
     comment = [
         *sentences,
         f"A shortest path within {bounds.in_words()}.",

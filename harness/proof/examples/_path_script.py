@@ -1,8 +1,9 @@
-"""A way through the graph as a scenario: scripted events, fates and lateness that make the simulation go the same way.
+"""Write a path through the graph as a scenario.
 
-A message takes LATENCY_S, or as long as it must so that everything reaches everybody in the order of the way, and
-before what follows at once; what is lost there has a fate here. A timer ends when it should, unless it has to wait for
-what was heard before.
+Scripted events, fates and lateness make the simulation take the same path. A message takes LATENCY_S. If the order of
+arrivals on the path requires it, or if the next instant follows soon, a fate gives the message another delay. A message
+that is lost on the path has the fate `drop`. A timer expires on time, unless messages of the instant before arrive
+later.
 """
 
 from collections import Counter, defaultdict
@@ -12,9 +13,9 @@ from itertools import pairwise
 from math import inf
 from typing import Any, NamedTuple
 
-from harness.proof.attacker._timeline_entries import Wording
+from harness.proof.attacker._timeline_entries import AttackEntries
 from harness.proof.bounds import EVENT_FILLS_BLOCK
-from harness.proof.examples._path_times import Ages, Run, instants_s, windows_s
+from harness.proof.examples._path_times import Ages, TimerRun, instants_s, windows_s
 from harness.proof.graph._exploration import Graph
 from harness.proof.model._global_states import AGENTS, Move
 from harness.proof.model._instant import Action, Wave
@@ -24,22 +25,22 @@ from harness.scenario.strict_model import format_pairs
 from netem.medium import LATENCY
 
 LATENCY_S = 0.02
-HEARD_AFTER_S = LATENCY.mean_s
-"""What a rogue node sends is heard so much later."""
+ROGUE_LATENCY_S = LATENCY.mean_s
+"""Seconds from the sending of a rogue node's message to its arrival."""
 MOMENT_S = 0.001
-"""Between two things of which one has to be the first."""
-SOON_S = 0.1
-"""When the next instant follows sooner, messages take a MOMENT_S, so that what begins then begins with the rest."""
+"""Seconds between two events that must happen in a fixed order."""
+NEXT_INSTANT_SOON_S = 0.1
+"""Distance in seconds to the next instant below which messages take only MOMENT_S, so that they arrive before it."""
 SETTLES_S = 60
 NO_CLOCKS = "if ties of phase 2 go as no clocks make them go"
-"""Of two blocks now the one has to be the older and then the other, or an agent's clock has to go back."""
+"""The text for contradictory ties: two blocks must be older than each other, or an agent's clock must go back."""
 
 Document = dict[str, Any]
 
 
 @dataclass(eq=False)
-class _Flight:
-    """One broadcast: what it says, by which of the agents, when, and which of its kind it is."""
+class _Broadcast:
+    """One broadcast. `count` is its number among the sender's messages with this name."""
 
     sender: int
     message: int
@@ -51,7 +52,7 @@ class _Flight:
 
 @dataclass
 class _Agent:
-    """An agent on the way: what it is, and the timers that it runs, with number and end."""
+    """An agent on the path. `timers` maps each running timer to its number among all its timers, and to its expiry."""
 
     agent_id: int
     local: int
@@ -60,7 +61,7 @@ class _Agent:
 
 
 class Completion(NamedTuple):
-    """When an agent may complete a block for the way to be gone: seconds after the first instant of the way."""
+    """The interval in which an agent may complete a block on the path, in seconds after the path's first instant."""
 
     agent: int
     earliest_s: float
@@ -68,44 +69,46 @@ class Completion(NamedTuple):
 
 
 class Script:
-    """Follows a way, step by step, and takes down what is to be scripted."""
+    """Follows a path step by step, and collects the entries of the scenario."""
 
-    def __init__(self, graph: Graph, way: Sequence[int]) -> None:
+    def __init__(self, graph: Graph, path: Sequence[int]) -> None:
         self._graph = graph
         self._swarm = graph.swarm
-        self._moves = [self._move(before, after) for before, after in pairwise(way)]
+        self._moves = [self._move(before, after) for before, after in pairwise(path)]
         self.coincidences = sum(
             self._swarm.coincidences(graph.states[number], move.actions)
-            for number, move in zip(way, self._moves, strict=False)
+            for number, move in zip(path, self._moves, strict=False)
         )
-        """So many moments on the way have to be the same by chance."""
-        begin = graph.states[way[0]]
+        """Number of pairs of instants on the path that must be equal by chance."""
+        begin = graph.states[path[0]]
         self._agents = [_Agent(place + 1, local) for place, local in enumerate(begin[AGENTS:])]
         self._sent: Counter[tuple[int, str]] = Counter()
         self._events: list[Document] = []
         self._ages = Ages()
         self.contradictory = False
-        """Whether ties go as no clocks make them go: known with the document."""
+        """True if no clocks give all ties the required results. `document` sets it."""
         self.losses = 0
-        """So many messages are lost by somebody on the way: known with the document, too."""
+        """Number of messages that receivers lose on the path. `document` sets it."""
         self._timeline: list[Document] = []
         self._fates: list[Document] = []
         self._late: dict[int, dict[int, float]] = defaultdict(dict)
         self._end_s = 0.0
         self._latency_s = LATENCY_S
-        captor = self._swarm.captor
-        self._wording = None if captor is None else Wording(self._swarm.local, captor.captured, captor.made)
+        attacker = self._swarm.captor
+        self._attack_entries = (
+            None if attacker is None else AttackEntries(self._swarm.local, attacker.captured, attacker.made)
+        )
 
     def document(self, name: str) -> Document:
-        """The scenario."""
+        """Return the scenario."""
         instants = instants_s(len(self._moves), list(self._runs()))
         for move, at_s, next_s in zip(self._moves, instants, [*instants[1:], inf], strict=True):
-            self._latency_s = LATENCY_S if next_s - at_s > SOON_S else MOMENT_S
+            self._latency_s = LATENCY_S if next_s - at_s > NEXT_INSTANT_SOON_S else MOMENT_S
             self._play(move, at_s)
-        self._let_nothing_end_before_the_end()
+        self._delay_open_timers()
         self.contradictory = not self._ages.date(self._events)
-        if self._wording is not None:
-            self._wording.word()
+        if self._attack_entries is not None:
+            self._attack_entries.word()
         bounds = self._swarm.bounds
         lateness = {
             agent_id: format_pairs(sorted(late.items()), "+") for agent_id, late in sorted(self._late.items()) if late
@@ -126,7 +129,7 @@ class Script:
         }
 
     def completions(self) -> Iterator[Completion]:
-        """When blocks are completed on the way, if nothing but the durations of timers binds them."""
+        """Yield the possible times of the completions, if only the durations of timers limit them."""
         agents = [agent.agent_id for agent in self._agents]
         for move, (earliest_s, latest_s) in zip(
             self._moves, windows_s(len(self._moves), list(self._runs())), strict=True
@@ -137,26 +140,26 @@ class Script:
             agents = [agents[old] for old in move.places]
 
     def _move(self, before: int, after: int) -> Move:
-        """How the one state followed from the other, losing nothing if that is possible."""
+        """Return the move from one state to the next, without losses if possible."""
         state, wanted = self._graph.states[before], self._graph.states[after]
         for lossy in (False, True) if self._swarm.bounds.network == "lossy" else (False,):
             for actions in self._swarm.actions(state):
                 if wanted in self._swarm.after(state, actions, lossy):
                     return next(move for move in self._swarm.moves(state, actions, lossy) if move.state == wanted)
-        raise AssertionError("a state on the way follows from the one before")
+        raise AssertionError("each state on the path is a successor of the one before")
 
-    # When
+    # Times
 
-    def _runs(self) -> list[Run]:
-        """All timers that run on the way."""
+    def _runs(self) -> list[TimerRun]:
+        """Return all timers that run on the path."""
         running: dict[tuple[int, int], tuple[int, float]] = {}
         runs = []
         for instant, move in enumerate(self._moves):
             for action in move.actions:
                 if action.what == "timer":
                     began, duration_s = running.pop((action.place, action.number))
-                    runs.append(Run(began, duration_s, instant, True))
-            runs += [Run(began, duration_s, instant, False) for began, duration_s in running.values()]
+                    runs.append(TimerRun(began, duration_s, instant, True))
+            runs += [TimerRun(began, duration_s, instant, False) for began, duration_s in running.values()]
             after: dict[tuple[int, int], tuple[int, float]] = {}
             for new, old in enumerate(move.places):
                 local = move.state[AGENTS + new]
@@ -170,10 +173,10 @@ class Script:
             running = after
         return runs
 
-    # What
+    # Events
 
     def _play(self, move: Move, at_s: float) -> None:
-        """One instant: what agents do of their own, then all that is heard."""
+        """Play one instant: first the actions of the agents, then the reception of all messages."""
         earliest = self._end_s + MOMENT_S if self._end_s else 0.0
         ends = [
             max(self._agents[action.place].timers[action.number][1], earliest)
@@ -181,9 +184,9 @@ class Script:
             if action.what == "timer"
         ]
         if any(action.what == "lie" for action in move.actions):
-            earliest += HEARD_AFTER_S
+            earliest += ROGUE_LATENCY_S
         other_s = round(max([at_s, earliest, *ends]), 3)
-        air: list[_Flight] = []
+        air: list[_Broadcast] = []
         acted_s = other_s if not ends else max(ends)
         for action in move.actions:
             agent = self._agents[action.place]
@@ -192,33 +195,33 @@ class Script:
                 now = max(nominal_s, earliest)
                 if now > nominal_s + 1e-9:
                     self._late[agent.agent_id][number] = now - nominal_s
-                self._ages.asked(*self._swarm.local.older(agent.local, action.number, action.way))
+                self._ages.require_older(*self._swarm.local.older(agent.local, action.number, action.way))
                 step = self._swarm.local.end_timer(agent.local, action.number, action.way)
             else:
                 now = other_s
-                if action.what != "lie":  # all hear it at once
+                if action.what != "lie":  # all receivers get a lie at the same moment
                     other_s = round(other_s + MOMENT_S, 3)
-                step = self._other(agent, action, now)
+                step = self._act(agent, action, now)
             acted_s = max(acted_s, now)
-            air += self._done(agent, step, now)
+            air += self._apply(agent, step, now)
         self._end_s = max(self._end_s, acted_s)
-        for wave in _in_order(move.wave):
-            air = self._hear(wave, self._as_in(wave, air), acted_s)
+        for wave in _waves_in_order(move.wave):
+            air = self._hear(wave, self._in_wave_order(wave, air), acted_s)
         self._ages.renumber(move.blocks)
         self._agents = [self._agents[old] for old in move.places]
         for agent, local in zip(self._agents, move.state[AGENTS:], strict=True):
             agent.local = local
 
-    def _other(self, agent: _Agent, action: Action, now: float) -> Step:
+    def _act(self, agent: _Agent, action: Action, now: float) -> Step:
         if action.what == "complete":
             self._events.append({"at_s": now, "agent": agent.agent_id})
             self._ages.completed(action.number)
             step = self._swarm.local.complete(agent.local, action.number)
-            if self._wording is not None:
-                self._wording.completed(agent.agent_id, action.number, now)
+            if self._attack_entries is not None:
+                self._attack_entries.completed(agent.agent_id, action.number, now)
             return step
-        if action.what == "lie" and self._wording is not None:
-            self._timeline += self._wording.lie(agent.agent_id, action.number, round(now - HEARD_AFTER_S, 6))
+        if action.what == "lie" and self._attack_entries is not None:
+            self._timeline += self._attack_entries.lie(agent.agent_id, action.number, round(now - ROGUE_LATENCY_S, 6))
             return self._swarm.local.lie(agent.local, action.number)
         agent.timers = {}
         if action.what == "reboot":
@@ -227,11 +230,11 @@ class Script:
         self._timeline.append({"at_s": now, "kill": [agent.agent_id]})
         return Step(DEAD, (), ())
 
-    def _done(self, agent: _Agent, step: Step, now: float) -> list[_Flight]:
-        """The agent has done this: its timers, and what it sends."""
+    def _apply(self, agent: _Agent, step: Step, now: float) -> list[_Broadcast]:
+        """Apply a step to an agent, and return the broadcasts of the step."""
         agent.local = step.local
-        if self._wording is not None and step.local != DEAD:
-            self._wording.sees(step.local)
+        if self._attack_entries is not None and step.local != DEAD:
+            self._attack_entries.sees(step.local)
         running = self._swarm.local.known[step.local].running if step.local != DEAD else ()
         agent.timers = {timer: run for timer, run in agent.timers.items() if timer in running}
         started = dict(step.started)
@@ -244,11 +247,11 @@ class Script:
         for message in step.sent:
             name = self._swarm.local.messages[message].NAME
             self._sent[agent.agent_id, name] += 1
-            flights.append(_Flight(agent.agent_id, message, name, self._sent[agent.agent_id, name], now))
+            flights.append(_Broadcast(agent.agent_id, message, name, self._sent[agent.agent_id, name], now))
         return flights
 
-    def _as_in(self, wave: Wave, flights: Sequence[_Flight]) -> list[_Flight]:
-        """These flights in the order in which the wave has them."""
+    def _in_wave_order(self, wave: Wave, flights: Sequence[_Broadcast]) -> list[_Broadcast]:
+        """Return the broadcasts in the order of the wave."""
         left, ordered = list(flights), []
         for place, message in wave.air:
             sender = self._agents[place].agent_id
@@ -257,10 +260,10 @@ class Script:
             ordered.append(flight)
         return ordered
 
-    def _hear(self, wave: Wave, air: Sequence[_Flight], acted_s: float) -> list[_Flight]:
-        """Everybody hears what it does of what is on the air; what they answer."""
-        answers: dict[int, list[_Flight]] = {}
-        heard_by_anybody: set[int] = set()
+    def _hear(self, wave: Wave, air: Sequence[_Broadcast], acted_s: float) -> list[_Broadcast]:
+        """Let each agent receive its messages of the wave, and return the answers."""
+        answers: dict[int, list[_Broadcast]] = {}
+        received: set[int] = set()
         for place, heard in enumerate(wave.heard):
             agent = self._agents[place]
             answers[place] = []
@@ -273,7 +276,7 @@ class Script:
             order_matters = self._swarm.order_matters(agent.local, place, wave, heard)
             last_s = acted_s
             for number in heard:
-                heard_by_anybody.add(number)
+                received.add(number)
                 flight = air[number]
                 arrives_s = flight.sent_s + self._latency_s
                 hurried = self._latency_s < LATENCY_S
@@ -285,27 +288,30 @@ class Script:
                 last_s = arrives_s
                 self._end_s = max(self._end_s, arrives_s)
                 sender = self._swarm.name_of(wave.air[number][0], place)
-                answers[place] += self._done(agent, self._swarm.local.hear(agent.local, sender, flight.message), last_s)
+                answers[place] += self._apply(
+                    agent, self._swarm.local.hear(agent.local, sender, flight.message), last_s
+                )
         for number, flight in enumerate(air):
-            if number not in heard_by_anybody and len(flight.lost_by) > 1:
+            if number not in received and len(flight.lost_by) > 1:
                 self._fate(flight, None, drop=True)
             else:
                 for agent_id in flight.lost_by:
                     self._fate(flight, agent_id, drop=True)
         return [flight for place in range(len(wave.heard)) for flight in answers[place]]
 
-    def _fate(self, flight: _Flight, receiver: int | None, **what: Any) -> None:
+    def _fate(self, flight: _Broadcast, receiver: int | None, **what: Any) -> None:
         whom = {} if receiver is None else {"receiver": receiver}
         self._fates.append({"message": flight.name, "sender": flight.sender, **whom, "count": flight.count, **what})
 
-    def _let_nothing_end_before_the_end(self) -> None:
+    def _delay_open_timers(self) -> None:
+        """Let timers that are open at the end of the path expire after it."""
         for agent in self._agents:
             for number, ends_s in agent.timers.values():
                 if ends_s <= self._end_s:
                     self._late[agent.agent_id][number] = self._end_s + MOMENT_S - ends_s
 
 
-def _in_order(last: Wave | None) -> list[Wave]:
+def _waves_in_order(last: Wave | None) -> list[Wave]:
     waves = []
     while last is not None:
         waves.append(last)

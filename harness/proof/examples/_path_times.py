@@ -1,9 +1,9 @@
-"""Mission seconds of each instant on a path, and the order in which its blocks were made.
+"""Compute the mission second of each instant on a path, and timestamps of its blocks.
 
-Every instant is a variable, every duration a bound on a difference of two; the shortest paths over the bounds are a
-solution (Bellman and Ford), if there is one.
+Each instant is a variable, and each duration is a bound on the difference of two variables. The longest paths over
+these bounds are a solution (Bellman and Ford), if a solution exists.
 
-Where any block may be the older (`Bounds.clocks_any`) a scenario says what the clocks showed.
+If any of two blocks may be the older one (`Bounds.clocks_any`), the scenario contains the timestamps of the events.
 """
 
 from collections.abc import Collection, Sequence
@@ -15,14 +15,14 @@ from typing import Any
 from harness.proof.model._block_renaming import Ordinals
 from ucp.clock import MICROSECONDS
 
-APART_S = (5.0, 2.0, 1.0, 0.5, 0.2, 0.0)
-"""How far from each other two instants should be: as far as can be."""
-BEGINS_S = 1.0
+DISTANCES_S = (5.0, 2.0, 1.0, 0.5, 0.2, 0.0)
+"""Minimum distances in seconds between two instants. The first one that allows a solution is used."""
+FIRST_INSTANT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
-    """A timer that ran from one instant until another, or at least until then if it did not `end`."""
+class TimerRun:
+    """A timer that ran from one instant to another. If it has not `ended`, it ran at least until then."""
 
     started: int
     duration_s: float
@@ -30,36 +30,39 @@ class Run:
     ended: bool
 
 
-def instants_s(count: int, runs: Sequence[Run]) -> list[float]:
-    """When each of `count` instants is; timers may have to be late only if they were let end in any order."""
-    for apart_s in APART_S:
-        solution = _solved(count, runs, apart_s, punctual=True)
+def instants_s(count: int, runs: Sequence[TimerRun]) -> list[float]:
+    """Return the mission second of each of `count` instants.
+
+    If no solution with punctual timers exists (timers may expire in any order), timers may be late.
+    """
+    for apart_s in DISTANCES_S:
+        solution = _solve(count, runs, apart_s, punctual=True)
         if solution is not None:
             return solution
-    solution = _solved(count, runs, APART_S[0], punctual=False)
+    solution = _solve(count, runs, DISTANCES_S[0], punctual=False)
     assert solution is not None, "every timer may be late"
     return solution
 
 
-def windows_s(count: int, runs: Sequence[Run]) -> list[tuple[float, float]]:
-    """How long after the first instant each of `count` can be, at the earliest and at the latest."""
-    later = _later(count, runs, 0.0, punctual=True)
+def windows_s(count: int, runs: Sequence[TimerRun]) -> list[tuple[float, float]]:
+    """Return the earliest and latest second of each of `count` instants after the first instant."""
+    later = _bounds(count, runs, 0.0, punctual=True)
     begin = [0.0, *[-inf] * (count - 1)]
-    earliest = _longest(begin, later)
-    latest = _longest(begin, [(after, before, least) for before, after, least in later])
+    earliest = _longest_paths(begin, later)
+    latest = _longest_paths(begin, [(after, before, least) for before, after, least in later])
     assert earliest is not None, "the path was found"
     assert latest is not None, "the path was found"
     return [(first + 0.0, 0.0 - last) for first, last in zip(earliest, latest, strict=True)]
 
 
-def _solved(count: int, runs: Sequence[Run], apart_s: float, *, punctual: bool) -> list[float] | None:
-    """The earliest times: each is the longest way over what has to lie between."""
-    later = _later(count, runs, apart_s, punctual=punctual)
-    return _longest([BEGINS_S] * count, later)
+def _solve(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: bool) -> list[float] | None:
+    """Return the earliest times with these distances. None if there is no solution."""
+    later = _bounds(count, runs, apart_s, punctual=punctual)
+    return _longest_paths([FIRST_INSTANT_S] * count, later)
 
 
-def _longest(at_least: Sequence[float], later: Sequence[tuple[int, int, float]]) -> list[float] | None:
-    """The longest way to each instant over what has to lie between; None if there is none."""
+def _longest_paths(at_least: Sequence[float], later: Sequence[tuple[int, int, float]]) -> list[float] | None:
+    """Return the longest path to each instant over the bounds `later`. None if a cycle makes it infinite."""
     longest = [*at_least]
     for _ in range(len(longest) + 1):
         changed = False
@@ -72,8 +75,8 @@ def _longest(at_least: Sequence[float], later: Sequence[tuple[int, int, float]])
     return None
 
 
-def _later(count: int, runs: Sequence[Run], apart_s: float, *, punctual: bool) -> list[tuple[int, int, float]]:
-    """(instant, another, how many seconds at least the other is later)."""
+def _bounds(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: bool) -> list[tuple[int, int, float]]:
+    """Return the bounds as (instant, other instant, minimum seconds from the first to the other)."""
     later: list[tuple[int, int, float]] = [(number - 1, number, apart_s) for number in range(1, count)]
     for run in runs:
         if run.ended:
@@ -86,35 +89,38 @@ def _later(count: int, runs: Sequence[Run], apart_s: float, *, punctual: bool) -
 
 
 class Ages:
-    """Takes down what the way asks for. Blocks are told by the numbers that they have in its states, which change."""
+    """The required order of the timestamps of the blocks on a path.
+
+    Blocks are identified by their ordinals in the states of the path. The ordinals change along the path.
+    """
 
     def __init__(self) -> None:
         self._events: list[int] = []
-        """For each block which of the events completes it."""
+        """Ordinal of a block minus 1 -> index of the event that completes it."""
         self._older: dict[int, set[int]] = {}
-        """For each event those with older blocks."""
+        """Index of an event -> indices of the events that complete older blocks."""
 
     def completed(self, ordinal: int) -> None:
-        """The next event completes this block."""
+        """Record that the next event completes this block."""
         assert ordinal == len(self._events) + 1, "blocks are numbered as they are completed"
         self._older[len(self._events)] = set()
         self._events.append(len(self._events))
 
     def renumber(self, blocks: Ordinals) -> None:
-        """From now on these blocks are the first, the second, and so on; those that nobody has come after them."""
+        """Renumber the blocks: these become 1, 2 and so on. Blocks that no agent has follow them."""
         if blocks:
             rest = [ordinal for ordinal in range(1, len(self._events) + 1) if ordinal not in blocks]
             self._events = [self._events[ordinal - 1] for ordinal in (*blocks, *rest)]
 
-    def asked(self, oldest: int, others: Collection[int]) -> None:
-        """One block has to be older than others; the inception block is, anyway."""
+    def require_older(self, oldest: int, others: Collection[int]) -> None:
+        """Require that one block is older than others. The inception block (0) is always the oldest."""
         for other in others if oldest else ():
             self._older[self._events[other - 1]].add(self._events[oldest - 1])
 
     def date(self, events: list[dict[str, Any]]) -> bool:
-        """Let the events have timestamps of which that is true, if it is not true as they are.
+        """Give the events timestamps that meet the requirements, if their times do not meet them already.
 
-        False if no timestamps make it true: a tie goes one way now and another way then, or an agent's clock goes back.
+        Return False if no timestamps meet them, because they contradict each other or an agent's clock would go back.
         """
         for index, event in enumerate(events):
             own = [earlier for earlier in range(index) if events[earlier]["agent"] == event["agent"]]

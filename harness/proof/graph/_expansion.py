@@ -1,4 +1,4 @@
-"""The successors of one state, and states packed into little memory."""
+"""The successors of one state, and compact sequences of states and successors."""
 
 import gc
 from array import array
@@ -14,14 +14,15 @@ from harness.proof.questions._attractor import ByTimer
 
 NumberOf = Callable[[State], int]
 _Following = dict[Actions, dict[int, None]]
-"""The states that may follow, in order, by what happens."""
+"""Actions of an instant -> numbers of the possible successors, in order."""
 
 
 class Expansion(NamedTuple):
-    """What may follow one state, in `ways`; the rest by numbers of states: nobody loses anything, no block comes.
+    """The successors of one state. `ways` is the number of its transitions.
 
-    `by_timer` has for each timer that may end next what may follow if it does: it ends alone, or others that have to
-    end at that very moment end before it or with it. `crossing` has what may follow if any that may end at once do.
+    The other fields have the numbers of successors without losses and without new blocks. `by_timer` has, for each
+    timer that may expire next, the possible successors: the timer expires alone, or timers that must expire at the same
+    moment expire before it or with it. `crossing` has the successors if several timers expire at once.
     """
 
     ways: int
@@ -30,7 +31,7 @@ class Expansion(NamedTuple):
 
 
 def expanded(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
-    """All that can follow this state; `number_of` is asked for all of it, in order."""
+    """Return the expansion of a state. `number_of` returns the number of each successor, and is called in order."""
     lossy = swarm.bounds.network == "lossy"
     ways = 0
     losing_nothing: _Following = {}
@@ -44,12 +45,12 @@ def expanded(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
 
 
 def quiet(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
-    """Where the state goes on when nothing is lost and no new block comes."""
+    """Return the expansion of a state without losses and without new blocks. Its `ways` is 0."""
     return _quiet(swarm, state, number_of, [*swarm.ending(state)], {})
 
 
 def _quiet(swarm: Swarm, state: State, number_of: NumberOf, ending: Sequence[Actions], known: _Following) -> Expansion:
-    """The same; `known` may have some of it."""
+    """Return the expansion without losses and new blocks. `known` may contain some of the successors."""
     after = {
         actions: known[actions]
         if actions in known
@@ -67,7 +68,7 @@ def _quiet(swarm: Swarm, state: State, number_of: NumberOf, ending: Sequence[Act
 
 @contextmanager
 def cycles_left_alone() -> Iterator[None]:
-    """Python's collector rests; in processes that are forked meanwhile, for good."""
+    """Switch off Python's garbage collector. It stays off in processes that are forked inside the context."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -78,7 +79,7 @@ def cycles_left_alone() -> Iterator[None]:
 
 
 class States(Sequence[State]):
-    """Different states of so many agents by number, in the order in which they were added; each as a row of bytes."""
+    """The states of a swarm of `agents` agents, numbered in the order of their addition. Each is stored as bytes."""
 
     def __init__(self, agents: int) -> None:
         self._form = Struct(f"={AGENTS + agents}i")
@@ -86,7 +87,7 @@ class States(Sequence[State]):
         self._numbers: dict[bytes, int] = {}
 
     def add(self, state: State) -> int:
-        """Its number; the next one if there is no such state yet."""
+        """Return the number of a state. A new state gets the next number."""
         row = self._form.pack(*state)
         number = self._numbers.setdefault(row, len(self._rows))
         if number == len(self._rows):
@@ -107,12 +108,12 @@ class States(Sequence[State]):
 
 
 class Followers(Sequence[ByTimer]):
-    """What follows each state, by timer: the numbers of one after the other, each timer's behind how many they are."""
+    """The successors of each state by timer, in one flat array. The successors of a timer follow their count."""
 
     def __init__(self) -> None:
         self._flat = array("i")
         self._ends = array("q", [0])
-        """What follows state n is in `_flat`, from `_ends[n]` up to `_ends[n + 1]`."""
+        """The successors of state n are in `_flat` from `_ends[n]` up to `_ends[n + 1]`."""
 
     def append(self, by_timer: ByTimer) -> None:
         for after in by_timer:

@@ -1,7 +1,7 @@
-"""Every global state that can be reached, breadth first: so the first that has a flaw is as near as any.
+"""Explore all reachable global states, breadth first. The first state with a flaw is therefore a nearest one.
 
-Of each state it is also kept where it goes on losing nothing and with no new block (`quiet`), for
-`../questions/convergence.py`.
+The graph also keeps the successors of each state without losses and new blocks (`quiet`), for
+`../questions/_convergence.py`.
 """
 
 from array import array
@@ -11,7 +11,7 @@ from functools import partial
 
 from harness.proof._progress_bar import LOOK_EVERY, Budget, Ended, GivenUpError, Progress
 from harness.proof.graph._expansion import Expansion, Followers, States, cycles_left_alone, expanded
-from harness.proof.graph._workers import Crew
+from harness.proof.graph._workers import Workers
 from harness.proof.model._flaws import Flaw
 from harness.proof.model._global_states import State, Swarm
 
@@ -20,10 +20,9 @@ NO_PARENT = -1
 
 @dataclass
 class Graph:
-    """The states by number, and how each was come to first. `ended` is "complete" if there are no others.
+    """The explored states by number, and the parent of each. `ended` is "complete" if these are all reachable states.
 
-    `quiet` has for each state and each timer that may end next the states that may follow if nobody loses anything, and
-    `crossing` those that may follow if several end at once: both as `Expansion` has them.
+    `quiet` and `crossing` have the fields `by_timer` and `crossing` of the expansion of each state.
     """
 
     swarm: Swarm
@@ -38,11 +37,11 @@ class Graph:
     ended: Ended = "complete"
     flawed: int | None = None
     shown: dict[str, int] = field(default_factory=dict)
-    """The first state, by characteristic, after each of what a captor can do that is no flaw of the agents."""
-    crew_bytes: float = 0.0
-    crew_s: float = 0.0
-    crew_steps: int = 0
-    """Memory and processor time of other processes, and the steps that they have computed."""
+    """Characteristic -> first state in which an attacker has violated it without a flaw of the agents."""
+    workers_bytes: float = 0.0
+    workers_s: float = 0.0
+    workers_steps: int = 0
+    """Memory and processor time of the workers, and the number of steps that they have computed."""
 
     def __post_init__(self) -> None:
         self.states = States(self.swarm.bounds.agents)
@@ -52,7 +51,7 @@ class Graph:
         return None if self.flawed is None else self.swarm.flaw(self.states[self.flawed])
 
     def reach(self, state: State, parent: int) -> int:
-        """Its number; a new one if it is new. It should have no flaw."""
+        """Return the number of a state. A new state is added, and checked for flaws."""
         number = self.states.add(state)
         if number == len(self.parents):
             self.parents.append(parent)
@@ -64,7 +63,7 @@ class Graph:
         return number
 
     def take_in(self, expansion: Expansion) -> None:
-        """What follows the next state of which that is not known yet."""
+        """Add the expansion of the next state."""
         number = len(self.quiet)
         self.transitions += expansion.ways
         self.quiet.append(expansion.by_timer)
@@ -75,7 +74,7 @@ class Graph:
         return Progress(len(self.states), self.looked_at, self.transitions, self.depth, seconds, asked)
 
     def path(self, number: int) -> list[int]:
-        """The states on the way to this one, from the beginning."""
+        """Return the states on the path to this one, from the initial state."""
         path = [number]
         while (parent := self.parents[path[-1]]) != NO_PARENT:
             path.append(parent)
@@ -88,18 +87,18 @@ def explore(
     *,
     most_bytes: float,
     most_s: float,
-    crew: Crew | None = None,
+    workers: Workers | None = None,
     watch: Callable[[Progress], None] = lambda progress: None,
 ) -> Graph:
-    """All states, or as many as memory and time allow, or up to the first that has a flaw.
+    """Explore all states, or as many as memory and time allow, or up to the first state with a flaw.
 
-    What comes out is the same whether there is a crew or not.
+    The result is the same with and without workers.
     """
     graph, budget = Graph(swarm), Budget(most_bytes, most_s)
     try:
-        for progress in _all(graph, budget, crew):
+        for progress in _all(graph, budget, workers):
             watch(progress)
-            ended = "flaw" if graph.flawed is not None else budget.ended(graph.crew_bytes)
+            ended = "flaw" if graph.flawed is not None else budget.ended(graph.workers_bytes)
             if ended is not None:
                 graph.ended = ended
                 break
@@ -111,10 +110,10 @@ def explore(
     return graph
 
 
-def _all(graph: Graph, budget: Budget, crew: Crew | None) -> Iterator[Progress]:
+def _all(graph: Graph, budget: Budget, workers: Workers | None) -> Iterator[Progress]:
     graph.reach(graph.swarm.initial, NO_PARENT)
     layer_ends = 1
-    for looked_at, expansion in enumerate(_expansions(graph, budget, crew), 1):
+    for looked_at, expansion in enumerate(_expansions(graph, budget, workers), 1):
         graph.take_in(expansion)
         graph.looked_at = looked_at
         if looked_at == layer_ends:
@@ -124,13 +123,22 @@ def _all(graph: Graph, budget: Budget, crew: Crew | None) -> Iterator[Progress]:
             yield graph.progress(budget.seconds)
 
 
-def _expansions(graph: Graph, budget: Budget, crew: Crew | None) -> Iterator[Expansion]:
-    """What follows each state, in order, also of those that are reached meanwhile; by a crew if it is many."""
+def _expansions(graph: Graph, budget: Budget, workers: Workers | None) -> Iterator[Expansion]:
+    """Yield the expansion of each state in order, also of states that are added meanwhile.
+
+    Workers compute many states.
+    """
     swarm, states, looked_at = graph.swarm, graph.states, 0
     while looked_at < len(states):
-        if crew is not None and crew.is_worth_it(len(states) - looked_at):
-            for expansion in crew.expansions(states, looked_at, graph.reach, lambda: budget.check(crew.memory_bytes)):
-                graph.crew_bytes, graph.crew_s, graph.crew_steps = crew.memory_bytes, crew.processor_s, crew.steps
+        if workers is not None and workers.pays_off(len(states) - looked_at):
+            for expansion in workers.expansions(
+                states, looked_at, graph.reach, lambda: budget.check(workers.memory_bytes)
+            ):
+                graph.workers_bytes, graph.workers_s, graph.workers_steps = (
+                    workers.memory_bytes,
+                    workers.processor_s,
+                    workers.steps,
+                )
                 yield expansion
             return
         yield expanded(swarm, states[looked_at], partial(graph.reach, parent=looked_at))

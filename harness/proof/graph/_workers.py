@@ -1,8 +1,11 @@
-"""All cores look at states, and at what more votes do: forked processes, with the agents and steps known by then.
+"""Explore states and further votes on all cores.
 
-Each goes on to number local states and zones as it comes upon them. So what one tells another it tells by the other's
-number where it knows it, and else by its own, the first time with what that number stands for. Who is told of states
-hands them out in their order and takes in what follows them in that order: so all comes out as in one process.
+The workers are forked processes. Each starts with the agents and steps that are known at the fork, and continues to
+number local states and zones itself. A message between two processes uses the receiver's number if the sender knows it.
+Otherwise it uses the sender's number, the first time together with its definition.
+
+The main process distributes the states in order, and adds their successors in the same order. The result is therefore
+the same as with one process.
 """
 
 import time
@@ -20,104 +23,108 @@ from harness.proof.model._block_renaming import Completed
 from harness.proof.model._global_states import AGENTS, ZONE, State, Swarm
 from harness.proof.model._known_states import DEAD
 from harness.proof.questions._attractor import Check
-from harness.proof.questions._extra_votes import UndecidedError, Votes
+from harness.proof.questions._extra_votes import ExtraVotes, UndecidedError
 from harness.run.parallel import FailedTask, Worker, signals_blocked
 
 WAIT_S = 0.5
-"""So long it is waited for an answer until memory and time are looked at once more."""
-WORTH_A_CREW = 500
-"""So many states that have not been looked at are shared among the cores."""
+"""Maximum time in seconds to wait for an answer before memory and time are checked again."""
+WORTH_WORKERS = 500
+"""Minimum number of unexplored states at which the workers are used."""
 CHUNK = 100
-"""So many states, at most, are looked at before they are told of."""
-MOST_TOLD = 500_000
-"""A process remembers so many states that it has told of; then it tells of them again."""
+"""Maximum number of states in one task of a worker."""
+MAX_REPORTED = 500_000
+"""Maximum number of reported states that a worker remembers.
 
-News = list[tuple[int, Any]]
-"""Numbers of whoever tells, and what they stand for."""
+Above it, the worker forgets them and reports them again.
+"""
+
+Definitions = list[tuple[int, Any]]
+"""Numbers of the sender, with their definitions."""
 
 
-class Told(NamedTuple):
-    """What one process tells another: `states` one after the other, and what must be known to read them."""
+class StateBatch(NamedTuple):
+    """States that one process sends to another, as a flat array, with the definitions that are needed to read them."""
 
-    locals: News
-    zones: News
+    locals: Definitions
+    zones: Definitions
     completed: list[Completed]
     states: "array[int]"
 
 
 class Forks(NamedTuple):
-    """States at rest with several chains, to be told how many more votes they need."""
+    """Idle states with several chains. The worker returns the number of votes that each one needs."""
 
-    told: Told
+    batch: StateBatch
 
 
-class Following(NamedTuple):
-    """What follows some states. `told` has those that follow and that this process has not told of before, in order.
+class Successors(NamedTuple):
+    """The successors of some states. `batch` has the successors that this worker has not reported before, in order.
 
-    `expansions` has for each state how many of them are its own, and what follows it, by where that was told.
+    `expansions` has for each state the number of new successors in `batch`, and its expansion with the worker's
+    numbers.
     """
 
-    told: Told
+    batch: StateBatch
     expansions: list[tuple[int, Expansion]]
 
 
-class Needed(NamedTuple):
-    """How many more votes some forks need, as `Votes` says it; None if that is not decided."""
+class NeededVotes(NamedTuple):
+    """The number of votes that each fork needs, as `ExtraVotes` returns it. None if it is not decided."""
 
     votes: list[int | None] | None
 
 
 class Answer(NamedTuple):
-    """And what the process has taken until now."""
+    """An answer of a worker, with the resources that the worker has used so far."""
 
-    answer: Following | Needed
+    answer: Successors | NeededVotes
     memory_bytes: float
     processor_s: float
     steps: int
 
 
-class _Numbers:
-    """The numbers that two processes have for the same things, as one of them sees it: equal up to `alike`."""
+class _NumberTranslator:
+    """The mapping between the numbers of two processes, in one of them. Numbers below `alike` are equal in both."""
 
     def __init__(self, alike: int, content: Callable[[int], Any], adopt: Callable[[Any], int]) -> None:
         self._content = content
         self._adopt = adopt
         self._codes: dict[int, int] = {DEAD: DEAD, **{number: number for number in range(alike)}}
         self._ours: dict[int, int] = {}
-        self._news: News = []
+        self._new_definitions: Definitions = []
 
     def code(self, ours: int) -> int:
-        """The number that the other has for it; or less than -1: ours."""
+        """Return the other process's number for our number. Values below -1 stand for our own number."""
         code = self._codes.get(ours)
         if code is None:
             code = self._codes[ours] = -ours - 2
-            self._news.append((ours, self._content(ours)))
+            self._new_definitions.append((ours, self._content(ours)))
         return code
 
     def ours(self, code: int) -> int:
         return code if code >= DEAD else self._ours[-code - 2]
 
-    def news(self) -> News:
-        news, self._news = self._news, []
-        return news
+    def definitions(self) -> Definitions:
+        definitions, self._new_definitions = self._new_definitions, []
+        return definitions
 
-    def learn(self, news: News) -> None:
-        for theirs, content in news:
+    def learn(self, definitions: Definitions) -> None:
+        for theirs, content in definitions:
             ours = self._ours[theirs] = self._adopt(content)
             self._codes.setdefault(ours, theirs)
 
 
-class _Line:
-    """The line between two processes that were one when it was laid, as one of them sees it."""
+class _StateTranslator:
+    """One end of the connection between two processes. It translates the numbers of states."""
 
     def __init__(self, swarm: Swarm) -> None:
         local, zones = swarm.local, swarm.zones
         self._swarm = swarm
-        self._locals = _Numbers(len(local.known), local.content, local.adopt)
-        self._zones = _Numbers(len(zones), zones.matrix, zones.adopt)
+        self._locals = _NumberTranslator(len(local.known), local.content, local.adopt)
+        self._zones = _NumberTranslator(len(zones), zones.matrix, zones.adopt)
         self._completed = len(local.blocks.completed)
 
-    def told(self, states: Sequence[State]) -> Told:
+    def encode(self, states: Sequence[State]) -> StateBatch:
         flat = array("q")
         for state in states:
             flat.extend(state[:ZONE])
@@ -125,15 +132,15 @@ class _Line:
             flat.extend(map(self._locals.code, state[AGENTS:]))
         completed = self._swarm.local.blocks.completed[self._completed :]
         self._completed += len(completed)
-        return Told(self._locals.news(), self._zones.news(), completed, flat)
+        return StateBatch(self._locals.definitions(), self._zones.definitions(), completed, flat)
 
-    def heard(self, told: Told) -> list[State]:
-        """The states, by our numbers."""
-        self._swarm.local.blocks.note_completed(told.completed)
+    def decode(self, batch: StateBatch) -> list[State]:
+        """Return the states with our numbers."""
+        self._swarm.local.blocks.note_completed(batch.completed)
         self._completed = len(self._swarm.local.blocks.completed)
-        self._locals.learn(told.locals)
-        self._zones.learn(told.zones)
-        flat, size = told.states, AGENTS + self._swarm.bounds.agents
+        self._locals.learn(batch.locals)
+        self._zones.learn(batch.zones)
+        flat, size = batch.states, AGENTS + self._swarm.bounds.agents
         return [
             (
                 *flat[at : at + ZONE],
@@ -144,71 +151,71 @@ class _Line:
         ]
 
 
-class _Hand:
-    """In a process of its own: looks at the states that it is told of."""
+class _WorkerFunction:
+    """The function of a worker process. It returns the successors or votes of the states in a task."""
 
     def __init__(self, swarm: Swarm) -> None:
         self._swarm = swarm
-        self._line = _Line(swarm)
-        self._told: dict[State, int] = {}
-        self._telling = count()
-        self._votes = Votes(swarm)
+        self._translator = _StateTranslator(swarm)
+        self._reported: dict[State, int] = {}
+        self._next_number = count()
+        self._votes = ExtraVotes(swarm)
 
-    def __call__(self, task: Told | Forks) -> Answer:
+    def __call__(self, task: StateBatch | Forks) -> Answer:
         answer = self._needed(task) if isinstance(task, Forks) else self._following(task)
         return Answer(answer, memory_bytes(), time.process_time(), self._swarm.local.steps)
 
-    def _following(self, task: Told) -> Following:
+    def _following(self, task: StateBatch) -> Successors:
         fresh: list[State] = []
-        if len(self._told) >= MOST_TOLD:
-            self._told.clear()
+        if len(self._reported) >= MAX_REPORTED:
+            self._reported.clear()
 
         def number_of(state: State) -> int:
-            number = self._told.get(state)
+            number = self._reported.get(state)
             if number is None:
-                number = self._told[state] = next(self._telling)
+                number = self._reported[state] = next(self._next_number)
                 fresh.append(state)
             return number
 
         expansions = []
-        for state in self._line.heard(task):
+        for state in self._translator.decode(task):
             known = len(fresh)
             expansion = expanded(self._swarm, state, number_of)
             expansions.append((len(fresh) - known, expansion))
-        return Following(self._line.told(fresh), expansions)
+        return Successors(self._translator.encode(fresh), expansions)
 
-    def _needed(self, task: Forks) -> Needed:
-        self._told.clear()  # nobody asks what follows any more
+    def _needed(self, task: Forks) -> NeededVotes:
+        self._reported.clear()  # there are no further tasks for successors
         try:
-            return Needed([self._votes.needed(fork) for fork in self._line.heard(task.told)])
+            return NeededVotes([self._votes.needed(fork) for fork in self._translator.decode(task.batch)])
         except UndecidedError:
-            return Needed(None)
+            return NeededVotes(None)
 
 
-class _Other:
-    """One of the processes, as seen from here."""
+class _WorkerHandle:
+    """A worker process, in the main process."""
 
     def __init__(self, swarm: Swarm) -> None:
         self.memory_bytes = 0.0
         self.processor_s = 0.0
         self.steps = 0
-        self._born_with = swarm.local.steps
-        self._line = _Line(swarm)
-        self._worker: Worker[Told | Forks, Answer] = Worker(_Hand(swarm))
+        self._steps_at_fork = swarm.local.steps
+        self._translator = _StateTranslator(swarm)
+        self._worker: Worker[StateBatch | Forks, Answer] = Worker(_WorkerFunction(swarm))
         self._numbers: list[int] = []
-        """Of each state that it has told of, here."""
+        """The main process's numbers of the states that the worker reported, in order of the reports."""
 
     @property
     def connection(self) -> Connection:
         return self._worker.connection
 
     def give(self, states: Sequence[State]) -> None:
-        self._worker.connection.send(self._line.told(states))
+        self._worker.connection.send(self._translator.encode(states))
 
     def give_forks(self, states: Sequence[State]) -> None:
-        self._worker.connection.send(Forks(self._line.told(states)))
+        self._worker.connection.send(Forks(self._translator.encode(states)))
 
-    def receive(self) -> Following | Needed:
+    def receive(self) -> Successors | NeededVotes:
         try:
             answer = self._worker.connection.recv()
         except EOFError:
@@ -222,92 +229,95 @@ class _Other:
         assert isinstance(answer, Answer)
         self.memory_bytes = answer.memory_bytes
         self.processor_s = answer.processor_s
-        self.steps = answer.steps - self._born_with
+        self.steps = answer.steps - self._steps_at_fork
         return answer.answer
 
-    def taken_in(self, answer: Following, first: int, add: Callable[[State, int], int]) -> Iterator[Expansion]:
-        """What follows each of the states from number `first` on; new states are added with `add`."""
-        fresh = iter(self._line.heard(answer.told))
+    def expansions_of(self, answer: Successors, first: int, add: Callable[[State, int], int]) -> Iterator[Expansion]:
+        """Yield the expansion of each state from number `first` on. `add` adds new states to the graph."""
+        fresh = iter(self._translator.decode(answer.batch))
         numbers = self._numbers
         for parent, (new, expansion) in enumerate(answer.expansions, first):
             for _ in range(new):
                 numbers.append(add(next(fresh), parent))
             yield Expansion(
                 expansion.ways,
-                tuple(tuple(numbers[told] for told in after) for after in expansion.by_timer),
-                tuple(numbers[told] for told in expansion.crossing),
+                tuple(tuple(numbers[reported] for reported in after) for after in expansion.by_timer),
+                tuple(numbers[reported] for reported in expansion.crossing),
             )
 
     def stop(self) -> None:
         self._worker.stop()
 
 
-Give = Callable[["_Other", Sequence[State]], None]
+Give = Callable[["_WorkerHandle", Sequence[State]], None]
 
 
-class Crew:
-    """So many processes, from when they are first asked; a context at whose end they are stopped."""
+class Workers:
+    """`size` worker processes. They start at the first task, and stop at the end of the context."""
 
     def __init__(self, swarm: Swarm, size: int) -> None:
         self._swarm = swarm
         self._size = size
-        self._others: list[_Other] = []
+        self._handles: list[_WorkerHandle] = []
 
-    def __enter__(self) -> "Crew":
+    def __enter__(self) -> "Workers":
         return self
 
     def __exit__(self, *_: object) -> None:
-        for other in self._others:
+        for other in self._handles:
             other.stop()
 
     @property
     def memory_bytes(self) -> float:
-        return sum(other.memory_bytes for other in self._others)
+        return sum(other.memory_bytes for other in self._handles)
 
     @property
     def processor_s(self) -> float:
-        return sum(other.processor_s for other in self._others)
+        return sum(other.processor_s for other in self._handles)
 
     @property
     def steps(self) -> int:
-        """That they have computed."""
-        return sum(other.steps for other in self._others)
+        """Number of steps that the workers have computed."""
+        return sum(other.steps for other in self._handles)
 
-    def is_worth_it(self, waiting: int) -> bool:
-        """Whether to ask it, if so many states wait."""
-        return self._size > 1 and waiting >= WORTH_A_CREW
+    def pays_off(self, waiting: int) -> bool:
+        """Return whether to use the workers for this number of waiting states."""
+        return self._size > 1 and waiting >= WORTH_WORKERS
 
     def expansions(
         self, states: Sequence[State], first: int, add: Callable[[State, int], int], check: Check = lambda: None
     ) -> Iterator[Expansion]:
-        """What follows each of `states` from number `first` on, in order, also of those that are added meanwhile."""
-        for other, number, answer in self._answers(_Other.give, states, check, first):
-            assert isinstance(answer, Following)
-            yield from other.taken_in(answer, number, add)
+        """Yield the expansion of each state from number `first` on, in order. `states` may grow meanwhile."""
+        for other, number, answer in self._answers(_WorkerHandle.give, states, check, first):
+            assert isinstance(answer, Successors)
+            yield from other.expansions_of(answer, number, add)
 
     def needed(self, forks: Sequence[State], check: Check) -> Iterator[int | None]:
-        """How many more votes each of these states needs, as `Votes` says it. Raises UndecidedError."""
-        for _, _, answer in self._answers(_Other.give_forks, forks, check):
-            assert isinstance(answer, Needed)
+        """Yield the number of votes that each state needs, as `ExtraVotes` returns it. Raises UndecidedError."""
+        for _, _, answer in self._answers(_WorkerHandle.give_forks, forks, check):
+            assert isinstance(answer, NeededVotes)
             if answer.votes is None:
                 raise UndecidedError
             yield from answer.votes
 
     def _answers(
         self, give: Give, states: Sequence[State], check: Check, first: int = 0
-    ) -> Iterator[tuple[_Other, int, Following | Needed]]:
-        """Each with whose it is and the first state that it is of; in order, also of states added meanwhile."""
-        if not self._others:
-            with signals_blocked():  # what a fork calls lets no Ctrl-C out
-                self._others = [_Other(self._swarm) for _ in range(self._size)]
-        idle = deque(self._others)
-        busy: dict[int, _Other] = {}
-        answers: dict[int, tuple[_Other, Following | Needed]] = {}
+    ) -> Iterator[tuple[_WorkerHandle, int, Successors | NeededVotes]]:
+        """Yield each answer with its worker and the number of its first state, in order.
+
+        `states` may grow meanwhile.
+        """
+        if not self._handles:
+            with signals_blocked():  # a Ctrl-C inside a fork must not end it halfway
+                self._handles = [_WorkerHandle(self._swarm) for _ in range(self._size)]
+        idle = deque(self._handles)
+        busy: dict[int, _WorkerHandle] = {}
+        answers: dict[int, tuple[_WorkerHandle, Successors | NeededVotes]] = {}
         due: deque[int] = deque()
         given = first
         while True:
             while idle and given < len(states):
-                size = min(CHUNK, max(1, (len(states) - given) // (2 * len(self._others))))
+                size = min(CHUNK, max(1, (len(states) - given) // (2 * len(self._handles))))
                 other = busy[given] = idle.popleft()
                 give(other, states[given : given + size])
                 due.append(given)
@@ -319,13 +329,13 @@ class Crew:
                 other = busy.pop(number)
                 answers[number] = other, other.receive()
                 idle.append(other)
-            if due[0] in answers and not (idle and given < len(states)):  # nobody waits until this is taken in
+            if due[0] in answers and not (idle and given < len(states)):  # first give tasks to all idle workers
                 number = due.popleft()
                 other, answer = answers.pop(number)
                 yield other, number, answer
 
 
-def _answered(busy: Mapping[int, _Other], *, wait_for_one: bool) -> list[int]:
-    """Those of the questions, by the number of their first state, that are answered; none if that takes long."""
+def _answered(busy: Mapping[int, _WorkerHandle], *, wait_for_one: bool) -> list[int]:
+    """Return the answered tasks by the number of their first state. Empty if no answer arrives within WAIT_S."""
     ready = wait([other.connection for other in busy.values()], timeout=WAIT_S if wait_for_one else 0)
     return [number for number, other in busy.items() if other.connection in ready]

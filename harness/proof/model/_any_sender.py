@@ -1,10 +1,12 @@
-"""The network `any`: each agent by itself, against all that anybody could ever have said.
+"""Explore each agent alone in the network `any`, with all messages that any agent can ever have sent.
 
-A message may be lost, be heard twice, take any time and overtake others. So an agent can hear, at any moment and as
-often as it likes, whatever somebody has sent, and depends on the others in no other way; only of its own block nobody
-speaks before it has completed it. Local states of each agent and messages that are sent are collected together until
-there are no more: whatever any run can show is among them, and maybe more, for not all of these messages need have been
-sent in one run. What holds of all of them holds; what does not is not shown.
+A message may be lost, duplicated, delayed for any time and overtaken. An agent can therefore receive each sent message
+at any moment, any number of times, and depends on other agents in no other way. The only exception: no agent can
+mention a block before it is completed.
+
+The local states of each agent and the sent messages are collected together until no new ones appear. The result
+contains everything that a run can show. It may contain more, because one run need not be able to send all these
+messages. A property that holds for all of them holds. If it does not, a violation is not shown.
 """
 
 import time
@@ -12,7 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from harness.proof._progress_bar import Ended, Progress, memory_bytes
-from harness.proof.attacker._attacker import Heard
+from harness.proof.attacker._attacker import AttackerKnowledge
 from harness.proof.attacker._forgeries import Material
 from harness.proof.bounds import Bounds
 from harness.proof.model._flaws import Flaw
@@ -24,14 +26,14 @@ from harness.proof.model._zones import NOTHING_RUNS, Zones
 LOOK_EVERY = 500
 
 Alone = tuple[int, int, int, int]
-"""An agent by itself: its ID, local state, zone, and how many of its own blocks it has completed."""
+"""A single agent: its ID, local state, zone, and number of its own completed blocks."""
 Said = tuple[int, int]
-"""A sender and a message."""
+"""The number of a sender and the number of a message."""
 
 
 @dataclass
 class Collected:
-    """What was collected, over all ways to divide the blocks among the agents. `said` counts messages by sender."""
+    """The collected figures, over all divisions of the blocks among the agents. `said` counts messages by sender."""
 
     bounds: Bounds
     states: int = 0
@@ -46,9 +48,9 @@ class Collected:
     ended: Ended = "complete"
     flaw: Flaw | None = None
     way: list[str] = field(default_factory=list)
-    """What the agent with the flaw did and heard before."""
+    """The earlier actions and received messages of the agent with the flaw."""
     shown: set[str] = field(default_factory=set)
-    """Characteristics that a captor violates though no agent does anything wrong."""
+    """Characteristics that an attacker violates without a flaw of the agents."""
 
 
 def collect(
@@ -59,9 +61,9 @@ def collect(
     watch: Callable[[Progress], None] = lambda progress: None,
     keep: Callable[[LocalStates], None] = lambda local: None,
 ) -> Collected:
-    """All local states, and all messages, or as many as memory and time allow, or up to the first flaw.
+    """Collect all local states and messages, or as many as memory and time allow, or up to the first flaw.
 
-    `keep` is given the local states of each way to divide the blocks.
+    `keep` is called with the local states of each division of the blocks.
     """
     collected, began = Collected(bounds), time.monotonic()
     try:
@@ -91,7 +93,10 @@ def collect(
 
 
 def divisions(agents: int, blocks: int, captured: int | None = None) -> Iterator[tuple[int, ...]]:
-    """Who completes which block, in the order of the blocks; agents are numbered as they come, but for the captured."""
+    """Yield each division of the blocks: the agents that complete them in order.
+
+    Agents that are alike are interchangeable, except the captured one.
+    """
     others = [agent_id for agent_id in range(1, agents + 1) if agent_id != captured]
     begun: list[tuple[int, ...]] = [()]
     for _ in range(blocks):
@@ -104,7 +109,7 @@ def divisions(agents: int, blocks: int, captured: int | None = None) -> Iterator
 
 
 class _Division:
-    """The agents when it is settled who completes which block."""
+    """The exploration of one division of the blocks among the agents."""
 
     def __init__(self, collected: Collected, makers: tuple[int, ...]) -> None:
         self._collected = collected
@@ -119,15 +124,18 @@ class _Division:
         self._said: dict[Said, None] = {}
         self._names: dict[int, frozenset[int]] = {}
         self._by_agent: dict[int, list[Alone]] = {agent_id: [] for agent_id in self._own if agent_id != bounds.captured}
-        self._heard = None if bounds.captured is None else Heard(bounds, self._own[bounds.captured])
-        """What a captor has heard, who can speak at any moment; the blocks of its vehicle it has from the beginning."""
+        self._heard = None if bounds.captured is None else AttackerKnowledge(bounds, self._own[bounds.captured])
+        """The knowledge of the attacker, who can send at any moment.
+
+        It has the blocks of its vehicle from the beginning.
+        """
         self._lied: dict[int, tuple[Material, int]] = {}
-        """Of each agent: with what the captor spoke to it last, and to how many of its states."""
+        """Agent -> material of the last attack messages to it, and number of its states that have received them."""
         self._looked_at = 0
-        """States whose own steps have been taken."""
+        """Number of states whose own actions have been explored."""
 
     def collect(self, began: float) -> Iterator[Progress]:
-        """Until there is no more."""
+        """Collect states and messages until no new ones appear."""
         collected = self._collected
         earlier = collected.states
         for agent_id in self._by_agent:
@@ -188,7 +196,7 @@ class _Division:
             collected.shown.add("4")
 
     def _act(self, state: Alone) -> None:
-        """What the agent may do of its own."""
+        """Explore the actions of an agent that need no message."""
         agent_id, local, zone, completed = state
         if self._known_flaw(local):
             return
@@ -219,13 +227,13 @@ class _Division:
             self._heard.hears(said[0], self.local.messages[said[1]])
 
     def _lied_to(self, agent_id: int, states: list[Alone]) -> bool:
-        """The captor says all that it can to the agent in each of these states; whether it had not done so before."""
+        """Give an agent all messages of the attacker in each of these states. Return whether any of them is new."""
         if self._heard is None:
             return False
         material, before = self._heard.material(agent_id), self._lied.get(agent_id)
         told = 0 if before is None or before[0] != material else before[1]
         for state in states[told:]:
-            for message in self._heard.letters(self.local.state(state[1]), material):
+            for message in self._heard.forgeries(self.local.state(state[1]), material):
                 self._lie(state, self.local.message(message))
         self._lied[agent_id] = material, len(states)
         return told < len(states)
@@ -244,7 +252,7 @@ class _Division:
         return self.local.known[local].flaw is not None
 
     def _named(self, message: int) -> frozenset[int]:
-        """The blocks that must have been completed for the message to be sent: it names them, or a chain of them."""
+        """Return the blocks that must be completed before a message that contains or implies them."""
         named = self._names.get(message)
         if named is None:
             named = self._names[message] = self.local.blocks.named_in(self.local.messages[message])

@@ -1,7 +1,7 @@
-"""Which blocks a local state is about, and the same state when other blocks stand for these.
+"""Find the blocks that a local state contains, and exchange them for other blocks.
 
-Agents ask of blocks whether they are the same, and of two whether one is older only in a tie of phase 2 (Algorithm 15).
-Where any may be the older (`Bounds.clocks_any`) it makes no difference which block is which.
+Agents compare blocks for equality. Only a tie of phase 2 (Algorithm 15) compares their ages. If any of two blocks may
+be the older one (`Bounds.clocks_any`), the identity of blocks makes no difference.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -13,28 +13,28 @@ from ucp.chain import Chain
 from ucp.messages import Message
 
 Ordinals = tuple[int, ...]
-"""Blocks by number: the how manieth of all it is."""
+"""Ordinals of blocks: the number of each block among all completed blocks."""
 Completed = tuple[bytes, int, int]
-"""A block that was completed: its hash, of whom, by the agent's number here, and its number."""
+"""A completed block: its hash, the number of its agent, and its ordinal."""
 
 
 class Blocks:
-    """The blocks and chains that were come upon, by number and by hash."""
+    """The known blocks and chains, by number and by hash."""
 
     def __init__(self, inception: InceptionBlock, make: Callable[[int], Block]) -> None:
         self.numbers: dict[bytes, int] = {}
-        """Of a block, by its hash."""
+        """Block hash -> ordinal."""
         self.makers: dict[bytes, int] = {}
-        """Who completed it, by its hash."""
+        """Block hash -> agent that completed the block."""
         self.completed: list[Completed] = []
-        """As they were."""
+        """The completed blocks in the order in which they became known."""
         self._inception = inception
         self._chains: dict[bytes, Ordinals] = {inception.chain_hash: ()}
-        """The blocks of a chain, the oldest first, by its chain hash."""
+        """Chain hash -> ordinals of the chain's blocks, the oldest first."""
         self._block = cache(make)
 
     def note_completed(self, blocks: Iterable[Completed]) -> None:
-        """These blocks were completed, here or in another process."""
+        """Add blocks that were completed in this or another process."""
         for block_hash, agent_id, ordinal in blocks:
             if block_hash not in self.makers:
                 self.makers[block_hash] = agent_id
@@ -42,11 +42,11 @@ class Blocks:
                 self.completed.append((block_hash, agent_id, ordinal))
 
     def completed_by(self, agent_id: int, ordinal: int) -> bytes:
-        """The hash of the `ordinal`th block of all, which this agent has completed."""
+        """Return the hash of the block with this ordinal, which this agent has completed."""
         return next(made for made, maker, number in self.completed if (maker, number) == (agent_id, ordinal))
 
     def in_words(self, block_hash: str) -> str:
-        """A block for people, by its hash."""
+        """Return the name of a block for messages, by its hash."""
         ordinal = self.numbers.get(bytes.fromhex(block_hash))
         return f"#{ordinal}" if ordinal else block_hash[:12]
 
@@ -59,19 +59,23 @@ class Blocks:
         self._chains[chain_hash] = ordinals
 
     def named(self, digest: bytes) -> Ordinals:
-        """The blocks that a hash names: a block's itself, a chain's all of it; none if it is neither."""
+        """Return the ordinals of the blocks that a hash stands for: one block, or all blocks of a chain.
+
+        Empty for other hashes.
+        """
         number = self.numbers.get(digest)
         return self._chains.get(digest, ()) if number is None else (number,)
 
     def named_in(self, message: Message) -> frozenset[int]:
-        """The blocks that a message names, by themselves or as those of a chain."""
+        """Return the ordinals of the blocks that a message contains or whose chain it names."""
         fields = (getattr(message, name) for name in message.__slots__)
         hashes = [field.block_hash if isinstance(field, Block) else field for field in fields]
         return frozenset().union(*(self.named(digest) for digest in hashes if isinstance(digest, bytes)))
 
     def of(self, snapshot: Snapshot) -> Ordinals:
-        """Which blocks the state is about, each once: in an order that is the same for states that are alike but for
-        which block is which."""
+        """Yield the ordinals of the blocks in a state, in an order that is equal for states that differ only in their
+        blocks. An ordinal can occur repeatedly.
+        """
         return tuple(dict.fromkeys(self._all(snapshot)))
 
     def _all(self, snapshot: Snapshot) -> Iterable[int]:
@@ -88,7 +92,7 @@ class Blocks:
         yield from sorted(numbers[candidate] for candidate in candidates if candidate)
 
     def exchanged(self, snapshot: Snapshot, exchange: Mapping[int, int]) -> Snapshot:
-        """The state with other blocks, by number, in the place of those that it is about."""
+        """Return the state after an exchange of its blocks. `exchange` maps old ordinals to new ones."""
         us = {self._block(old).timestamp_us: self._block(new).timestamp_us for old, new in exchange.items()}
 
         def block_of(block: Block) -> Block:

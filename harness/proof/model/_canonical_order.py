@@ -1,7 +1,8 @@
-"""Of all orders of the agents one that stands for all: agents that are alike change places freely, and blocks numbers.
+"""Choose one order of the agents that represents all orders. Agents that are alike are interchangeable, and so are
+blocks.
 
-It is chosen by what the agents are and how their timers stand to each other, never by the numbers that states and zones
-have got: so it is the same on any machine, and in whatever order states were come upon.
+The order is chosen by the states of the agents and the relations of their timers, and never by the numbers of states
+and zones. It is therefore the same on all machines, and for any order of exploration.
 """
 
 from collections import defaultdict
@@ -16,13 +17,13 @@ from harness.proof.model._snapshot import NAMES_OF_OTHERS
 from harness.proof.model._zones import Zones
 
 Places = tuple[int, ...]
-"""For each place of a state the place at which its agent stood before."""
+"""The previous place of the agent at each place of a state."""
 
 
 class Ordered(NamedTuple):
-    """Agents in order, the zone with their timers in that order, and where each of them stood.
+    """Agents in order, the zone with their timers in this order, and their previous places.
 
-    `blocks` has for each block that they are about, from 1, which it was before; none if it still is what it was.
+    `blocks` has the previous ordinal of each block, from 1. It is empty if the blocks keep their ordinals.
     """
 
     agents: tuple[int, ...]
@@ -32,13 +33,16 @@ class Ordered(NamedTuple):
 
 
 MOST_KNOWN = 200_000
-"""So many orders are remembered; then they are chosen again."""
+"""Maximum number of cached orders. Above it, the cache is emptied."""
 MOST_ORDERS = 120
-"""So many orders of agents that look alike are compared; of more, states that are alike may count as several."""
+"""Maximum number of compared orders of agents that look alike.
+
+Above it, equivalent states may count as several states.
+"""
 
 
 class Order:
-    """Puts agents in order. `name_of` is what the agent at a place calls the one at another."""
+    """Puts agents into their canonical order. `name_of` returns the ID that the agent at one place uses for another."""
 
     def __init__(self, local: LocalStates, zones: Zones, name_of: Callable[[int, int], int]) -> None:
         self._as_they_are = tuple(range(local.bounds.agents))
@@ -79,13 +83,16 @@ class Order:
         return Ordered(agents, zone, places, blocks)
 
     def _blocks(self, agents: Sequence[int]) -> Ordinals:
-        """The blocks that these agents are about, as one comes upon them; none if blocks keep their numbers."""
+        """Return the ordinals of the agents' blocks in order of their occurrence.
+
+        Empty if blocks keep their ordinals.
+        """
         if not self._local.bounds.blocks_alike:
             return ()
         return tuple(dict.fromkeys(chain.from_iterable(map(self._local.about, agents))))
 
     def _timers(self, locals_: Sequence[int]) -> list[range]:
-        """For each place which of the zone's timers are its agent's."""
+        """Return the timers of each agent in the zone, by place."""
         timers, first = [], 1
         for local in locals_:
             end = first if local == DEAD else first + len(self._local.known[local].running)
@@ -94,7 +101,7 @@ class Order:
         return timers
 
     def _orders(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range]) -> Iterator[Places]:
-        """All orders of the agents by what can be said of each; those of whom the same can be said in any."""
+        """Yield all orders of the agents by their descriptions. Agents with equal descriptions come in any order."""
         known, pattern = self._local.known, self._local.pattern
         bounds = self._zones.bounds(zone) if zone else [()]
         looks: list[tuple[Any, ...]] = [
@@ -130,11 +137,11 @@ class Order:
             yield tuple(place for group in chosen for place in group)
 
     def _are_one(self, group: Sequence[int], locals_: Sequence[int], timers: Sequence[range]) -> bool:
-        """Whether agents are in one local state, without timers."""
+        """Return whether agents are in the same local state, without timers."""
         return not timers[group[0]] and len({locals_[place] for place in group}) == 1
 
     def _with_blocks(self, locals_: Sequence[int], looks: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-        """How agents look, and which others have the blocks that they are about, and where."""
+        """Return the descriptions of the agents, extended by the other agents that share their blocks."""
         ranks = {look: rank for rank, look in enumerate(sorted(set(looks)))}
         where: dict[int, list[tuple[int, int]]] = defaultdict(list)
         for local, look in zip(locals_, looks, strict=True):
@@ -148,8 +155,10 @@ class Order:
     def _change_places_freely(
         self, group: Sequence[int], timers: Sequence[range], named: Sequence[Sequence[set[int]]]
     ) -> bool:
-        """Whether agents that look alike are one as the other but for their blocks: without timers, and in nobody's
-        tally or in the same."""
+        """Return whether agents that look alike differ only in their blocks.
+
+        Then they have no timers, and are in no tally or in the same ones.
+        """
         if timers[group[0]]:
             return False
         return all(
@@ -159,18 +168,18 @@ class Order:
         )
 
     def _named(self, local: int, place: int) -> list[set[int]]:
-        """For each kind of tally whom the agent at `place` has in it, by their places."""
+        """Return, for each kind of tally, the places of its members in the state of the agent at `place`."""
         if local == DEAD:
             return [set() for _ in NAMES_OF_OTHERS]
         snapshot = self._local.known[local].snapshot
         return [{self._place_of(other, place) for other in snapshot[name]} for name in NAMES_OF_OTHERS]
 
     def _place_of(self, name: int, place: int) -> int:
-        """Whom the agent at `place` calls so."""
+        """Return the place of the agent that the agent at `place` calls by this ID."""
         return name - 2 if name - 2 < place else name - 1
 
     def _looks(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places) -> tuple[Any, ...]:
-        """What tells this order from others."""
+        """Return a key that distinguishes this order from others."""
         new_place = {old: new for new, old in enumerate(places)}
         named = [
             [sorted(new_place[other] for other in part) for part in self._named(locals_[old], old)] for old in places
@@ -182,7 +191,7 @@ class Order:
         return named, about, [[matrix[i][j] for j in order] for i in order]
 
     def _renamed(self, local: int, new: int, places: Places) -> int:
-        """The agent at its new place, calling the others by theirs."""
+        """Return the local state of an agent at its new place, with the new IDs of the other agents."""
         if local == DEAD:
             return local
         if not self._local.known[local].names_others:
@@ -195,13 +204,13 @@ class Order:
 
 
 def _groups(looks: Sequence[Any]) -> list[list[int]]:
-    """The places of those that look alike, in the order of their looks."""
+    """Return the places of agents that look alike, in the order of their descriptions."""
     in_order = sorted(range(len(looks)), key=looks.__getitem__)
     return [list(group) for _, group in groupby(in_order, looks.__getitem__)]
 
 
 def _unlike(group: Sequence[int], locals_: Sequence[int]) -> Iterator[Places]:
-    """All orders of these places that differ in the local states there."""
+    """Yield all orders of these places that differ in the local states."""
     if not group:
         yield ()
     for first in {locals_[place]: place for place in reversed(group)}.values():

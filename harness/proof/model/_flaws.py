@@ -1,4 +1,4 @@
-"""What must never be, as far as it can be seen at one agent."""
+"""The flaws that are visible in the state of one agent."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -10,10 +10,11 @@ from ucp.state import AgentState
 
 @dataclass(frozen=True, slots=True)
 class Flaw:
-    """Something that must never be: of which characteristic ("2", "3", "4"), or "hang", "crash" or "steps"; a sentence.
+    """A flaw: its kind and a sentence.
 
-    Or of a captor: what is heard in another's "name", or of a vehicle that is "revoked", and a block in the name of an
-    "honest" one. `handler` is that of a wrong step.
+    The kind is a characteristic ("2", "3", "4"), "hang", "crash" or "steps". With an attacker it can also be "name" (an
+    agent accepted a message in the name of another vehicle), "revoked" (of a revoked vehicle), or "honest" (a block in
+    the name of an honest vehicle). `handler` is the handler of a wrong step.
     """
 
     kind: str
@@ -22,13 +23,14 @@ class Flaw:
 
 
 FLAWS_OF_STEPS = ("crash", "steps", "name", "revoked")
-"""Kinds that the state after a step does not show."""
+"""Kinds of flaws that the state after a step does not show."""
 
 
 def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> Flaw | None:
-    """What is wrong with an agent's state, if anything; `completed` are all blocks by hash, and who completed each.
+    """Return the flaw of an agent's state, or None.
 
-    Blocks in the name of the agent that is `captured` need not have been completed.
+    `completed` maps each completed block hash to the agent that completed the block. Blocks in the name of the
+    `captured` agent need not have been completed.
     """
     aside = [block.block_hash for block in (*state.blocks_to_be_committed, *state.reconcile_stack)]
     chain = [block.block_hash for block in state.chain]
@@ -52,13 +54,13 @@ def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | N
 
 
 def is_deceived(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> bool:
-    """Whether the agent holds a block in the name of the one that is `captured` which that never completed."""
+    """Return whether the agent holds a block in the name of the `captured` agent that this agent never completed."""
     if captured is None:
         return False
     return any(maker == captured and made not in completed for made, maker in _makers(state).items())
 
 
 def _makers(state: AgentState) -> dict[bytes, int]:
-    """Who made the blocks that an agent holds, as these say; by hash."""
+    """Return the makers of the blocks that an agent holds, by hash, as the blocks name them."""
     held = (*state.chain, *state.blocks_to_be_committed, *state.reconcile_stack)
     return {block.block_hash: block.agent_id for block in held}

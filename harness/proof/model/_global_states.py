@@ -1,8 +1,8 @@
-"""Global states, and all that may happen next in each.
+"""Global states and their successors.
 
-A global state is how many blocks were completed, which faults are left, the zone of the timers that run, and the
-agents' local states: a tuple of small numbers. Where `bounds.alike`, agents that are alike change places freely:
-of all orders of the agents one stands for all; and where `bounds.blocks_alike` of all orders of the blocks.
+A global state is a tuple of small numbers: the completed blocks, the remaining faults, the zone of the running timers,
+and the local states of the agents. If `bounds.alike`, agents that are alike are interchangeable, and one order of the
+agents represents all orders. If `bounds.blocks_alike`, the same holds for blocks.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -10,7 +10,7 @@ from functools import lru_cache
 from itertools import combinations, permutations, product
 from typing import NamedTuple
 
-from harness.proof.attacker._attacker import Captor
+from harness.proof.attacker._attacker import Attacker
 from harness.proof.bounds import FAULTS, MAX_COINCIDENCES, MAX_LIES, Bounds
 from harness.proof.model._block_renaming import Ordinals
 from harness.proof.model._canonical_order import Order, Ordered, Places
@@ -22,40 +22,49 @@ from harness.proof.model._snapshot import Started
 from harness.proof.model._zones import NOTHING_RUNS, Zones
 
 State = tuple[int, ...]
-"""Blocks completed, what may yet befall (a bit for each fault and the capture, how many lies,
-coincidences and losses), zone, the agents."""
+"""A global state: the number of completed blocks, the remaining faults, the zone, and the local states.
+
+The remaining faults are a bit for each fault and for the capture, and the numbers of remaining lies, coincidences and
+losses.
+"""
 MOST_KNOWN = 200_000
-"""So many instants are remembered; then they are worked out again."""
+"""Maximum number of cached instants. Above it, the cache is emptied."""
 ONCE = (*FAULTS, "captured")
-"""What may befall an agent once, by the bit that says that it still may."""
+"""Faults that can happen once, by the bit that is set while they remain."""
 ALL_LEFT = -1
 LIES = 1 << len(ONCE)
-"""One more lie that may be told."""
+"""The unit of the number of remaining lies."""
 COINCIDENCES = LIES << (MAX_LIES.bit_length())
-"""One more moment that may be the same as another by chance, where that is bounded."""
+"""The unit of the number of remaining coincidences, if it is bounded."""
 LOSSES = COINCIDENCES << (MAX_COINCIDENCES.bit_length())
-"""One more message that an agent may lose, where that is bounded."""
+"""The unit of the number of remaining losses, if it is bounded."""
 ANY_NUMBER = 1 << 30
-"""Of losses."""
+"""The number of losses that stands for an unlimited number."""
 BLOCKS, LEFT, ZONE, AGENTS = 0, 1, 2, 3
-"""Where they stand in it."""
+"""The indices of the parts of a global state."""
 
 
 class Move(NamedTuple):
-    """One way on: what is done, what comes of it, and who then stands where. `wave` is the last round of hearing."""
+    """One transition: its actions, its result, and the previous places of the agents.
+
+    `wave` is the last round of received messages.
+    """
 
     actions: Actions
     state: State
     places: Places
     wave: Wave | None
     started: tuple[Started, ...]
-    """By the places before."""
+    """The started timers, by the places before the transition."""
     blocks: Ordinals
-    """Which the first, second, ... block of `state` was before; none if it still is what it was."""
+    """The previous ordinals of the blocks 1, 2, ... of `state`. Empty if they are unchanged."""
 
 
 class _Outcome(NamedTuple):
-    """Agents after an instant. `running` says of each of their timers which it was; the rest says how it came so."""
+    """The agents after an instant.
+
+    `running` has the previous number of each running timer. The other fields describe how the outcome came about.
+    """
 
     agents: tuple[int, ...]
     running: tuple[int, ...]
@@ -64,7 +73,9 @@ class _Outcome(NamedTuple):
 
 
 class _Instant(NamedTuple):
-    """What may come of agents, whatever the zone: the timers that end, blocks completed, what is left, and outcomes."""
+    """The outcomes of an instant for any zone: the expired timers, the completed blocks, the remaining faults, and the
+    agents.
+    """
 
     ended: tuple[int, ...]
     completed: int
@@ -74,10 +85,10 @@ class _Instant(NamedTuple):
 
 
 class Swarm:
-    """All global states of `bounds` are made here.
+    """The global states within `bounds`, and their successors.
 
-    `every_count`: for all local states that there are: answers are heard in every order, though they are only counted,
-    and counts are kept, though they decide nothing any more.
+    If `every_count`, all existing local states are explored: answers are received in each order although they are only
+    counted, and counts are kept although they decide nothing.
     """
 
     def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
@@ -91,20 +102,20 @@ class Swarm:
         self._as_they_are = tuple(range(bounds.agents))
         own = [1] * bounds.agents if bounds.alike else range(1, bounds.agents + 1)
         faults = sum(1 << ONCE.index(name) for name in bounds.faults if name != "duplicate")
-        self.captor = None if bounds.captured is None else Captor(bounds, self.local)
+        self.captor = None if bounds.captured is None else Attacker(bounds, self.local)
         if bounds.captured is not None:
             faults += (1 << ONCE.index("captured")) + bounds.lies * LIES
         faults += (bounds.coincidences or 0) * COINCIDENCES + (bounds.losses or 0) * LOSSES
         self.initial: State = (0, faults, NOTHING_RUNS, *(self.local.initial[agent_id] for agent_id in own))
 
-    # What an instant begins with
+    # Actions of an instant
 
     def firsts(self, state: State) -> list[Action]:
-        """The timers that may be the next to end, each in all ways in which it may."""
+        """Yield the actions of the timers that may expire next, one for each possible result."""
         return [action for actions in self._firsts(state) for action in actions]
 
     def _firsts(self, state: State) -> list[list[Action]]:
-        """The same by timer."""
+        """Return these actions grouped by timer."""
         running = self._running(state[AGENTS:])
         if not self.bounds.timers_any:
             running = tuple([running[first - 1] for first in self.zones.firsts(state[ZONE])])
@@ -114,9 +125,9 @@ class Swarm:
         ]
 
     def alternatives(self, state: State) -> Iterator[tuple[Action, frozenset[Action]]]:
-        """Each timer that may be the next to end, with those that have to end at that very moment, and itself.
+        """Yield each timer that may expire next, with all timers that must expire at the same moment, itself included.
 
-        And that for all that blocks may be to them: which of two is the older nobody can choose.
+        The ages of blocks are chosen for all results, because no agent can choose the older one of two blocks.
         """
         firsts = self._firsts(state)
         tied = [(index,) for index in range(len(firsts))] if self.bounds.timers_any else self.zones.tied(state[ZONE])
@@ -126,9 +137,10 @@ class Swarm:
                 yield actions[0], frozenset(actions)
 
     def ending(self, state: State) -> Iterator[Actions]:
-        """All sets of timers that may end in one instant, of each agent one at most; some of the sets cannot.
+        """Yield all sets of timers that may expire in one instant, with at most one timer per agent. Some sets may be
+        impossible.
 
-        Where nothing crosses they end one by one.
+        Without crossing, timers expire one by one.
         """
         by_place: dict[int, list[Action]] = {}
         for action in self.firsts(state):
@@ -141,9 +153,10 @@ class Swarm:
                         yield actions
 
     def actions(self, state: State, ending: Iterable[Actions] | None = None) -> Iterator[Actions]:
-        """All sets of what may happen in one instant: timers that end at once, and blocks completed meanwhile.
+        """Yield all sets of actions that may happen in one instant: simultaneous timers, and blocks completed
+        meanwhile.
 
-        `ending` has what there is of it, if that is known.
+        `ending` has the sets of timers, if they are known.
         """
         alive = [place for place, local in enumerate(state[AGENTS:]) if local != DEAD]
         left = self.bounds.blocks - state[BLOCKS]
@@ -171,8 +184,8 @@ class Swarm:
         if self.captor is not None:
             yield from self._of_the_captor(self.captor, state)
 
-    def _of_the_captor(self, captor: Captor, state: State) -> Iterator[Actions]:
-        """It takes the vehicle, and then says one thing after the other, which any of the agents hear."""
+    def _of_the_captor(self, captor: Attacker, state: State) -> Iterator[Actions]:
+        """Yield the actions of the attacker: the capture, and then messages one after the other, to any receivers."""
         assert self.bounds.captured is not None, "it has somebody's keys"
         if state[LEFT] >> ONCE.index("captured") & 1:
             yield (Action(self.bounds.captured - 1, "captured"),)
@@ -185,22 +198,22 @@ class Swarm:
         return self.coincidences(state, actions) <= state[LEFT] % LOSSES // COINCIDENCES
 
     def coincidences(self, state: State, actions: Sequence[Action]) -> int:
-        """How many moments have to be the same by chance for this to happen in one instant, and before all else."""
+        """Return the number of coincidences that are needed for these actions to happen next, in one instant."""
         if self.bounds.timers_any:
             return 0
         ended = self._ended(state[AGENTS:], actions)
         if not ended:
-            chosen = actions[0].what in ("captured", "lie")  # by somebody who may wait for his moment
+            chosen = actions[0].what in ("captured", "lie")  # the attacker can wait for its moment
             between = not chosen and self.zones.no_time_passes(state[ZONE])
             return len({(action.what, action.number) for action in actions}) - 1 + between
         if self.zones.after(state[ZONE], ended, ()) is None:
-            return len(actions)  # they never end at once
+            return len(actions)  # they never happen at once
         return self.zones.coincidences(state[ZONE], ended) + len(actions) - len(ended)
 
     def _unlike(self, state: State, choices: Iterable[tuple[int, ...]]) -> Iterator[tuple[int, ...]]:
-        """Of all choices of agents one for each that makes a difference: agents at rest in one state are alike.
+        """Yield one of all equivalent choices of agents.
 
-        Unless somebody has heard one of them and not the other.
+        Idle agents in the same local state are equivalent, unless a tally distinguishes them.
         """
         known = self.local.known
         locals_ = state[AGENTS:]
@@ -214,10 +227,10 @@ class Swarm:
                 seen.add(looks)
                 yield places
 
-    # What comes of it
+    # Results of an instant
 
     def after(self, state: State, actions: Actions, lossy: bool) -> Iterator[State]:
-        """The states that may come of these actions in one instant; none if their timers cannot end at once."""
+        """Yield the possible states after these actions in one instant. None if their timers cannot expire at once."""
         key = state[AGENTS:], actions, self._most_lost(state, lossy)
         instant = self._known.get(key)
         if instant is None:
@@ -231,7 +244,7 @@ class Swarm:
                 yield (state[BLOCKS] + instant.completed, still, there.zone, *there.agents)
 
     def moves(self, state: State, actions: Actions, lossy: bool) -> Iterator[Move]:
-        """The same, with how each comes about."""
+        """Yield the transitions to the possible states after these actions."""
         instant = self._instant(state[AGENTS:], actions, self._most_lost(state, lossy), tell=True)
         if self._can_be(state, instant):
             left = self._left(state, actions, instant)
@@ -242,13 +255,13 @@ class Swarm:
                 yield Move(actions, after, there.places, outcome.way.wave, outcome.started, there.blocks)
 
     def _most_lost(self, state: State, lossy: bool) -> int:
-        """So many messages may be lost in an instant."""
+        """Return the maximum number of messages that may be lost in an instant."""
         if not lossy:
             return 0
         return ANY_NUMBER if self.bounds.losses is None else state[LEFT] // LOSSES
 
     def _can_be(self, state: State, instant: _Instant) -> bool:
-        """Whether these timers can end at once, before all others; it is known that each can by itself."""
+        """Return whether these timers can expire at once, before all others. Each of them must be able to by itself."""
         if len(instant.ended) < 2 or self.bounds.timers_any:
             return True
         return self.zones.after(state[ZONE], instant.ended, ()) is not None
@@ -268,7 +281,7 @@ class Swarm:
                 yield self._order.of(outcome.agents, zone)
 
     def _left(self, state: State, actions: Sequence[Action], instant: _Instant) -> int:
-        """What may still befall."""
+        """Return the remaining faults after these actions."""
         left = (state[LEFT] & instant.left) - instant.lies * LIES
         if self.bounds.coincidences:
             left -= self.coincidences(state, actions) * COINCIDENCES
@@ -292,7 +305,10 @@ class Swarm:
         )
 
     def _running_after(self, at: dict[tuple[int, int], int], there: Agents) -> tuple[int, ...]:
-        """Of each timer that runs then which it was, or, if it has just been started, minus its duration less one."""
+        """Return the previous number of each running timer.
+
+        For a timer that was just started, return -1 minus its duration.
+        """
         running = []
         for place, local in enumerate(there.locals):
             if local == DEAD:
@@ -306,37 +322,37 @@ class Swarm:
         return tuple(running)
 
     def _ended(self, locals_: tuple[int, ...], actions: Sequence[Action]) -> tuple[int, ...]:
-        """The timers that end, from 1, in the order of the zone."""
+        """Return the expired timers, numbered from 1, in the order of the zone."""
         ended = [(action.place, action.number) for action in actions if action.what == "timer"]
         running = self._running(locals_)
         return tuple(sorted([running.index(timer) + 1 for timer in ended]))
 
     def _running_of(self, locals_: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
-        """(place, timer) of all timers that run, in the order of the zone."""
+        """Return (place, timer) of all running timers, in the order of the zone."""
         known = self.local.known
         return tuple(
             [(place, timer) for place, local in enumerate(locals_) if local != DEAD for timer in known[local].running]
         )
 
     def name_of(self, other: int, place: int) -> int:
-        """What the agent at `place` calls the one at `other`."""
+        """Return the ID that the agent at `place` uses for the one at `other`."""
         return self._instants.name_of(other, place)
 
     def order_matters(self, local: int, place: int, wave: Wave, heard: Sequence[int]) -> bool:
-        """Whether it makes a difference to the agent at `place` in which order it hears what it heard of the wave."""
+        """Return whether the order of the received messages of the wave matters to the agent at `place`."""
         return self._instants.order_matters(local, place, wave, heard)
 
-    # What is to be known of a state
+    # Properties of a state
 
     def flaw(self, state: State) -> Flaw | None:
-        """What must never be and is, at one of its agents."""
+        """Return the flaw of one of the agents, or None."""
         known = self.local.known
         return next((flaw for local in state[AGENTS:] if local != DEAD and (flaw := known[local].flaw)), None)
 
     def violated(self, state: State) -> Iterator[str]:
-        """Characteristics that a captor has violated though no agent has done anything wrong.
+        """Return the characteristics that an attacker has violated without a flaw of the agents.
 
-        Somebody believed what the vehicle never sent, or holds a block in its name that it never completed.
+        An agent accepted a message that the vehicle never sent, or holds a block in its name that it never completed.
         """
         if _lies(state) < self.bounds.lies:
             yield "1"
@@ -347,10 +363,10 @@ class Swarm:
         return all(local == DEAD or self.local.known[local].idle for local in state[AGENTS:])
 
     def chains(self, state: State) -> set[tuple[int, ...]]:
-        """The chains that there are."""
+        """Return the different chains of the agents."""
         return {self.local.known[local].chain for local in state[AGENTS:] if local != DEAD}
 
 
 def _lies(state: State) -> int:
-    """How many lies may yet be told."""
+    """Return the number of remaining lies."""
     return state[LEFT] % COINCIDENCES // LIES

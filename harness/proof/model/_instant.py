@@ -1,10 +1,11 @@
-"""What an instant makes of the agents: timers end and blocks are completed, and then all that is said of it is heard.
+"""Compute the outcomes of an instant: timers expire and blocks are completed, and then all messages are received.
 
-Some agents act, none having heard of the others yet: so their messages cross. What they send is heard, in any order
-between different senders; then what was answered to it, and so on until nobody says anything. Who loses messages may
-lose any of them. Of what an agent says of its own in one go the first is heard first; answers overtake each other.
+Some agents act before they receive messages of the others, so their messages cross. The messages are received, in any
+order of their senders. Then the answers to them are received, and so on until no agent sends a message. A lossy
+receiver may lose any of the messages. If an agent sends several messages in one action, they arrive in order. Answers
+can overtake each other.
 
-For each agent the outcomes of all orders, and of all losses, are worked out once and are mostly one or two.
+For each agent, the outcomes of all orders and all losses are computed once. Mostly there are one or two.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,25 +17,26 @@ from harness.proof.model._known_states import DEAD
 from harness.proof.model._local_steps import LocalStates
 from harness.proof.model._snapshot import Started, Step
 
-Heard = tuple[tuple[int, int], ...]
-"""What reaches an agent in one go: (sender, as the agent knows it, and message), in the order of the senders."""
+ReceivedMessages = tuple[tuple[int, int], ...]
+"""The messages that reach an agent in one round: (ID of the sender for this agent, message), in the order of senders.
+"""
 
 
 ANSWERED = 2
-"""In the first round of an instant questions are heard, in the second what is answered."""
+"""The number of the round of an instant in which answers are received. Questions are received in the round before."""
 
 
 MOST_KNOWN = 200_000
-"""So much of what may become of agents is remembered; then it is worked out again."""
+"""Maximum number of cached outcomes. Above it, the cache is emptied."""
 MOST_SEEN = 500
-"""An agent comes to fewer states by hearing what is said in one round of an instant, unless it counts for ever."""
+"""Maximum number of states that an agent can reach by one round of messages, unless it counts them without end."""
 
 
 class Action(NamedTuple):
-    """What an agent does of its own: "timer" and its number, "complete" and the block's ordinal, or a fault.
+    """An action of an agent: "timer" with its number, "complete" with the block's ordinal, or a fault.
 
-    Or what befalls it: it is "captured", or hears a "lie", a message with this number. A timer that may end in several
-    ways, as any block may be the older, ends in this `way`.
+    It can also be an action of the attacker: the agent is "captured", or receives a "lie", a message with this number.
+    If a timer has several possible results because any block may be the older one, `way` selects the result.
     """
 
     place: int
@@ -44,20 +46,20 @@ class Action(NamedTuple):
 
 
 Actions = tuple[Action, ...]
-"""What happens in one instant."""
+"""The simultaneous actions of an instant."""
 
 
 class Agents(NamedTuple):
-    """The agents, and the timers that each has started in this instant."""
+    """The local states of the agents, and the timers that each has started in this instant."""
 
     locals: tuple[int, ...]
     started: tuple[Started, ...]
 
 
 class Wave(NamedTuple):
-    """One round of hearing: what was on the air as (place of the sender, message), and what each heard of it.
+    """One round of messages: the sent messages as (place of the sender, message), and the received ones.
 
-    `heard` has for each place the numbers of what it heard in `air`, in order.
+    `heard` has, for each place, the indices of the received messages in `air`, in order.
     """
 
     before: "Wave | None"
@@ -66,9 +68,9 @@ class Wave(NamedTuple):
 
 
 class Way(NamedTuple):
-    """How agents came to be what they are in an instant: its last round of hearing.
+    """The last round of messages that leads to an outcome.
 
-    `lost`: so many messages, of each that hears of it for itself, were not heard on it; 0 where that is not counted.
+    `lost` is the number of lost messages, counted for each receiver. It is 0 if losses are not counted.
     """
 
     lost: int
@@ -76,20 +78,22 @@ class Way(NamedTuple):
 
 
 _Said = tuple[tuple[int, int], ...]
-"""What is on the air: (place of the sender, message)."""
+"""The messages of a round: (place of the sender, message)."""
 _Agent = tuple[int, int, Started]
-"""One agent: its place, its local state, and the timers that it has started in this instant."""
+"""An agent: its place, its local state, and the timers that it has started in this instant."""
 _Choice = tuple[int, Started, _Said, tuple[int, ...], int]
-"""Of one agent: its local state, what it has started, what it says, what it has heard, in order, and how much not."""
+"""A possible result for one agent: its local state, started timers, sent messages, received messages in order, and
+number of lost messages.
+"""
 
 
 _Key = TypeVar("_Key")
 _Outcome = tuple[Step, tuple[int, ...]]
-"""What becomes of an agent, and an order in which it hears what it does: positions in what reaches it."""
+"""A step of an agent, and an order of received messages that leads to it, as indices of the messages that reach it."""
 
 
 class Instants:
-    """What instants make of agents."""
+    """Computes and caches the outcomes of instants."""
 
     def __init__(self, local: LocalStates, bounds: Bounds, *, every_order: bool = False) -> None:
         self._local = local
@@ -97,7 +101,7 @@ class Instants:
         self._twice = "duplicate" in bounds.faults
         self._counts_losses = bounds.losses is not None
         self._any_order_of_counting = bounds.reduced and not self._twice and not every_order
-        self._outcomes: dict[tuple[int, Heard, bool, bool], list[_Outcome]] = {}
+        self._outcomes: dict[tuple[int, ReceivedMessages, bool, bool], list[_Outcome]] = {}
         self._choices_of: dict[tuple[_Said, bool, bool], dict[_Agent, list[_Choice]]] = {}
         self._choices_known = 0
         self._places = range(bounds.agents)
@@ -107,18 +111,21 @@ class Instants:
         ]
 
     def name_of(self, other: int, place: int) -> int:
-        """What the agent at `place` calls the one at `other`."""
+        """Return the ID that the agent at `place` uses for the one at `other`."""
         return self._names[place][other]
 
     def order_matters(self, local: int, place: int, wave: Wave, heard: Sequence[int]) -> bool:
-        """Whether it makes a difference to the agent at `place` in which order it hears what it heard of the wave."""
+        """Return whether the order of the received messages of the wave matters to the agent at `place`."""
         reached = tuple((self.name_of(wave.air[number][0], place), wave.air[number][1]) for number in sorted(heard))
         return len(self._outcomes_of(local, reached, lossy=False, answered=wave.before is not None)) > 1
 
     def outcomes(
         self, locals_: tuple[int, ...], actions: Sequence[Action], most_lost: int, *, tell: bool
     ) -> dict[Agents, Way]:
-        """All that may come of it, each in the way on which least is lost; with its rounds, if that is to be told."""
+        """Yield the outcomes of the actions, each with the fewest losses.
+
+        The rounds of messages are included if requested.
+        """
         agents, started = list(locals_), [()] * len(locals_)  # type: list[int], list[Started]
         air: list[tuple[int, int]] = []
         for action in actions:
@@ -184,7 +191,7 @@ class Instants:
     def _choices(
         self, known: dict[_Agent, list[_Choice]], agent: _Agent, said: _Said, lossy: bool, answered: bool
     ) -> list[_Choice]:
-        """What may become of this agent, from now on `known`."""
+        """Return the possible results for one agent, and cache them."""
         place, local, before = agent
         if local == DEAD:
             return [(DEAD, (), (), (), 0)]
@@ -204,7 +211,7 @@ class Instants:
         return choices
 
     def _still(self, before: Started, step: Step) -> Started:
-        """What an agent has started in this instant and still runs."""
+        """Return the timers that an agent has started in this instant and that still run."""
         if not before and not step.started:
             return ()
         if step.local == DEAD:
@@ -215,8 +222,8 @@ class Instants:
         running = self._local.known[step.local].running
         return tuple([item for item in started if item[0] in running])
 
-    def _outcomes_of(self, local: int, heard: Heard, lossy: bool, answered: bool) -> list[_Outcome]:
-        """What can become of an agent that hears these, each with an order in which it does: positions in `heard`."""
+    def _outcomes_of(self, local: int, heard: ReceivedMessages, lossy: bool, answered: bool) -> list[_Outcome]:
+        """Return the outcomes of the messages that reach an agent, each with an order of them, as indices."""
         key = local, heard, lossy, answered
         outcomes = self._outcomes.get(key)
         if outcomes is None:
@@ -238,18 +245,19 @@ class Instants:
                     for step, way in reversed(outcomes):
                         _keep_fullest(settled, step._replace(local=self._local.settled(step.local)), way)
                     outcomes = list(settled.items())
-                if lossy and not self._counts_losses:  # to lose what it says more may be several losses
+                if lossy and not self._counts_losses:  # losing the additional messages may count as several losses
                     outcomes = [outcome for outcome in outcomes if not _is_covered(outcome[0], outcomes)]
             if len(self._outcomes) >= MOST_KNOWN:
                 self._outcomes.clear()
             self._outcomes[key] = outcomes
         return outcomes
 
-    def _when_counting(self, local: int, heard: Heard, lossy: bool) -> list[_Outcome] | None:
-        """If the agent only counts what it hears, each of another sender: in which order makes no difference then.
+    def _when_counting(self, local: int, heard: ReceivedMessages, lossy: bool) -> list[_Outcome] | None:
+        """Return the outcomes if the agent only counts the messages, each of a different sender. Their order makes no
+        difference then.
 
-        None if it does more. Whether an answer is counted depends on what is no tally, and on whether its sender is in
-        the tally already (docs/explanation/proof.md).
+        None if it does more. Whether an answer counts depends on parts of the state that are no tally, and on whether
+        its sender is in the tally already (docs/explanation/proof.md).
         """
         hear, only_counts, lets_be = self._local.hear, self._local.only_counts, self._local.lets_be
         matter, others = [], []
@@ -273,7 +281,7 @@ class Instants:
             ways = after
         return [(Step(at, (), ()), (*way, *others)) for at, way in ways.items()]
 
-    def _in_any_order(self, local: int, heard: Heard, lossy: bool, in_order: bool) -> Iterator[_Outcome]:
+    def _in_any_order(self, local: int, heard: ReceivedMessages, lossy: bool, in_order: bool) -> Iterator[_Outcome]:
         matter = self._that_matter(local, heard)
         copies = 2 if self._twice else 1
         earlier = {  # of the same sender
@@ -314,10 +322,11 @@ class Instants:
         for step, way in outcomes.items():
             yield step, (*way, *others)
 
-    def _that_matter(self, local: int, heard: Heard) -> list[int]:
-        """Positions of what may change the agent or make it answer, whatever of the rest it has heard before.
+    def _that_matter(self, local: int, heard: ReceivedMessages) -> list[int]:
+        """Return the indices of the messages that may change the agent or cause an answer, after any of the other
+        messages.
 
-        All of them, if a wrong agent comes to ever more states by hearing the same again and again.
+        All of them, if a wrong agent reaches more and more states by the same messages.
         """
         seen, waiting = {local}, [local]
         matter: set[int] = set()
@@ -336,21 +345,21 @@ class Instants:
 
 
 def _keep(ways: dict[Agents, Way], there: Agents, way: Way) -> None:
-    """The way there on which less is lost."""
+    """Keep the way to an outcome with fewer losses."""
     known = ways.get(there)
     if known is None or way.lost < known.lost:
         ways[there] = way
 
 
 def _keep_fullest(ways: dict[_Key, tuple[int, ...]], there: _Key, way: tuple[int, ...]) -> None:
-    """The way there on which more is heard, be it once or twice."""
+    """Keep the way to an outcome with more different received messages."""
     known = ways.get(there)
     if known is None or len(set(way)) > len(set(known)):
         ways[there] = way
 
 
 def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[_Choice, ...]]:
-    """All combinations in which no more is lost than that."""
+    """Yield all combinations with at most this number of losses."""
     combined: list[tuple[int, tuple[_Choice, ...]]] = [(0, ())]
     for of_one in choices:
         combined = [
@@ -363,7 +372,7 @@ def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[
 
 
 def _is_covered(step: Step, outcomes: Sequence[_Outcome]) -> bool:
-    """Whether another outcome is the same but for saying more: what it says more may be lost by everybody."""
+    """Return whether another outcome is equal except for more sent messages. All receivers may lose these."""
     return any(
         other.local == step.local
         and other.started == step.started
@@ -374,6 +383,6 @@ def _is_covered(step: Step, outcomes: Sequence[_Outcome]) -> bool:
 
 
 def _is_part(some: tuple[int, ...], of: tuple[int, ...]) -> bool:
-    """Whether `of` has all of `some`, in order."""
+    """Return whether `of` contains the elements of `some` in order."""
     rest = iter(of)
     return all(message in rest for message in some)

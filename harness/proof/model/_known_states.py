@@ -1,6 +1,6 @@
-"""Local states by number. Every state that an agent comes to is looked at once, when it gets its number.
+"""The known local states by number. Each state is examined once, when it gets its number.
 
-A local state is all that `ucp.agent.Agent` holds (`_snapshot.py`).
+A local state is the whole state of a `ucp.agent.Agent` (`_snapshot.py`).
 """
 
 from collections.abc import Sequence
@@ -14,24 +14,24 @@ from harness.proof.model._snapshot import NAMES_OF_OTHERS, Parts, Snapshot, dead
 from ucp.state import AgentState
 
 DEAD = -1
-"""The local state of an agent that is gone."""
+"""The local state of a dead agent."""
 
 FIRST, FIRST_OTHER = 1, 2
-"""What an agent calls itself, and the first of the others, where it makes no difference who is who."""
+"""The ID that an agent uses for itself, and the first ID of the other agents, if IDs make no difference."""
 
 Names = tuple[int, ...]
-"""What an agent is to call the others, from `FIRST_OTHER` on."""
+"""The IDs that an agent uses for the other agents, in their order from `FIRST_OTHER` on."""
 
 WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us": -1}
-"""Parts of the state that no handler needs where nothing is ever lost, as they are at the beginning."""
+"""Parts of the state that no handler reads if no block is ever lost, with their initial values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """A local state of the agent with this ID on the roster. `waits` says whether it reconciles, `chain` numbers its
-    chain's blocks.
+    """A local state of the agent with this ID.
 
-    `deceived`: it holds a block in the captured vehicle's name which that never completed.
+    `waits` is true if the agent reconciles. `chain` has the numbers of its chain's blocks. `deceived` is true if it
+    holds a block in the captured vehicle's name that this vehicle never completed.
     """
 
     agent_id: int
@@ -42,16 +42,19 @@ class Known:
     chain: tuple[int, ...]
     flaw: Flaw | None
     anonymous: int
-    """The same for states that differ only in who has voted and answered; the same number on any machine."""
+    """A number that is equal for states that differ only in the identity of voters and responders.
+
+    It is equal on all machines.
+    """
     names_others: bool
     deceived: bool
 
 
 class KnownStates:
-    """All local states that were come upon.
+    """All known local states.
 
-    If `bounds.reduced`, state that no handler reads before it is written again counts as in its initial value.
-    docs/explanation/proof.md says why that is sound.
+    If `bounds.reduced`, parts of the state that no handler reads before they are written again count as initial.
+    docs/explanation/proof.md explains why this is sound.
     """
 
     def __init__(self, bounds: Bounds, blocks: Blocks) -> None:
@@ -60,14 +63,14 @@ class KnownStates:
         self.others = tuple(range(FIRST_OTHER, bounds.agents + 1))
         self.known: list[Known] = []
         self.flawed: set[int] = set()
-        """Those that must never be."""
+        """The numbers of states with a flaw."""
         self._nameless = bounds.nameless
         self._parts = Parts()
         self._numbers: dict[tuple[Any, ...], int] = {}
         self._renamed: dict[tuple[int, Names], int] = {}
 
     def number(self, agent_id: int, state: AgentState, taken: Snapshot, flaw: Flaw | None) -> int:
-        """The number of the state that an agent is in, which was `taken`, in parts that there are."""
+        """Return the number of an agent's state. `taken` is its snapshot, made of interned parts."""
         snapshot = taken
         if self.bounds.reduced:
             forgotten = WHAT_ONLY_CHECKS_READ | dead(state)
@@ -97,7 +100,7 @@ class KnownStates:
         return number
 
     def with_tallies(self, local: int, tallies: Snapshot) -> int:
-        """The same agent but for what is in these tallies."""
+        """Return the local state with other values in these tallies."""
         known = self.known[local]
         snapshot = known.snapshot | {name: self._parts.part(name, value) for name, value in tallies.items()}
         key = self._parts.key(known.agent_id, known.flaw, snapshot)
@@ -108,10 +111,10 @@ class KnownStates:
             self.known.append(replace(known, snapshot=snapshot, anonymous=anonymous, names_others=names_others))
         return number
 
-    # Who is who
+    # Names of other agents
 
     def renamed(self, local: int, names: Names) -> int:
-        """The same agent when the others are called otherwise."""
+        """Return the local state after a renaming of the other agents."""
         if not self.known[local].names_others or self.known[local].flaw is not None:
             return local
         key = local, names
@@ -124,13 +127,15 @@ class KnownStates:
         return number
 
     def renamed_back(self, local: int, names: Names) -> int:
-        """The agent that was `renamed` by these names as it was."""
+        """Return the local state before it was `renamed` with these names."""
         return self.renamed(local, _back(names))
 
     def names_in_order(self, local: int, sender: int) -> Names | None:
-        """Names by which the others are in order: those in tallies first, then the sender; None if they are.
+        """Return the names that put the other agents in order: those in tallies first, then the sender. None if they
+        are in order.
 
-        Where IDs make no difference, what an agent does is the same but for these names (docs/explanation/proof.md).
+        If IDs make no difference, the behaviour of an agent is the same except for these names
+        (docs/explanation/proof.md).
         """
         known = self.known[local]
         if not self._nameless or known.flaw is not None:
@@ -140,9 +145,9 @@ class KnownStates:
         return None if tuple(in_order) == self.others else _back(tuple(in_order))
 
     def first_names(self, local: int, senders: Sequence[int]) -> Names | None:
-        """Names by which those who are heard are the first of the others, in their order; None if they are.
+        """Return the names that make the senders the first of the other agents, in their order. None if they are.
 
-        Or if they have other names to the agent, as it has heard of somebody before.
+        It is also None if the agent already distinguishes other agents in its tallies.
         """
         known = self.known[local]
         if not self._nameless or known.names_others or known.flaw is not None:
@@ -151,11 +156,11 @@ class KnownStates:
         return None if in_order == self.others else _back(in_order)
 
     def _names_others(self, snapshot: Snapshot) -> bool:
-        """Whether it tells some of the others from the rest."""
+        """Return whether the state distinguishes some of the other agents from the rest."""
         return any(0 < len(snapshot[name]) < len(self.others) for name in NAMES_OF_OTHERS)
 
 
 def _back(names: Names) -> Names:
-    """The names by which everybody has the name again that he had."""
+    """Return the names that undo a renaming."""
     before = {name: other for other, name in enumerate(names, FIRST_OTHER)}
     return tuple(before[name] for name in sorted(names))

@@ -1,7 +1,7 @@
-"""What the real agent makes of each input in each local state: computed once, and then looked up.
+"""Compute the step of the real agent for each local state and input, once, and cache it.
 
-To compute a step the agent is put into the state, given the input, and its state is taken: no line of the protocol is
-written here.
+To compute a step, the agent is put into the state and given the input, and its new state is taken. This module contains
+no protocol logic.
 """
 
 from collections.abc import Iterator
@@ -35,24 +35,24 @@ from ucp.state import AgentState
 from ucp.store import StoredState
 
 Content = tuple[int, Snapshot, "Flaw | None", Ordinals]
-"""What another process needs to know of a local state."""
+"""The definition of a local state, as another process needs it."""
 
 
 OTHER_COUNTS = (1, 2, 1000)
 """Counts with which each step of an unreduced proof is repeated."""
 COUNTED = ("reconciles", "sent", "chain_changed_at")
-"""Attributes of the state that are only counted, in the words of an error."""
+"""Attributes of the state that are only counted, with their names in error messages."""
 
 
 class LocalStates(KnownStates):
-    """All local states that were come upon, and all steps between them."""
+    """The known local states, and the steps between them."""
 
     def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
         self.agents = Agents(bounds)
         first = self.agents.by_id[FIRST].state
         super().__init__(bounds, Blocks(first.chain.inception, self.agents.made))
         self.steps = 0
-        """How many the real agent has computed."""
+        """Number of steps that the real agent has computed."""
         self._counting = {agent_id: self.agents.new(agent_id) for agent_id in self.agents.by_id}
         """Agents that repeat steps with other counts."""
         self._reference = Reference(bounds, self.agents.new) if bounds.steps else None
@@ -66,7 +66,7 @@ class LocalStates(KnownStates):
             settings.finalize_gap_s,
         )
         self.durations_us = [round(duration * MICROSECONDS) for duration in durations]
-        """By timer."""
+        """The duration of each timer in microseconds."""
         self._tallies = Tallies(self, self.timers, self.ends, every_count=every_count)
         self._about: dict[int, Ordinals] = {}
         self._patterns: dict[int, int] = {}
@@ -84,7 +84,7 @@ class LocalStates(KnownStates):
     # Steps
 
     def hear(self, local: int, sender: int, message: int) -> Step:
-        """The agent hears a message from another, who is `sender` to it."""
+        """Return the step of an agent that receives a message. `sender` is the sender's ID for this agent."""
         key = local, sender, message
         step = self._steps.get(key)
         if step is None:
@@ -99,7 +99,7 @@ class LocalStates(KnownStates):
         return step
 
     def lets_be(self, local: int, sender: int, message: int) -> bool:
-        """Whether it makes no difference at all that the agent hears this."""
+        """Return whether a message has no effect on the agent."""
         if self._nameless and not self.known[local].names_others:
             sender = FIRST_OTHER  # it is one to the agent who says it
         key = local, sender, message
@@ -110,7 +110,7 @@ class LocalStates(KnownStates):
         return lets_be
 
     def only_counts(self, local: int, sender: int, message: int) -> bool:
-        """Whether all that the agent does when it hears this is to count it, or to let it be."""
+        """Return whether the agent only counts or ignores a message."""
         key = local, sender, message
         counts = self._counts.get(key)
         if counts is None:
@@ -125,12 +125,14 @@ class LocalStates(KnownStates):
         return counts
 
     def end_timer(self, local: int, timer: int, way: int = 0) -> Step:
-        """A timer of the agent ends, in one of the `ends` that this may have."""
+        """Return the step of an agent whose timer expires, with one of the results of `ends`."""
         return self.ends(local, timer)[way].step
 
     def ends(self, local: int, timer: int) -> list[End]:
-        """All that may come of it when this timer ends: more than one only if the agent asks which block is older, and
-        any may be."""
+        """Return the possible results of a timer's expiry.
+
+        There are several only if the agent compares the ages of blocks and any block may be the older one.
+        """
         key = local, timer
         ends = self._ends.get(key)
         if ends is None:
@@ -145,9 +147,9 @@ class LocalStates(KnownStates):
         return ends
 
     def older(self, local: int, timer: int, way: int) -> tuple[int, frozenset[int]]:
-        """Which block has to be older than which for a timer to end in this way: 0 is the inception block's number.
+        """Return the block that must be older than others for this result of a timer. 0 is the inception block.
 
-        It is older than none where nothing is asked of it.
+        There are no others if the agent does not compare ages.
         """
         ends = self.ends(local, timer)
         oldest = ends[way].oldest
@@ -162,7 +164,7 @@ class LocalStates(KnownStates):
         return asked[oldest], frozenset(asked.values()) - {asked[oldest]}
 
     def complete(self, local: int, ordinal: int) -> Step:
-        """The agent completes a block, the `ordinal`th of all."""
+        """Return the step of an agent that completes the block with this ordinal."""
         key = local, -2, ordinal
         step = self._steps.get(key)
         if step is None:
@@ -170,7 +172,7 @@ class LocalStates(KnownStates):
         return step
 
     def reboot(self, local: int) -> Step:
-        """The agent's computer browns out and goes on from what was on its disk."""
+        """Return the step of an agent that has a brown-out and continues from its disk."""
         key = local, -3, 0
         step = self._steps.get(key)
         if step is None:
@@ -179,7 +181,7 @@ class LocalStates(KnownStates):
         return step
 
     def lie(self, local: int, message: int) -> Step:
-        """The agent hears a datagram that is sealed with the captured vehicle's keys, which the real gate opens."""
+        """Return the step of an agent that receives a datagram of the attacker through the security gate."""
         key = local, -4, message
         step = self._steps.get(key)
         if step is None:
@@ -195,7 +197,9 @@ class LocalStates(KnownStates):
         return step
 
     def _got_in(self, local: int, message: int) -> Flaw | None:
-        """What must not: the same of a vehicle known to be revoked, in another's name, or with another's block."""
+        """Return the kind of a message that the agent must not accept but accepts: of a revoked vehicle, in another
+        name, or with another's block.
+        """
         known, said = self.known[local], self.messages[message]
         revoked = self.agents.revoked[known.agent_id]
         put_back(revoked, known.snapshot)
@@ -209,19 +213,19 @@ class LocalStates(KnownStates):
         return None
 
     def _sealed(self, message: int) -> bytes:
-        """A new datagram of the attacker that says this."""
+        """Return a new datagram of the attacker with this message."""
         said = self.messages[message]
         genuine = type(said) in CARRY_A_BLOCK and said.block.block_hash in self.blocks.makers  # type: ignore[union-attr]
         return self.agents.gate.sealed(said, NOW_S, genuine=genuine)
 
     def state(self, local: int) -> AgentState:
-        """The whole of a local state, to look at before the next step is computed."""
+        """Return the complete state of a local state. It is valid until the next step is computed."""
         return self._restored(local).state
 
     def inputs(self) -> Iterator[tuple[int, Message | str | None, Step]]:
-        """Each local state with each input that was given there: what was heard, the timer that ended; None: a block.
+        """Yield each local state with each input that it got, and the resulting step.
 
-        And what came of it.
+        The input is a received message, the name of an expired timer, or None for a completed block.
         """
         for (local, timer), ends in self._ends.items():
             yield from ((local, self.timers[timer], end.step) for end in ends)
@@ -252,7 +256,7 @@ class LocalStates(KnownStates):
         crashed = wrong = None
         try:
             give(agent)
-        except Exception as error:  # whatever a handler raises is what we look for
+        except Exception as error:  # any exception of a handler is a flaw
             crashed = f"{type(error).__name__}: {error}"
         if completes is not None:
             made = agent.state.completed[completed:]
@@ -293,7 +297,7 @@ class LocalStates(KnownStates):
     def _check_counts(
         self, agent_id: int, before: Snapshot, give: Give, after: Snapshot, sent: tuple[int, ...]
     ) -> None:
-        """Raise UncoveredError if the step is another one after the agent has counted more reconciles or messages."""
+        """Raise UncoveredError if the step differs after the agent has counted more reconciles or messages."""
         for count in OTHER_COUNTS:
             agent = self._counting[agent_id]
             put_back(agent, before)
@@ -312,7 +316,7 @@ class LocalStates(KnownStates):
                 )
 
     def message(self, message: Message) -> int:
-        """Its number."""
+        """Return the number of a message."""
         number = self._message_numbers.setdefault(message, len(self.messages))
         if number == len(self.messages):
             self.messages.append(message)
@@ -321,7 +325,7 @@ class LocalStates(KnownStates):
     # Blocks
 
     def pattern(self, local: int) -> int:
-        """One local state for all that differ only in which block is which, where that makes no difference."""
+        """Return the local state that represents all states that differ only in their blocks."""
         if not self.bounds.blocks_alike or local == DEAD:
             return local
         pattern = self._patterns.get(local)
@@ -330,7 +334,7 @@ class LocalStates(KnownStates):
         return pattern
 
     def about(self, local: int) -> Ordinals:
-        """The blocks that it is about, each once, in an order that is the same for all of one pattern."""
+        """Return the ordinals of the blocks of a state, each once. The order is equal for all states of one pattern."""
         about = self._about.get(local)
         if about is None:
             nothing = local == DEAD or self.known[local].flaw is not None
@@ -338,7 +342,7 @@ class LocalStates(KnownStates):
         return about
 
     def exchanged(self, local: int, blocks: Ordinals) -> int:
-        """The same agent with these blocks in the place of those that it is `about`."""
+        """Return the local state after its blocks (`about`) are exchanged for these."""
         if blocks == self.about(local):
             return local
         key = self.pattern(local), blocks
@@ -358,7 +362,7 @@ class LocalStates(KnownStates):
     # States
 
     def settled(self, local: int) -> int:
-        """The same agent when all answers to what was asked have come, or are lost: who voted matters no more."""
+        """Return the local state with reduced tallies, after all answers have arrived or are lost."""
         return self._tallies.settled(local)
 
     def _intern(
@@ -371,9 +375,10 @@ class LocalStates(KnownStates):
         *,
         keep: bool = True,
     ) -> int:
-        """The number of the state that this agent is in, as it was `taken`; it was in `before`.
+        """Return the number of an agent's state. `taken` is its snapshot, and `before` the number of its state before
+        the step.
 
-        `keep`: it will be given more inputs.
+        If `keep`, the agent gets further inputs in this state.
         """
         snapshot = self._parts.of(taken, before or {})
         if keep:
@@ -381,14 +386,14 @@ class LocalStates(KnownStates):
         return self.number(agent_id, agent.state, snapshot, flaw)
 
     def content(self, local: int) -> Content:
-        """What another process needs to know of it."""
+        """Return the definition of a local state for another process."""
         known = self.known[local]
         flaw = known.flaw if known.flaw is not None and known.flaw.kind in FLAWS_OF_STEPS else None
         initiated = self.blocks.named(known.snapshot["top_chain_hash_at_initiation"])
         return known.agent_id, known.snapshot, flaw, initiated
 
     def adopt(self, content: Content) -> int:
-        """The number of a state that another process has come upon."""
+        """Return the number of a state that another process found."""
         agent_id, snapshot, flaw, initiated = content
         self.blocks.learn_chain_hash(snapshot["top_chain_hash_at_initiation"], initiated)
         agent = self.agents.put_into(agent_id, snapshot)

@@ -1,4 +1,4 @@
-"""The real agents, each put into whatever state is looked at, and what is done to them there."""
+"""The real agents. They are put into the explored states and get inputs there."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,7 +6,7 @@ from functools import partial
 from random import Random
 from typing import Any
 
-from harness.proof.attacker._security_gate import Gate
+from harness.proof.attacker._security_gate import SecurityGate
 from harness.proof.bounds import Bounds
 from harness.proof.model._known_states import FIRST
 from harness.proof.model._snapshot import NOW_S, ReductionError, Snapshot, put_back, take
@@ -19,31 +19,31 @@ from ucp.quirks import wrong_handlers
 
 INITIAL_DATA = b"proof"
 AT_ONCE_S = 0.05
-"""A timer that is shorter ends before any answer can come (a message takes 2 to 50 ms)."""
+"""A timer that is shorter expires before any answer can arrive (a message takes 2 to 50 ms)."""
 MOST_AT_ONCE = 100
 
 
 class Agents:
-    """One of each on the roster; if a vehicle is captured they are behind the real gate.
+    """One agent for each ID on the roster. With a captured vehicle they are secured agents.
 
-    Where they are `nameless` each has its own settings, but the first's ID.
+    If agents are `nameless`, each has its own settings, and the ID of the first agent.
     """
 
     def __init__(self, bounds: Bounds) -> None:
         self._bounds = bounds
         self._roster = range(1, bounds.agents + 1)
-        self._gate = None if bounds.captured is None else Gate(self._roster, bounds.captured)
+        self._gate = None if bounds.captured is None else SecurityGate(self._roster, bounds.captured)
         self.by_id = {agent_id: self.new(agent_id) for agent_id in self._roster}
         self._left_in: dict[int, Snapshot] = {}
-        """In what state each of them is, while that is known."""
+        """Agent ID -> present state of the agent, if it is known."""
         self.revoked = {
             agent_id: self.new(agent_id, revoked=True) for agent_id in self._roster if self._gate is not None
         }
-        """Others, to whom the captured vehicle is revoked."""
+        """Further agents that know the revocation of the captured vehicle."""
 
     @property
-    def gate(self) -> Gate:
-        """What opens datagrams, where a vehicle is captured."""
+    def gate(self) -> SecurityGate:
+        """The security gate. A vehicle must be captured."""
         assert self._gate is not None, "a vehicle is captured"
         return self._gate
 
@@ -59,7 +59,7 @@ class Agents:
         return make(own_id, self._roster, INITIAL_DATA, settings, handlers=handlers, tracing=tracing)
 
     def put_into(self, agent_id: int, snapshot: Snapshot) -> Agent:
-        """The agent, which is in this state now."""
+        """Put an agent into a state, and return it."""
         agent = self.by_id[agent_id]
         put_back(agent, snapshot, self._left_in.pop(agent_id, None))
         return agent
@@ -69,7 +69,7 @@ class Agents:
         self._left_in[agent_id] = snapshot
 
     def made(self, ordinal: int) -> Block:
-        """The block that an agent completes if it is the `ordinal`th of all."""
+        """Return the block that an agent completes as the block with this ordinal."""
         agent = self.new(FIRST)
         log(agent, ordinal)
         if agent.state.current_block:
@@ -79,7 +79,7 @@ class Agents:
 
 
 def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHandler[Any]:
-    """The handler, after which `after` is called."""
+    """Return the handler, extended by a call of `after`."""
 
     def run(*inputs: Any) -> str:
         branch = handler.run(*inputs)
@@ -90,7 +90,7 @@ def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHand
 
 
 def log(agent: Agent, ordinal: int) -> None:
-    """Log events until a block is complete: the `ordinal`th of all."""
+    """Log events until the block with this ordinal is complete."""
     completed = len(agent.state.completed)
     data = bytes(min(MAX_EVENT_BYTES, agent.state.settings.max_event_bytes) - EVENT_HEADER_BYTES)
     for number in range(MOST_AT_ONCE):
@@ -100,7 +100,7 @@ def log(agent: Agent, ordinal: int) -> None:
 
 
 def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
-    """End a timer; of the candidates of phase 2 this one is the oldest, unless it is the inception block."""
+    """End a timer. `oldest` becomes the oldest candidate of phase 2, except for the inception block."""
     if oldest is not None:
         counted = agent.state.reconcile_response_dictionary[oldest]
         counted[1] = min(counted[1], 1)
@@ -108,20 +108,20 @@ def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
 
 
 def end_at_once(agent: Agent) -> str | None:
-    """End the timers that end before anything can be heard; what a handler raised, if one did."""
+    """End the timers that expire before any message can arrive. Return the exception of a handler as text, or None."""
     try:
         for _ in range(MOST_AT_ONCE):
             soon = [t for t in agent.state.timers if t.deadline is not None and t.deadline <= NOW_S + AT_ONCE_S]
             if not soon:
                 return None
             agent.end_timer(min(soon, key=lambda timer: timer.deadline or 0.0), NOW_S)
-    except Exception as error:  # whatever a handler raises is what we look for
+    except Exception as error:  # any exception of a handler is a flaw
         return f"{type(error).__name__}: {error}"
     return "its timers end at once again and again"
 
 
 def is_heard(agent: Agent, datagram: bytes, before: Snapshot) -> bool:
-    """Whether anything comes of a datagram that the agent is given in this state: it should drop it."""
+    """Return whether a datagram has any effect in this state. The agent should drop it."""
     dropped = agent.dropped.total()
     agent.receive_datagram(datagram, NOW_S)
     unchanged = all(value is before[name] for name, value in take(agent, before).items())

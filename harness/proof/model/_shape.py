@@ -1,11 +1,10 @@
-"""The shape of a local state: the same for all states that differ only in which blocks and which agents they are about.
+"""The shape of a local state. States that differ only in the identity of blocks and agents have the same shape.
 
-A local state is what `_snapshot.py` says. Its shape calls blocks by their order: by timestamp, and if that is equal by
-hash, among those that the agent knows of in this state. Others it only counts. What `_local_steps.py` may forget it
-leaves
-out, too: what is dead, and of a vote all but whether more approve than not. Besides it leaves out the block that is
-being built, since within bounds an event fills a block. So it compares what an agent was in in any run, of whatever
-mission, with what it can be in within bounds.
+A shape refers to blocks by their order among the blocks that the agent holds: by timestamp, then by hash. Blocks that
+the agent does not hold are only counted. Like the reductions of `_local_steps.py`, a shape omits parts that are written
+before they are read, and keeps of a vote only whether more agents approve. It also omits the block under construction,
+because an event fills a block within the bounds. Shapes therefore compare the states of any run of any mission with the
+states that exist within bounds.
 """
 
 from bisect import bisect_left
@@ -21,16 +20,18 @@ from ucp.state import AgentState
 Shape = tuple[Any, ...]
 
 LEFT_OUT = frozenset(("current_block", "completed", "newest_block_timestamp_us", "voters", "reconcile_responders"))
-"""Beside what a snapshot leaves out: what is only looked at to make blocks, and whoever is in a tally."""
+"""Parts that a shape omits in addition to those that a snapshot omits: parts for making blocks, and the members of
+tallies.
+"""
 
 ELSEWHERE = -1
-"""A hash of what the agent does not have."""
+"""The ordinal of a hash that the agent does not hold."""
 ON_TOP = "on top"
-"""The chain hash of the agent's chain with the block on top that the message is about."""
+"""The chain hash of the agent's chain with the message's block on top."""
 
 
 class Held:
-    """The blocks that an agent holds, by their order, and its chain. It does not change."""
+    """The blocks that an agent holds in their order, and its chain. The object is immutable."""
 
     __slots__ = ("_blocks", "_heights", "_numbers", "_ordinals", "_shape", "_top")
 
@@ -54,9 +55,9 @@ class Held:
         )
 
     def number(self, shape: Shape) -> int:
-        """The same number for the same shape on any machine, of 64 bits: no two that there are have the same.
+        """Return the number of a shape: 64 bits of a hash, equal on all machines.
 
-        Of a state that holds this, and of which this is the rest; or of such a state and an input.
+        `shape` is the rest of a state that holds these blocks, or such a state together with an input.
         """
         number = self._numbers.get(shape)
         if number is None:
@@ -65,19 +66,22 @@ class Held:
         return number
 
     def height(self, chain_hash: bytes) -> int:
-        """How many blocks of the chain are below this chain hash."""
+        """Return the number of blocks of the chain below this chain hash, or ELSEWHERE."""
         return self._heights.get(chain_hash, ELSEWHERE)
 
     def ordinal(self, block_hash: bytes) -> int:
-        """Which of the blocks held it is."""
+        """Return the ordinal of a held block, or ELSEWHERE."""
         return self._ordinals.get(block_hash, ELSEWHERE)
 
     def between(self, timestamp_us: int, block_hash: bytes = b"") -> int:
-        """How many of the blocks held are older than a block of that time."""
+        """Return the number of held blocks that are older than this timestamp."""
         return bisect_left(self._blocks, (timestamp_us, block_hash))
 
     def input_shape(self, message: Message) -> Shape:
-        """The message, as it is to this agent: whoever sent it, it names what the agent holds, or other things."""
+        """Return the shape of a message for this agent.
+
+        It refers to the blocks that the agent holds, and omits the sender.
+        """
         values = [getattr(message, name) for name in type(message).__slots__]
         about = next((value for value in values if isinstance(value, bytes | Block)), b"")
         if isinstance(about, Block):
@@ -101,7 +105,7 @@ class Held:
 
 
 def shape_of(state: AgentState | State, held: Held) -> Shape:
-    """The shape of `state` but for what it holds, which is `held`; their numbers tell states apart."""
+    """Return the shape of `state` without the blocks that it holds (`held`). The numbers of both distinguish states."""
     shape: list[Any] = [state.reconcile_in_progress]
     for timer in state.timers:
         shape.append(1 if timer.deadline is not None else 2 if timer.active else 0)

@@ -1,8 +1,8 @@
-"""The whole state of an agent as a snapshot: its interned parts, and one step from it.
+"""The complete state of an agent as a snapshot of interned parts, and a step of an agent.
 
-What is left out of the key changes nothing that the agent will ever do: the moment of its last input, counters that
-are only reported, and what it has yet to hand over. Everything else that `ucp.state.AgentState` has is in it, also
-what it will have one day; a value of a kind that is not known here is an error, and never left out.
+The key of a snapshot omits only parts that never affect the agent's behaviour: the time of its last input, counters
+that are only reported, and its pending output. All other attributes of `ucp.state.AgentState` are in the key, including
+attributes of future versions. A value of an unknown type is an error and is never omitted.
 """
 
 from collections import Counter, deque
@@ -19,20 +19,20 @@ from ucp.state import AgentState
 from ucp.timers import Timer
 
 REPORTED = frozenset(("now", "sent", "reconciles", "chain_changed_at", "_sequence"))
-"""Counters and notes, which only a trace or the number of a datagram needs.
+"""Counters and notes that only a trace or the sequence number of a datagram needs.
 
-They grow for ever, so they cannot be part of a state. Every step begins with them at zero. `LocalStates` repeats each
-step of an unreduced proof with other counts, and refuses an agent whose step depends on them.
+They grow without limit, so they cannot be part of a state. Each step begins with them at zero. `LocalStates` repeats
+each step of an unreduced proof with other counts, and refuses an agent whose step depends on them.
 """
 COUNTS = ("reconciles", "_sequence", "chain_changed_at")
-"""Those that are numbers and that no input sets."""
+"""The counters among them that are numbers and that no input sets."""
 FIXED = frozenset(("agent_id", "settings", "timers", "reconcile_timers", "running", "_tracing", "_seal", "sealed"))
-"""What never changes (no agent that is looked at seals its events), or is another name of what is there."""
+"""Attributes that never change (explored agents do not seal events), or that are other names of included parts."""
 HANDED_OVER = frozenset(("outbox", "changes", "announced", "started"))
 LEFT_OUT = REPORTED | FIXED | HANDED_OVER
 
 NOW_S = 1000.0
-"""The mission second of every input: what matters of time is in the zones."""
+"""The mission second of every input. The zones contain the relevant times."""
 RUNNING_S = 1e15
 """The deadline of a timer that was running before the input."""
 
@@ -40,7 +40,7 @@ MESSAGE_NAMES = tuple(message.NAME for message in ON_MESSAGE)
 
 Snapshot = dict[str, Any]
 NameOf = Callable[[bytes], int]
-"""A small number for a hash, always the same."""
+"""A function that returns the number of a hash. It is always the same for the same hash."""
 
 
 _DEAD_VOTE: Snapshot = {
@@ -56,7 +56,7 @@ _DEAD_PHASE_3: Snapshot = {"majority_response_block_hash": None}
 
 
 def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
-    """A copy of the agent's state; of what is still as in `like` it has the very parts of that."""
+    """Return a snapshot of the agent's state. Parts that equal those of `like` are shared with it."""
     state = vars(agent.state)
     if like is None:
         return {name: _copied(value) for name, value in state.items() if name not in LEFT_OUT}
@@ -68,7 +68,7 @@ def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
 
 
 def dead(state: AgentState) -> Snapshot:
-    """What every handler of a right agent writes before it reads it again, as it is at the beginning."""
+    """Return the parts that every handler of a correct agent writes before it reads them, with their initial values."""
     parts: Snapshot = {}
     if not state.voting_timer.active:
         parts |= _DEAD_VOTE
@@ -84,9 +84,9 @@ def dead(state: AgentState) -> Snapshot:
 
 
 def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) -> None:
-    """Let the agent be in the state of the snapshot. Its running timers have the deadline RUNNING_S.
+    """Put the agent into the state of a snapshot. Its running timers have the deadline RUNNING_S.
 
-    `since` is what it is now, if that is known: parts that both have are left alone.
+    `since` is the agent's present state, if it is known. Parts that both have are not changed.
     """
     state = vars(agent.state)
     state["now"] = NOW_S
@@ -112,14 +112,14 @@ def set_counts(agent: Agent, count: int) -> None:
 
 
 def _is_part(part: Any, value: Any) -> bool:
-    """Whether this part of the state still is what it was."""
+    """Return whether a part of the state is unchanged."""
     if isinstance(part, _TimerState | _ChainState):
         return part.is_of(value)
     return bool(part == value)
 
 
 def replaced(value: Any, hash_of: Callable[[bytes], bytes], block_of: Callable[[Block], Block]) -> Any:
-    """A part of the state with other hashes and blocks in it."""
+    """Return a part of the state with other hashes and blocks."""
     if isinstance(value, bytes):
         return hash_of(value)
     if isinstance(value, Block):
@@ -134,13 +134,13 @@ def replaced(value: Any, hash_of: Callable[[bytes], bytes], block_of: Callable[[
 
 
 def keyed(value: Any, name_of: NameOf) -> Any:
-    """A part of the state as numbers and tuples, equal for equal parts and whichever machine it is."""
+    """Return a part of the state as numbers and tuples. They are equal for equal parts, on all machines."""
     key = _KEYED.get(type(value))
     return value if key is None else key(value, name_of)
 
 
 def key_of(snapshot: Snapshot, name_of: NameOf) -> tuple[Any, ...]:
-    """Equal for equal states, and only for these."""
+    """Return a key of a state. It is equal only for equal states."""
     return tuple(keyed(value, name_of) for value in snapshot.values())
 
 
@@ -156,7 +156,7 @@ class _TimerState:
         return self.running or self.paused
 
     def is_of(self, timer: Timer) -> bool:
-        """A timer that was started anew is not what it was."""
+        """Return whether a timer is unchanged. A timer that was started again is not."""
         return (timer.deadline == RUNNING_S) == self.running and timer.active == (self.running or self.paused)
 
     def put_back(self, timer: Timer) -> None:
@@ -190,7 +190,7 @@ class _ChainState:
 
 
 def _copied(value: Any) -> Any:
-    """A copy that shares nothing that changes."""
+    """Return a copy that shares no mutable object."""
     copy = _COPIED.get(type(value))
     if copy is None:
         copy = next((way for kind, way in _COPIED.items() if isinstance(value, kind)), None)
@@ -235,11 +235,11 @@ _KEYED: dict[type, Callable[[Any, NameOf], Any]] = {
 
 
 Started = tuple[tuple[int, int], ...]
-"""Timers that an agent has started in this instant and that run: (number, duration in microseconds)."""
+"""The running timers that an agent has started in this instant: (number, duration in microseconds)."""
 
 
 class Step(NamedTuple):
-    """What an input makes of an agent: its state, the messages that it sends, the timers that it has started."""
+    """The result of an input: the new state, the sent messages, and the started timers."""
 
     local: int
     sent: tuple[int, ...]
@@ -247,7 +247,7 @@ class Step(NamedTuple):
 
 
 class End(NamedTuple):
-    """What may come of it when a timer ends, and which of the candidates of phase 2 is the oldest then."""
+    """A possible result of a timer's expiry, with the candidate of phase 2 that is the oldest in this case."""
 
     step: Step
     oldest: bytes | None
@@ -258,18 +258,18 @@ NAMES_OF_OTHERS = ("voters", "reconcile_responders")
 
 
 class Parts:
-    """All parts of the states that were come upon."""
+    """The interned parts of all known states."""
 
     def __init__(self) -> None:
         self._parts: dict[tuple[str, Any], Any] = {}
         self._numbers: dict[int, int] = {}
-        """By `id`."""
+        """`id` of a part -> number of the part."""
         self._digests: dict[int, bytes] = {}
-        """Of each part, by its `id`: the same on any machine."""
+        """`id` of a part -> digest, which is equal on all machines."""
         self._hashes: dict[int, bytes] = {}
 
     def part(self, name: str, value: Any) -> Any:
-        """The one part that stands for all that are equal."""
+        """Return the interned part that represents all equal parts."""
         key = name, keyed(value, self.name)
         part = self._parts.setdefault(key, value)
         if part is value:
@@ -278,40 +278,45 @@ class Parts:
         return part
 
     def of(self, snapshot: Snapshot, like: Snapshot) -> Snapshot:
-        """The same state of parts that there are; of `like` all are."""
+        """Return the state made of interned parts. All parts of `like` are interned."""
         return {
             name: value if like.get(name, self) is value else self.part(name, value) for name, value in snapshot.items()
         }
 
     def key(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> tuple[Any, ...]:
-        """Equal for equal states, whose snapshots are of parts that there are."""
+        """Return a key of a state made of interned parts. It is equal for equal states."""
         numbers = self._numbers
         return (agent_id, flaw, *[numbers[id(part)] for part in snapshot.values()])
 
     def anonymous(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> int:
-        """Equal for states that differ only in who has voted and answered; the same number on any machine."""
+        """Return a number that is equal for states that differ only in the identity of voters and responders, on all
+        machines.
+        """
         parts = [
             len(value) if name in NAMES_OF_OTHERS else self._digests[id(value)] for name, value in snapshot.items()
         ]
         return int.from_bytes(blake2b(repr((agent_id, flaw, parts)).encode(), digest_size=8).digest())
 
     def name(self, digest: bytes) -> int:
-        """A number for a hash, the same on any machine."""
+        """Return the number of a hash. It is equal on all machines."""
         name = int.from_bytes(digest[:8])
         assert self._hashes.setdefault(name, digest) == digest, "no two hashes that there are begin alike"
         return name
 
 
 class UncoveredError(Exception):
-    """The agent depends on something that is no part of a state, so no proof covers it."""
+    """An error: the agent depends on something that is not part of a state, so no proof covers it."""
 
 
 class ReductionError(Exception):
-    """The agent does what the argument for a reduction says that it never does."""
+    """An error: the agent does something that the argument for a reduction excludes."""
 
 
 def check_that_nothing_is_lost(before: Snapshot, state: AgentState) -> None:
-    """Blocks stay: without that the completed ones could not be forgotten (characteristic 2)."""
+    """Raise ReductionError if a block is lost.
+
+    Otherwise the completed blocks could not be forgotten (characteristic 2).
+    """
     held = {block.block_hash for name in ("blocks_to_be_committed", "reconcile_stack") for block in before[name]}
     held.update(before["chain"].parts["_block_of_hash"])
     if not all(state.holds(block_hash) for block_hash in held):

@@ -1,6 +1,7 @@
-"""What tallies decide: agents that differ only in what their tallies will never ask again are one.
+"""Reduce the tallies of local states to their decisions.
 
-See docs/explanation/proof.md.
+Agents whose tallies differ, but always lead to the same decision, count as one local state. See
+docs/explanation/proof.md.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,14 +11,14 @@ from harness.proof.model._snapshot import NAMES_OF_OTHERS, End, ReductionError, 
 from ucp.reconcile import most_named
 
 TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "reconcile_response_dictionary"))
-"""Parts of the state in which answers are counted, and nothing else is done with them until a timer ends."""
+"""Parts of the state that count answers, and are otherwise read only when a timer expires."""
 
 
 class Tallies:
-    """What is left of the tallies of each state when an instant is over.
+    """The reduced tallies of each local state at the end of an instant.
 
-    `ends` asks the real agent what may come of it when a timer ends, by the state's number and the timer's place in
-    `timers`. `every_count`: of what is counted in a reconcile all stays.
+    `ends` returns the possible results of a timer's expiry for a state's number and the timer's index in `timers`. The
+    real agent computes them. If `every_count`, the counts of a reconcile are kept.
     """
 
     def __init__(
@@ -36,7 +37,10 @@ class Tallies:
         self._settled: dict[int, int] = {}
 
     def settled(self, local: int) -> int:
-        """The same agent when all answers to what was asked have come, or are lost: who voted matters no more."""
+        """Return the local state with reduced tallies.
+
+        At the end of an instant, all answers have arrived or are lost, so the voters no longer matter.
+        """
         number = self._settled.get(local)
         if number is None:
             tallies = {} if local == DEAD or local in self._states.flawed else self._left(local)
@@ -45,7 +49,7 @@ class Tallies:
         return number
 
     def _left(self, local: int) -> Snapshot:
-        """What is left of its tallies: no more than what they decide."""
+        """Return the reduced tallies of a state."""
         known = self._states.known[local]
         snapshot = known.snapshot
         left: Snapshot = {}
@@ -65,7 +69,10 @@ class Tallies:
         return left
 
     def _of_phase_1(self, local: int) -> Snapshot:
-        """What is left of the tally of phase 1, if it makes no difference what those say who have not answered yet."""
+        """Return the reduced tally of phase 1, if the missing answers cannot change its result.
+
+        Otherwise it is empty.
+        """
         snapshot = self._states.known[local].snapshot
         yes, no = (snapshot["reconcile_vote_count"][answer] for answer in ("yes", "no"))
         silent = self._silent(snapshot)
@@ -78,12 +85,14 @@ class Tallies:
         return {"reconcile_vote_count": {"yes": yes, "no": no}, "reconcile_responders": {*self._states.others}}
 
     def _ends_with(self, local: int, yes: int, no: int) -> Sequence[End]:
-        """What comes of phase 1 if it ends with so many answers."""
+        """Return the possible results of phase 1 if it ends with these counts."""
         counted = self._states.with_tallies(local, {"reconcile_vote_count": {"yes": yes, "no": no}})
         return self._ends(counted, self._phase_one)
 
     def _of_phase_2(self, snapshot: Snapshot) -> Snapshot:
-        """The same of phase 2, of which those candidates are left that most have named."""
+        """Return the reduced tally of phase 2, with only the most named candidates, if the missing answers cannot
+        change them. Otherwise it is empty.
+        """
         candidates = snapshot["reconcile_response_dictionary"]
         most, next_most, *_ = sorted([*(count for count, _ in candidates.values()), 0, 0], reverse=True)
         silent = self._silent(snapshot)
@@ -93,11 +102,11 @@ class Tallies:
         return {"reconcile_response_dictionary": left, "reconcile_responders": {*self._states.others}}
 
     def _silent(self, snapshot: Snapshot) -> int:
-        """How many have not answered yet."""
+        """Return the number of agents that have not answered yet."""
         return len(self._states.others) - len(snapshot["reconcile_responders"])
 
     def _check_that_it_ends_alike(self, local: int, settled: int) -> None:
-        """A timer has to make the same of an agent whose tallies are settled as it would have made of it."""
+        """Raise ReductionError if a timer's expiry gives another result after the reduction."""
         if settled != local and any(
             self._settled_ends(local, timer) != self._settled_ends(settled, timer)
             for timer in self._states.known[local].running

@@ -1,9 +1,9 @@
-"""How long the timers that run have yet to run, compared with each other: difference bounds, as small numbers.
+"""The possible remaining times of the running timers as zones (difference bounds), with small numbers.
 
-A zone is a set of possible remaining times of n timers: all that satisfy x_i - x_j <= m[i][j], with x_0 = 0. The matrix
-is closed (no bound can be tightened), so equal sets have equal matrices. A zone is kept as it is when any time may
-have passed: with a point of it all earlier ones are in it, down to where the first timer ends. Bounds are whole
-microseconds between minus and plus the longest duration, so there are finitely many.
+A zone is a set of possible remaining times of n timers: all times with x_i - x_j <= m[i][j], where x_0 = 0. The matrix
+is closed (no bound can be tightened), so equal sets have equal matrices. A zone is stored for any time that may have
+passed: with each point it contains all earlier points, down to the first expiry. Bounds are whole microseconds between
+minus and plus the longest duration, so their number is finite.
 """
 
 from collections.abc import Sequence
@@ -11,11 +11,11 @@ from collections.abc import Sequence
 Matrix = tuple[tuple[int, ...], ...]
 NOTHING_RUNS = 0
 EVER_US = 10**15
-"""Longer than anything runs."""
+"""A duration that is longer than any timer, in microseconds."""
 
 
 class Zones:
-    """Zones by number."""
+    """All zones by number, with cached results of their operations."""
 
     def __init__(self) -> None:
         self._matrices: list[Matrix] = []
@@ -35,20 +35,22 @@ class Zones:
         return self._matrices[zone]
 
     def adopt(self, matrix: Matrix) -> int:
-        """The number of a zone that another process has come upon."""
+        """Return the number of a zone that another process found."""
         return self._intern(matrix)
 
     def firsts(self, zone: int) -> list[int]:
-        """The timers, from 1, that may be the next to end."""
+        """Return the timers, numbered from 1, that may expire next."""
         least = self._matrices[zone][0]
         return [timer for timer in range(1, len(least)) if not least[timer]]
 
     def no_time_passes(self, zone: int) -> bool:
-        """Whether some timer has to end at the very moment at which the last one did."""
+        """Return whether a timer must expire at the moment of the last expiry."""
         return any(row[0] == 0 for row in self._matrices[zone][1:])
 
     def tied(self, zone: int) -> list[tuple[int, ...]]:
-        """For each of `firsts` which of them have to end at the very moment at which it does, if it is the next."""
+        """Return, for each timer of `firsts`, the indices of those that must expire at the same moment if it is the
+        next.
+        """
         tied = self._tied.get(zone)
         if tied is None:
             firsts = self.firsts(zone)
@@ -60,7 +62,7 @@ class Zones:
         return tied
 
     def bounds(self, zone: int) -> list[tuple[int, ...]]:
-        """Of each timer, from 1, what tells it apart, whatever their places."""
+        """Return, for each timer, a description by its bounds that does not depend on the order of the timers."""
         bounds = self._bounds.get(zone)
         if bounds is None:
             matrix = self._matrices[zone]
@@ -71,10 +73,10 @@ class Zones:
         return bounds
 
     def after(self, zone: int, ended: tuple[int, ...], running: tuple[int, ...]) -> int | None:
-        """The zone when all of `ended` have ended in one instant; None if they cannot.
+        """Return the zone after all of `ended` have expired in one instant. None if they cannot.
 
-        `running` says of each timer that then runs which it was, or, if it has just been started, minus its duration
-        in microseconds less one.
+        `running` has, for each timer that runs then, its number before. For a timer that was just started, it has -1
+        minus its duration in microseconds.
         """
         key = zone, ended, running
         if key not in self._after:
@@ -82,7 +84,7 @@ class Zones:
         return self._after[key]
 
     def permuted(self, zone: int, places: tuple[int, ...]) -> int:
-        """The same with its timers in another order: `places` names for each the place that it had, from 1."""
+        """Return the zone with its timers in another order. `places` has the previous number of each timer."""
         key = zone, places
         if key not in self._permuted:
             matrix, order = self._matrices[zone], (0, *places)
@@ -90,9 +92,9 @@ class Zones:
         return self._permuted[key]
 
     def adrift(self, zone: int) -> int:
-        """The zone whose timers differ as in this one, and may all have as much longer to run as you like.
+        """Return the zone with the same differences of timers, in which all timers may run for any further time.
 
-        Where nothing can happen before the first of them ends it makes no difference how long that takes.
+        If nothing can happen before the first expiry, the time until then makes no difference.
         """
         if zone not in self._adrift:
             matrix = [list(row) for row in self._matrices[zone]]
@@ -103,9 +105,10 @@ class Zones:
         return self._adrift[zone]
 
     def coincidences(self, zone: int, ended: tuple[int, ...]) -> int:
-        """How many moments have to be the same by chance for these to be the next to end, and at once.
+        """Return the number of coincidences that are needed for these timers to expire next, at the same time.
 
-        As many as differences between timers are open in the zone and are not when these end; they must be able to.
+        This is the number of differences between timers that are open in the zone and fixed when these timers expire.
+        The timers must be able to expire at the same time.
         """
         key = zone, ended
         if key not in self._coincidences:
@@ -117,7 +120,10 @@ class Zones:
         return self._coincidences[key]
 
     def _ended(self, zone: int, ended: Sequence[int]) -> list[list[int]] | None:
-        """The bounds at the moment when these end, and no other has before; None if that cannot be."""
+        """Return the bounds at the moment when these timers expire and none has expired before.
+
+        None if it is impossible.
+        """
         matrix = [list(row) for row in self._matrices[zone]]
         size = range(len(matrix))
         for timer in ended:
@@ -140,7 +146,7 @@ class Zones:
         places = [0, *running]
 
         def bound(left: int, right: int) -> int:
-            """Of x_left - x_right; what was just started has its whole duration to run."""
+            """Return the bound of x_left - x_right. A timer that was just started has its whole duration left."""
             left_s, left_place = (0, left) if left >= 0 else (-left - 1, 0)
             right_s, right_place = (0, right) if right >= 0 else (-right - 1, 0)
             return left_s - right_s + matrix[left_place][right_place]
@@ -158,7 +164,7 @@ class Zones:
 
 
 def _apart(matrix: Sequence[Sequence[int]], timers: range) -> int:
-    """How many of the timers are left if of those whose distance from each other is fixed only one counts."""
+    """Return the number of timers, counting only one of those with fixed distances from each other."""
     return sum(
         not any(matrix[timer][other] + matrix[other][timer] == 0 for other in timers if other < timer)
         for timer in timers

@@ -1,1 +1,1 @@
-"""The questions of a proof: livelocks, ways to one chain, and the number of further votes."""
+"""The questions of a proof: livelocks, paths to one chain, and the number of further votes."""

@@ -1,22 +1,22 @@
-"""From which states a goal is come to, whichever timer is the next to end."""
+"""Compute the states from which a goal can be reached, whichever timer expires next."""
 
 from array import array
 from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
 
 ByTimer = tuple[tuple[int, ...], ...]
-"""For each timer of a state that may be the next to end the numbers of the states that may follow if it does."""
+"""The numbers of the possible successors of a state, for each timer that may expire next."""
 
 Check = Callable[[], object]
-"""Is called again and again, and raises GivenUpError when memory or time have come to an end."""
+"""A function that is called repeatedly, and raises GivenUpError when the limit of memory or time is reached."""
 
 
 class Attractor:
-    """States, by number, of which some are in: the goals, and all from which some way leads to them.
+    """A set of states by number: the goals, and all states from which a path leads to them.
 
-    The durations decide which timer is next, and a zone does not tell: so all that it leaves open have to lead there,
-    unless timers end in `any_order`. Of timers that have to end at the same moment only how long messages take decides
-    which is first: any may be.
+    The durations of timers determine the next timer, but a zone may leave several timers open. All of these must
+    therefore lead to the goals, unless timers expire in `any_order`. If timers must expire at the same moment, only the
+    transit times of messages determine their order, so any order that leads to the goals is enough.
     """
 
     def __init__(self, by_timer: Sequence[ByTimer], any_order: bool, check: Check = lambda: None) -> None:
@@ -24,9 +24,9 @@ class Attractor:
         self._any_order = any_order
         self._inside = bytearray(len(by_timer))
         self._open = array("q", map(len, by_timer))
-        """Of each state how many of its timers do not lead to the goals yet."""
+        """Number of timers of each state that do not lead to the goals yet."""
         self._whose = array("q", (number for number, choices in enumerate(by_timer) for _ in choices))
-        """Of each timer, all counted one after the other, whose it is."""
+        """The state of each timer. The timers of all states are numbered consecutively."""
         self._leads = bytearray(len(self._whose))
         self._ends = _ends(by_timer, check)
         """The timers that may lead to state n are in `_before`, from `_ends[n]` up to `_ends[n + 1]`."""
@@ -43,16 +43,16 @@ class Attractor:
 
     @property
     def left(self) -> int:
-        """How many states are not in."""
+        """Number of states outside the set."""
         return self._inside.count(0)
 
     @property
     def first_left(self) -> int:
-        """The first that is not; -1 if all are."""
+        """The first state outside the set. -1 if there is none."""
         return self._inside.find(0)
 
     def add(self, goals: Iterable[int]) -> None:
-        """These are goals, too."""
+        """Add goals, and all states from which a path leads to them."""
         waiting = [number for number in goals if not self._inside[number]]
         for number in waiting:
             self._inside[number] = 1
@@ -71,7 +71,10 @@ class Attractor:
 
 
 def _ends(by_timer: Sequence[ByTimer], check: Check) -> "array[int]":
-    """How many timers may lead to states before each, and in the end, to all."""
+    """Return, for each state, the number of transitions to the states before it.
+
+    The last entry counts all transitions.
+    """
     count = array("q", bytes(8 * (len(by_timer) + 1)))
     for choices in by_timer:
         check()

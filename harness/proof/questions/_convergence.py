@@ -1,6 +1,6 @@
-"""Whether the swarm can always come to rest with one chain, and whether a cycle lasts for ever.
+"""Find states from which the swarm cannot become idle with one chain, and cycles that never end.
 
-Both are asked of what follows when nothing is lost any more and no new block comes, beside some more votes.
+Both questions concern the successors without losses and without new blocks, except the blocks of further votes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -9,23 +9,28 @@ from functools import partial
 
 from harness.proof.graph._expansion import cycles_left_alone
 from harness.proof.graph._exploration import Graph
-from harness.proof.graph._workers import Crew
+from harness.proof.graph._workers import Workers
 from harness.proof.questions._attractor import Attractor, Check
-from harness.proof.questions._extra_votes import UndecidedError, Votes
+from harness.proof.questions._extra_votes import ExtraVotes, UndecidedError
 from harness.proof.questions._graph_cycles import cycles
 
 Watch = Callable[[str], None]
-"""Is told again and again what is asked now, and raises GivenUpError when memory or time have come to an end."""
+"""A function that is called repeatedly with the present question.
+
+It raises GivenUpError when the limit of memory or time is reached.
+"""
 
 
 @dataclass
 class Liveness:
-    """`forks`: states at rest with several chains, of which `fork` is the nearest. `cycles`: ways round, each as the
-    states on it, the nearest first.
+    """The answers to both questions.
 
-    `astray`: how many states have no way to rest with one chain if there are 0, 1, 2, ... more votes, until it is none,
-    or there was one vote for each agent. `lost` is the nearest of those that are left then, `reluctant` the nearest of
-    those for which one is not enough.
+    - `forks`: number of idle states with several chains. `fork` is the nearest of them.
+    - `cycles`: cycles as lists of their states, the nearest first.
+    - `astray`: numbers of states without a path to an idle swarm with one chain, after 0, 1, 2, ... further votes. The
+      list ends at 0 states, or at one vote for each agent.
+    - `lost`: the nearest state without such a path after all these votes.
+    - `reluctant`: the nearest state for which one vote is not enough.
     """
 
     forks: int = 0
@@ -35,22 +40,22 @@ class Liveness:
     lost: int | None = None
     reluctant: int | None = None
     decided: bool = True
-    """Whether all that follows more votes was looked at."""
+    """True if all states after further votes were explored."""
 
 
 @cycles_left_alone()
-def look(graph: Graph, watch: Watch = lambda asked: None, crew: Crew | None = None) -> Liveness:
-    """Of a graph that is complete; a crew, if there is one, lets those vote who are at rest with several chains."""
-    at_rest = dict(_at_rest(graph, partial(watch, "idle states")))
-    forks = [number for number, chains in at_rest.items() if chains > 1]
+def look(graph: Graph, watch: Watch = lambda asked: None, workers: Workers | None = None) -> Liveness:
+    """Answer both questions for a complete graph. `workers` compute the votes that forks need."""
+    idle_states = dict(_idle_states(graph, partial(watch, "idle states")))
+    forks = [number for number, chains in idle_states.items() if chains > 1]
     result = Liveness(len(forks), forks[0] if forks else None, cycles(graph, partial(watch, "cycles")))
     safe = Attractor(graph.quiet, graph.swarm.bounds.timers_any, partial(watch, "paths to one chain"))
-    safe.add(number for number, chains in at_rest.items() if chains <= 1)
+    safe.add(number for number, chains in idle_states.items() if chains <= 1)
     result.astray.append(safe.left)
     if not safe.left:
         return result
     try:
-        needed = _needed(graph, forks, watch, crew)
+        needed = _needed(graph, forks, watch, workers)
     except UndecidedError:
         result.decided = False
         return result
@@ -65,8 +70,8 @@ def look(graph: Graph, watch: Watch = lambda asked: None, crew: Crew | None = No
     return result
 
 
-def _at_rest(graph: Graph, check: Check) -> Iterator[tuple[int, int]]:
-    """Each state at rest, and how many chains there are."""
+def _idle_states(graph: Graph, check: Check) -> Iterator[tuple[int, int]]:
+    """Yield each idle state with its number of chains."""
     for number, by_timer in enumerate(graph.quiet):
         check()
         state = graph.states[number]
@@ -74,16 +79,16 @@ def _at_rest(graph: Graph, check: Check) -> Iterator[tuple[int, int]]:
             yield number, len(graph.swarm.chains(state))
 
 
-def _needed(graph: Graph, forks: Sequence[int], watch: Watch, crew: Crew | None) -> dict[int, int | None]:
-    """How many more votes each of these states needs; None if one for each agent is not enough."""
+def _needed(graph: Graph, forks: Sequence[int], watch: Watch, workers: Workers | None) -> dict[int, int | None]:
+    """Return the number of votes that each state needs. None if one vote for each agent is not enough."""
     needed: dict[int, int | None] = {}
 
     def check() -> None:
         watch(f"what votes lead to ({len(needed):,} of {len(forks):,} forks)")
 
     states = [graph.states[number] for number in forks]
-    shared = crew if crew is not None and crew.is_worth_it(len(states)) else None
-    votes = map(Votes(graph.swarm, check).needed, states) if shared is None else shared.needed(states, check)
+    shared = workers if workers is not None and workers.pays_off(len(states)) else None
+    votes = map(ExtraVotes(graph.swarm, check).needed, states) if shared is None else shared.needed(states, check)
     for fork, need in zip(forks, votes, strict=True):
         needed[fork] = need
     return needed

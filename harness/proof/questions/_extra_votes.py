@@ -1,7 +1,7 @@
-"""How many more votes it takes, from a state at rest with several chains, until there is one.
+"""Compute the number of further votes that an idle state with several chains needs until there is one chain.
 
-A vote is a block more that somebody completes. What follows it is looked at only as far as one way to one chain asks,
-and all of it only where none was found like that.
+A further vote is the vote on a block that an agent completes in the idle state. Its successors are first explored along
+single paths until one path leads to one chain. All successors are explored only if no such path was found.
 """
 
 from collections import Counter
@@ -13,47 +13,53 @@ from harness.proof.model._instant import Action
 from harness.proof.model._known_states import DEAD
 from harness.proof.questions._attractor import Attractor, ByTimer, Check
 
-MOST_LOOKED_AT = 50_000
-"""States that follow the votes of one state, with wrong agents without end; with more it is not decided."""
-MOST_KNOWN = 200_000
-"""Of so many states it is remembered how many votes they need."""
-LONGEST = 150
-"""So many instants, at most, has a way that is tried, with those of all its votes, before all are looked at."""
+MAX_EXPLORED = 50_000
+"""Maximum number of states that are explored after the votes of one state.
+
+With wrong agents there can be infinitely many. Above the limit, the question is not decided.
+"""
+MAX_CACHED = 200_000
+"""Maximum number of states whose votes are cached."""
+MAX_PATH_INSTANTS = 150
+"""Maximum number of instants of a single path, with those of all its votes, before all successors are explored."""
 
 
 class UndecidedError(Exception):
-    """More may follow than is looked at."""
+    """More successors exist than the limit allows to explore."""
 
 
-class Votes:
-    """Of states at rest, and of all that follow when they vote."""
+class ExtraVotes:
+    """The numbers of further votes that idle states and their successors need."""
 
     def __init__(self, swarm: Swarm, check: Check = lambda: None) -> None:
         self._swarm = swarm
         self._check = check
         self._enough: dict[State, int] = {}
-        """So many votes are enough; and so many are not."""
+        """State -> number of votes that is enough. `_too_few` has numbers that are not enough."""
         self._too_few: dict[State, int] = {}
-        self._looked_at = 0
+        self._explored = 0
 
     def needed(self, fork: State) -> int | None:
-        """The least number; None if one for each agent is not enough. Raises UndecidedError."""
-        if len(self._enough) + len(self._too_few) > MOST_KNOWN:
+        """Return the least number of votes. None if one for each agent is not enough. Raises UndecidedError."""
+        if len(self._enough) + len(self._too_few) > MAX_CACHED:
             self._enough.clear()
             self._too_few.clear()
-        self._looked_at = 0
+        self._explored = 0
         most = self._swarm.bounds.agents
-        return next((votes for votes in range(1, most + 1) if self._leads_by_a_vote(fork, votes)), None)
+        return next((votes for votes in range(1, most + 1) if self._a_vote_leads(fork, votes)), None)
 
-    def _leads_by_a_vote(self, fork: State, votes: int, instants: int = 0) -> bool:
-        """Whether a vote of somebody's leads to one chain, if then there may be all but one of `votes` more.
+    def _a_vote_leads(self, fork: State, votes: int, instants: int = 0) -> bool:
+        """Return whether one vote leads to one chain, with at most `votes - 1` votes after it.
 
-        So many `instants` are on the way to it: Python bears only so many.
+        `instants` is the number of instants on the path so far. It is limited because the search is recursive.
         """
         return any(self._leads(after, votes - 1, instants + 1) for after in self._after_a_vote(fork))
 
     def _after_a_vote(self, fork: State) -> Iterator[State]:
-        """What may follow when one of the agents that make a difference votes; those first whose chain fewest have."""
+        """Yield the successors of a vote of each agent, one of agents that are alike.
+
+        Agents whose chain is rarest come first.
+        """
         locals_, known = fork[AGENTS:], self._swarm.local.known
         alike = {
             local if self._swarm.bounds.alike else place: place for place, local in enumerate(locals_) if local != DEAD
@@ -63,25 +69,25 @@ class Votes:
             yield from self._swarm.after(fork, (Action(place, "complete", fork[BLOCKS] + 1),), lossy=False)
 
     def _leads(self, state: State, votes: int, instants: int) -> bool:
-        """Whether some way, whichever timer is the next to end, leads from here to rest with one chain."""
-        if not self._some_way(state, votes, set(), instants) and self._too_few.get(state, -1) < votes:
-            self._look_at_all(state, votes, instants)
+        """Return whether the swarm can become idle with one chain from here, whichever timer expires next."""
+        if not self._find_path(state, votes, set(), instants) and self._too_few.get(state, -1) < votes:
+            self._explore_all(state, votes, instants)
         return self._is_enough(state, votes)
 
     def _is_enough(self, state: State, votes: int) -> bool:
         enough = self._enough.get(state)
         return enough is not None and enough <= votes
 
-    def _some_way(self, state: State, votes: int, tried: set[State], instants: int) -> bool:
-        """Whether a way is found that comes to no state twice. If not there may be one nevertheless."""
+    def _find_path(self, state: State, votes: int, tried: set[State], instants: int) -> bool:
+        """Return whether a path without repeated states was found. If not, a path may exist nevertheless."""
         if self._is_enough(state, votes):
             return True
-        if state in tried or instants > LONGEST or self._too_few.get(state, -1) >= votes:
+        if state in tried or instants > MAX_PATH_INSTANTS or self._too_few.get(state, -1) >= votes:
             return False
         tried.add(state)
-        self._count()
+        self._count_explored()
         if self._swarm.is_idle(state):
-            leads = self._at_rest_leads(state, votes, instants)
+            leads = self._idle_leads(state, votes, instants)
         else:
             leads = self._timers_lead(state, votes, tried, instants)
         if leads:
@@ -89,24 +95,27 @@ class Votes:
         return leads
 
     def _timers_lead(self, state: State, votes: int, tried: set[State], instants: int) -> bool:
-        """The same of a state in which timers run: whichever of them is the next to end."""
+        """Return whether a path was found for each timer of a state that may expire next.
+
+        With timers in any order, a path for one timer is enough.
+        """
         any_order = self._swarm.bounds.timers_any
         leads = False
         for following in self._by_timer(state):
             leads = False
             for after in following:
-                if self._some_way(after, votes, tried, instants + 1):
+                if self._find_path(after, votes, tried, instants + 1):
                     leads = True
                     break
             if leads == any_order:
                 break
         return leads
 
-    def _at_rest_leads(self, state: State, votes: int, instants: int) -> bool:
-        return len(self._swarm.chains(state)) <= 1 or (votes > 0 and self._leads_by_a_vote(state, votes, instants))
+    def _idle_leads(self, state: State, votes: int, instants: int) -> bool:
+        return len(self._swarm.chains(state)) <= 1 or (votes > 0 and self._a_vote_leads(state, votes, instants))
 
     def _by_timer(self, state: State) -> Iterator[Iterator[State]]:
-        """For each timer that may be the next to end what may follow if it does."""
+        """Yield an iterator over the successors for each timer of a state that may expire next."""
         ending = [*self._swarm.ending(state)]
         for action, tied in self._swarm.alternatives(state):
             if (action,) in ending:
@@ -117,8 +126,8 @@ class Votes:
                     for after in self._swarm.after(state, actions, lossy=False)
                 )
 
-    def _look_at_all(self, state: State, votes: int, instants: int) -> None:
-        """Of all that may follow it is known then whether so many votes are enough."""
+    def _explore_all(self, state: State, votes: int, instants: int) -> None:
+        """Explore all successors, and record for each whether this number of votes is enough."""
         states, numbers = [state], {state: 0}
 
         def number_of(after: State) -> int:
@@ -129,13 +138,13 @@ class Votes:
 
         by_timer: list[ByTimer] = []
         for at in states:
-            self._count()
+            self._count_explored()
             by_timer.append(quiet(self._swarm, at, number_of).by_timer)
         attractor = Attractor(by_timer, self._swarm.bounds.timers_any, self._check)
         attractor.add(
             number
             for number, at in enumerate(states)
-            if self._swarm.is_idle(at) and self._at_rest_leads(at, votes, instants)
+            if self._swarm.is_idle(at) and self._idle_leads(at, votes, instants)
         )
         for number, at in enumerate(states):
             if number in attractor:
@@ -143,8 +152,8 @@ class Votes:
             else:
                 self._too_few[at] = max(votes, self._too_few.get(at, votes))
 
-    def _count(self) -> None:
+    def _count_explored(self) -> None:
         self._check()
-        self._looked_at += 1
-        if self._looked_at > MOST_LOOKED_AT:
+        self._explored += 1
+        if self._explored > MAX_EXPLORED:
             raise UndecidedError

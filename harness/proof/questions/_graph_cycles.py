@@ -1,4 +1,4 @@
-"""Ways that lead back to where they began, when nothing is lost and no new block comes."""
+"""Find cycles of the graph without losses and without new blocks."""
 
 from array import array
 from collections.abc import Iterator
@@ -8,20 +8,20 @@ from harness.proof.questions._attractor import Check
 
 
 def cycles(graph: Graph, check: Check = lambda: None) -> list[list[int]]:
-    """A shortest way round in each part of the graph from whose states all others of it are reached; nearest first."""
+    """Return a shortest cycle of each strongly connected component, the nearest first."""
     parts = [part for part in _parts(graph, check) if len(part) > 1 or part[0] in _after(graph, part[0])]
-    return [_round(graph, min(part), set(part)) for part in sorted(parts, key=min)]
+    return [_shortest_cycle(graph, min(part), set(part)) for part in sorted(parts, key=min)]
 
 
 def _after(graph: Graph, number: int) -> set[int]:
-    """What may follow; only of what was looked at, if that is not all."""
+    """Return the successors of a state. In an incomplete graph, return only the explored ones."""
     following = {state for after in graph.quiet[number] for state in after} | {*graph.crossing.get(number, ())}
     if graph.ended == "complete":
         return following
     return {state for state in following if state < len(graph.quiet)}
 
 
-def _round(graph: Graph, start: int, part: set[int]) -> list[int]:
+def _shortest_cycle(graph: Graph, start: int, part: set[int]) -> list[int]:
     came_from: dict[int, int] = {}
     layer = [start]
     while layer:
@@ -41,8 +41,10 @@ def _round(graph: Graph, start: int, part: set[int]) -> list[int]:
 
 
 def _after_a_cycle(graph: Graph, check: Check) -> list[int]:
-    """States that are on a way round, or can be come to from one: those that are left when again and again what follows
-    none of those that are left is taken away."""
+    """Return the states on a cycle or after one.
+
+    States without a predecessor among the remaining states are removed until none is left to remove.
+    """
     ways_in = array("q", bytes(8 * len(graph.quiet)))
     for number in range(len(graph.quiet)):
         check()
@@ -59,7 +61,7 @@ def _after_a_cycle(graph: Graph, check: Check) -> list[int]:
 
 
 def _parts(graph: Graph, check: Check) -> Iterator[list[int]]:
-    """Strongly connected components (Tarjan), without recursion; without most of those that are one state."""
+    """Yield the strongly connected components (Tarjan) without recursion. Most components of one state are left out."""
     index: dict[int, int] = {}
     low: dict[int, int] = {}
     stack: list[int] = []

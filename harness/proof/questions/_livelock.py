@@ -1,6 +1,6 @@
-"""Livelocks, each form of going round once: who, how often, what has to be the same moment, and a scenario of it.
+"""Livelocks: an example of each form of cycle, with its coincidences and a scenario.
 
-Ways round are of one form if the same timers run in their states, whoever runs them and whatever the chains are.
+Two cycles have the same form if the same timers run in their states, for any agents and any chains.
 """
 
 from collections import defaultdict
@@ -16,24 +16,27 @@ from harness.proof.graph._exploration import Graph
 from harness.proof.model._global_states import AGENTS
 from harness.proof.model._known_states import DEAD
 
-MOST_FORMS = 12
-"""So many forms are played: those that clocks can show before those that they cannot, and of these the nearest."""
-MOST_PLAYED = 5
-"""So many ways of one form are played, to find one that the simulation goes too."""
+MAX_FORMS = 12
+"""Maximum number of forms that are played. Forms that real clocks allow come first, then the nearest ones."""
+MAX_PLAYED = 5
+"""Maximum number of cycles of one form that are played, until the simulation confirms one."""
 ROUNDS = 3
-"""For so many rounds it is worked out how far apart what leads there may be."""
+"""Number of rounds of the cycle over which the possible times of completions are computed."""
 
 _Form = tuple[tuple[tuple[tuple[int, ...], bool], ...], ...]
 
 
 @dataclass(frozen=True)
 class Livelock:
-    """`ways` parts of the graph go round in this form. `completions` are when blocks may be completed to come there.
+    """The livelocks of one form.
 
-    `coincidences`: so many moments have to be the same by chance on this way, to within the time that a message takes;
-    another may need fewer; None if timers end in any order, which leaves that open.
-    `cycle` is what the simulation was found to go round in when it played the example; None if it went another way.
-    `losses`: so many messages are lost by somebody on this way. `contradictory`: ties go as no clocks make them go.
+    - `ways`: number of components of the graph with a cycle of this form.
+    - `coincidences`: number of pairs of instants on the example's path that must be equal by chance, to within the
+      transit time of a message. Another path may need fewer. None if timers expire in any order.
+    - `completions`: the possible times of the blocks on the path.
+    - `losses`: number of messages that receivers lose on the path.
+    - `cycle`: the cycle that the simulation of the example showed. None if the simulation took another path.
+    - `contradictory`: true if no clocks give all ties of the path the required results.
     """
 
     ways: int
@@ -56,7 +59,7 @@ class Livelock:
         }
 
     def in_words(self) -> str:
-        """What it takes to get there."""
+        """Return the conditions of the livelock as text."""
         if not self.losses:
             return self._timings_in_words()
         return f"{self._timings_in_words()}; {self.losses} loss{'es lead' if self.losses > 1 else ' leads'} there"
@@ -75,7 +78,7 @@ class Livelock:
 
 
 def forms(graph: Graph, cycles: Sequence[list[int]]) -> list[list[list[int]]]:
-    """The ways round by form, the nearest first."""
+    """Return the cycles grouped by form, the nearest first."""
     alike: dict[_Form, list[list[int]]] = defaultdict(list)
     for cycle in cycles:
         alike[_form(graph, cycle)].append(cycle)
@@ -83,7 +86,7 @@ def forms(graph: Graph, cycles: Sequence[list[int]]) -> list[list[list[int]]]:
 
 
 def _form(graph: Graph, cycle: Sequence[int]) -> _Form:
-    """The same wherever one begins to go round."""
+    """Return the form of a cycle. It does not depend on the first state of the list."""
     known = graph.swarm.local.known
     looks = [
         tuple(
@@ -109,8 +112,8 @@ def in_timers(graph: Graph, cycles: Sequence[list[int]]) -> list[str]:
     return sorted({form(cycle) for cycle in cycles})
 
 
-class _Round(NamedTuple):
-    """A way to where the swarm goes round, and once round, with its scenario."""
+class _CycleExample(NamedTuple):
+    """A path to a cycle, and one round of the cycle, with their scenario."""
 
     begin: list[int]
     cycle: list[int]
@@ -119,41 +122,44 @@ class _Round(NamedTuple):
 
 
 def show(graph: Graph, cycles: Sequence[list[int]], path: Path, name: str) -> Iterator[Livelock]:
-    """Of each form one, written to `path` and beside it."""
+    """Write an example of each form to `path` and to files next to it, and yield the livelocks."""
     by_form = [(len(alike), _nearest(graph, alike)) for alike in forms(graph, cycles)]
     by_form.sort(key=lambda form: form[1][0].script.contradictory)
-    for number, (ways, rounds) in enumerate(by_form[:MOST_FORMS], 1):
+    for number, (ways, rounds) in enumerate(by_form[:MAX_FORMS], 1):
         file = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
-        yield _shown(graph, ways, rounds, file, name if number == 1 else f"{name} {number}")
+        yield _livelock_of(graph, ways, rounds, file, name if number == 1 else f"{name} {number}")
 
 
-def _nearest(graph: Graph, alike: Sequence[list[int]]) -> list[_Round]:
-    """Some ways of one form: first those that clocks can show, with the fewest coincidences, and with blocks as free as
-    can be."""
-    tried: list[tuple[bool, int, int, _Round]] = []
-    for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MOST_PLAYED]:
+def _nearest(graph: Graph, alike: Sequence[list[int]]) -> list[_CycleExample]:
+    """Return some cycles of one form, the best example first.
+
+    Cycles that real clocks allow come first, then those with the fewest coincidences, then those with the fewest blocks
+    of fixed time.
+    """
+    tried: list[tuple[bool, int, int, _CycleExample]] = []
+    for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MAX_PLAYED]:
         begin = graph.path(cycle[0])
         script = Script(graph, [*begin, *cycle[1:], cycle[0]])
         document = script.document("")
         any_time = graph.swarm.bounds.timers_any
         bound = 0 if any_time else sum(each.earliest_s == each.latest_s for each in script.completions())
-        tried.append((script.contradictory, script.coincidences, bound, _Round(begin, cycle, script, document)))
+        tried.append((script.contradictory, script.coincidences, bound, _CycleExample(begin, cycle, script, document)))
     return [each for *_, each in sorted(tried, key=lambda one: one[:3])]
 
 
-def _shown(graph: Graph, ways: int, rounds: Sequence[_Round], path: Path, name: str) -> Livelock:
-    """The first of them that the simulation goes, too; if it goes none, the first."""
+def _livelock_of(graph: Graph, ways: int, rounds: Sequence[_CycleExample], path: Path, name: str) -> Livelock:
+    """Return the livelock with the first cycle that the simulation confirms. If it confirms none, the first one."""
     bounds = graph.swarm.bounds
-    went: tuple[_Round, Played] | None = None
+    chosen: tuple[_CycleExample, Played] | None = None
     for each in rounds:
         played = play({**each.document, "name": name})
         goes_round = "liveness" in played.judged
-        if went is None or goes_round:
-            went = each, played
+        if chosen is None or goes_round:
+            chosen = each, played
         if goes_round:
             break
-    assert went is not None, "there is a way round"
-    (begin, cycle, script, _), played = went
+    assert chosen is not None, "there is a cycle"
+    (begin, cycle, script, _), played = chosen
     several = Script(graph, [*begin, *(cycle[1:] + cycle[:1]) * ROUNDS])
     completions = () if bounds.timers_any else tuple(several.completions())
     sentence = f"The swarm can repeat a cycle for ever: {len(begin) - 1} instants after the beginning."

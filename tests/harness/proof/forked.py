@@ -1,4 +1,4 @@
-"""A swarm that is looked at from a fork on: some agents rest on chains of their own, of one block each."""
+"""A swarm that is explored from a fork on: some agents are idle with different chains of one block each."""
 
 from collections.abc import Sequence
 
@@ -8,9 +8,11 @@ from harness.proof.model._zones import NOTHING_RUNS
 
 
 def forked(bounds: Bounds, holders: Sequence[int]) -> Swarm:
-    """Of each chain so many agents hold it, and the others hold none: they were out of each other's reach until now.
+    """Return a swarm whose initial state is a fork.
 
-    The blocks of these chains are the first of `bounds.blocks`.
+    `holders` has the number of agents that hold each chain. The other agents hold no block.
+
+    The agents could not reach each other until now. The blocks of these chains are the first of `bounds.blocks`.
     """
     swarm = Swarm(bounds)
     agents = list(swarm.initial[AGENTS:])

@@ -1,4 +1,4 @@
-"""Blocks that are alike: where any may be the older, states that differ only in which block is which are one."""
+"""States that differ only in the identity of blocks are one state, if any block may be the older one."""
 
 from collections.abc import Iterator, Sequence
 from itertools import permutations
@@ -19,12 +19,12 @@ from tests.harness.proof.test_explore import Seen, all_seen, by_chance, explored
 
 
 def alike(seen: Seen) -> Seen:
-    """One of all that are the same but for who is who and which block is which."""
+    """Return a representative of all views that differ only in the identity of agents and blocks."""
     return min(tuple(sorted(called)) for called in renumbered(seen))
 
 
 def renumbered(seen: Seen) -> Iterator[Seen]:
-    """All that are the same but for which block is which."""
+    """Yield all views that differ only in the identity of blocks."""
     there = sorted({block for agent in seen for held in agent[:3] for block in held})
 
     def called(order: Sequence[int]) -> Seen:
@@ -46,7 +46,9 @@ def all_alike(graph: Graph) -> set[Seen]:
     ("agents", "blocks", "network", "faults"),
     [(2, 3, "lossless", ()), (2, 2, "lossy", ("reboot",)), (3, 2, "lossless", ("death",))],
 )
-def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any, faults: tuple[str, ...]) -> None:
+def test_reduced_and_whole_state_spaces_are_equal(
+    agents: int, blocks: int, network: Any, faults: tuple[str, ...]
+) -> None:
     reduced = explored(agents, blocks, network, faults, clocks_any=True)
     whole = explored(agents, blocks, network, faults, clocks_any=True, reduced=False)
     assert len(reduced.states) < len(whole.states)
@@ -54,21 +56,21 @@ def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any, fa
     assert {*map(len, map(reduced.swarm.chains, reduced.states))} == {*map(len, map(whole.swarm.chains, whole.states))}
 
 
-def test_what_clocks_that_agree_lead_to_is_among_it() -> None:
+def test_states_with_equal_clocks_are_contained() -> None:
     agreed, any_older = explored(3, 3, "lossy"), explored(3, 3, "lossy", clocks_any=True)
     assert len(any_older.states) < len(agreed.states) / 3
     assert all_alike(agreed) <= all_alike(any_older)
 
 
 @pytest.mark.parametrize(("agents", "blocks", "loss"), [(2, 3, 0.4), (3, 3, 0.4), (3, 3, 0.0)])
-def test_whatever_agents_do_with_clocks_that_are_apart_is_among_it(agents: int, blocks: int, loss: float) -> None:
+def test_runs_with_different_clocks_are_contained(agents: int, blocks: int, loss: float) -> None:
     seen = all_alike(explored(agents, blocks, "lossy" if loss else "lossless", clocks_any=True))
     for seed in range(40):
         for there in by_chance(agents, blocks, loss, Random(seed), clocks_apart=True):
             assert alike(there) in seen
 
 
-def test_a_tie_that_goes_to_the_younger_block_is_played_by_what_the_clocks_showed() -> None:
+def test_tie_for_the_younger_block_is_played_with_timestamps() -> None:
     graph = explored(3, 3, "lossy", clocks_any=True)
     at_rest = [number for number, state in enumerate(graph.states) if number and graph.swarm.is_idle(state)]
     played = 0
@@ -85,7 +87,7 @@ def test_a_tie_that_goes_to_the_younger_block_is_played_by_what_the_clocks_showe
     assert played
 
 
-def test_which_block_is_older_nobody_can_choose() -> None:
+def test_without_clocks_any_the_older_block_is_fixed() -> None:
     graph = explored(3, 3, "lossy", clocks_any=True)
     several = 0
     for number, state in enumerate(graph.states):
@@ -100,7 +102,7 @@ def test_which_block_is_older_nobody_can_choose() -> None:
     assert several
 
 
-def test_on_ties_that_contradict_each_other_it_says_so(tmp_path: Path) -> None:
+def test_contradictory_ties_are_reported(tmp_path: Path) -> None:
     proof = prove(Bounds(4, 4, "lossless", clocks_any=True), out=tmp_path / "four.yaml")
     said = [livelock.in_words() for livelock in proof.livelocks]
     assert [livelock.contradictory for livelock in proof.livelocks] == [False, True]
@@ -109,35 +111,35 @@ def test_on_ties_that_contradict_each_other_it_says_so(tmp_path: Path) -> None:
     assert proof.livelocks[0].cycle is not None
 
 
-def test_ages() -> None:
+def test_ages_give_timestamps_in_the_required_order() -> None:
     ages = Ages()
     for ordinal in (1, 2, 3):
         ages.completed(ordinal)
     ages.renumber((3, 1))  # now the third is 1, the first is 2, the second is 3
-    ages.asked(1, [2])
+    ages.require_older(1, [2])
     events: list[dict[str, Any]] = [{"at_s": float(number), "agent": number} for number in (1, 2, 3)]
     assert ages.date(events)
     assert events[2]["timestamp_us"] < events[0]["timestamp_us"]
     assert sorted(event["timestamp_us"] for event in events) == [1_000_000, 2_000_000, 3_000_000]
-    ages.asked(2, [1])
+    ages.require_older(2, [1])
     assert not ages.date(events)
 
 
-def test_an_agents_own_clock_does_not_go_back() -> None:
+def test_clock_of_an_agent_does_not_go_back() -> None:
     ages = Ages()
     ages.completed(1)
     ages.completed(2)
-    ages.asked(2, [1])
+    ages.require_older(2, [1])
     assert not ages.date([{"at_s": 1.0, "agent": 7}, {"at_s": 2.0, "agent": 7}])
 
 
-def test_with_more_coincidences_there_is_more() -> None:
+def test_more_coincidences_give_more_states() -> None:
     bounded = [explored(2, 4, "lossless", coincidences=most) for most in (0, 1, 9)]
     seen = [all_seen(graph) for graph in bounded]
     assert seen[0] < seen[1] < seen[2] == all_seen(explored(2, 4, "lossless"))
 
 
-def test_a_livelock_takes_as_many_coincidences_as_it_says(tmp_path: Path) -> None:
+def test_livelock_needs_its_number_of_coincidences(tmp_path: Path) -> None:
     free = prove(Bounds(2, 4, "lossless"), out=tmp_path / "free.yaml")
     least = min(livelock.coincidences for livelock in free.livelocks if livelock.coincidences is not None)
     assert least > 0

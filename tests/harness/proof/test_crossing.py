@@ -1,4 +1,4 @@
-"""Swarms in which all that comes of one act is heard before anybody else acts."""
+"""Swarms without crossing: all messages of an action are received before another agent acts."""
 
 from pathlib import Path
 from random import Random
@@ -13,7 +13,7 @@ from tests.harness.proof.test_explore import all_seen, by_chance, explored
 
 
 @pytest.mark.parametrize(("agents", "blocks", "network"), [(2, 4, "lossless"), (2, 3, "lossy"), (3, 2, "lossy")])
-def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any) -> None:
+def test_reduced_and_whole_state_spaces_are_equal(agents: int, blocks: int, network: Any) -> None:
     reduced = explored(agents, blocks, network, crossing=False)
     whole = explored(agents, blocks, network, crossing=False, reduced=False)
     assert len(reduced.states) < len(whole.states)
@@ -21,7 +21,7 @@ def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any) ->
 
 
 @pytest.mark.parametrize(("agents", "blocks", "loss"), [(2, 3, 0.4), (3, 2, 0.4), (3, 3, 0.0)])
-def test_whatever_comes_by_chance_if_messages_take_no_time_is_among_it(agents: int, blocks: int, loss: float) -> None:
+def test_random_runs_without_latency_are_contained(agents: int, blocks: int, loss: float) -> None:
     seen = all_seen(explored(agents, blocks, "lossy" if loss else "lossless", crossing=False))
     for seed in range(60):
         for there in by_chance(agents, blocks, loss, Random(seed)):
@@ -29,7 +29,7 @@ def test_whatever_comes_by_chance_if_messages_take_no_time_is_among_it(agents: i
 
 
 @pytest.mark.parametrize(("agents", "blocks", "network"), [(2, 4, "lossless"), (3, 3, "lossless"), (2, 3, "lossy")])
-def test_it_is_part_of_what_there_is_if_messages_cross(agents: int, blocks: int, network: Any) -> None:
+def test_states_without_crossing_are_contained_in_those_with_it(agents: int, blocks: int, network: Any) -> None:
     assert all_seen(explored(agents, blocks, network, crossing=False)) < all_seen(explored(agents, blocks, network))
 
 
@@ -48,7 +48,7 @@ def test_agents_act_one_by_one() -> None:
     assert at_once > 0
 
 
-def test_without_a_loss_nothing_goes_wrong_whatever_coincides(tmp_path: Path) -> None:
+def test_no_flaw_exists_without_losses_and_crossing(tmp_path: Path) -> None:
     crossing = prove(Bounds(2, 4, "lossless"), out=tmp_path / "crossing.yaml")
     assert crossing.livelocks
     for bounds in (
@@ -64,13 +64,13 @@ def test_without_a_loss_nothing_goes_wrong_whatever_coincides(tmp_path: Path) ->
         assert proof.to_json()["crossing"] is False
 
 
-def test_with_losses_the_way_round_of_three_needs_no_crossing(tmp_path: Path) -> None:
+def test_livelock_of_three_with_losses_needs_no_crossing(tmp_path: Path) -> None:
     proof = prove(Bounds(3, 3, "lossy", crossing=False), out=tmp_path / "three.yaml")
     [livelock] = proof.livelocks
     assert livelock.losses == 3
 
 
-def test_played_as_scenarios_ways_lead_to_as_many_chains() -> None:
+def test_paths_played_as_scenarios_give_equal_numbers_of_chains() -> None:
     graph = explored(3, 2, "lossy", crossing=False)
     forked = 0
     for number, state in enumerate(graph.states):
@@ -81,7 +81,7 @@ def test_played_as_scenarios_ways_lead_to_as_many_chains() -> None:
     assert forked > 1
 
 
-def test_where_messages_take_as_long_as_they_like_they_cross() -> None:
+def test_network_any_allows_crossing() -> None:
     with pytest.raises(BoundsError, match=r"--no-crossing does not apply to --network any"):
         Bounds(2, 2, "any", crossing=False)
 

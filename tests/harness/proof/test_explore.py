@@ -1,4 +1,4 @@
-"""All states: whole and reduced, and whatever agents do by chance is among them."""
+"""The whole and the reduced state space are equal, and contain the states of random runs."""
 
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -10,7 +10,7 @@ import pytest
 
 from harness.proof import Bounds
 from harness.proof.graph._exploration import Graph, explore
-from harness.proof.graph._workers import Crew
+from harness.proof.graph._workers import Workers
 from harness.proof.model._global_states import AGENTS, Swarm
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._snapshot import key_of, put_back, take
@@ -32,7 +32,7 @@ def explored(*arguments: Any, **options: Any) -> Graph:
 
 
 def view_of(agent: Agent) -> View:
-    """What one sees of an agent: which blocks are where, and which timers run."""
+    """Return the visible state of an agent: the places of its blocks, and its running timers."""
     return (
         tuple(block.timestamp_us // MICROSECONDS for block in agent.state.chain),
         tuple(block.timestamp_us // MICROSECONDS for block in agent.state.blocks_to_be_committed),
@@ -43,12 +43,12 @@ def view_of(agent: Agent) -> View:
 
 
 def seen_of(agents: Sequence[Agent]) -> Seen:
-    """What one sees of agents, whoever is who."""
+    """Return the visible states of agents in a sorted order, without their identity."""
     return tuple(sorted(map(view_of, agents)))
 
 
 def by_place(graph: Graph) -> set[Seen]:
-    """What one sees of the agents of each state that are still there, in the order of their places."""
+    """Return the visible states of the living agents in each state, in the order of their places."""
     local = graph.swarm.local
     agent = Agent(1, range(1, graph.swarm.bounds.agents + 1), b"proof", local.settings)
 
@@ -73,7 +73,9 @@ def all_seen(graph: Graph) -> set[Seen]:
         (4, 2, "lossless", ()),
     ],
 )
-def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any, faults: tuple[str, ...]) -> None:
+def test_reduced_and_whole_state_spaces_are_equal(
+    agents: int, blocks: int, network: Any, faults: tuple[str, ...]
+) -> None:
     reduced = explored(agents, blocks, network, faults)
     whole = explored(agents, blocks, network, faults, reduced=False)
     assert len(reduced.states) < len(whole.states)
@@ -81,7 +83,7 @@ def test_reduced_is_all_that_there_is(agents: int, blocks: int, network: Any, fa
 
 
 @pytest.mark.parametrize("network", ["lossless", "lossy"])
-def test_how_answers_are_counted_makes_no_difference(network: Any) -> None:
+def test_reduction_of_tallies_changes_no_result(network: Any) -> None:
     in_one, in_every = Swarm(Bounds(3, 2, network)), Swarm(Bounds(3, 2, network), every_count=True)
     one, every = (explore(swarm, most_bytes=8e9, most_s=60) for swarm in (in_one, in_every))
     assert in_one.local.steps < in_every.local.steps
@@ -97,15 +99,15 @@ def test_how_answers_are_counted_makes_no_difference(network: Any) -> None:
         (Bounds(3, 2, "lossy", stagger={"phase1_timeout_s": 0.5}, clocks_any=True), 500_000),
     ],
 )
-def test_on_two_cores_it_is_the_same(bounds: Bounds, most_told: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.proof.graph._workers.WORTH_A_CREW", 10)
-    monkeypatch.setattr("harness.proof.graph._workers.MOST_TOLD", most_told)
+def test_two_cores_give_the_result_of_one(bounds: Bounds, most_told: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)
+    monkeypatch.setattr("harness.proof.graph._workers.MAX_REPORTED", most_told)
     alone = explore(Swarm(bounds), most_bytes=8e9, most_s=60)
     swarm = Swarm(bounds)
-    with Crew(swarm, 2) as crew:
-        shared = explore(swarm, most_bytes=8e9, most_s=60, crew=crew)
-        assert _convergence.look(shared, crew=crew) == _convergence.look(alone)
-    assert shared.crew_steps > 0
+    with Workers(swarm, 2) as workers:
+        shared = explore(swarm, most_bytes=8e9, most_s=60, workers=workers)
+        assert _convergence.look(shared, workers=workers) == _convergence.look(alone)
+    assert shared.workers_steps > 0
     assert shared.ended == alone.ended == "complete"
     assert shared.parents == alone.parents
     assert [*shared.quiet] == [*alone.quiet]
@@ -119,7 +121,7 @@ def test_on_two_cores_it_is_the_same(bounds: Bounds, most_told: int, monkeypatch
 
 
 @pytest.mark.parametrize(("agents", "blocks", "loss"), [(2, 3, 0.4), (3, 2, 0.4), (3, 2, 0.0)])
-def test_whatever_agents_do_by_chance_is_among_it(agents: int, blocks: int, loss: float) -> None:
+def test_random_runs_are_contained(agents: int, blocks: int, loss: float) -> None:
     seen = all_seen(explored(agents, blocks, "lossy" if loss else "lossless"))
     for seed in range(60):
         for there in by_chance(agents, blocks, loss, Random(seed)):
@@ -136,10 +138,10 @@ def by_chance(
     most_lost: float = inf,
     stagger: Stagger | None = None,
 ) -> Iterator[Seen]:
-    """What is seen whenever nothing is on the air: messages take no time, blocks come at any time.
+    """Play a random run, and yield the visible states whenever no message is under way. Messages take no time, and
+    blocks come at any time.
 
-    With clocks that are apart the agents' timestamps are years from each other. `most_lost`: so often, at most, an
-    agent loses a message.
+    If clocks differ, the timestamps of the agents are years apart. `most_lost` limits the number of lost messages.
     """
     settings = [staggered(Settings(max_block_bytes=267), stagger or {}, place) for place in range(count)]
     roster = range(1, count + 1)
@@ -168,7 +170,7 @@ def by_chance(
 
 
 def deliver(agents: Sequence[Agent], loss: float, now: float, lots: Random, most_lost: float = inf) -> int:
-    """How many were lost."""
+    """Deliver messages, and return the number of lost ones."""
     lost = 0
     while said := [(agent, sent) for agent in agents for sent in agent.messages_to_send()]:
         for receiver in agents:
@@ -186,7 +188,7 @@ def first(pair: tuple[float, Agent]) -> float:
     return pair[0]
 
 
-def test_a_snapshot_is_the_whole_state() -> None:
+def test_snapshot_contains_the_whole_state() -> None:
     agents = [Agent(agent_id, (1, 2), b"proof", Settings(max_block_bytes=267)) for agent_id in (1, 2)]
     names: dict[bytes, int] = {}
     keys = []
@@ -200,7 +202,7 @@ def test_a_snapshot_is_the_whole_state() -> None:
     assert agents[0].state.voting_timer.active
 
 
-def test_what_nobody_knows_how_to_copy_is_refused() -> None:
+def test_snapshot_refuses_an_unknown_attribute() -> None:
     agent = Agent(1, (1, 2), b"proof")
     vars(agent.state)["new"] = object()
     with pytest.raises(TypeError, match="object"):

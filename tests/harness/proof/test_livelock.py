@@ -1,4 +1,4 @@
-"""Ways to go round for ever: what they take, and that the simulation goes round too."""
+"""Livelocks: their conditions, and their confirmation by the simulation."""
 
 from pathlib import Path
 
@@ -12,14 +12,14 @@ from harness.proof.graph._exploration import explore
 from harness.proof.model._global_states import AGENTS, BLOCKS, ZONE, Swarm
 from harness.proof.model._instant import Action
 from harness.proof.model._zones import NOTHING_RUNS, Zones
-from harness.proof.questions._extra_votes import Votes
+from harness.proof.questions._extra_votes import ExtraVotes
 from harness.proof.questions._graph_cycles import cycles
 from harness.proof.questions._livelock import Livelock, show
 from tests.harness.proof.test_explore import explored
 
 
 @pytest.mark.parametrize(("blocks", "network"), [(4, "lossless"), (3, "lossy")])
-def test_each_form_becomes_a_scenario_that_goes_round(tmp_path: Path, blocks: int, network: str) -> None:
+def test_each_form_becomes_a_scenario_with_a_livelock(tmp_path: Path, blocks: int, network: str) -> None:
     proof = prove(Bounds(2, blocks, network), out=tmp_path / "round.yaml")  # type: ignore[arg-type]
     assert proof.liveness is not None
     (livelock,) = proof.livelocks
@@ -44,7 +44,7 @@ def test_each_form_becomes_a_scenario_that_goes_round(tmp_path: Path, blocks: in
         (None, 0, False, False, "if timers can expire in this order"),
     ],
 )
-def test_what_it_takes_is_said(
+def test_livelock_reports_its_conditions(
     tmp_path: Path, coincidences: int | None, losses: int, goes_round: bool, contradictory: bool, expected: str
 ) -> None:
     cycle = Cycle(since_s=1.0, period_s=15.0, agents=[1]) if goes_round else None
@@ -52,23 +52,19 @@ def test_what_it_takes_is_said(
     assert expected in Livelock(1, coincidences, (), example, losses, cycle, contradictory).in_words()
 
 
-def test_forms_that_clocks_can_show_come_first_and_what_is_not_played_is_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_possible_forms_come_first_and_the_rest_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     graph = explored(4, 4, "lossless", clocks_any=True)
     ways = cycles(graph)
     for number, each in enumerate((ways, ways[::-1])):
         shown = [livelock.contradictory for livelock in show(graph, each, tmp_path / f"{number}.yaml", "round")]
         assert shown == [False, True]
-    monkeypatch.setattr("harness.proof.questions._livelock.MOST_FORMS", 1)
+    monkeypatch.setattr("harness.proof.questions._livelock.MAX_FORMS", 1)
     proof = prove(Bounds(4, 4, "lossless", clocks_any=True), out=tmp_path / "some.yaml")
     assert [livelock.contradictory for livelock in proof.livelocks] == [False]
     assert "  1 more, of other forms, was not played" in [*in_words(proof)]
 
 
-def test_a_way_round_is_found_also_if_not_everything_is_looked_at(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cycle_is_found_in_an_incomplete_graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(progress: Progress) -> None:
         if progress.looked_at >= 500:
             monkeypatch.setattr(Budget, "ended", lambda *_: "time")
@@ -79,8 +75,11 @@ def test_a_way_round_is_found_also_if_not_everything_is_looked_at(
     assert [line[0] for line in in_words(proof) if "one chain:" in line or "livelock:" in line] == ["-", "✘"]
 
 
-def test_blocks_may_come_when_they_like_but_for_one(tmp_path: Path) -> None:
-    """Of the first of each agent one follows the other at once; the others have until that is decided."""
+def test_only_one_block_of_the_livelock_has_a_fixed_time(tmp_path: Path) -> None:
+    """The first blocks of both agents must follow each other at once.
+
+    The other blocks may come until the vote is decided.
+    """
     proof = prove(Bounds(2, 4, "lossless"), out=tmp_path / "round.yaml")
     completions = proof.livelocks[0].completions
     assert sorted(completion.agent for completion in completions) == [1, 1, 2, 2]
@@ -88,13 +87,13 @@ def test_blocks_may_come_when_they_like_but_for_one(tmp_path: Path) -> None:
     assert max(completion.latest_s for completion in completions) == 10.0
 
 
-def test_of_timers_in_any_order_nothing_is_said_of_coincidence(tmp_path: Path) -> None:
+def test_livelock_with_timers_any_has_no_number_of_coincidences(tmp_path: Path) -> None:
     proof = prove(Bounds(2, 4, "lossless", timers_any=True), out=tmp_path / "any.yaml")
     assert proof.livelocks[0].coincidences is None
     assert any("one of them may wait for ever" in line for line in in_words(proof))
 
 
-def test_nothing_goes_round_if_nothing_is_at_once_by_chance(tmp_path: Path) -> None:
+def test_no_livelock_exists_without_coincidences(tmp_path: Path) -> None:
     proof = prove(Bounds(2, 4, "lossless", coincidences=0), out=tmp_path / "none.yaml")
     assert proof.exit_status == 0
     assert proof.liveness is not None
@@ -103,14 +102,17 @@ def test_nothing_goes_round_if_nothing_is_at_once_by_chance(tmp_path: Path) -> N
 
 
 def test_one_more_vote_is_enough_for_three_agents_and_two_blocks(tmp_path: Path) -> None:
-    """Whoever has to end a timer at the same moment as another may be before it or after: that is what it takes."""
+    """If two timers must expire at the same moment, either may be first.
+
+    One more vote is enough only for this reason.
+    """
     proof = prove(Bounds(3, 2, "lossy"), out=tmp_path / "three.yaml")
     assert proof.liveness is not None
     assert proof.liveness.lost is proof.reluctant is None
     assert proof.liveness.astray == [68, 0]
 
 
-def test_what_needs_more_than_one_vote_is_a_scenario(tmp_path: Path) -> None:
+def test_state_that_needs_two_votes_becomes_a_scenario(tmp_path: Path) -> None:
     proof = prove(Bounds(4, 2, "lossy"), out=tmp_path / "four.yaml")
     assert proof.liveness is not None
     assert proof.liveness.astray[1:] == [1, 0]
@@ -119,18 +121,18 @@ def test_what_needs_more_than_one_vote_is_a_scenario(tmp_path: Path) -> None:
     assert any("needs more than one vote" in line for line in in_words(proof))
 
 
-def test_one_way_that_is_found_says_what_all_that_may_follow_say(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_single_path_gives_the_result_of_all_successors(monkeypatch: pytest.MonkeyPatch) -> None:
     graph = explore(Swarm(Bounds(4, 2, "lossy")), most_bytes=8e9, most_s=60)
     forks = [state for state in graph.states if graph.swarm.is_idle(state) and len(graph.swarm.chains(state)) > 1]
-    lazy = Votes(graph.swarm)
+    lazy = ExtraVotes(graph.swarm)
     needed = [lazy.needed(fork) for fork in forks]
     assert {*needed} == {1, 2}
-    monkeypatch.setattr(Votes, "_some_way", lambda *_: False)
-    thorough = Votes(graph.swarm)
+    monkeypatch.setattr(ExtraVotes, "_find_path", lambda *_: False)
+    thorough = ExtraVotes(graph.swarm)
     assert [thorough.needed(fork) for fork in forks] == needed
 
 
-def test_a_coincidence_is_a_difference_that_was_open() -> None:
+def test_coincidence_is_an_open_difference_of_two_times() -> None:
     zones = Zones()
     ten_s = -10_000_000 - 1
     first = zones.after(NOTHING_RUNS, (), (ten_s,))
@@ -145,7 +147,7 @@ def test_a_coincidence_is_a_difference_that_was_open() -> None:
     assert zones.coincidences(at_once, (1, 2)) == 0
 
 
-def test_a_block_between_two_timers_that_end_at_once_is_a_coincidence() -> None:
+def test_block_between_two_simultaneous_timers_is_a_coincidence() -> None:
     free, none = explored(3, 3, "lossy"), explored(3, 3, "lossy", coincidences=0)
     assert len(none.states) < len(free.states)
     between = 0
@@ -160,7 +162,7 @@ def test_a_block_between_two_timers_that_end_at_once_is_a_coincidence() -> None:
     assert between
 
 
-def test_a_fault_between_them_is_one_too_and_a_captor_waits_for_his_moment() -> None:
+def test_fault_or_attack_between_timers_counts_as_a_coincidence() -> None:
     graph = explored(3, 2, "lossy", ("death",))
     swarm, between = graph.swarm, 0
     for state in graph.states:

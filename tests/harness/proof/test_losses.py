@@ -1,4 +1,4 @@
-"""Losses that are counted."""
+"""State spaces with a limited number of losses."""
 
 from pathlib import Path
 from random import Random
@@ -11,17 +11,17 @@ from harness.proof.model._global_states import LEFT, LOSSES
 from tests.harness.proof.test_explore import all_seen, by_chance, explored
 
 
-def test_without_any_it_is_lossless() -> None:
+def test_zero_losses_equal_the_lossless_network() -> None:
     assert all_seen(explored(3, 3, "lossy", losses=0)) == all_seen(explored(3, 3, "lossless"))
 
 
-def test_with_more_there_is_more() -> None:
+def test_more_losses_give_more_states() -> None:
     bounded = [all_seen(explored(3, 2, "lossy", losses=most)) for most in (0, 1, 2, 9)]
     assert bounded[0] < bounded[1] < bounded[2] < bounded[3] == all_seen(explored(3, 2, "lossy"))
 
 
 @pytest.mark.parametrize(("agents", "blocks", "losses"), [(2, 3, 2), (3, 2, 1), (3, 2, 3)])
-def test_reduced_is_all_that_there_is(agents: int, blocks: int, losses: int) -> None:
+def test_reduced_and_whole_state_spaces_are_equal(agents: int, blocks: int, losses: int) -> None:
     reduced = explored(agents, blocks, "lossy", losses=losses)
     whole = explored(agents, blocks, "lossy", losses=losses, reduced=False)
     assert len(reduced.states) < len(whole.states)
@@ -29,7 +29,7 @@ def test_reduced_is_all_that_there_is(agents: int, blocks: int, losses: int) -> 
 
 
 @pytest.mark.parametrize("losses", [1, 2, 4])
-def test_whatever_comes_of_so_many_by_chance_is_among_it(losses: int) -> None:
+def test_random_runs_with_limited_losses_are_contained(losses: int) -> None:
     seen = all_seen(explored(3, 3, "lossy", losses=losses))
     for seed in range(60):
         for there in by_chance(3, 3, 0.2, Random(seed), most_lost=losses):
@@ -37,7 +37,7 @@ def test_whatever_comes_of_so_many_by_chance_is_among_it(losses: int) -> None:
 
 
 @pytest.mark.parametrize("faults", [(), ("duplicate",)])
-def test_the_scenario_of_a_way_loses_as_much_as_is_counted(faults: tuple[str, ...]) -> None:
+def test_scenario_of_a_path_has_the_counted_losses(faults: tuple[str, ...]) -> None:
     graph = explored(3, 2, "lossy", faults, losses=3)
     lost_most = 0
     for number, state in enumerate(graph.states[1:], 1):
@@ -48,7 +48,7 @@ def test_the_scenario_of_a_way_loses_as_much_as_is_counted(faults: tuple[str, ..
     assert lost_most == 3
 
 
-def test_a_fork_takes_one_loss_and_a_livelock_of_three_takes_three(tmp_path: Path) -> None:
+def test_fork_needs_one_loss_and_livelock_of_three_needs_three(tmp_path: Path) -> None:
     proofs = [prove(Bounds(3, 3, "lossy", losses=most), out=tmp_path / f"{most}.yaml") for most in range(4)]
     assert [[each.losses for each in proof.livelocks] for proof in proofs] == [[], [], [], [3]]
     assert any("; 3 losses lead there: " in line for line in in_words(proofs[3]))

@@ -1,4 +1,4 @@
-"""What is kept of states in little room comes out as it went in."""
+"""Packed states and successors unpack to the originals."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from harness.proof.graph._expansion import Followers, States
 from harness.proof.model._known_states import DEAD
 
 
-def test_a_state_has_one_number_and_comes_out_as_it_went_in() -> None:
+def test_packed_state_has_one_number_and_unpacks_unchanged() -> None:
     wide = (9, 2**31 - 1, 70_000, DEAD, 300)
     states = States(agents=2)
     assert [states.add(state) for state in ((0, 0, 0, 1, 2), wide, (0, 0, 0, 2, 1), wide)] == [0, 1, 2, 1]
@@ -16,7 +16,7 @@ def test_a_state_has_one_number_and_comes_out_as_it_went_in() -> None:
     assert [*states] == [(0, 0, 0, 1, 2), wide, (0, 0, 0, 2, 1)]
 
 
-def test_what_follows_is_kept_by_timer() -> None:
+def test_followers_keep_successors_by_timer() -> None:
     whole = [(), ((7,), (), (1, 2, 3)), ((),), ((2_000_000_000,),)]
     followers = Followers()
     for by_timer in whole:

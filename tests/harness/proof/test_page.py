@@ -17,15 +17,15 @@ from harness.proof.questions._convergence import look
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = DOCS / "appendix/proof-bounds.md"
 MOST_S = 0.5
-"""Rows that take longer are left to whoever measures them."""
+"""Maximum time in seconds of a row on the page that this test repeats."""
 FEW_STATES = 1_000
-"""So many take a moment."""
+"""Maximum number of states of a cell that this test repeats."""
 
 Row = dict[str, str]
 
 
 def rows() -> Iterator[Row]:
-    """Each row of a table of bounds, with the options that all of the table's have, as the comment above it says."""
+    """Yield each row of a table of bounds, with the options in the comment above the table."""
     lines = iter(PAGE.read_text().splitlines())
     for line in lines:
         if options := re.fullmatch(r"<!-- prove(.*) -->", line):
@@ -67,7 +67,7 @@ def at_most(cell: str) -> int | None:
 
 
 def one_chain(proof: Proof) -> str:
-    """As the page says it: after how many more votes, and how many states cannot yet with 0, 1, ... of them."""
+    """Return the text of the page: the number of further votes, and the numbers of states that need 0, 1, ... more."""
     live = proof.liveness
     if live is None:
         return "not looked at"
@@ -88,7 +88,7 @@ def test_the_page_has_tables() -> None:
 
 
 @pytest.mark.parametrize("row", SMALL, ids=lambda row: f"{row['agents']}/{row['blocks']} {row['states']}")
-def test_a_row_says_what_is_found(row: Row, tmp_path: Path) -> None:
+def test_row_of_the_page_equals_the_proof(row: Row, tmp_path: Path) -> None:
     proof = prove(bounds_of(row), out=tmp_path / "row.yaml")
     assert proof.complete
     assert proof.flaw is None, "everything holds in every state"
@@ -124,7 +124,7 @@ def test_row_of_captured_agent_equals_the_proof(row: Row, tmp_path: Path) -> Non
 
 
 class Cell(NamedTuple):
-    """One of the table of ways round: bounds, and what the page says of them."""
+    """A cell of the table of cycles: its bounds and its text."""
 
     bounds: Bounds
     said: str
@@ -149,13 +149,13 @@ CELLS = [*ways_round()]
 
 
 @pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.bounds.in_words())
-def test_there_are_as_many_ways_round_as_the_page_says(cell: Cell) -> None:
+def test_number_of_cycles_equals_that_of_the_page(cell: Cell) -> None:
     graph = explore(Swarm(cell.bounds), most_bytes=4e9, most_s=60)
     assert graph.ended == "complete"
     assert f"{len(look(graph).cycles)} ({len(graph.states):,})" == cell.said
 
 
-def test_cells_with_and_without_a_way_round_are_looked_at() -> None:
+def test_checked_cells_have_and_lack_cycles() -> None:
     assert len(CELLS) > 20
     assert {cell.said.startswith("0 ") for cell in CELLS if cell.bounds.stagger} == {True}
     assert {cell.said.startswith("0 ") for cell in CELLS if not cell.bounds.stagger} == {True, False}

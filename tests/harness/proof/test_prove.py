@@ -1,4 +1,4 @@
-"""What is found, that the simulation plays it again, and what the command says."""
+"""The findings of `prove`, their confirmation by the simulation, and the output of the command."""
 
 import json
 import multiprocessing
@@ -16,14 +16,14 @@ from harness.errors import INCOMPLETE, INTERRUPTED
 from harness.proof import Bounds, BoundsError, Limits, Progress, in_words, prove
 from harness.proof._progress_bar import memory_bytes
 from harness.proof.graph._exploration import LOOK_EVERY, explore
-from harness.proof.graph._workers import Crew
+from harness.proof.graph._workers import Workers
 from harness.proof.model._any_sender import collect
 from harness.proof.model._global_states import Swarm
 from harness.scenario.agent_options import Stagger
 from tests.harness.command import COMMAND, harness, sentences
 
 
-def test_the_livelock_in_step_is_found_without_being_told(tmp_path: Path) -> None:
+def test_proof_finds_the_livelock_in_step(tmp_path: Path) -> None:
     proof = prove(Bounds(2, 4, "lossless"), out=tmp_path / "in_step.yaml")
     assert proof.flaw is None
     assert proof.liveness is not None
@@ -34,7 +34,7 @@ def test_the_livelock_in_step_is_found_without_being_told(tmp_path: Path) -> Non
     assert proof.exit_status == 1
 
 
-def test_fewer_blocks_hold(tmp_path: Path) -> None:
+def test_all_properties_hold_with_fewer_blocks(tmp_path: Path) -> None:
     proof = prove(Bounds(2, 2, "lossy"), out=tmp_path / "none.yaml")
     assert proof.exit_status == 0
     assert proof.example is None
@@ -48,7 +48,7 @@ def test_fewer_blocks_hold(tmp_path: Path) -> None:
     ("quirk", "kind", "key"),
     [("forget_stack", "2", "2"), ("commit_others_twice", "3", "3"), ("leave_flag_set", "hang", "liveness")],
 )
-def test_a_wrong_agent_is_found_and_its_scenario_shows_it(tmp_path: Path, quirk: str, kind: str, key: str) -> None:
+def test_wrong_agent_is_found_and_its_scenario_confirms_it(tmp_path: Path, quirk: str, kind: str, key: str) -> None:
     bounds = Bounds(2, 2, "lossy", quirks={quirk: True}, reduced=False)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
     assert proof.flaw is not None
@@ -77,7 +77,7 @@ def test_scenario_forces_the_order_of_messages_that_cross(tmp_path: Path) -> Non
         ("skip_phase2", "reconcile_phase_1_timer_expiration"),
     ],
 )
-def test_a_wrong_step_is_found_also_if_nothing_comes_of_it(tmp_path: Path, quirk: str, handler: str) -> None:
+def test_wrong_step_without_consequence_is_found(tmp_path: Path, quirk: str, handler: str) -> None:
     bounds = Bounds(2, 2, "lossy", quirks={quirk: True}, reduced=False, steps=True)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
     assert proof.flaw is not None
@@ -87,8 +87,8 @@ def test_a_wrong_step_is_found_also_if_nothing_comes_of_it(tmp_path: Path, quirk
     assert handler in proof.example.judged["steps"].reason
 
 
-def test_a_timer_that_was_not_stopped_is_told_before_it_ends(tmp_path: Path) -> None:
-    """A run's record shows it only when it has ended."""
+def test_timer_that_was_not_stopped_is_found_before_it_expires(tmp_path: Path) -> None:
+    """The record of a run shows the timer only after its expiry."""
     bounds = Bounds(2, 2, "lossy", quirks={"phase3_timer_runs_on": True}, reduced=False, steps=True)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
     assert proof.flaw is not None
@@ -97,7 +97,7 @@ def test_a_timer_that_was_not_stopped_is_told_before_it_ends(tmp_path: Path) -> 
     assert "reconcile_phase_3_timer_expiration" in proof.example.judged["steps"].reason
 
 
-def test_a_wrong_step_may_take_a_message_that_comes_late() -> None:
+def test_wrong_step_on_a_late_message_is_found() -> None:
     bounds = Bounds(2, 2, "any", quirks={"pause_without_resume": True}, reduced=False, steps=True)
     collected = collect(bounds, most_bytes=8e9, most_s=60)
     assert collected.flaw is not None
@@ -107,7 +107,7 @@ def test_a_wrong_step_may_take_a_message_that_comes_late() -> None:
     assert min(*counted, collected.zones) > 0, "a proof that ends early counts the states that it has seen"
 
 
-def test_what_playing_does_not_show_is_said(tmp_path: Path) -> None:
+def test_flaw_that_the_scenario_does_not_show_is_reported(tmp_path: Path) -> None:
     bounds = Bounds(2, 2, "lossy", quirks={"forget_stack": True}, reduced=False)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
     assert proof.example is not None
@@ -117,13 +117,13 @@ def test_what_playing_does_not_show_is_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stagger", [{}, {"phase1_timeout_s": 0.5}])
-def test_every_step_of_right_agents_is_right(stagger: Stagger, tmp_path: Path) -> None:
+def test_each_step_of_correct_agents_is_correct(stagger: Stagger, tmp_path: Path) -> None:
     proof = prove(Bounds(2, 2, "lossy", ("reboot",), steps=True, stagger=stagger), out=tmp_path / "steps.yaml")
     assert proof.exit_status == 0
     assert any("every step" in line and line.startswith("✔") for line in in_words(proof))
 
 
-def test_the_bound_of_memory_is_of_what_is_taken_not_of_what_once_was() -> None:
+def test_memory_limit_concerns_present_memory() -> None:
     before = memory_bytes()
     once = b"x" * 500_000_000
     assert memory_bytes() > before + 400_000_000
@@ -131,7 +131,7 @@ def test_the_bound_of_memory_is_of_what_is_taken_not_of_what_once_was() -> None:
     assert memory_bytes() < before + 100_000_000
 
 
-def test_what_was_not_looked_at_never_holds(tmp_path: Path) -> None:
+def test_property_of_unexplored_states_never_holds(tmp_path: Path) -> None:
     proof = prove(Bounds(3, 3, "lossy"), Limits(most_s=0.0), tmp_path / "none.yaml")
     assert proof.exit_status == INCOMPLETE
     assert not any("✔" in line for line in in_words(proof))
@@ -160,12 +160,12 @@ def test_what_was_not_looked_at_never_holds(tmp_path: Path) -> None:
         {"losses": 1, "network": "any"},
     ],
 )
-def test_impossible_bounds_are_one_sentence(wrong: dict[str, object]) -> None:
+def test_impossible_bounds_end_with_one_sentence(wrong: dict[str, object]) -> None:
     with pytest.raises(BoundsError):
         Bounds(**wrong)  # type: ignore[arg-type]
 
 
-def test_the_command(tmp_path: Path) -> None:
+def test_command_prints_the_proof(tmp_path: Path) -> None:
     held = harness("prove", "--blocks", 1, "--json", cwd=tmp_path)
     assert held.returncode == 0
     assert json.loads(held.stdout)["complete"] is True
@@ -174,7 +174,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert [sentence.split()[0] for sentence in sentences(wrong.stderr)] == ["vote_timeout_s"]
 
 
-def test_ctrl_c_says_how_far_it_is(tmp_path: Path) -> None:
+def test_ctrl_c_prints_the_progress(tmp_path: Path) -> None:
     scenario = tmp_path / "begun" / "proof.yaml"
     command = [*COMMAND, "prove", "--agents", "5", "--blocks", "5", "--json", "--out", str(scenario)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
@@ -190,37 +190,37 @@ def test_ctrl_c_says_how_far_it_is(tmp_path: Path) -> None:
     assert not scenario.exists()
 
 
-def test_nobody_goes_on_who_was_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_workers_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(progress: Progress) -> None:
         assert multiprocessing.active_children()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("harness.proof.graph._workers.WORTH_A_CREW", 10)
+    monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)
     swarm = Swarm(Bounds(3, 3, "lossy"))
-    with Crew(swarm, 2) as crew:
-        graph = explore(swarm, most_bytes=8e9, most_s=60, crew=crew, watch=interrupt)
+    with Workers(swarm, 2) as workers:
+        graph = explore(swarm, most_bytes=8e9, most_s=60, workers=workers, watch=interrupt)
     assert graph.ended == "interrupted"
     assert graph.looked_at == LOOK_EVERY
     assert not multiprocessing.active_children()
 
 
-def test_ctrl_c_while_a_crew_begins_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is called at a fork swallows all exceptions."""
+def test_ctrl_c_during_the_start_of_workers_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Functions that run at a fork swallow all exceptions."""
     interruptions = [signal.SIGINT]
     os.register_at_fork(before=lambda: signal.raise_signal(interruptions.pop()) if interruptions else None)
-    monkeypatch.setattr("harness.proof.graph._workers.WORTH_A_CREW", 10)
+    monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)
     swarm = Swarm(Bounds(2, 3, "lossy"))
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's job in the background ignores
     try:
-        with Crew(swarm, 2) as crew:
-            graph = explore(swarm, most_bytes=8e9, most_s=60, crew=crew)
+        with Workers(swarm, 2) as workers:
+            graph = explore(swarm, most_bytes=8e9, most_s=60, workers=workers)
     finally:
         signal.signal(signal.SIGINT, before)
     assert not interruptions
     assert graph.ended == "interrupted"
 
 
-def test_bounds_are_those_of_the_whole_graph_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_also_concern_questions_to_the_whole_graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         import_module("harness.proof._proof"), "explore", lambda *_, **__: replace(explored, seconds=61.0)
     )
@@ -230,7 +230,7 @@ def test_bounds_are_those_of_the_whole_graph_too(tmp_path: Path, monkeypatch: py
     assert [line[0] for line in in_words(proof) if "one chain" in line or "livelock" in line] == ["-", "-"]
 
 
-def test_what_the_whole_graph_is_asked_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_shows_the_question_to_the_whole_graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.proof._progress_bar.LOOK_EVERY_S", 0.0)
     told: list[Progress] = []
     proof = prove(Bounds(2, 3, "lossless"), out=tmp_path / "asked.yaml", watch=told.append)
@@ -250,18 +250,18 @@ def take_long(*_: object) -> None:
     raise RuntimeError("nobody has stopped it")
 
 
-def test_time_is_up_also_for_who_is_long_about_one_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.proof.graph._workers.WORTH_A_CREW", 10)
+def test_time_limit_ends_a_long_question_about_one_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)
     monkeypatch.setattr("harness.proof.graph._workers.WAIT_S", 0.01)
     monkeypatch.setattr("harness.proof.graph._workers.expanded", take_long)
     swarm = Swarm(Bounds(3, 3, "lossy"))
-    with Crew(swarm, 2) as crew:
-        graph = explore(swarm, most_bytes=8e9, most_s=0.5, crew=crew)
+    with Workers(swarm, 2) as workers:
+        graph = explore(swarm, most_bytes=8e9, most_s=0.5, workers=workers)
     assert graph.ended == "time"
     assert not multiprocessing.active_children()
 
 
-def test_each_agent_by_itself_against_all_that_could_be_said(tmp_path: Path) -> None:
+def test_network_any_checks_each_agent_against_all_messages(tmp_path: Path) -> None:
     proof = prove(Bounds(2, 2, "any", ("reboot",)), out=tmp_path / "none.yaml")
     assert proof.exit_status == 0
     assert any("not looked at" in line for line in in_words(proof))

@@ -1,4 +1,4 @@
-"""One agent that all refuse, looked at from the fork on: what its livelock takes, and what cures it."""
+"""An agent that all other agents refuse, explored from the fork on: the conditions of its livelock, and the cures."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ STAGGER = {"stagger": {"phase1_timeout_s": 0.5}}
 
 
 def after_the_fork(agents: int, holders: list[int], keys: dict[str, Any]) -> Liveness:
-    """What may come of it if nothing is lost any more, and somebody completes a block at any moment."""
+    """Return the graph after the fork, without losses, with a block of any agent at any moment."""
     bounds = Bounds(agents, len(holders) + 1, "lossless", **keys)
     graph = explore(forked(bounds, holders), most_bytes=8e9, most_s=300)
     assert graph.ended == "complete"
@@ -35,7 +35,7 @@ def after_the_fork(agents: int, holders: list[int], keys: dict[str, Any]) -> Liv
         pytest.param(5, [1, 1, 1], MAJORITY, False, id="nor are two of five"),
     ],
 )
-def test_who_is_refused_goes_round_alone_unless_the_top_needs_a_majority(
+def test_refused_agent_has_a_livelock_unless_top_needs_majority(
     agents: int, holders: list[int], keys: dict[str, Any], goes_round: bool
 ) -> None:
     look = after_the_fork(agents, holders, keys)

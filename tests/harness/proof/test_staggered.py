@@ -1,4 +1,4 @@
-"""Agents whose timers differ: who is who makes a difference then, but not by which ID, nor which block is which."""
+"""Agents with different timers: the identity of agents matters, but not their IDs or the identity of blocks."""
 
 from pathlib import Path
 from random import Random
@@ -20,7 +20,7 @@ PHASE_1: Stagger = {"phase1_timeout_s": 0.5}
 
 
 def whichever_block(graph: Graph) -> set[Seen]:
-    """By place; of all that are the same but for which block is which one."""
+    """Return a representative of all views by place that differ only in the identity of blocks."""
     return {min(renumbered(seen)) for seen in by_place(graph)}
 
 
@@ -33,7 +33,7 @@ def whichever_block(graph: Graph) -> set[Seen]:
     ],
 )
 @pytest.mark.parametrize("any_older", [False, True])
-def test_reduced_is_all_that_there_is(
+def test_reduced_and_whole_state_spaces_are_equal(
     agents: int, blocks: int, network: Any, faults: tuple[str, ...], stagger: Stagger, any_older: bool
 ) -> None:
     reduced = explored(agents, blocks, network, faults, stagger=stagger, clocks_any=any_older)
@@ -45,21 +45,21 @@ def test_reduced_is_all_that_there_is(
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.4])
-def test_whatever_agents_do_by_chance_is_among_it(loss: float) -> None:
+def test_random_runs_are_contained(loss: float) -> None:
     seen = all_alike(explored(3, 2, "lossy" if loss else "lossless", stagger=PHASE_1, clocks_any=True))
     for seed in range(40):
         for there in by_chance(3, 2, loss, Random(seed), clocks_apart=True, stagger=PHASE_1):
             assert alike(there) in seen
 
 
-def test_whichever_block_is_which_there_is_less_to_look_at() -> None:
+def test_renaming_of_blocks_reduces_the_state_space() -> None:
     agreed = explored(3, 2, "lossy", stagger=PHASE_1)
     any_older = explored(3, 2, "lossy", stagger=PHASE_1, clocks_any=True)
     assert len(any_older.states) < len(agreed.states)
     assert whichever_block(agreed) <= whichever_block(any_older)
 
 
-def test_a_way_to_rest_is_played_by_the_agents_at_their_places() -> None:
+def test_path_to_an_idle_swarm_is_played_by_the_right_agents() -> None:
     graph = explored(2, 3, "lossy", stagger=PHASE_1, clocks_any=True)
     at_rest = [number for number, state in enumerate(graph.states) if number and graph.swarm.is_idle(state)]
     played = 0
@@ -75,8 +75,8 @@ def test_a_way_to_rest_is_played_by_the_agents_at_their_places() -> None:
     assert played > 10
 
 
-def test_the_cure_is_held_where_any_block_may_be_the_older(tmp_path: Path) -> None:
-    """Two agents in step, which go round with the thesis's timers."""
+def test_cure_holds_with_clocks_any(tmp_path: Path) -> None:
+    """Two agents act in step. They have a livelock with the timers of the thesis."""
     bounds = Bounds(2, 4, "lossless", clocks_any=True)
     assert prove(bounds, out=tmp_path / "thesis.yaml").livelocks
     cured = prove(Bounds(2, 4, "lossless", clocks_any=True, stagger=PHASE_1), out=tmp_path / "cured.yaml")

@@ -1,16 +1,16 @@
-"""Difference bounds against all times there are, on a grid."""
+"""Zones compared with all possible times on a grid."""
 
 from itertools import product
 from random import Random
 
-from harness.proof.examples._path_times import Run, instants_s
+from harness.proof.examples._path_times import TimerRun, instants_s
 from harness.proof.model._zones import NOTHING_RUNS, Zones
 
 DURATIONS = (10, 5)
 
 
-def test_zones_are_the_times_that_are_possible() -> None:
-    """Timers are started and end at random; whole units are enough, for all bounds are whole (explanation/proof.md)."""
+def test_zones_contain_exactly_the_possible_times() -> None:
+    """Timers start and expire at random. Whole units are enough because all bounds are whole (explanation/proof.md)."""
     for seed in range(30):
         lots, zones = Random(seed), Zones()
         zone, points = NOTHING_RUNS, {()}
@@ -34,7 +34,7 @@ def test_zones_are_the_times_that_are_possible() -> None:
             assert points == set(inside(zones, zone, len(stay) + len(new)))
 
 
-def test_some_timers_have_to_end_at_one_moment() -> None:
+def test_zone_finds_timers_that_expire_at_the_same_moment() -> None:
     zones = Zones()
     zone = zones.after(NOTHING_RUNS, (), (-11, -11))
     assert zone is not None
@@ -45,7 +45,7 @@ def test_some_timers_have_to_end_at_one_moment() -> None:
 
 
 def inside(zones: Zones, zone: int, timers: int) -> list[tuple[int, ...]]:
-    """The whole points of a zone."""
+    """Return the points of a zone with whole coordinates."""
     matrix = zones.matrix(zone)
     found = []
     for point in product(range(max(DURATIONS) + 1), repeat=timers):
@@ -55,11 +55,11 @@ def inside(zones: Zones, zone: int, timers: int) -> list[tuple[int, ...]]:
     return found
 
 
-def test_instants_are_as_far_apart_as_the_timers_allow() -> None:
-    assert instants_s(3, [Run(0, 10, 2, True)]) == [1, 6, 11]
-    assert instants_s(3, [Run(0, 10, 1, True), Run(1, 5, 2, True)]) == [1, 11, 16]
-    assert instants_s(3, [Run(0, 10, 2, True), Run(1, 10, 2, True)]) == [1, 1, 11]
+def test_instants_have_the_largest_possible_distance() -> None:
+    assert instants_s(3, [TimerRun(0, 10, 2, True)]) == [1, 6, 11]
+    assert instants_s(3, [TimerRun(0, 10, 1, True), TimerRun(1, 5, 2, True)]) == [1, 11, 16]
+    assert instants_s(3, [TimerRun(0, 10, 2, True), TimerRun(1, 10, 2, True)]) == [1, 1, 11]
 
 
 def test_only_timers_in_any_order_may_be_late() -> None:
-    assert instants_s(3, [Run(0, 10, 1, True), Run(0, 5, 2, True)]) == [1, 11, 16]
+    assert instants_s(3, [TimerRun(0, 10, 1, True), TimerRun(0, 5, 2, True)]) == [1, 11, 16]

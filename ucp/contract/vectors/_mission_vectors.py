@@ -1,6 +1,6 @@
 """Whole missions in virtual time. Together they take every branch of the 20 algorithms.
 
-Each function is a mission: its name is the transcript's, and its docstring says what happens.
+Each function plays a mission. Its name is the name of the transcript, and its docstring is the description.
 """
 
 from collections.abc import Callable
@@ -312,7 +312,7 @@ def ties_read_otherwise() -> Story:
 
 
 def asks_after_commit() -> Story:
-    """The setting is `asks_after_commit`. The agent asks a gap after its commits, unless it reconciles by then."""
+    """The setting is `asks_after_commit`. After a commit and a gap, the agent sends a query unless it reconciles."""
     story = Story(asks_after_commit=True)
     story.complete_a_block()
     story.vote((A, True))

@@ -1,4 +1,4 @@
-"""What runs reached is what exists: the same numbers in simulated runs, in recorded ones, and in `prove`."""
+"""States that runs reach exist: simulated runs, recorded runs and `prove` give them the same numbers."""
 
 import json
 from pathlib import Path
@@ -54,20 +54,20 @@ def reached(asked: Scenario, seed: int = 1, **options: Any) -> Reached:
     return reached_in(simulate(asked, seed, tracing=True, deliver_all=True, **options).evidence)
 
 
-def test_everything_of_an_agents_state_is_shaped_or_left_out_with_a_reason() -> None:
+def test_shape_covers_each_attribute_or_omits_it_with_a_reason() -> None:
     there = vars(Agent(1, [1], b"").state).keys() - OF_SNAPSHOTS
     assert there == SHAPED | TIMERS | BETWEEN_STEPS | LEFT_OUT
 
 
 @pytest.mark.parametrize("bounds", [Bounds(2, 2), Bounds(2, 1, "any"), Bounds(2, 3, "lossless")])
-def test_reductions_leave_no_local_state_and_no_input_out(bounds: Bounds) -> None:
+def test_reductions_keep_all_local_states_and_inputs(bounds: Bounds) -> None:
     whole = existing(Bounds(bounds.agents, bounds.blocks, bounds.network, reduced=False))
     there = existing(bounds)
     assert there.states == whole.states
     assert there.pairs == whole.pairs
 
 
-def test_whatever_a_run_reaches_exists() -> None:
+def test_states_that_a_run_reaches_exist() -> None:
     there, both = existing(Bounds(2, 2, "any")), Reached()
     for seed in range(30):
         both.add(reached(by_chance(2, 2, seed), seed))
@@ -76,7 +76,7 @@ def test_whatever_a_run_reaches_exists() -> None:
     assert len(both.states) > 10
 
 
-def test_it_does_not_matter_who_makes_which_block_of_which_mission() -> None:
+def test_shape_does_not_depend_on_agents_blocks_and_mission() -> None:
     alike = {"network": {"delay": 0.02}, "duration_s": 200}
 
     def made_by(agent: int, at_s: float, initial_data: str) -> Scenario:
@@ -90,7 +90,7 @@ def test_it_does_not_matter_who_makes_which_block_of_which_mission() -> None:
     assert one.pairs == other.pairs
 
 
-def test_a_larger_run_is_partly_beyond_the_bounds() -> None:
+def test_larger_run_is_partly_beyond_the_bounds() -> None:
     all_reached, there = reached(by_chance(3, 6, 1)), existing(Bounds(2, 2))
     within = to_json(all_reached, there)["within"]["local_states"]
     assert 0 < within["reached"] < within["exist"] == len(there.states)
@@ -106,7 +106,7 @@ def test_branches_are_those_of_the_contract() -> None:
     assert any("reconcile_begin: already in progress, begun" in line for line in in_words(nothing_lost, None))
 
 
-def test_a_recorded_run_counts_as_it_was_played(tmp_path: Path) -> None:
+def test_recorded_run_has_the_coverage_of_the_played_run(tmp_path: Path) -> None:
     asked = by_chance(3, 3, 4)
     path = tmp_path / "scenario.yaml"
     path.write_text(json.dumps(asked.model_dump(mode="json", exclude_defaults=True)))
@@ -123,7 +123,7 @@ def test_a_recorded_run_counts_as_it_was_played(tmp_path: Path) -> None:
     assert document["within"]["local_states"]["exist"] == len(existing(Bounds(2, 2)).states)
 
 
-def test_without_traces_there_is_nothing_to_say(tmp_path: Path) -> None:
+def test_run_without_traces_has_unknown_coverage(tmp_path: Path) -> None:
     asked = by_chance(2, 1, 1)
     path = tmp_path / "scenario.yaml"
     path.write_text(json.dumps(asked.model_dump(mode="json", exclude_defaults=True)))

@@ -62,7 +62,7 @@ def test_they_come_to_the_same_states_where_nothing_crosses(
     assert opinion.livelock is opinion.specified_livelock is (None if network == "lossy" else False)
 
 
-def test_with_timers_that_differ_they_come_to_the_same_states_and_neither_goes_round() -> None:
+def test_different_timers_give_equal_states_without_a_livelock() -> None:
     """Where both do if timers are alike."""
     stagger: Stagger = {"phase1_timeout_s": 2.5}
     opinion = second_opinion(Bounds(2, 4, "lossless", settings=NO_GAP, stagger=stagger))

@@ -1,4 +1,7 @@
-"""Somebody with a vehicle's keys: what is looked at is all that can be said, and playing shows what comes of it."""
+"""An attacker with the keys of a vehicle.
+
+All its possible messages are explored, and simulated runs confirm the results.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,8 +16,8 @@ from harness.errors import ScenarioError
 from harness.play.process.process_preflight import refuse_virtual_time_keys
 from harness.play.rogue.lies import made_block
 from harness.proof import Bounds, BoundsError, in_words, prove
-from harness.proof.attacker._attacker import Captor
-from harness.proof.attacker._forgeries import NOBODYS, Asked, Material, asked, letters
+from harness.proof.attacker._attacker import Attacker
+from harness.proof.attacker._forgeries import NOBODYS, Material, PendingQuestions, asked, forgeries
 from harness.proof.examples._path_script import Script
 from harness.proof.graph._exploration import Graph, explore
 from harness.proof.model._any_sender import collect
@@ -59,9 +62,11 @@ def explored(agents: int = 3, blocks: int = 1, lies: int = 1) -> Graph:
 
 
 def lied_to(graph: Graph) -> Iterator[tuple[Agent, Material]]:
-    """Each agent in each state in which somebody could lie to it once more, and of what that can speak."""
+    """Yield each agent in each state in which the attacker can send it one more message, with the material of this
+    message.
+    """
     bounds, local = graph.swarm.bounds, graph.swarm.local
-    captor = Captor(replace(bounds, lies=bounds.lies + 1), local)
+    captor = Attacker(replace(bounds, lies=bounds.lies + 1), local)
     pairs = {
         (state[AGENTS + place], place, material)
         for state in graph.states
@@ -75,7 +80,7 @@ def lied_to(graph: Graph) -> Iterator[tuple[Agent, Material]]:
 
 
 def random_message(lots: Random, agent: Agent, material: Material) -> Message:
-    """Whatever can be said by who knows of these blocks, and can make others."""
+    """Return a random message of an attacker that knows these blocks and can make others."""
     made = Block(CAPTURED, lots.randrange(2_000_000), lots.randbytes(20))
     blocks = [*material.blocks, made]
     hashes = [*material.named, made.block_hash, lots.randbytes(32)]
@@ -102,8 +107,11 @@ def random_message(lots: Random, agent: Agent, material: Material) -> Message:
     )
 
 
-def outcome(agent: Agent, message: Message, others: frozenset[Asked]) -> Any:
-    """What the agent becomes, whatever new blocks are called, and what it says that anybody waits for; it goes back."""
+def outcome(agent: Agent, message: Message, others: frozenset[PendingQuestions]) -> Any:
+    """Return the agent's state after a message, and the answers that other agents wait for.
+
+    New blocks have neutral names. The agent is restored.
+    """
     before = take(agent)
     agent.receive_message(CAPTURED, 0, message, NOW_S)
     state = agent.state
@@ -114,7 +122,7 @@ def outcome(agent: Agent, message: Message, others: frozenset[Asked]) -> Any:
     return held.number(shape), counted, said
 
 
-def matters(message: Message, others: frozenset[Asked]) -> bool:
+def matters(message: Message, others: frozenset[PendingQuestions]) -> bool:
     match message:
         case BlockAddResponse():
             return any(waits.vote is not None and waits.vote[0] == message.block_hash for waits in others)
@@ -127,11 +135,14 @@ def matters(message: Message, others: frozenset[Asked]) -> bool:
     return True
 
 
-def test_whatever_is_said_comes_to_what_one_of_the_letters_comes_to() -> None:
+def test_random_message_has_the_effect_of_one_of_the_forgeries() -> None:
     lots, changed = Random(20), 0
     for agent, material in lied_to(explored()):
         nothing = outcome(agent, ChainContainQuery(NOBODYS), material.others)
-        known = [nothing, *(outcome(agent, said, material.others) for said in letters(agent.state, CAPTURED, material))]
+        known = [
+            nothing,
+            *(outcome(agent, said, material.others) for said in forgeries(agent.state, CAPTURED, material)),
+        ]
         for _ in range(80):
             message = random_message(lots, agent, material)
             came = outcome(agent, message, material.others)
@@ -140,7 +151,7 @@ def test_whatever_is_said_comes_to_what_one_of_the_letters_comes_to() -> None:
     assert changed > 500
 
 
-def test_reduced_is_all_that_there_is() -> None:
+def test_reduced_and_whole_state_spaces_are_equal() -> None:
     reduced, whole = (
         explored(2, 2),
         explore(Swarm(Bounds(2, 2, "lossy", captured=2, reduced=False)), most_bytes=8e9, most_s=60),
@@ -149,7 +160,7 @@ def test_reduced_is_all_that_there_is() -> None:
     assert all_seen(reduced) == all_seen(whole)
 
 
-def test_whatever_a_captor_does_by_chance_is_among_it() -> None:
+def test_random_attacks_are_contained() -> None:
     seen = all_seen(explored())
     for seed in range(200):
         for there in by_chance(Random(seed)):
@@ -157,7 +168,7 @@ def test_whatever_a_captor_does_by_chance_is_among_it() -> None:
 
 
 def by_chance(lots: Random) -> Iterator[Any]:
-    """Three agents complete one block, and lose what they lose; the third is captured, and one lie is told."""
+    """Play a random run: three agents complete one block and lose messages, the third is captured and sends one lie."""
     agents = [Agent(number, (1, 2, 3), b"proof", Settings(max_block_bytes=267)) for number in (1, 2, 3)]
     times = {lots.uniform(0, 30): what for what in ("completes", "captured", "lies")}
     while True:
@@ -183,7 +194,7 @@ def by_chance(lots: Random) -> Iterator[Any]:
 
 
 def lie(agents: list[Agent], now: float, lots: Random) -> None:
-    """Some of the agents hear it."""
+    """Send a random message of the attacker to some of the agents."""
     captor = Swarm(Bounds(3, 1, captured=CAPTURED)).captor
     assert captor is not None
     held = [frozenset((*agent.state.chain, *agent.state.reconcile_stack)) for agent in agents]
@@ -201,7 +212,7 @@ def lie(agents: list[Agent], now: float, lots: Random) -> None:
             agent.receive_message(CAPTURED, 0, message, now)
 
 
-def test_every_letter_is_let_in_and_nothing_else() -> None:
+def test_agents_accept_all_forgeries_and_no_other_messages() -> None:
     local = explored().swarm.local
     dropped = set().union(*(agent.dropped for agent in local.agents.by_id.values()))
     assert dropped == {"not signed by its sender", "block not signed by its maker"}
@@ -216,7 +227,7 @@ def test_every_letter_is_let_in_and_nothing_else() -> None:
         ("name", BlockSignatures, "is_genuine", lambda self, block, signature: True),
     ],
 )
-def test_a_gate_with_a_rule_left_out_is_found(
+def test_security_gate_without_a_rule_is_found(
     monkeypatch: pytest.MonkeyPatch, kind: str, owner: type, rule: str, broken: Any
 ) -> None:
     monkeypatch.setattr(owner, rule, broken)
@@ -225,7 +236,7 @@ def test_a_gate_with_a_rule_left_out_is_found(
     assert graph.flaw.kind == kind
 
 
-def test_what_was_looked_at_is_what_is_played() -> None:
+def test_scenario_of_an_attack_plays_the_explored_path() -> None:
     graph, lots = explored(2, 1, 2), Random(20)
     lied = [number for number, state in enumerate(graph.states) if state[LEFT] // LIES == 0 and number]
     for number in lots.sample(lied, 12):
@@ -247,7 +258,7 @@ def test_what_was_looked_at_is_what_is_played() -> None:
                 assert there in [(0, 0, 0, True), *seen]
 
 
-def test_a_captor_violates_1_and_4_and_nothing_else(tmp_path: Path) -> None:
+def test_attacker_violates_only_characteristics_1_and_4(tmp_path: Path) -> None:
     proof = prove(Bounds(3, 1, "lossy", captured=CAPTURED), out=tmp_path / "captured.yaml")
     assert proof.exit_status == 1
     assert proof.flaw is None
@@ -260,11 +271,11 @@ def test_a_captor_violates_1_and_4_and_nothing_else(tmp_path: Path) -> None:
     assert proof.to_json()["lies"] == 1
 
 
-def test_who_says_nothing_violates_nothing(tmp_path: Path) -> None:
+def test_attacker_without_messages_violates_nothing(tmp_path: Path) -> None:
     assert prove(Bounds(3, 1, "lossy", captured=1, lies=0), out=tmp_path / "silent.yaml").exit_status == 0
 
 
-def test_any_number_of_lies_in_any_network_comes_to_nothing_worse(tmp_path: Path) -> None:
+def test_unlimited_lies_in_any_network_violate_nothing_more(tmp_path: Path) -> None:
     collected = collect(Bounds(3, 1, "any", captured=CAPTURED), most_bytes=8e9, most_s=60)
     assert (collected.ended, collected.flaw, collected.shown) == ("complete", None, {"1", "4"})
 
@@ -273,12 +284,12 @@ def test_any_number_of_lies_in_any_network_comes_to_nothing_worse(tmp_path: Path
     "wrong",
     [{"captured": 4}, {"captured": 1, "lies": 99}, {"captured": 1, "faults": ("death",)}, {"captured": 1, "agents": 1}],
 )
-def test_impossible_bounds_are_one_sentence(wrong: dict[str, Any]) -> None:
+def test_impossible_bounds_end_with_one_sentence(wrong: dict[str, Any]) -> None:
     with pytest.raises(BoundsError):
         Bounds(**{"agents": 3, **wrong})
 
 
-def test_a_lie_is_heard_by_whom_it_is_told_also_without_keys() -> None:
+def test_lie_reaches_its_receivers_also_without_keys() -> None:
     lie = {"message": "Commit Block", "sender": 3, "receivers": [1], "block": "made 4.5", "chain": []}
     unheard = {"message": "Commit Block", "sender": 3, "block": "2.7", "chain": []}
     document = {
@@ -296,14 +307,17 @@ def test_a_lie_is_heard_by_whom_it_is_told_also_without_keys() -> None:
         refuse_virtual_time_keys(parse(document))
 
 
-def test_lies_are_for_who_is_captured(tmp_path: Path) -> None:
+def test_lie_needs_a_captured_vehicle(tmp_path: Path) -> None:
     refused = harness("prove", "--lies", 2, cwd=tmp_path)
     assert refused.returncode == 2
     assert len(sentences(refused.stderr)) == 1
 
 
-def test_whatever_a_captor_does_by_chance_in_any_network_is_among_it() -> None:
-    """One block of its own, any number of lies; messages of the others come late, twice, or never."""
+def test_random_attacks_in_any_network_are_contained() -> None:
+    """The agent has one block of its own and receives any number of lies.
+
+    Messages of other agents come late, twice or never.
+    """
     seen = set()
 
     def keep(local: LocalStates) -> None:
@@ -334,7 +348,7 @@ def lied_to_at_any_time(lots: Random) -> Iterator[Any]:
         material = Material(
             frozenset((own,)), frozenset((own.block_hash, NOBODYS)), frozenset((asked(other.state),)), (1,)
         )
-        chosen = [*letters(agent.state, CAPTURED, material), random_message(lots, agent, material)]
+        chosen = [*forgeries(agent.state, CAPTURED, material), random_message(lots, agent, material)]
         lie = lots.choice(chosen)
         if getattr(lie, "block", own) == own:
             agent.receive_message(CAPTURED, 0, lie, now)
