@@ -223,7 +223,7 @@ def test_agents_accept_all_forgeries_and_no_other_messages() -> None:
 @pytest.mark.parametrize(
     ("kind", "owner", "rule", "broken"),
     [
-        ("revoked", SecuredAgent, "_why_not_opened", lambda self, clear: None),
+        ("revoked", SecuredAgent, "_drop_reason", lambda self, clear: None),
         ("name", BlockSignatures, "is_genuine", lambda self, block, signature: True),
     ],
 )
