@@ -35,7 +35,7 @@ def write_exports(air: Air, directory: Path, traces: bool = True) -> list[Path]:
         if traces:
             initial_data = agent.state.chain.inception.block_data
             clock = {"epoch_us": 0, "speedup": 1.0}
-            header = header_line(agent_id, sorted(agent.roster), initial_data, {"vote_timeout_s": 10.0}, clock)
+            header = header_line(agent_id, sorted(agent.roster), initial_data, agent.state.settings.to_json(), clock)
             lines = "".join(run.to_line() for run in air.runs[agent_id])
             (directory / f"{agent_id}.trace.jsonl").write_text(header + lines)
     return paths

@@ -47,7 +47,7 @@ def _repeated(runs: Sequence[HandlerRun]) -> Iterator[Reordered]:
     position = 0
     while position < len(runs):
         run = runs[position]
-        key = run.t, run.handler, run.trigger, run.branch
+        key = run.t, run.handler, repr(run.trigger), run.branch
         before = last_at.get(key)
         if before is not None and position - before <= MAX_REPEATED and runs[before] == run:
             length = position - before

@@ -326,7 +326,10 @@ def test_exit_status_shows_whether_all_files_were_usable(tmp_path: Path) -> None
     assert harness("consolidate", tmp_path / "home" / "2.chain.json").returncode == 2
     assert harness("consolidate", tmp_path / "home", "-o", tmp_path / "x.kml").returncode == 2
     assert harness("consolidate", tmp_path / "home", "--reconcile").returncode == 2
-    assert harness("consolidate", tmp_path / "home", "--kml", tmp_path / "x.kml").returncode == 2
+    without_map = harness("consolidate", tmp_path / "home", "--kml", tmp_path / "x.kml")
+    assert without_map.returncode == 1
+    assert "no vehicle logged a position, so there is no map" in without_map.stdout
+    assert not (tmp_path / "x.kml").exists()
 
 
 def test_logged_position_is_in_the_track_files(tmp_path: Path) -> None:

@@ -5,6 +5,6 @@ it notices. `edits.yaml` therefore holds mistakes for each Algorithm. The progra
 
     python -m tests.harness.proof.specification.mutation
 
-plants each mistake into the specification, and finds the smallest comparison that tells it apart from the core. It
+plants each mistake into the specification, and finds the smallest comparison that distinguishes it from the core. It
 writes the results to `score.json`, and the tables of docs/explanation/specification.md.
 """
