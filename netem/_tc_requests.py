@@ -86,7 +86,7 @@ class TrafficControl:
         self.index = index
 
     def install(self) -> list[Request]:
-        """Return requests for an HTB without classes."""
+        """Return the netlink requests that install an HTB queueing discipline without classes."""
         settings = struct.pack("=5I", 3, 10, 0, 0, 0)  # version, rate2quantum, default class, debug, direct packets
         return [Request("add qdisc htb", RTM_NEWQDISC, self._message("htb", _ROOT, _HTB, attribute(2, settings)), NEW)]
 

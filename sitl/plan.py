@@ -99,7 +99,7 @@ class Plan:
 
 
 def _problem(leg: Leg, first: bool, last: bool, vehicle_type: VehicleType) -> str | None:
-    """Return the error in a leg, or None."""
+    """Return a sentence about the error in a leg of the flight plan. None without an error."""
     if vehicle_type == "rover" and isinstance(leg, TakeOff | Land):
         return "a rover neither takes off nor lands"
     match leg:

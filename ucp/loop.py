@@ -92,7 +92,7 @@ class Loop:
         self._selector.close()
 
     def _call_back(self, ready: list[tuple[selectors.SelectorKey, int]]) -> None:
-        """Call back for a socket that can be read or written."""
+        """Call the function of a socket that can be read or written."""
         for key, events in ready:
             readable, writable = self._callbacks.get(key.fileobj, (None, None))  # type: ignore[call-overload]
             self._call(readable if events & selectors.EVENT_READ and readable else writable)

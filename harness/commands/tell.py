@@ -59,7 +59,10 @@ def tell_command(
 
 
 def _parse_requests(sentence: str) -> list[dict[str, Any]]:
-    """Return the requests that a sentence stands for. Raises ScenarioError for an unknown sentence."""
+    """Return the control requests that mean the same as a sentence of the user, such as "speed 10".
+
+    Raises ScenarioError for an unknown sentence.
+    """
     for pattern, command, key in _TIME_COMMANDS:
         if match := pattern.fullmatch(sentence):
             return [{"command": command, **({key: float(match[1])} if key else {})}]

@@ -53,7 +53,7 @@ class RunOutcome:
         self.exit_status = error.exit_status
 
     def record(self, change: dict[str, Any]) -> None:
-        """Record a change. Of the changes by flight, record only those of the connected groups."""
+        """Record a change. A movement is recorded only if it changes which vehicles are in range of each other."""
         if change["what"] == RANGE and self.network and _same_connections(change, self.network[-1]):
             return
         if "fully_connected" in change:
@@ -104,7 +104,7 @@ class Swarm(Protocol):
         """Make the change, and record it in `played`."""
 
     async def hold(self, fate: Fate) -> int:
-        """Hold back the messages that match the fate, from its `from_s` until `release`. Return the number of the hold.
+        """Keep the messages that match the scripted fate, from its `from_s` on. Return a number for `release`.
 
         Raises ScenarioError if messages cannot be held here.
         """

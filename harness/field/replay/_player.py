@@ -271,7 +271,7 @@ def _short(block_hash: str) -> str:
 
 
 def _later_than(entries: Iterable[Entry], until_s: float) -> int:
-    """Return the number of entries before the first one that is later."""
+    """Return the number of entries before the first one after `until_s`."""
     count = 0
     for entry in entries:
         if entry.content.t > until_s:

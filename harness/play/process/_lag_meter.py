@@ -11,7 +11,7 @@ END_LIMIT_S = 5.0
 
 
 class LagMeter:
-    """One run of `_lag_probe.py`. It ends with this process at the latest."""
+    """One run of `_lag_probe.py`. The program ends when this process ends, or before."""
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self._process = process

@@ -103,7 +103,7 @@ class Attacker:
 
 
 class AttackerKnowledge:
-    """The knowledge of an attacker in the network `any`.
+    """The messages that an attacker can send, in the network `any` (each agent is explored alone).
 
     The attacker can send each message to each agent any number of times.
 

@@ -111,11 +111,11 @@ class Swarm:
     # Actions of an instant
 
     def firsts(self, state: State) -> list[Action]:
-        """Yield the actions of the timers that may expire next, one for each possible result."""
+        """Return the actions of the timers that may expire next, one for each possible result."""
         return [action for actions in self._firsts(state) for action in actions]
 
     def _firsts(self, state: State) -> list[list[Action]]:
-        """Return these actions grouped by timer."""
+        """Return the actions of the timers that may expire next: a list for each timer."""
         running = self._running(state[AGENTS:])
         if not self.bounds.timers_any:
             running = tuple([running[first - 1] for first in self.zones.firsts(state[ZONE])])

@@ -79,7 +79,7 @@ class Agents:
 
 
 def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHandler[Any]:
-    """Return the handler, extended by a call of `after`."""
+    """Return a handler that runs this one and then calls `after`."""
 
     def run(*inputs: Any) -> str:
         branch = handler.run(*inputs)

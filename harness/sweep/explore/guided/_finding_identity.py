@@ -39,7 +39,7 @@ class Identity:
 
 
 def identities(result: Result, cycle: Cycle | None, scenario: Scenario) -> tuple[Identity, ...]:
-    """Return the identities of all bad verdicts of a run.
+    """Return the identity of the finding of each bad verdict.
 
     Settings that differ from the thesis are part of the shape.
     """
