@@ -396,7 +396,7 @@ def conclude(home: Path, damage: str, whole: Undamaged, commands: Sequence[Comma
             command(home, concluded, whole)
         except HarnessError:
             concluded.unusable |= command is run_reconstruct
-        except Exception:
+        except Exception:  # a traceback is a result of this measurement
             concluded.tracebacks.append(f"{command.__name__}: {traceback.format_exc()}")
     return concluded
 

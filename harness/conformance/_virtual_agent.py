@@ -219,8 +219,8 @@ class VirtualTimeAgent(AgentUnderTest):
             answer = await self._program.ask(line)
             sent = [base64.b64decode(text, validate=True) for text in answer["sent"]]
             announced_s = answer.get("timer")
-            told = (await self._program.ask({"t": self._now, "command": "status"})).get("answer")
-            status = told if isinstance(told, dict) else {}
+            reported = (await self._program.ask({"t": self._now, "command": "status"})).get("answer")
+            status = reported if isinstance(reported, dict) else {}
         except (AgentEndedError, UnsupportedError) as error:
             wrong.append(str(error))
             ended = str(error) if isinstance(error, AgentHangsError | AgentExitedError) else None
@@ -235,13 +235,13 @@ class VirtualTimeAgent(AgentUnderTest):
         if _same_instant(announced_s, expected_s):
             return replace(observation, running_timer=timer)
         sentence = f"according to its answer its next timer expires at {announced_s} s, not at {expected_s} s"
-        told = replace(observation, wrong=(*observation.wrong, sentence))
+        differing = replace(observation, wrong=(*observation.wrong, sentence))
         if observation.wrong:  # a wrong handler run starts other timers, so this difference is no further evidence
-            return told
+            return differing
         if isinstance(announced_s, float) and announced_s in self._stopped_timers:
-            return replace(told, hidden_run=self._stopped_timers[announced_s])
-        begun = (each.name for each in model.state.timers if each.deadline and each.deadline not in running)
-        return replace(told, wrong_timer=next(begun, None))
+            return replace(differing, hidden_run=self._stopped_timers[announced_s])
+        started = (each.name for each in model.state.timers if each.deadline and each.deadline not in running)
+        return replace(differing, wrong_timer=next(started, None))
 
 
 def _deadlines(model: ReferenceModel) -> set[float]:

@@ -117,9 +117,9 @@ async def _reboot_in_reconcile(bench: Bench) -> None:
             require(below != query and below.NAME == query.NAME, "a query about the chain below", below.NAME)
             directory = first.process.directory
         async with bench.agent(STORE, port=port, directory=directory) as second:
-            (back,) = await second.receive(1, "a Commit Block of what was on the stack")
+            (back,) = await second.receive(1, "a Commit Block with the block of the stack")
             right = CommitBlock(blocks[1], query.chain_hash)
-            require(back == right, "a Commit Block of what was on the stack", back.NAME)
+            require(back == right, "a Commit Block with the block of the stack", back.NAME)
             await second.require_single_answer(query.chain_hash, "it came back")
     finally:
         bench.lab.return_port(port)

@@ -151,10 +151,10 @@ def test_import_copies_flight_logs_and_names_the_others(folder: Path, tmp_path: 
     done = harness("import", folder, "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "2 export(s), 1 flight log(s)" in done.stdout
-    told = " ".join(sentences(done.stderr))
-    assert "00000003.BIN: the DataFlash log of a copter is of agent 7 by 14 positions" in told
-    assert "other.tlog: the telemetry log of a plane matches no agent" in told
-    assert "mission.plan" in told
+    printed = " ".join(sentences(done.stderr))
+    assert "00000003.BIN: the DataFlash log of a copter is of agent 7 by 14 positions" in printed
+    assert "other.tlog: the telemetry log of a plane matches no agent" in printed
+    assert "mission.plan" in printed
     record = json.loads((tmp_path / "out" / "import.json").read_text())
     (flight,) = record["flights"]
     (copy,) = flight["agents"]["7"]["flight_logs"]

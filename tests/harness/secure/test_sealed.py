@@ -84,13 +84,13 @@ def test_the_judge_follows_agents_that_seal(swarm: SealedSwarm) -> None:
     assert judgement.verdict == "as specified", judgement
 
 
-@pytest.mark.parametrize("told", [None, b"", LOGGED * 40, b"?"])
-def test_the_judge_finds_an_agent_that_tells_of_another_seal(swarm: SealedSwarm, told: bytes | None) -> None:
+@pytest.mark.parametrize("sealed", [None, b"", LOGGED * 40, b"?"])
+def test_judge_finds_an_agent_whose_trace_has_other_sealed_data(swarm: SealedSwarm, sealed: bytes | None) -> None:
     evidence = swarm.evidence()
     runs = evidence.traces[2].runs
     position = next(position for position, run in enumerate(runs) if run.sealed is not None)
     runs[position] = dataclasses.replace(
-        runs[position], sealed=None if told is None else RecordedBytes(in_base64(told))
+        runs[position], sealed=None if sealed is None else RecordedBytes(in_base64(sealed))
     )
     judgement = steps.check(evidence)
     assert judgement.verdict == "deviates"

@@ -105,6 +105,19 @@ def test_hidden_stations_collide_although_each_senses_an_idle_channel() -> None:
     assert first.fate(2) is Fate.RANGE
 
 
+@pytest.mark.parametrize("seed", range(40))
+def test_station_counts_no_slots_during_several_frames_of_others(seed: int) -> None:
+    own = sent(QUIET, [0, 10], (0, 1.0), (0, 1.0001), seed=seed)
+    slots_drawn = round((own[1].began_at - own[0].ended_at - DIFS_S) / 20e-6)
+    traffic = ((0, 1.0), (1, 1.0001), (1, 1.0002))
+    first, second, third = sent(QUIET, [0, 10], *traffic, seed=seed)
+    passed = [second.began_at - first.ended_at, third.began_at - second.ended_at]
+    slots_left = slots_drawn - sum(round((gap_s - DIFS_S) / 20e-6) for gap_s in passed)
+    *_, last = sent(QUIET, [0, 10], *traffic, (0, third.began_at + 0.0005), seed=seed)
+    if slots_left > 0:
+        assert last.began_at == pytest.approx(third.ended_at + DIFS_S + slots_left * 20e-6, abs=1e-9)
+
+
 def starts_between_two_frames(energy_dbm: float, seed: int) -> float:
     """Return when station 2 begins a frame that it queues at 1.0005 s.
 

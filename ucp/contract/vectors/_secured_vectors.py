@@ -59,7 +59,7 @@ def cases() -> Iterator[tuple[str, bytes]]:
     yield "an answer to what was not asked", other.seal(2, BlockAddResponse(BLOCK_HASH, True), stale, None, 0)
     forged = CommitBlock(Block(1, 5, b"never made"), BLOCK_HASH)
     yield "a block that its maker did not sign", other.seal(3, forged, None, bytes(64), 0)
-    yield "type 10, by nobody", other.revocation_datagram(1, bytes(72))
+    yield "type 10, without the signature of the authority", other.revocation_datagram(1, bytes(72))
 
 
 def vectors() -> dict[str, Any]:
