@@ -16,6 +16,8 @@ class Damage:
     searches: int = 0
     skipped_bytes: int = 0
     first_at: int | None = None
+    ends_at: int | None = None
+    """Byte from which the file is not read, because it has too much damage. None if it is read to its end."""
     unusable: int = 0
     """Number of messages with an unknown layout or impossible values."""
 
@@ -25,6 +27,13 @@ class Damage:
         if self.first_at is None:
             self.first_at = at
 
+    def ends_reading(self, at: int) -> bool:
+        """Return true if the file has too much damage to be read from byte `at` on."""
+        if self.searches <= MAX_SEARCHES:
+            return False
+        self.ends_at = at
+        return True
+
     def sentences(self) -> list[str]:
         """Return a sentence for each kind of damage."""
         sentences = []
@@ -32,6 +41,8 @@ class Damage:
             sentences.append(
                 f"{self.skipped_bytes:,} bytes are no whole message and are skipped, first at byte {self.first_at:,}"
             )
+        if self.ends_at is not None:
+            sentences.append(f"the part after byte {self.ends_at:,} is not read, because the file has too much damage")
         if self.unusable:
             messages = "1 message has" if self.unusable == 1 else f"{self.unusable:,} messages have"
             sentences.append(f"{messages} an unknown layout or impossible values and are left out")

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from harness.field.flight_logs import _gps_time
 from harness.field.flight_logs._collecting import Budget, Collector, LogClock
-from harness.field.flight_logs._limits import MAX_SEARCHES, Damage, is_place
+from harness.field.flight_logs._limits import Damage, is_place
 from harness.field.flight_logs._records import (
     Arming,
     Battery,
@@ -103,10 +103,7 @@ class TelemetryReader:
                 after = _next_start(buffer, at)
                 self.damage.skip(offset + at, after - at)
                 at = after
-                if self.damage.searches > MAX_SEARCHES:
-                    self.problems.append(
-                        f"the part after byte {offset + at:,} is not read, because the file has too much damage"
-                    )
+                if self.damage.ends_reading(offset + at):
                     return
                 continue
             messages += 1
