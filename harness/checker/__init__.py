@@ -1,4 +1,4 @@
-"""The checker decides from exports and traces whether the six characteristics of Section 4.3 hold.
+"""Decide from the recorded files of a run whether the protocol kept its six required properties.
 
 One file decides each characteristic, with a function from `Evidence` to `Judgement`. `_verdict.py` collects the
 judgements. `survival.py` reports the blocks that were lost together with vehicles, and those that a loss would take.

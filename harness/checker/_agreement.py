@@ -1,4 +1,4 @@
-"""Decide for characteristics 5 and 6 whether agents with different chains had the chance to agree.
+"""Decide whether agents with different chains had a chance to agree. The checks of characteristics 5 and 6 use this.
 
 Two idle agents with different chains stay different, because only a vote or a query of another agent's phase 2 starts a
 reconcile. A difference is therefore a violation only if the network was fully connected, and the differing agent then
@@ -19,7 +19,8 @@ from harness.checker.recurring_cycles import cycle_of
 
 
 def check_endless_cycle(name: str, evidence: Evidence) -> Judgement | None:
-    """Return `violated` if all agents are present and connected, but some never finish. Otherwise return None.
+    """Return the verdict `violated` if all agents are present and connected, but some repeat a cycle forever. Otherwise
+    return None.
 
     `harness.checker._liveness` has the evidence.
     """
@@ -34,7 +35,7 @@ MAX_REASONS = 3
 
 
 def explain_unknown(evidence: Evidence) -> str | None:
-    """Return the reason why the exports do not show the whole system in an idle state. None if they show it."""
+    """Return the reason why the exported chains do not show the whole system in an idle state, or None if they do."""
     if not evidence.exports:
         return "the run has no chain exports"
     if evidence.missing:
@@ -52,7 +53,7 @@ def _idle(ids: list[int]) -> str:
 
 
 def explain_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
-    """Return the reason why no differing agent had the chance to agree. None if at least one had it."""
+    """Return the reason why none of the agents in `differing` had a chance to agree, or None if at least one had it."""
     if evidence.record is None:
         return "exports do not show whether the system was fully connected"
     since = evidence.connected_since_s
@@ -79,7 +80,7 @@ def explain_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
 
 
 def _explain_agent(evidence: Evidence, since: float, agent_id: int) -> str:
-    """Return the reason why this agent, which has a trace, had no chance."""
+    """Return the reason why this agent had no chance to agree. The agent must have a trace."""
     changed = {peer: trace.chain_changed_at() for peer, trace in evidence.traces.items() if peer != agent_id}
     peer = max(changed, key=lambda peer: changed[peer], default=agent_id)
     when = "the system became fully connected"
@@ -98,13 +99,14 @@ def _explain_agent(evidence: Evidence, since: float, agent_id: int) -> str:
 
 
 def describe_absent_agents(evidence: Evidence) -> str:
-    """Return the switched-off agents, whose exports do not count, for the end of a sentence."""
+    """Return a phrase that names the switched-off agents, whose chains are ignored. It completes a sentence."""
     away = set(evidence.exports) - set(evidence.present)
     return f"; without {agents(away)}, which {'was' if len(away) == 1 else 'were'} switched off" if away else ""
 
 
 def find_agents_with_chance(evidence: Evidence, differing: set[int]) -> set[int]:
-    """Return the agents of `differing` that completed a reconcile after full connectivity and the others' last change.
+    """Return the agents of `differing` that compared their chain with their neighbours' after the network was whole
+    again and after the other agents' last change.
 
     During this reconcile all judged agents ran, none was paused, and no other agent was present.
     """
@@ -133,5 +135,5 @@ def find_agents_with_chance(evidence: Evidence, differing: set[int]) -> set[int]
 
 
 def _any_was_paused(evidence: Evidence, from_s: float, until_s: float) -> bool:
-    """Return true if a judged agent was paused, because a query then does not reach all agents."""
+    """Return true if an agent was paused in this interval. A query then does not reach all agents."""
     return any(evidence.was_paused(agent_id, from_s, until_s) for agent_id in evidence.present)

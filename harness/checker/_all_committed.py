@@ -1,4 +1,6 @@
-"""Characteristic 5: in a fully connected system every completed block is in every living agent's chain, eventually."""
+"""Check characteristic 5: in a connected system, each completed block eventually reaches the chain of each living
+agent.
+"""
 
 from harness.checker._agreement import (
     check_endless_cycle,
@@ -14,7 +16,7 @@ NAME = "all committed everywhere"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Judge the exports. Blocks that only killed or switched off agents held are left out (Section 3.3).
+    """Judge the exported chains. Blocks that only killed or switched-off agents held do not count (Section 3.3).
 
     `not applicable` where an export is missing, an agent was not idle, or those that lack a block had no chance.
     """
@@ -60,7 +62,8 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _split_completed(evidence: Evidence) -> tuple[int, list[str]]:
-    """Return the number of completed blocks that no present agent holds, and the hashes of the other ones.
+    """Return two values: the number of completed blocks that no present agent holds, and the hashes of all other
+    completed blocks.
 
     The former were lost with killed agents (Section 3.3), or an agent that was switched off has them.
     """

@@ -1,4 +1,4 @@
-"""Characteristic 1: distributed, event driven and asynchronous.
+"""Check characteristic 1: agents work without a coordinator, and run code only in reaction to events.
 
 Every handler run has a local trigger, or a message that its sender really sent. Every vote ends with its own timer, so
 no vote waits for another agent. Only traces show this, and only if their names are known.
@@ -31,7 +31,9 @@ _LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Judge every line of all traces. The result is `not applicable` if a trace is missing, damaged or incomplete."""
+    """Check the trigger of every handler run in all traces. The verdict is `not applicable` if a trace is missing,
+    damaged or incomplete.
+    """
     if not evidence.traces:
         return Judgement(
             NAME, "not applicable", "the run has no traces, and exports do not show the triggers of handlers"
@@ -80,7 +82,9 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _is_certainly_correct(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings]) -> bool:
-    """Return true if the trigger is its own timer, an event, an earlier handler, or a message that its sender sent."""
+    """Return true if the run was triggered by the agent's own timer, an event, an earlier handler, or a message that
+    its sender did send.
+    """
     trigger, handler = run.trigger, run.handler
     if isinstance(trigger, MessageTrigger):
         name = trigger.message
@@ -93,7 +97,7 @@ def _is_certainly_correct(run: HandlerRun, ran: set[str], sent: dict[Any, Sendin
 
 
 def _has_known_names(run: HandlerRun) -> bool:
-    """Return true if the agent contract defines the names of handler and trigger."""
+    """Return true if the agent contract defines both the name of the handler and the name of its trigger."""
     if run.handler not in HANDLERS:
         return False
     match run.trigger:
@@ -109,7 +113,9 @@ def _has_known_names(run: HandlerRun) -> bool:
 
 
 def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) -> str | None:
-    """Return the error of the trigger, to complete "the handler ...". None if the trigger is valid."""
+    """Return the error in the trigger of a handler run, or None if it is valid. The text completes "the handler
+    ...".
+    """
     match run.trigger:
         case MessageTrigger(name, sender, sequence):
             if _OF_MESSAGE.get(name) != run.handler:

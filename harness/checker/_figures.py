@@ -1,4 +1,4 @@
-"""Compute the figures of a run: the agreement of the chains, and its cost."""
+"""Compute the figures of a run, for example the number of different chains and of messages."""
 
 from collections import Counter
 
@@ -8,7 +8,7 @@ from harness.checker.uniform_chain import common_prefix
 
 
 def figures(evidence: Evidence) -> dict[str, float | int | None]:
-    """Return the figures by name. None means unknown.
+    """Return the figures of a run by name. None means that a figure is unknown.
 
     `copies` counts the chains that contain a completed block. `uniform_at_s` is the mission second since which all
     chains are equal, or None if they differ.
@@ -50,7 +50,7 @@ def figures(evidence: Evidence) -> dict[str, float | int | None]:
 
 
 def _sum_over_agents(evidence: Evidence, counter: str) -> int | None:
-    """Return the sum of a counter over all agents, from the record or from complete traces. None without both."""
+    """Return the sum of a counter over all agents, or None if neither run.json nor complete traces contain it."""
     agents = evidence.record.agents.values() if evidence.record else ()
     counts: list[int | None] = [getattr(agent, counter) for agent in agents]
     known = [count for count in counts if count is not None]
@@ -68,9 +68,9 @@ def _sum_over_agents(evidence: Evidence, counter: str) -> int | None:
 
 
 def compute_uniform_at_s(evidence: Evidence) -> float | None:
-    """Return the mission second since which all chains are equal: that of the last change of any chain.
+    """Return the mission second of the last change of any chain, after which all chains are equal.
 
-    None if the chains differ at the end, or if their changes are not on record.
+    Return None if the chains differ at the end, or if their changes are not on record.
     """
     if len({export.chain_of_block_hashes for export in evidence.exports.values()}) != 1:
         return None

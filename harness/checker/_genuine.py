@@ -1,4 +1,4 @@
-"""Characteristic 4: the agent that a block names completed this block, and the block is unchanged."""
+"""Check characteristic 4: each block is unchanged, and was completed by the agent that it names."""
 
 import base64
 from dataclasses import dataclass, field, replace
@@ -26,13 +26,13 @@ _Link = tuple[str, str, str | None]
 
 @dataclass
 class _VerifiedHashes:
-    """Verified hashes. A block that many agents hold is hashed once."""
+    """A cache of verified hashes. A block that many agents hold is hashed once."""
 
     blocks: set[_Content] = field(default_factory=set)
     links: set[_Link] = field(default_factory=set)
 
     def is_block(self, block: ExportedBlock) -> bool:
-        """Return true if the block has its block hash."""
+        """Return true if the content of the block gives its block hash."""
         content = block.agent_id, block.timestamp_us, block.event_data, block.block_hash
         if content not in self.blocks:
             if Block(block.agent_id, block.timestamp_us, block.event_bytes).block_hash.hex() != block.block_hash:
@@ -41,7 +41,7 @@ class _VerifiedHashes:
         return True
 
     def is_link(self, link: _Link) -> bool:
-        """Return true if the chain hash follows from the other two hashes (eq. 3.2)."""
+        """Return true if the chain hash follows from the previous chain hash and the block hash (eq. 3.2)."""
         if link not in self.links:
             below, block_hash, chain_hash = link
             if next_chain_hash(bytes.fromhex(below), bytes.fromhex(block_hash)).hex() != chain_hash:
@@ -51,7 +51,7 @@ class _VerifiedHashes:
 
 
 class _SignatureChecks:
-    """Signatures of blocks. Each is verified once."""
+    """A cache of verified block signatures. Each signature is verified once."""
 
     def __init__(self, keys: "PublicKeys", verified: "Callable[[SignatureClaim], bool] | None") -> None:
         from ucp.secure.crypto_suite import verify
@@ -61,7 +61,9 @@ class _SignatureChecks:
         self._checked: dict[tuple[_Content, str | None], str | None] = {}
 
     def find_error(self, block: ExportedBlock) -> str | None:
-        """Return the end of a sentence about a block without a valid signature, else None."""
+        """Return the error in the signature of the block, or None if it is valid. The text ends a sentence about
+        the block.
+        """
         claim = (block.agent_id, block.timestamp_us, block.event_data, block.block_hash), block.signature
         if claim not in self._checked:
             self._checked[claim] = self._verify(block)
@@ -82,7 +84,7 @@ class _SignatureChecks:
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Recompute the hashes of all exports, and compare their blocks with the blocks that each agent completed.
+    """Compute the hashes in all exports again, and compare the blocks with those that each agent completed.
 
     In a secured mission signatures decide, so that the records of the agent that made a block may be missing. A signed
     block that this agent did not complete is not genuine either, because an attacker has its key.
@@ -144,7 +146,8 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _may_be_of_earlier_incarnation(evidence: Evidence, block: ExportedBlock) -> bool:
-    """Return true if the agent of a block holds this block, and its records do not show all its incarnations.
+    """Return true if a block may come from an incarnation of its agent (the time between two restarts) that left no
+    records.
 
     An agent that lost its data and restarted holds its earlier blocks, but its export does not list them as completed.
     """
@@ -155,7 +158,7 @@ def _may_be_of_earlier_incarnation(evidence: Evidence, block: ExportedBlock) -> 
 
 
 def _describe_arrival(trace: Trace | None, block_hash: str) -> str:
-    """Return the time and the handler of the block's arrival, for the end of a sentence."""
+    """Return the time and the handler with which an agent received a block. The text ends a sentence."""
     came = ("chain+", block_hash)
     for run in trace.runs if trace else ():
         if came in map(tuple, run.changes):

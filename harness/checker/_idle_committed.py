@@ -1,4 +1,4 @@
-"""Characteristic 2: an idle agent has committed every block that it completed."""
+"""Check characteristic 2: an idle agent has committed every block that it completed."""
 
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, agents, violated
@@ -7,7 +7,7 @@ NAME = "idle implies committed"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Judge the exports, and the traced state after each handler run.
+    """Judge the exported state of each agent, and its traced state after each handler run.
 
     `not applicable` where an agent was not idle at the end, or left no export.
     """

@@ -1,4 +1,4 @@
-"""Liveness: after the last event the swarm becomes idle, and has committed all completed blocks.
+"""Check liveness: after the last event, the swarm becomes idle with all completed blocks committed.
 
 A swarm that is not idle at the end may never finish, which the records must show, or may only need more time. If agents
 still commit blocks, the rate of these commits gives an estimate of the remaining time.
@@ -14,7 +14,9 @@ NAME = "liveness"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Return `never finishes` if the records show it, `not finished` if the swarm was not idle, else `finished`."""
+    """Return the verdict on liveness: `finished`, `not finished`, or `never finishes` if the records prove an endless
+    cycle.
+    """
     unknown = _explain_unknown(evidence)
     if unknown:
         return Judgement(NAME, "not applicable", unknown)
@@ -67,7 +69,7 @@ def _describe_busy_end(evidence: Evidence) -> str:
 
 
 def _estimate_remaining_time(evidence: Evidence) -> str:
-    """Estimate the remaining time from the rate of commits since the last completed block."""
+    """Return a sentence that estimates the remaining time from the rate of commits since the last completed block."""
     waiting = sum(len(export.blocks_to_be_committed) for export in evidence.exports.values())
     blocks = f"{waiting} block{'s' if waiting != 1 else ''} waited for their commit"
     if not waiting:

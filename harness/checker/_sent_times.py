@@ -1,4 +1,4 @@
-"""The mission second at which an agent sent a message of its trace.
+"""Compute the mission second at which an agent sent a message of its trace.
 
 A trace has the time of the handler run. With the setting `answer_spread_s`, an answer is sent later, after a wait that
 CONTRACT.md defines. This module computes the wait on its own, because the agent under test computes it too.
@@ -17,13 +17,15 @@ ANSWERS = frozenset(
 
 
 def spread_of(trace: Trace) -> float:
-    """Return `answer_spread_s` of the agent in mission seconds. 0 if its header has none, or an impossible value."""
+    """Return the longest random delay of the agent's answers (`answer_spread_s`) in mission seconds. It is 0 if the
+    trace header has no valid value.
+    """
     spread_s = trace.header.settings.get("answer_spread_s", 0.0)
     return float(spread_s) if isinstance(spread_s, int | float) and spread_s > 0 else 0.0
 
 
 def sent_at(run: HandlerRun, message: SentMessage, spread_s: float) -> float:
-    """Return the mission second at which a message of the run is sent."""
+    """Return the mission second at which the agent sent this message of the handler run."""
     if not spread_s or message.message not in ANSWERS or message.datagram is None:
         return run.t
     try:

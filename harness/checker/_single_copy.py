@@ -1,4 +1,4 @@
-"""Characteristic 3: at most one copy of a block on an agent, across chain, deque and reconcile stack."""
+"""Check characteristic 3: an agent holds at most one copy of a block in its chain, deque and reconcile stack."""
 
 from collections import Counter
 
@@ -9,7 +9,7 @@ NAME = "single copy"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Judge the exports and the traced states. The result is `not applicable` if an export is missing."""
+    """Judge the exports and the states in traces. The verdict is `not applicable` if an export is missing."""
     findings: list[Finding] = []
     for agent_id, export in evidence.exports.items():
         copies = Counter(block.block_hash for block in export.blocks())

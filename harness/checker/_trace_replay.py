@@ -21,7 +21,7 @@ COMPLETES = "build_data_block"
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """An observation at a line of a trace. Lines count from 1."""
+    """An observation of the checker at one line of a trace. The first line has number 1."""
 
     line: int
     run: HandlerRun
@@ -30,13 +30,13 @@ class Observation:
 
     @property
     def where(self) -> str:
-        """The place in words, such as "trace line 7, t=12.5 s, receive_commit_block"."""
+        """The place of the observation, such as "trace line 7, t=12.5 s, receive_commit_block"."""
         return f"trace line {self.line}, t={self.run.t:g} s, {self.run.handler}"
 
 
 @dataclass(slots=True)
 class Incarnation:
-    """One incarnation of an agent: the blocks that it held at its end, and observations on the way.
+    """The replay of an agent between two restarts: the blocks that it held at the end, and all observations.
 
     `chain` is oldest first, `deque` front first, `stack` top last; all are block hashes.
     """
@@ -67,12 +67,12 @@ class Incarnation:
     out_of_sequence: list[Observation] = field(default_factory=list)
 
     def numbered_runs(self) -> Iterator[tuple[int, HandlerRun]]:
-        """Return the runs with their lines."""
+        """Yield the handler runs together with their line numbers."""
         return next(islice(self.trace.incarnations(), self.number, None))
 
 
 def replay(trace: Trace, inception: str | None) -> list[Incarnation]:
-    """Return each incarnation of the agent. `inception` is the chain hash CH_0 of the mission, or None if unknown."""
+    """Return the replay of each incarnation of an agent, that is, of each part of its trace between restarts."""
     bounds = [0, *trace.starts, len(trace.runs)]
     return [
         _replay_incarnation(Incarnation(trace, number, trace.runs[start:end]), inception)
@@ -119,7 +119,7 @@ def _replay_incarnation(incarnation: Incarnation, inception: str | None) -> Inca
 
 
 class _HeldBlocks:
-    """The blocks of an agent, step by step."""
+    """The blocks that an agent holds. The replay updates them with each handler run."""
 
     def __init__(self, incarnation: Incarnation, inception: str | None) -> None:
         self._incarnation = incarnation
@@ -165,7 +165,7 @@ class _HeldBlocks:
                 self._chain_hashes.append(next_chain_hash(self._chain_hashes[-1], _digest(block)))
 
     def _take(self, name: str, place: list[str], block: str) -> str | None:
-        """Why the block cannot have been taken from there; it is taken all the same, if it is there."""
+        """Remove the block from this structure. Return the reason if that is impossible, or None."""
         end = 0 if name == "deque" else -1
         in_turn = bool(place) and place[end] == block
         if in_turn:
@@ -185,7 +185,7 @@ class _HeldBlocks:
         return f"{block[:12]} leaves the {name}, but is not {'in front' if name == 'deque' else 'on top'}"
 
     def compare(self, line: int, run: HandlerRun) -> bool:
-        """Return whether the state in the line equals the result of all changes so far."""
+        """Return true if the state in the trace line equals the result of all changes up to this line."""
         incarnation, state = self._incarnation, run.state
         if (state.chain, state.deque, state.stack) != (
             len(incarnation.chain),
@@ -213,7 +213,7 @@ class _HeldBlocks:
 
 
 def _digest(block_hash: str) -> bytes:
-    """Return the block hash as bytes. An invalid hash gives zeros, which are the hash of no block."""
+    """Return the block hash as bytes. For an invalid hash, return zeros, which no block has as its hash."""
     try:
         return bytes.fromhex(block_hash)
     except ValueError:

@@ -1,4 +1,4 @@
-"""The verdict on a run: the six characteristics, the three further checks, and the figures."""
+"""Combine all checks of a run into one verdict: the six characteristics, three further checks, and the figures."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -43,7 +43,7 @@ FURTHER_CHECKS: dict[str, Callable[[Evidence], Judgement]] = {
 
 @dataclass(frozen=True)
 class Result:
-    """The verdict on a run.
+    """The complete verdict on a run.
 
     `characteristics` holds the judgement of each characteristic by its number, "1" to "6". `beside` holds the
     judgements `steps`, `records` and `liveness`. `figures` has the figures of run.json by name; None means not known.
@@ -59,26 +59,28 @@ class Result:
 
     @property
     def judgements(self) -> dict[str, Judgement]:
-        """All judgements, by number or key, in the order of the report."""
+        """All judgements by number or key, in the order in which the report shows them."""
         return {**self.characteristics, **self.beside}
 
     @property
     def bad(self) -> tuple[str, ...]:
-        """Numbers and keys of the bad judgements."""
+        """The numbers or keys of the judgements with a bad verdict."""
         return tuple(key for key, judgement in self.judgements.items() if judgement.kind == "bad")
 
     @property
     def wrong(self) -> tuple[str, ...]:
-        """Numbers and keys of the bad judgements, without a swarm that may only need more time."""
+        """The numbers or keys of the bad judgements, except those of a swarm that may only need more time."""
         return tuple(key for key in self.bad if self.judgements[key].verdict != UNFINISHED)
 
     @property
     def exit_status(self) -> int:
-        """The exit status for these judgements: 0, 1 for a violation, or 4 if a swarm only needs more time."""
+        """The exit status of the command: 0 without violations, 1 after a violation, 4 if the swarm only needs more
+        time.
+        """
         return VIOLATED if self.wrong else INCOMPLETE if self.bad else 0
 
     def to_json(self) -> dict[str, Any]:
-        """Return the keys of the schema `ucp-run/1` that contain the verdict."""
+        """Return the verdict as keys of the JSON schema `ucp-run/1`."""
         return {
             "characteristics": {
                 number: characteristic.to_json() for number, characteristic in self.characteristics.items()
@@ -90,7 +92,7 @@ class Result:
 
 
 def check(run: Evidence | RunArchive) -> Result:
-    """Decide the six characteristics (Section 4.3), and the judgements `steps`, `records` and `liveness`.
+    """Judge the six characteristics (Section 4.3), all steps of agents, the agreement of the records, and liveness.
 
     `run` is an archive, or the evidence from it. A damaged file raises no error, but adds a sentence to
     `Result.errors`.

@@ -1,4 +1,5 @@
-"""The part of characteristic 1 about waiting: no agent waits for another one.
+"""Check the part of characteristic 1 about waiting: an agent continues when its own timer expires, and never waits
+longer for other agents.
 
 A vote and each step of a reconcile end with a timer. An agent that waits longer than its timers run would wait forever.
 """
@@ -46,7 +47,7 @@ ALL_TIMERS = (*VOTE_TIMERS, *RECONCILE_TIMERS)
 
 @dataclass(slots=True)
 class _Wait:
-    """A vote or reconcile that must continue within `longest` mission seconds, and the place of its last step."""
+    """A vote or reconcile of an agent that must continue within `longest` mission seconds after its last step."""
 
     what: str
     longest: float
@@ -60,7 +61,7 @@ class _Wait:
 
 
 def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
-    """Yield each wait that lasted longer than the timers of an agent that was not paused."""
+    """Yield each vote or reconcile that lasted longer than the agent's timers allow. Paused agents are excluded."""
     for agent_id, trace in evidence.traces.items():
         if evidence.describe_unknown_name("handler", "branch", agent_id=agent_id):
             continue  # only known names show the steps of votes and reconciles
@@ -100,7 +101,9 @@ def _find_overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Wait) 
 
 
 def longest(trace: Trace, timers: tuple[str, ...]) -> float:
-    """Return the longest of these timers in mission seconds, plus slack. Infinity if it is not known."""
+    """Return the duration of the longest of these timers in mission seconds, with a tolerance. It is infinite if a
+    duration is unknown.
+    """
     settings: list[Any] = [trace.header.settings.get(timer) for timer in timers]
     if not all(isinstance(setting, int | float) for setting in settings):
         return math.inf

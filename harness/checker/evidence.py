@@ -1,4 +1,4 @@
-"""The evidence of the checker: exports, traces, the record of the run, and records of network and captures.
+"""Collect the evidence for the checker: exported chains, traces, run.json, network records and packet captures.
 
 Checks read an `Evidence` and nothing else. It caches values that several checks derive from the files. All its parts
 except the exports may be missing.
@@ -61,7 +61,7 @@ _HASH = re.compile(f"[0-9a-f]{{{2 * HASH_BYTES}}}")
 
 
 class InjectedDatagram(BaseModel):
-    """A line of `rogue.jsonl`: a message, a malformed datagram, or a number of datagrams without details."""
+    """A line of `rogue.jsonl`, the log of injected datagrams. It describes one datagram, or only counts several."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -92,7 +92,7 @@ class Condition(BaseModel):
 
 @dataclass
 class RogueTraffic:
-    """The messages of a rogue node, as far as traces distinguish them from messages of agents."""
+    """The messages that a rogue node (a sender outside the swarm) injected, as far as traces show them."""
 
     messages: set[tuple[Any, Any, Any]] = field(default_factory=set)
     """Sender, sequence number and type."""
@@ -102,7 +102,7 @@ class RogueTraffic:
     """Agents whose datagrams from another place the scenario delivers. The records of that place are missing."""
 
     def add(self, datagrams: Iterable[InjectedDatagram]) -> "RogueTraffic":
-        """Add datagrams of the rogue node. Return this object."""
+        """Add injected datagrams, and return this object."""
         for datagram in datagrams:
             self.messages.add((datagram.sender, datagram.sequence, datagram.message))
             self.counted |= datagram.count is not None
@@ -111,7 +111,7 @@ class RogueTraffic:
         return self
 
     def may_include(self, trigger: MessageTrigger) -> bool:
-        """Return true if the rogue node may have sent the message that triggered a handler."""
+        """Return true if the message that triggered a handler may come from the rogue node."""
         if not self.messages:
             return False
         return self.counted or (trigger.sender, trigger.sequence, trigger.message) in self.messages
@@ -119,7 +119,7 @@ class RogueTraffic:
 
 @dataclass
 class Evidence:
-    """The evidence of one run.
+    """All recorded files of one run, as far as the checker uses them.
 
     `record` is the content of `run.json`. None for exports without a record. `before_final_reconcile` has the exports
     before the final reconcile, if there was one.
@@ -160,21 +160,27 @@ class Evidence:
 
     @cached_property
     def names(self) -> dict[str, str]:
-        """Block hash -> name of the block, such as 4.11."""
+        """The short name of each block by its hash, such as 4.11 for the eleventh block of agent 4."""
         return name_blocks(self.exports)
 
     def name(self, block_hash: str) -> str:
-        """Return the name of the block, such as 4.11, or the first 12 digits of its hash."""
+        """Return the short name of the block, such as 4.11. If the block has none, return the first 12 digits of its
+        hash.
+        """
         return self.names.get(block_hash, block_hash[:12])
 
     @cached_property
     def unknown(self) -> dict[int, UnknownNames]:
-        """The unknown names in traces, by agent. Agents without unknown names are omitted."""
+        """The names in each agent's trace that the agent contract does not define. Agents without such names are
+        omitted.
+        """
         words = {agent_id: unknown_names(trace.runs) for agent_id, trace in self.traces.items()}
         return {agent_id: unknown for agent_id, unknown in words.items() if unknown}
 
     def describe_unknown_name(self, *kinds: Kind, agent_id: int | None = None) -> str | None:
-        """Describe the first unknown name of these kinds in the trace of the agent, or in any trace. Else None."""
+        """Return a description of the first undefined name of these kinds in the agent's trace, or None. Without an
+        agent, search all traces.
+        """
         for named, unknown in self.unknown.items():
             if agent_id in (None, named) and (words := first_unknown(unknown, kinds)):
                 return f"{words} in the trace of agent {named}"
@@ -182,7 +188,7 @@ class Evidence:
 
     @cached_property
     def incarnations(self) -> dict[int, list[Incarnation]]:
-        """The replayed incarnations of each agent with a trace."""
+        """The replayed trace of each agent, divided at its restarts."""
         inception = next((export.inception.chain_hash for export in self.exports.values()), None)
         if inception is None:
             states = (run.state for trace in self.traces.values() for run in trace.runs)
@@ -191,7 +197,7 @@ class Evidence:
 
     @cached_property
     def sendings(self) -> dict[Any, Sendings]:
-        """Agent -> the messages that it sent according to its trace."""
+        """The messages that each agent sent according to its trace."""
         sendings: dict[Any, Sendings] = {}
         for agent_id, trace in self.traces.items():
             of_agent: Sendings = defaultdict(dict)
@@ -205,7 +211,7 @@ class Evidence:
         return sendings
 
     def cached(self, derive: Callable[["Evidence"], Derived]) -> Derived:
-        """Return `derive(self)`. The value is computed at the first call."""
+        """Return `derive(self)`. The function runs once, and later calls return the same value."""
         if derive not in self._derived:
             self._derived[derive] = derive(self)
         derived: Derived = self._derived[derive]
@@ -213,7 +219,7 @@ class Evidence:
 
     @property
     def roster(self) -> list[int] | None:
-        """The IDs of all agents of the mission, from the record or a trace. None without both."""
+        """The IDs of all agents of the mission, or None if neither run.json nor a trace names them."""
         if self.record is not None:
             return self.record.roster
         for trace in self.traces.values():
@@ -222,25 +228,27 @@ class Evidence:
 
     @property
     def missing(self) -> list[int]:
-        """The agents without an export, except killed agents."""
+        """The agents without an export. Killed agents are not included."""
         return [agent for agent in self.roster or [] if agent not in self.exports and not self.was_killed(agent)]
 
     def was_killed(self, agent_id: int) -> bool:
-        """Return true if the scenario killed the agent, with all its data, and did not restart it."""
+        """Return true if the scenario killed the agent together with its data, and did not restart it."""
         agent = self.recorded(agent_id)
         return agent is not None and agent.outcome == "killed"
 
     def was_restarted(self, agent_id: int) -> bool:
-        """Return true if the scenario restarted the agent. Its export then covers only its last incarnation."""
+        """Return true if the scenario restarted the agent. Its export then covers only the time since its last
+        restart.
+        """
         agent = self.recorded(agent_id)
         return agent is not None and agent.restarts > 0
 
     def recorded(self, agent_id: int) -> AgentRecord | None:
-        """Return the entry of the agent in the record. None without one."""
+        """Return the entry of the agent in run.json, or None if there is none."""
         return self.record.agents.get(str(agent_id)) if self.record else None
 
     def was_paused(self, agent_id: int, from_s: float, until_s: float) -> bool:
-        """Return true if the scenario paused the agent at any time between these mission seconds."""
+        """Return true if the scenario paused the agent at any time between these two mission seconds."""
         since: float | None = None
         for fault in self.record.faults if self.record else ():
             if agent_id not in (fault.agents or ()):
@@ -255,47 +263,49 @@ class Evidence:
 
     @property
     def paused_at_end(self) -> list[int]:
-        """The agents that are paused at the end of the run."""
+        """The agents that are still paused when the run ends."""
         end_s = self.ended_at_s
         return [agent_id for agent_id in self.exports if end_s is not None and self.was_paused(agent_id, end_s, end_s)]
 
     @cached_property
     def switched_off(self) -> dict[int, float]:
-        """Agent -> mission second at which it was switched off before the end of the run."""
+        """The agents that were switched off before the end of the run, with the mission second of each."""
         return self.record.switched_off if self.record else {}
 
     @property
     def present(self) -> dict[int, Export]:
-        """The exports of agents that were not switched off. If all were switched off, all exports."""
+        """The exports of the agents that were not switched off, or all exports if all agents were switched off."""
         there = {agent_id: export for agent_id, export in self.exports.items() if agent_id not in self.switched_off}
         return there or self.exports
 
     @property
     def presence_s(self) -> tuple[float, float]:
-        """The mission seconds between which exactly the `present` agents ran: start and end."""
+        """The start and end, in mission seconds, of the time in which exactly the agents in `present` ran."""
         off_s = self.switched_off.values()
         if set(self.exports) <= set(self.switched_off):
             return 0.0, min(off_s, default=math.inf)
         return max(off_s, default=0.0), math.inf
 
     def end_of(self, agent_id: int) -> float | None:
-        """Return the mission second of the end of this agent. None if it is not on record."""
+        """Return the mission second at which the agent ended, or None if no record contains it."""
         return self.record.end_of(agent_id) if self.record else None
 
     @property
     def busy(self) -> list[int]:
-        """The agents that are not idle at the end, without paused and switched-off agents."""
+        """The agents that are not idle when the run ends. Paused and switched-off agents are not included."""
         gone = {*self.paused_at_end, *self.switched_off}
         return [agent_id for agent_id, export in self.exports.items() if not export.idle and agent_id not in gone]
 
     @property
     def ended_at_s(self) -> float | None:
-        """The mission second of the end of the run. None if it is not on record."""
+        """The mission second at which the run ended, or None if no record contains it."""
         return self.record.mission_s if self.record else None
 
     @property
     def connected_since_s(self) -> float | None:
-        """The mission second since which the network is fully connected. None if it is not, or not on record."""
+        """The mission second since which the network is fully connected, or None if it is not connected or no record
+        shows it.
+        """
         since: float | None = None
         for state in self.record.network if self.record else ():
             if not state.fully_connected:
@@ -306,12 +316,12 @@ class Evidence:
 
     @property
     def network_at_end(self) -> str | None:
-        """The network conditions at the end of the run in words. None if they are not on record."""
+        """A description of the network at the end of the run, or None if no record contains it."""
         return self.record.network[-1].detail if self.record and self.record.network else None
 
     @cached_property
     def requested_links(self) -> set[LinkConditions] | None:
-        """All conditions that the scenario asked for any link. None if they are not on record, or not readable."""
+        """All network conditions that the scenario requested for any link, or None if no record contains them."""
         if self.conditions is None:
             return None
         links: set[LinkConditions] = set()
@@ -327,21 +337,21 @@ class Evidence:
 
     @property
     def has_fates(self) -> bool:
-        """True if a scenario script decided about the delivery of messages, in place of the network."""
+        """True if a script in the scenario decided which messages arrive. Otherwise the network decides."""
         return self.record is not None and any(state.what == NO_MORE_FATES for state in self.record.network)
 
     @property
     def has_channel(self) -> bool:
-        """True if vehicles shared a radio channel, on which messages wait and are lost for further reasons."""
+        """True if the vehicles shared one radio channel, on which messages wait for each other and can collide."""
         return self.record is not None and self.record.channel is not None
 
     def agents_with_unknown_completed(self) -> set[int]:
-        """Return the agents whose completed blocks are unknown because their traces contain unknown operations."""
+        """The agents whose completed blocks are unknown, because their traces contain undefined operations."""
         unknown = {agent_id for agent_id, words in self.unknown.items() if "operation" in words}
         return {agent for agent in unknown if agent not in self.exports or self.was_restarted(agent)}
 
     def completed_blocks(self) -> dict[str, int]:
-        """Return the hash of each completed block on record, with the agent that completed it."""
+        """The agent that completed each block on record, by block hash."""
         return self._completed_blocks
 
     @cached_property
@@ -355,7 +365,7 @@ class Evidence:
 
 
 def gather(archive: RunArchive) -> Evidence:
-    """All that an archive has of it. Raises VariantError if the run was made with another variant than is in use."""
+    """Return the evidence in an archive. Raises VariantError if the run used a different variant of the protocol."""
     check_variant(archive)
     problems = list(archive.problems)
     if archive.record_problems and archive.judged_record is None:
@@ -380,7 +390,9 @@ def gather(archive: RunArchive) -> Evidence:
 
 
 def check_variant(archive: RunArchive) -> None:
-    """Raise VariantError if the run was made with another variant of the protocol than is in use, or without one."""
+    """Raise VariantError if the run used a different variant of the protocol than this process, or if only one of them
+    uses a variant.
+    """
     if not archive.recorded:
         return
     made_with, variant = archive.record.versions.get("variant"), variant_in_use()
@@ -396,7 +408,7 @@ def check_variant(archive: RunArchive) -> None:
 
 
 def _link_losses(archive: RunArchive) -> list[tuple[float, dict[Link, float]]]:
-    """Return the losses of all links over time. Empty if they would take too long to compute."""
+    """Return the loss rate of each link over time, or an empty list if the computation would take too long."""
     changes = len(archive.conditions(Condition) or ())
     if changes * len(archive.roster) ** 2 > MAX_LINK_CHANGES:
         return []
@@ -404,7 +416,7 @@ def _link_losses(archive: RunArchive) -> list[tuple[float, dict[Link, float]]]:
 
 
 def _captures(archive: RunArchive) -> Captures | None:
-    """Return the captures of a run. None without captures."""
+    """Return the packet captures of a run, or None if it has none."""
     if archive.directory is None or not (archive.directory / DIRECTORY).is_dir():
         return None
     try:

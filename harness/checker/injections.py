@@ -1,4 +1,4 @@
-"""Count how the agents handled the messages of the rogue node, from its journal and the traces.
+"""Count how the agents handled injected messages, from the injection log and the traces.
 
 A forged message has a sequence number that no agent uses, so each handler run with this number belongs to the rogue
 node. A copy is equal to its original. Of the handler runs of one agent for this message, the last ones therefore count
@@ -34,7 +34,7 @@ Count = Annotated[int, Field(ge=0, le=10**9)]
 
 
 class _Line(BaseModel):
-    """A line of `rogue.jsonl`: a datagram, or a number of datagrams without details."""
+    """A line of `rogue.jsonl`, the log of injected datagrams. It describes one datagram, or only counts several."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -66,7 +66,7 @@ class _Tally:
 
 
 def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
-    """Return the effect of each injection of the scenario, in order."""
+    """Return the effect of each injection that the scenario planned, in order."""
     injections = injections_of(scenario)
     if not injections:
         return []
@@ -93,7 +93,7 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
 
 
 def in_words(injection: RogueInjection) -> str:
-    """Return the effect of an injection in one line."""
+    """Return one line of text that describes the effect of an injection."""
     branches = sum((Counter(of.handled) for of in injection.messages), Counter()).most_common()
     done = [f"{branch} {count}" for branch, count in branches[:BRANCHES_NAMED]]
     if len(branches) > BRANCHES_NAMED:
@@ -107,7 +107,7 @@ def in_words(injection: RogueInjection) -> str:
 
 
 def describe_handling(messages: InjectedMessages) -> str:
-    """Return the branches of the handler runs, such as "held already 4, committed 1"."""
+    """Return the number of handler runs with each result, such as "held already 4, committed 1"."""
     done = [f"{branch} {count}" for branch, count in messages.handled.items()]
     return (
         ", ".join([*done, *([f"{messages.unhandled} handled by no agent"] if messages.unhandled else [])]) or "unknown"
@@ -131,7 +131,7 @@ def _count_line(line: _Line, tally: _Tally, copies: dict[_Key, list[tuple[float,
 
 
 def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[HandlerRun]]:
-    """Return the handler runs that these messages or forged messages triggered, by message."""
+    """Return the handler runs that these injected messages triggered, grouped by message."""
     triggered: dict[_Key, list[HandlerRun]] = defaultdict(list)
     for run in trace.runs:
         trigger = run.trigger
@@ -145,7 +145,9 @@ def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[H
 def _pair_with_copies(
     copies: Sequence[tuple[float, int]] | None, key: _Key, runs: list[HandlerRun]
 ) -> Iterator[tuple[int, int, HandlerRun]]:
-    """Yield (number of the injection, index of the copy, run). The last run belongs to the last copy."""
+    """Yield each handler run with the number of the injection and the index of the copy that triggered it. Copies and
+    runs are matched from the end.
+    """
     forged = injection_of(key[1])
     if copies is None and forged is not None:
         yield from ((forged, 0, run) for run in runs)
@@ -157,7 +159,9 @@ def _pair_with_copies(
 
 
 def _to_record(at_s: float, what: str, detail: str, tally: _Tally, has_unknown_names: bool) -> RogueInjection:
-    """Return the effect of an injection. With `has_unknown_names`, traces contain unknown names of messages."""
+    """Return the record of an injection's effect. `has_unknown_names` is true if traces contain undefined message
+    names.
+    """
     messages = [
         InjectedMessages(
             message=message,

@@ -1,4 +1,4 @@
-"""The verdict of one check, with its reason and evidence.
+"""The verdict of one check, with its reason and its evidence.
 
 A check without evidence is `not applicable`, never `holds`.
 """
@@ -14,7 +14,7 @@ MAX_EVIDENCE = 50
 
 @dataclass(frozen=True)
 class Finding:
-    """One piece of evidence: the agent, the block if there is one, and the observation with its place."""
+    """One piece of evidence for a verdict: an agent, an observation, and a block if the observation concerns one."""
 
     agent_id: int
     detail: str
@@ -26,7 +26,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict of one check, its reason in one sentence, and at most 50 pieces of evidence."""
+    """The verdict of one check, with its reason in one sentence and at most 50 pieces of evidence."""
 
     name: str
     verdict: Verdict
@@ -35,11 +35,11 @@ class Judgement:
 
     @property
     def kind(self) -> Kind:
-        """`good`, `bad` or `unknown`. A bad verdict leads to exit status 1."""
+        """The class of the verdict: `good`, `bad` or `unknown`. A bad verdict leads to exit status 1."""
         return kind_of(self.verdict)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the judgement as a `JudgementRecord` of the schema `ucp-run/1`."""
+        """Return the judgement as an object of type `JudgementRecord` in the JSON schema `ucp-run/1`."""
         return {
             "name": self.name,
             "verdict": self.verdict,
@@ -49,17 +49,19 @@ class Judgement:
 
 
 def violated(name: str, what: str, findings: list[Finding]) -> Judgement:
-    """`what` completes the sentence "N times ...", as in "1 time an idle agent ..."."""
+    """Return a judgement with a bad verdict. Its reason counts the findings and adds `what`, as in "1 time an idle
+    agent ...".
+    """
     return Judgement(name, "violated", f"{times(len(findings))}: {what}", findings[:MAX_EVIDENCE])
 
 
 def times(count: int) -> str:
-    """ "1 time", "3 times"."""
+    """Return the count as a phrase, such as "1 time" or "3 times"."""
     return f"{count} time{'s' if count != 1 else ''}"
 
 
 def agents(ids: "list[int] | set[int] | tuple[int, ...]") -> str:
-    """ "agent 3", "agents 3 and 4", "agents 1, 2 and 5"."""
+    """Return a phrase that lists the agents, such as "agent 3", "agents 3 and 4" or "agents 1, 2 and 5"."""
     names = [str(agent_id) for agent_id in sorted(ids)]
     if len(names) == 1:
         return f"agent {names[0]}"

@@ -1,4 +1,4 @@
-"""Find the places at which a trace lacks lines, or has them in the wrong order, by its own account.
+"""Find the places at which a trace contradicts itself because lines are lost or in the wrong order.
 
 A file from the field may have lost lines without a trace. A right agent then seems to do something impossible, so a
 judge must know these places. Four facts prove them:
@@ -25,7 +25,8 @@ places the agent writes its trace in its own way."""
 
 
 def lost_lines(trace: Trace) -> dict[int, str]:
-    """Return the positions of runs that a lost line may explain, each with the reason, as "lines are missing ...".
+    """Return the positions of handler runs whose errors a lost line may explain. Each has a reason such as "lines are
+    missing ...".
 
     A position is the number of runs before it, as in `Trace.gaps`.
     """
@@ -43,7 +44,7 @@ def lost_lines(trace: Trace) -> dict[int, str]:
 
 
 class _Kind:
-    """The places that one kind of fact shows. `possible` is the number of lines that could show it."""
+    """The places with one kind of contradiction. `possible` is the number of lines at which it could occur."""
 
     def __init__(self) -> None:
         self.found: dict[int, str] = {}
@@ -106,7 +107,7 @@ def _other_states(runs: Sequence[HandlerRun], start: int, end: int, known: set[i
 
 
 def _differing(before: StateSummary, run: HandlerRun) -> Iterator[str]:
-    """Yield the parts of the state that changed between a line and the run after it."""
+    """Yield the names of the state fields that differ between one line and the start of the next handler run."""
     added = dict.fromkeys(("chain", "deque", "stack"), 0)
     for operation, _ in run.changes:
         if operation[:-1] in added:

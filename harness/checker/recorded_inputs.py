@@ -18,11 +18,11 @@ LENGTH_BYTES = 2
 
 
 class NotOnRecordError(Exception):
-    """A required value is not in the records. The message is one sentence."""
+    """An error: the records do not contain a required value. The message is one sentence."""
 
 
 def decoded(record: RecordedBytes | None) -> Datagram:
-    """Return the decoded datagram. Raises MalformedDatagramError."""
+    """Return the decoded datagram. Raises MalformedDatagramError if the bytes are invalid."""
     if record is None:
         return _decoded("")
     content = record.content
@@ -39,7 +39,7 @@ def _decoded(text: str) -> Datagram:
 
 
 def event_of(record: RecordedBytes | None) -> LoggableEvent:
-    """Return the decoded event. Raises MalformedEventsError."""
+    """Return the decoded event. Raises MalformedEventsError if the bytes are invalid."""
     if record is not None and isinstance(record.content, LoggableEvent):
         return record.content
     try:
@@ -53,7 +53,7 @@ def event_of(record: RecordedBytes | None) -> LoggableEvent:
 
 
 def sealed_of(record: RecordedBytes | None) -> bytes | None:
-    """Return the sealed data of an agent. None if the record has none, or is not base64."""
+    """Return the encrypted data that an agent recorded, or None if there is none or it is not valid base64."""
     try:
         return None if record is None else base64.b64decode(record.text, validate=True)
     except ValueError:
@@ -61,7 +61,7 @@ def sealed_of(record: RecordedBytes | None) -> bytes | None:
 
 
 def stored_blocks(record: RecordedBytes | None) -> Iterator[Block]:
-    """Yield the blocks of a store. Each follows its length. Raises ValueError."""
+    """Yield the blocks in the stored state of an agent. Raises ValueError if the bytes are invalid."""
     if record is not None and isinstance(record.content, StoredState):
         yield from record.content.blocks()
         return
@@ -78,23 +78,23 @@ def stored_blocks(record: RecordedBytes | None) -> Iterator[Block]:
 
 
 class Blocks:
-    """All blocks on record by hash, from exports and from messages that agents received or sent."""
+    """An index of all blocks on record by hash. They come from exports and from messages."""
 
     def __init__(self, exported: Iterable[ExportedBlock]) -> None:
         self._exported = {block.block_hash: block for block in exported}
         self._blocks: dict[str, Block] = {}
 
     def add(self, block: Block) -> None:
-        """Add a complete block."""
+        """Add a complete block to the index."""
         self._blocks[block.block_hash.hex()] = block
 
     def add_from(self, message: Message) -> None:
-        """Add the block in a message, if it contains one."""
+        """Add the block that the message carries, if it carries one."""
         if isinstance(message, CommitBlock | BlockResponse):
             self.add(message.block)
 
     def get(self, block_hash: str) -> Block:
-        """Return the block with this hash. Raises NotOnRecordError."""
+        """Return the block with this hash. Raises NotOnRecordError if no record contains it."""
         block = self._blocks.get(block_hash)
         if block is None and (exported := self._exported.get(block_hash)) is not None:
             block = Block(exported.agent_id, exported.timestamp_us, exported.event_bytes)

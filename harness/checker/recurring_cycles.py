@@ -1,4 +1,4 @@
-"""Find the cycle in which agents never finish, from a proof in virtual time or from the traces.
+"""Find the cycle that agents repeat forever, from a proof in virtual time or from the traces.
 
 A trace shows a cycle if it ends in the same sequence of handler runs several times in a row, each time with the same
 chain and the same numbers of blocks in deque and stack. It shows a standstill if an agent is not idle, and ran no
@@ -37,7 +37,7 @@ SHORTEST_PAUSE_S = 0.05
 
 
 def cycle_of(evidence: Evidence) -> Cycle | None:
-    """Return the cycle of agents that are not idle at the end. None if the records show no cycle."""
+    """Return the cycle that agents repeat at the end of the run, or None if the records show none."""
     busy = evidence.busy
     if not busy:
         return None
@@ -57,7 +57,7 @@ def cycle_of(evidence: Evidence) -> Cycle | None:
 
 
 def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
-    """Return the mission second of the last handler run of the hanging agents, without received messages."""
+    """Return the mission second of the last handler run of the agents in the cycle, not counting received messages."""
     traces = [evidence.traces.get(agent_id) for agent_id in standstill.agents]
     ran_at = [runs[-1].t for trace in traces if trace is not None and (runs := _own_runs(trace))]
     return max(ran_at) if len(ran_at) == len(traces) else standstill.since_s
@@ -65,7 +65,9 @@ def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Round:
-    """The part of one agent in a cycle: the runs of one period, its start, length and number of repetitions."""
+    """The part of one agent in an endless cycle: the handler runs of one period, its start, length and number of
+    repetitions.
+    """
 
     runs: list[HandlerRun]
     since_s: float
@@ -119,14 +121,14 @@ def _in_traces(evidence: Evidence, busy: Sequence[int], times: int) -> Cycle | N
 
 
 def _own_runs(trace: Trace) -> list[HandlerRun]:
-    """Return the last runs of the last incarnation that changed data, or that no message triggered."""
+    """Return the handler runs since the last restart that changed data, or that no message triggered."""
     start = max(trace.starts[-1] if trace.starts else 0, len(trace.runs) - LAST_RUNS)
     runs = (run for run in trace.runs[start:] if run.changes or not isinstance(run.trigger, MessageTrigger))
     return [run for run in runs if run.branch != ALREADY]
 
 
 def _round(runs: Sequence[HandlerRun], times: int) -> _Round | None:
-    """Return the shortest period in which `runs` end at least `times` times in a row. None without one."""
+    """Return the shortest sequence that the runs repeat at least `times` times at their end, or None."""
     keys = [_key(run) for run in reversed(runs)]
     for length, matching in enumerate(_matches(keys)):
         if length and length + matching >= times * length:
@@ -143,7 +145,9 @@ def _key(run: HandlerRun) -> tuple[object, ...]:
 
 
 def _matches(keys: Sequence[object]) -> list[int]:
-    """Return the Z-function: for each place, the length of the common prefix of the keys from there and all keys."""
+    """Return the Z-function of a sequence: for each position, the length of the common prefix of the sequence and its
+    rest from there.
+    """
     matching = [0] * len(keys)
     left = right = 0
     for place in range(1, len(keys)):
@@ -157,7 +161,9 @@ def _matches(keys: Sequence[object]) -> list[int]:
 
 
 def _waits(evidence: Evidence, rounds: dict[int, _Round], period_s: float) -> Iterator[CycleWait]:
-    """Yield for each agent the peers whose answers never count in the last period, and those that refuse its blocks."""
+    """Yield, for each agent, the peers whose answers did not count in the last period and the peers that rejected its
+    blocks.
+    """
     for agent_id, each in rounds.items():
         heard, refused_by = set[int](), set[int]()
         for run in reversed(evidence.traces[agent_id].runs):
@@ -179,14 +185,14 @@ def _waits(evidence: Evidence, rounds: dict[int, _Round], period_s: float) -> It
 
 
 def in_short(cycle: Cycle) -> str:
-    """Return the agents that never finish, and the start of the cycle."""
+    """Return a short phrase: the agents that never finish, and the start of their cycle."""
     many = len(cycle.agents) > 1
     goes = "repeated the same cycle" if cycle.period_s is not None else "hung"
     return f"{named(cycle.agents)} {'have' if many else 'has'} {goes} since {cycle.since_s:.0f} s"
 
 
 def in_words(cycle: Cycle) -> str:
-    """Return the agents of the cycle, its start, the evidence for it, and the waiting agents."""
+    """Return a text about the cycle: its agents, its start, the evidence, and the reason why each agent waits."""
     if cycle.period_s is None:
         return f"{in_short(cycle)}: not idle, and no running timer can change this"
     every = f"every {cycle.period_s:.4g} s"
@@ -218,7 +224,7 @@ def _each_other(peers: Mapping[int, tuple[int, ...]]) -> bool:
 
 
 def _alike(peers: Mapping[int, tuple[int, ...]]) -> Iterator[tuple[tuple[int, ...], list[int]]]:
-    """Yield each tuple of peers with all agents that have it."""
+    """Yield each set of peers together with all agents for which it is the same."""
     alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
     for agent_id, whom in peers.items():
         alike[whom].append(agent_id)
@@ -226,12 +232,12 @@ def _alike(peers: Mapping[int, tuple[int, ...]]) -> Iterator[tuple[tuple[int, ..
 
 
 def named(ids: Collection[int]) -> str:
-    """Return the agents, or only their number if the list is long."""
+    """Return the names of the agents, or only their number if the list is long."""
     return agents(tuple(ids)) if len(ids) <= MAX_NAMED else f"{len(ids)} agents"
 
 
 def findings(cycle: Cycle) -> list[Finding]:
-    """Return the handler runs of one period for each agent. Agents with the same runs share a finding."""
+    """Return the handler runs of one period for each agent, as evidence. Agents with equal runs share one finding."""
     alike: dict[str, list[int]] = defaultdict(list)
     for agent_id in cycle.agents:
         alike[_round_in_words(cycle, agent_id)].append(agent_id)
@@ -242,7 +248,9 @@ def findings(cycle: Cycle) -> list[Finding]:
 
 
 def _round_in_words(cycle: Cycle, agent_id: int) -> str:
-    """Return the runs of one period, starting after the longest pause, so that shifted cycles have the same text."""
+    """Return a text that lists the runs of one period. It starts after the longest pause, so equal cycles give equal
+    texts.
+    """
     steps = [step for step in cycle.steps if step.agent_id == agent_id]
     if not steps or cycle.period_s is None:
         return f"not idle, and inactive since {cycle.since_s:.0f} s"

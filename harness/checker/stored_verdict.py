@@ -1,4 +1,4 @@
-"""Compare the verdict that run.json stores with the verdict on the files of the run.
+"""Compare the verdict in run.json with a new verdict on the files of the run.
 
 The same code gives the same verdict on the same files. A difference then means that a file was edited after the run.
 Other code may judge differently, because the checker was changed.
@@ -12,7 +12,9 @@ from harness.scenario.verdict_names import ALL_CHECKS, CHARACTERISTICS
 
 
 def differences(record: RunRecord, result: Result, survived: Survival) -> Iterator[str]:
-    """Yield a sentence for each verdict, figure, and survival that differs. A run without a verdict yields nothing."""
+    """Yield a sentence for each stored verdict or figure that differs from the new one. A run without a stored verdict
+    yields nothing.
+    """
     if not record.characteristics:
         return
     for key, judgement in result.judgements.items():

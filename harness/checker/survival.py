@@ -1,4 +1,4 @@
-"""Decide which blocks survive the loss of vehicles (thesis, Chapter 1 and Section 3.3).
+"""Decide which blocks survive when vehicles are lost (thesis, Chapter 1 and Section 3.3).
 
 A block survives if any remaining vehicle holds it, in the chain, in the deque or on the reconcile stack. Traces show
 the blocks of each vehicle at the time of a loss. Exports show them at the end.
@@ -18,7 +18,9 @@ MAX_SENTENCES = 5
 
 
 def survival(evidence: Evidence) -> Survival:
-    """Return the blocks that each loss of vehicles affected, and the smallest further loss that would lose a block."""
+    """Return the blocks that each loss of vehicles destroyed, and the smallest further loss of vehicles that would
+    destroy a block.
+    """
     at_end = _holders(evidence.exports)
     completed = None if evidence.agents_with_unknown_completed() else evidence.completed_blocks()
     lost = [fault for fault in (evidence.record.faults if evidence.record else ()) if fault.loses_data]
@@ -32,7 +34,7 @@ def survival(evidence: Evidence) -> Survival:
 
 
 def _holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
-    """Return the vehicles that hold each block in any place, by block hash."""
+    """Return, for each block hash, the vehicles that hold the block anywhere."""
     holders: dict[str, list[int]] = {}
     for agent_id, export in sorted(exports.items()):
         for block_hash in dict.fromkeys(block.block_hash for block in export.blocks()):
@@ -41,7 +43,9 @@ def _holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def _least_held(evidence: Evidence, exports: Mapping[int, Export]) -> LeastHeld | None:
-    """Return the block with the fewest holders, the oldest if there are several. None without a block."""
+    """Return the block that the fewest vehicles hold (the oldest one if there are several), or None if there is no
+    block.
+    """
     holders = _holders(exports)
     if not holders:
         return None
@@ -108,7 +112,7 @@ def _losses(evidence: Evidence, lost: list[FaultRecord], at_end: Mapping[str, li
 
 
 def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) -> list[set[str]]:
-    """Return the blocks that an agent held directly before each instant, none after its own loss."""
+    """Return the blocks that an agent held just before each time. The set is empty after the agent's own loss."""
     waiting, blocks_held = deque(instants), []
     held, at_s = HeldBlocks(), -math.inf
 
@@ -130,7 +134,7 @@ def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) 
 
 
 def in_words(survived: Survival) -> list[str]:
-    """Return a sentence for each of the first losses, for the end, and for the smallest further loss."""
+    """Return sentences about the first losses of vehicles, the end of the run, and the smallest further loss."""
     sentences = [_loss_in_words(loss) for loss in survived.losses[:MAX_SENTENCES]]
     if len(survived.losses) > MAX_SENTENCES:
         sentences.append(f"{len(survived.losses) - MAX_SENTENCES} more losses of vehicles are in run.json")

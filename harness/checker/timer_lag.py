@@ -1,4 +1,4 @@
-"""Measure how late the vote timers of agents expired, to warn about a machine that is too slow."""
+"""Measure how late the vote timers of agents expired, so that a warning can name a machine that is too slow."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -14,19 +14,21 @@ TOLERATED = 0.05
 
 @dataclass(frozen=True)
 class TimerLag:
-    """One in twenty vote timers, set to `asked_s`, expired more than `late_s` late. Times are mission seconds."""
+    """The lateness of vote timers: one in twenty timers of `asked_s` mission seconds was more than `late_s` mission
+    seconds late.
+    """
 
     late_s: float
     asked_s: float
 
     @property
     def tolerable(self) -> bool:
-        """True if the lateness is at most a twentieth of the duration."""
+        """True if the lateness is at most one twentieth of the timer's duration."""
         return self.late_s <= TOLERATED * self.asked_s
 
 
 def timer_lag(traces: Iterable[Trace], lag: MeasuredLag | None = None) -> TimerLag | None:
-    """Return the lateness of all votes that no reconcile interrupted. None if there are too few.
+    """Return the lateness of all votes that ran without interruption, or None if there were too few.
 
     With a measured `lag`, lateness that it does not explain is not the machine's, and does not count.
     """
@@ -41,14 +43,14 @@ def timer_lag(traces: Iterable[Trace], lag: MeasuredLag | None = None) -> TimerL
 
 
 def _of_machine(trace: Trace, ended_s: float, late_s: float, lag: MeasuredLag | None) -> float:
-    """Return the part of the lateness that the measured lag explains, in mission seconds."""
+    """Return the part of the lateness, in mission seconds, that the measured delays of the machine explain."""
     speedup = trace.header.clock.get("speedup")
     explained_s = lag.explains(trace.header.agent_id, ended_s - max(0.0, late_s), ended_s) if lag else None
     return late_s if explained_s is None or not speedup else min(late_s, explained_s * speedup)
 
 
 def _votes(trace: Trace) -> Iterator[tuple[float, float]]:
-    """Yield the end and the duration of each vote. A reconcile pauses the timer, and leaves its vote out."""
+    """Yield the end and the duration of each vote. Votes that a reconcile interrupted are left out."""
     for life in trace.incarnations():
         began: float | None = None
         for _, run in life:

@@ -1,4 +1,4 @@
-"""Characteristic 6: in a fully connected system where all had the chance to reconcile, one uniform chain emerges."""
+"""Check characteristic 6: if all agents had a chance to reconcile in a connected system, all have the same chain."""
 
 from collections import Counter
 
@@ -16,7 +16,7 @@ NAME = "one uniform chain"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Judge the exports.
+    """Judge whether all exported chains are equal.
 
     `not applicable` where an export is missing, an agent was not idle, or those that differ had no chance.
     """
@@ -52,7 +52,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def common_prefix(chains: list[tuple[str, ...]]) -> int:
-    """Return the length of the mutual chain: the number of blocks that all chains have in common from the start."""
+    """Return the number of blocks at the start of the chains that are the same in all chains."""
     length = 0
     for level in zip(*chains, strict=False):
         if len(set(level)) > 1:

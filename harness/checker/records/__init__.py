@@ -1,4 +1,4 @@
-"""Compare records of the same facts. Two records that contradict each other are a finding.
+"""Compare different records of the same facts. A contradiction between two of them is a finding.
 
 Each comparison is a file in this folder: a function from `Evidence` to the `Contradiction`s that it finds. An unaltered
 run has no contradiction. The records contain each kill, restart, reboot, pause, rogue node and full disk.
@@ -56,7 +56,7 @@ be missing."""
 
 @dataclass(frozen=True)
 class Examination:
-    """The result of all comparisons."""
+    """The result of all comparisons between the records of a run."""
 
     contradictions: list[Contradiction]
     short: dict[int, str]
@@ -65,12 +65,12 @@ class Examination:
     """Agent -> number of messages that it could not send, by its own count."""
 
     def touching(self, number: str) -> list[Finding]:
-        """Return the findings that concern this characteristic."""
+        """Return the contradictions that affect the characteristic with this number."""
         return [contradiction.finding for contradiction in self.contradictions if contradiction.touches == number]
 
 
 def cross_examine(evidence: Evidence) -> Examination:
-    """Run all comparisons in their order."""
+    """Run all comparisons between the records of a run, and return their results."""
     comparisons = [compare for compare in COMPARISONS if not evidence.from_field or compare not in NEEDS_ALL_LINES]
     contradictions = [contradiction for compare in comparisons for contradiction in compare(evidence)]
     if evidence.from_field:
@@ -90,7 +90,7 @@ def cross_examine(evidence: Evidence) -> Examination:
 
 
 def _agents_without_known_end(evidence: Evidence) -> Iterator[int]:
-    """Yield the agents of an interrupted run whose number of handler runs is not on record."""
+    """Yield the agents of an interrupted run for which run.json lacks the number of handler runs."""
     if evidence.record is None or evidence.record.outcome != "running":
         return
     for agent_id in evidence.traces:
@@ -100,7 +100,9 @@ def _agents_without_known_end(evidence: Evidence) -> Iterator[int]:
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Return `contradict` for any contradiction, `not applicable` if a trace is missing or incomplete, else `agree`."""
+    """Return the verdict on the records: `contradict` after any contradiction, `not applicable` if a trace is missing
+    or incomplete, else `agree`.
+    """
     examination = evidence.cached(cross_examine)
     findings = [contradiction.finding for contradiction in examination.contradictions]
     if findings:
@@ -128,7 +130,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def describe_incomplete(examination: Examination) -> str:
-    """Describe the incomplete traces. At least one must exist."""
+    """Return a phrase that names the incomplete traces. At least one trace must be incomplete."""
     agent_id, why = next(iter(examination.short.items()))
     others = len(examination.short) - 1
     more = f"; so are the traces of {others} more" if others else ""

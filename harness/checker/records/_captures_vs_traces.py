@@ -1,4 +1,4 @@
-"""Compare captures and kernel counters with the traces.
+"""Compare packet captures and the kernel's packet counters with the traces of agents.
 
 An agent writes a message to its trace before it sends the message. An agent that is killed in between does not send it.
 """
@@ -22,7 +22,7 @@ Datagrams = Counter[tuple[object, object]]
 
 
 def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
-    """A complete capture has the sent and handled messages of the trace, and no further ones of this vehicle."""
+    """Yield each difference between the packets in a vehicle's capture and the messages in its agent's trace."""
     captures = evidence.captures
     if captures is None:
         return
@@ -50,7 +50,7 @@ def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams]]:
-    """Return the datagrams that left each vehicle, and those that reached it."""
+    """Return two tables by vehicle: the datagrams that left it, and the datagrams that reached it."""
     left: dict[int, Datagrams] = defaultdict(Counter)
     reached: dict[int, Datagrams] = defaultdict(Counter)
     by_number = {capture.number: capture for capture in captures.used}
@@ -68,7 +68,8 @@ def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams
 
 
 def _not_sent(evidence: Evidence, agent_id: int) -> int:
-    """Return the number of messages in its trace that an agent may not have sent, because of an error or its end.
+    """Return the number of traced messages that the agent may have failed to send, because of an error or because it
+    ended.
 
     A killed agent does not send the messages of its last input. An agent that ends sends no answer that still waits.
     """
@@ -89,7 +90,7 @@ def _not_sent(evidence: Evidence, agent_id: int) -> int:
 
 
 def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
-    """The kernel counted at least the datagrams that other agents sent, and those that the agent handled.
+    """Yield each agent for which the kernel counted fewer packets than the traces show as sent or handled.
 
     It does not count datagrams on a shared channel, which bypass its engine.
     """
@@ -119,7 +120,7 @@ def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _sent_by(evidence: Evidence, agent_id: int, mission_s: float) -> int:
-    """Return the least number of messages that an agent had sent when the kernel's counters were read."""
+    """Return the smallest number of messages that the agent can have sent when the kernel's counters were read."""
     trace = evidence.traces[agent_id]
     by = mission_s - slack_s(trace)
     spread_s = spread_of(trace)

@@ -1,4 +1,4 @@
-"""Compare the journal of a shared channel with run.json and with the traces.
+"""Compare the log of a shared radio channel with run.json and with the traces.
 
 A message reaches an agent only over the channel, until a final reconcile ends the channel. Of a restarted sender, two
 messages can have the same number, so its messages are not compared.
@@ -17,7 +17,9 @@ from ucp.trigger import MessageTrigger
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each count of run.json that the journal contradicts, and agents that handled messages they had lost."""
+    """Yield each count in run.json that the channel's log contradicts, and each agent that handled a message after the
+    channel lost it.
+    """
     record, lines = evidence.record, evidence.channel
     if record is None or record.channel is None or not lines:
         return
@@ -51,7 +53,7 @@ def _fates(lines: list[ChannelLine]) -> dict[tuple[int, int], ChannelLine]:
 
 
 def _counted(lines: list[ChannelLine]) -> Counter[tuple[str, int]]:
-    """Return the numbers that run.json must have: of frames, and of losses and dropped messages by vehicle."""
+    """Return the numbers that run.json must contain: all frames, and the lost and dropped messages of each vehicle."""
     counted: Counter[tuple[str, int]] = Counter()
     for line in lines:
         if line.dropped is not None:

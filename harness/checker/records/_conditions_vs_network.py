@@ -1,4 +1,4 @@
-"""Compare the network changes and faults in run.json with network.jsonl.
+"""Compare the network changes and faults in run.json with those in network.jsonl.
 
 Of the changes by flight, run.json has only those that change which vehicles are connected.
 """
@@ -16,7 +16,7 @@ Change = tuple[float, str, str | None, bool | None, tuple[int, ...], str | None,
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Each change of the network and each fault is in both, with the same words, and times do not go back."""
+    """Yield each network change or fault that only one of the two files contains, and each time that goes back."""
     record, log = evidence.record, evidence.conditions
     if record is None or log is None or record.mission_s is None:
         return

@@ -1,4 +1,4 @@
-"""Compare what run.json counts of an agent, and the blocks it completed, with its trace and its export."""
+"""Compare the counters and completed blocks of each agent in run.json with its trace and its export."""
 
 from bisect import bisect_left, bisect_right
 from collections import Counter
@@ -21,7 +21,7 @@ ROUNDED_S = 5e-4
 
 
 def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each count of an agent that differs from its trace at that time."""
+    """Yield each counter of an agent that differs from the number of matching lines in its trace."""
     for agent_id, trace in evidence.traces.items():
         recorded = evidence.recorded(agent_id)
         if recorded is None or trace.problem:
@@ -49,7 +49,7 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _ran_nothing_since(recorded: AgentRecord, incarnation: Incarnation) -> bool:
-    """Return False if the agent ran handlers after its last report."""
+    """Return true if the agent ran no handler after it last reported its counters."""
     counted = recorded.handler_runs[-1] if recorded.handler_runs else None
     return counted is None or counted.counted == len(incarnation.runs)
 
@@ -67,7 +67,9 @@ def _incarnations(agent_id: int, recorded: AgentRecord, incarnations: list[Incar
 def _handler_runs(
     agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[Incarnation]
 ) -> Iterator[Contradiction]:
-    """The trace has a line for each handler run that the agent had counted."""
+    """Yield a contradiction if the trace has fewer or more lines than the number of handler runs that the agent
+    counted.
+    """
     expected = 1 + recorded.restarts + recorded.reboots
     if len(recorded.handler_runs) not in (0, expected):
         counts = _count(len(recorded.handler_runs), "count")
@@ -90,7 +92,9 @@ def _handler_runs(
 
 
 def _lines_by(incarnation: Incarnation, counted: HandlerRuns) -> tuple[int, int]:
-    """Return the least and the greatest number of lines that the trace had when the agent reported its count."""
+    """Return the smallest and the largest number of trace lines that fit the time at which the agent reported its
+    counters.
+    """
     if in_virtual_time(incarnation.trace):
         return len(incarnation.runs), len(incarnation.runs)
     slack = ROUNDED_S + (slack_s(incarnation.trace) if counted.from_s < counted.until_s else 0.0)
@@ -103,7 +107,7 @@ def _lines_by(incarnation: Incarnation, counted: HandlerRuns) -> tuple[int, int]
 def _counted(
     evidence: Evidence, agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[Incarnation]
 ) -> Iterator[Contradiction]:
-    """Compare the sums over all incarnations of the agent."""
+    """Compare the counters with the sums over all incarnations of the agent, that is, over all its restarts."""
     sent = sum(incarnation.sent for incarnation in incarnations)
     if recorded.messages_sent is not None and recorded.messages_sent != sent:
         detail = (
@@ -140,7 +144,7 @@ def _counted(
 
 
 def _bytes_sent(trace: Trace) -> int | None:
-    """Return the bytes of all sent datagrams. None if the agent sent revocations, which the trace lacks."""
+    """Return the total size of all sent datagrams, or None if the agent sent revocations, which are not in traces."""
     if any(isinstance(aside, CommandEntry) and aside.command == "revoke" for _, aside in trace.asides):
         return None
     added = ADDED_BYTES if trace.header.secured else {}
@@ -149,14 +153,14 @@ def _bytes_sent(trace: Trace) -> int | None:
 
 
 def _bytes(datagram: RecordedBytes) -> int:
-    """Return the size of a datagram. In base64, four characters are three bytes."""
+    """Return the size of a datagram in bytes, computed from the length of its base64 text."""
     if isinstance(datagram.content, Datagram):
         return datagram_bytes(datagram.content.message)
     return len(datagram.text) // 4 * 3 - datagram.text.count("=", -2)
 
 
 def _dropped(agent_id: int, recorded: AgentRecord, trace: Trace) -> Iterator[Contradiction]:
-    """The trace has a line for each counted drop. The agent may have dropped further datagrams since its report."""
+    """Yield a contradiction if the trace has fewer lines about dropped datagrams than the agent counted."""
     if recorded.dropped is None or not trace.header.has_inputs:
         return
     traced = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, DroppedDatagram))
@@ -181,7 +185,7 @@ def _count(number: int, what: str) -> str:
 
 
 def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
-    """Trace, export and run.json have the same completed blocks, in the same order."""
+    """Yield each difference between the completed blocks (and their order) in the trace, the export and run.json."""
     for agent_id, incarnations in evidence.incarnations.items():
         if evidence.traces[agent_id].problem or any(incarnation.unknown for incarnation in incarnations):
             continue
@@ -209,7 +213,9 @@ def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _over_brown_outs(evidence: Evidence, agent_id: int, incarnations: list[Incarnation]) -> Iterator[Contradiction]:
-    """A reboot restores all completed blocks from the disk. The trace may lack the last line before the kill."""
+    """Yield completed blocks that an agent lost when it restarted from its disk. One line before the power loss may be
+    missing in the trace.
+    """
     for before, after in pairwise(incarnations):
         if not after.runs or not isinstance(after.runs[0].trigger, BootTrigger):
             continue
@@ -221,7 +227,7 @@ def _over_brown_outs(evidence: Evidence, agent_id: int, incarnations: list[Incar
 
 
 def _out_of_order(exported: list[str], traced: list[str]) -> bool:
-    """Return true if the common blocks have different order in the two lists, or occur twice."""
+    """Return true if the common blocks of the two lists have different order, or occur twice."""
     both = {*exported} & {*traced}
     return [block for block in exported if block in both] != [block for block in traced if block in both]
 

@@ -1,4 +1,4 @@
-"""Compare the datagrams that an agent read, as the kernel counted them, with its trace and with those that arrived.
+"""Compare the number of datagrams that the kernel delivered to an agent with the datagrams in traces.
 
 A trace has a line for each datagram that its agent handled or dropped. The agent also reads its own broadcasts, which
 it ignores. Any further datagram that it read is missing in its trace. A datagram that was read at the end of an
@@ -26,7 +26,7 @@ UNREAD_WALL_S = 1.0
 
 
 def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
-    """Find agents that read datagrams and recorded them neither as handled nor as dropped."""
+    """Yield agents that read datagrams from their socket, but recorded them neither as handled nor as dropped."""
     record = evidence.record
     if record is None or set(record.roster) - set(evidence.traces):
         return
@@ -50,7 +50,7 @@ def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def find_unread(evidence: Evidence) -> Iterator[Contradiction]:
-    """Find agents that left datagrams in their sockets, although they were not paused."""
+    """Yield agents that left datagrams unread in their sockets although they were not paused."""
     record = evidence.record
     if record is None or set(record.roster) - set(evidence.traces):
         return
@@ -80,7 +80,7 @@ def _sentence(counted: DatagramsRead, unrecorded: int, handled: int, dropped: in
 
 
 def _at_the_end(evidence: Evidence, agent_id: int, trace: Trace, wall_s: float) -> int:
-    """Return the maximum number of datagrams that were under way to the agent when its incarnations ended."""
+    """Return the largest number of datagrams that may have been on their way to the agent each time it stopped."""
     before_s = _mission_s(trace, wall_s)
     ends = _killed_at(evidence, agent_id)
     if (last_s := evidence.end_of(agent_id)) is not None:
@@ -100,5 +100,5 @@ def _killed_at(evidence: Evidence, agent_id: int) -> list[float]:
 
 
 def _sent_at(evidence: Evidence) -> list[float]:
-    """Return the mission seconds at which agents sent messages, in order."""
+    """Return the mission seconds of all sent messages of all agents, in ascending order."""
     return sorted(run.t for trace in evidence.traces.values() for run in trace.runs for _ in run.sent)

@@ -1,4 +1,4 @@
-"""Adjust the judgement on a characteristic to the contradictions between records, and to their gaps."""
+"""Change the verdict on a characteristic if records contradict each other or are incomplete."""
 
 from harness.checker.judgement import MAX_EVIDENCE, Judgement, agents, times
 from harness.checker.records import Examination, describe_incomplete
@@ -10,7 +10,7 @@ NEEDS_CONNECTIVITY = frozenset("56")
 
 
 def in_doubt(number: str, judgement: Judgement, examination: Examination) -> Judgement:
-    """Return the judgement on the characteristic with this number, in view of all records."""
+    """Return the judgement on the characteristic with this number, corrected by the comparisons of all records."""
     touching = examination.touching(number)
     if touching:
         contradict = f"{times(len(touching))}: the records behind this verdict contradict each other"

@@ -1,4 +1,4 @@
-"""Compare the store of an agent with its export.
+"""Compare the state that an agent stored on its disk with the state that it exported.
 
 An agent writes each change to its store before any other agent can observe the change. At its end, the store therefore
 has the blocks of the export. Stores of other formats than `ucp-store/1` belong to agents of other authors and are
@@ -16,7 +16,7 @@ MAX_STORE_BYTES = 256 * 1024 * 1024
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each store that is damaged, or whose content differs from the export."""
+    """Yield each disk store that is damaged, or that differs from the agent's export."""
     for agent_id, path in evidence.stores.items():
         export, recorded = evidence.exports.get(agent_id), evidence.recorded(agent_id)
         incarnations = evidence.incarnations.get(agent_id)

@@ -1,4 +1,4 @@
-"""Compare a trace with itself, and an export with the trace that must have led to it.
+"""Check that each trace is consistent, and that each export equals the state at the end of its trace.
 
 An export contains its time. The trace until this time ends in a state. The top chain hash of this state covers all
 blocks of the chain and their order.
@@ -27,7 +27,7 @@ FIELDS = {
 
 
 def compare_export(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each export that differs from the state at the end of its trace, in its blocks or their order."""
+    """Yield each export whose blocks, or their order, differ from the state at the end of the agent's trace."""
     for agent_id, export in evidence.exports.items():
         trace = evidence.traces.get(agent_id)
         if trace is None or trace.problem:
@@ -69,7 +69,9 @@ def _state(export: Export) -> StateSummary:
 
 
 def _states_when(export: Export, trace: Trace) -> list[StateSummary]:
-    """Return the possible states of the agent at its export: several if handlers ran at the same instant."""
+    """Return the states in which the agent may have been at its export. There are several if handlers ran at the same
+    time.
+    """
     at_s = mission_s(export.exported_at_us, trace.header)
     if at_s is None:
         return []
@@ -82,7 +84,7 @@ def _states_when(export: Export, trace: Trace) -> list[StateSummary]:
 
 
 def _completed_when(export: Export, incarnations: list[Incarnation]) -> list[list[str]]:
-    """Return the blocks that each incarnation of the agent had completed at the export."""
+    """Return the completed blocks of each incarnation of the agent (the time between two restarts) up to its export."""
     at_s = mission_s(export.exported_at_us, incarnations[0].trace.header)
     if at_s is None:
         return [export.completed]
@@ -117,7 +119,9 @@ def _value(value: object) -> str:
 
 
 def _contents(agent_id: int, export: Export, incarnation: Incarnation) -> Iterator[Contradiction]:
-    """Compare the blocks of an export with those of the trace, whose lengths and top chain hash agree."""
+    """Yield differences between the blocks of an export and those of the trace, if both have the same lengths and top
+    chain hash.
+    """
     if incarnation.wrong_lengths or incarnation.wrong_tops or incarnation.impossible or incarnation.unknown:
         return
     for place, exported, traced, touches in (
@@ -134,7 +138,7 @@ def _contents(agent_id: int, export: Export, incarnation: Incarnation) -> Iterat
 
 
 def compare_with_itself(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield contradictions within each incarnation of an agent, and between incarnations."""
+    """Yield contradictions inside the trace of one agent, before and after its restarts."""
     for agent_id, incarnations in evidence.incarnations.items():
         for incarnation in incarnations:
             yield from _in_incarnation(evidence, agent_id, incarnation)
@@ -155,7 +159,7 @@ def _in_incarnation(evidence: Evidence, agent_id: int, incarnation: Incarnation)
 
 
 def finding(evidence: Evidence, agent_id: int, observation: Observation) -> Finding:
-    """Return the observation as evidence, with the name of the block."""
+    """Return the observation as a piece of evidence that names the block."""
     block = observation.block_hash
     return Finding(agent_id, f"{observation.where}: {observation.what}", evidence.name(block) if block else None, block)
 

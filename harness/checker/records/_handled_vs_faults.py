@@ -1,4 +1,4 @@
-"""Compare the handler runs in traces with the faults that stopped an agent, and with the network that cut links.
+"""Compare the handler runs in traces with the faults that stopped agents and the partitions that cut links.
 
 An agent that is killed, reboots, is switched off or is paused runs no handler. An agent handles no message that its
 sender sent while the link lost all messages. The time of sending decides, because messages under way arrive.
@@ -32,7 +32,7 @@ Stop = tuple[float, float, str]
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each handler run of a stopped agent, and each handled message of a cut link."""
+    """Yield each handler run of an agent while it was stopped, and each handled message of a link while it was cut."""
     if evidence.record is None:
         return
     cuts = _cuts(evidence)
@@ -55,7 +55,9 @@ def _clock_slack_s(trace: Trace) -> float:
 
 
 def stopped(evidence: Evidence, agent_id: int, slack_s: float) -> list[Stop]:
-    """Return the intervals in which the agent was killed, rebooting, switched off or paused, shorter by the slack."""
+    """Return the intervals in which the agent was killed, rebooting, switched off or paused. Each is shortened by
+    `slack_s` at both ends.
+    """
     stops: list[Stop] = []
     since: tuple[float, str] | None = None
     end_s = inf
@@ -97,7 +99,7 @@ class _Cuts:
                     times.append(at_s)
 
     def cut_at(self, link: Link, sent_s: float) -> bool:
-        """Return true if the link was cut at this time, and for the slack before and after it."""
+        """Return true if the link was cut at this time, and also shortly before and after it."""
         times = self._times.get(link, [])
         from_s, until_s = sent_s - self.slack_s, sent_s + self.slack_s
         number = bisect_right(times, from_s)
@@ -105,7 +107,7 @@ class _Cuts:
 
 
 def _cuts(evidence: Evidence) -> _Cuts | None:
-    """Return the cut links. None if no link was ever cut, or if messages may pass a cut link.
+    """Return the intervals in which links were cut, or None if no link was cut or a cut link may pass messages.
 
     Scripted fates deliver messages regardless of the loss, netem may pass a second copy of a lost message, and on a
     shared channel a message waits before it is sent.

@@ -1,4 +1,5 @@
-"""Compare the headers of all traces, and the number of each handler's Algorithm with its name.
+"""Compare the headers of all traces with each other, and the Algorithm number of each trace line with the handler's
+name.
 
 The scenario may stagger timers. The comparison therefore subtracts the stagger of each agent from its timers.
 """
@@ -15,7 +16,7 @@ MAX_VALUE = 40
 
 
 def compare_headers(evidence: Evidence) -> Iterator[Contradiction]:
-    """All headers have the same roster, settings, clock and inception block."""
+    """Yield each header that differs from the others in roster, settings, clock or inception block."""
     first: dict[str, tuple[object, str]] = {}
     if evidence.record is not None:
         first["roster"] = sorted(evidence.record.roster), "run.json"
@@ -37,7 +38,7 @@ def compare_headers(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _in_common(evidence: Evidence, agent_id: int) -> dict[str, object]:
-    """Return the settings of the agent without its stagger."""
+    """Return the settings of the agent that must be equal for all agents. Timer offsets differ between agents."""
     settings: dict[str, Any] = {**evidence.traces[agent_id].header.settings}
     record = evidence.record
     if record is None or not record.stagger or agent_id not in record.roster:
@@ -58,7 +59,7 @@ ALGORITHM = {name: handler.algorithm for name, handler in HANDLERS.items()}
 
 
 def compare_algorithms(evidence: Evidence) -> Iterator[Contradiction]:
-    """Each known handler has the number of its Algorithm. The step judge uses only the name."""
+    """Yield each trace line whose Algorithm number does not belong to its handler. Other checks use only the name."""
     for agent_id, trace in evidence.traces.items():
         said = dict.fromkeys((run.handler, run.algorithm) for run in trace.runs)
         for handler, number in said:

@@ -1,4 +1,4 @@
-"""Compare the messages that agents handled with the messages that others sent.
+"""Compare the messages that agents handled with the messages that other agents sent.
 
 An agent handles a message after its sender sent it, with the content that was sent. It handles the message once, unless
 the network duplicates messages.
@@ -19,7 +19,7 @@ CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each handled message that differs from the sent one, was handled too early, or was handled again."""
+    """Yield each handled message that differs from the sent message, arrived too early, or was handled twice."""
     slack = max(map(slack_s, evidence.traces.values()), default=0.0)
     sendings = evidence.sendings
     once = not _may_duplicate(evidence)
@@ -50,7 +50,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _may_duplicate(evidence: Evidence) -> bool:
-    """Return true if the network or a script can deliver a message twice, or if the network is not on record."""
+    """Return true if the network or a script may deliver a message twice, or if no record describes the network."""
     links = evidence.requested_links
     return links is None or evidence.has_fates or any(link.duplicate > 0 for link in links)
 
@@ -58,7 +58,7 @@ def _may_duplicate(evidence: Evidence) -> bool:
 def _find_differences(
     line: int, run: HandlerRun, trigger: MessageTrigger, sent: Sending, earliest_s: float
 ) -> Iterator[tuple[Observation, str]]:
-    """Yield each difference between the handled and the sent message, and the characteristic that it concerns."""
+    """Yield each difference between a handled message and the sent message, with the affected characteristic."""
     if run.t < earliest_s:
         yield Observation(line, run, f"handled {_named(trigger)} before it was sent at {sent[0][0]:g} s"), "1"
     if run.input is not None and not _is_unchanged(run.input, sent):
@@ -82,7 +82,7 @@ def _is_unchanged(datagram: RecordedBytes, sent: Sending) -> bool:
 
 
 def _another_block(run: HandlerRun, trigger: MessageTrigger, sent: Sending) -> str | None:
-    """Return the block that the agent added to its chain although the message did not carry it. None without one."""
+    """Return the block that the agent added to its chain although the message carried a different one, or None."""
     if trigger.message not in CARRY_A_BLOCK:
         return None
     carried = {message.block for _, message in sent}

@@ -1,4 +1,4 @@
-"""Compare the share of lost messages with the loss that the network recorded.
+"""Compare the share of lost messages with the loss rate that the network was set to.
 
 Each receiver of a message loses it independently, with a known probability. The number of lost messages is therefore a
 sum of independent draws. By Hoeffding's bound (1963, Theorem 1) the probability that the share of n draws is a or more,
@@ -42,7 +42,7 @@ MAX_CHANCE = 1e-12
 
 @dataclass
 class _Expected:
-    """The messages to one receiver: their number, and the sums of the least and greatest probability of their loss."""
+    """The messages to one receiver: their number, and the sums of the smallest and largest probability of loss."""
 
     messages: int = 0
     least: float = 0.0
@@ -50,11 +50,11 @@ class _Expected:
     handled: int = 0
 
     def loss_range(self) -> tuple[float, float]:
-        """Return the least and the greatest mean loss of these messages."""
+        """Return the smallest and the largest possible mean loss rate of these messages."""
         return self.least / self.messages, self.most / self.messages
 
     def pass_range(self) -> tuple[float, float]:
-        """Return the least and the greatest mean probability that such a message passes."""
+        """Return the smallest and the largest possible mean probability that such a message arrives."""
         return 1 - self.most / self.messages, 1 - self.least / self.messages
 
     def add(self, losses: tuple[float, float]) -> None:
@@ -64,7 +64,7 @@ class _Expected:
 
 
 class _LossHistory:
-    """The loss of each link over time."""
+    """The loss rate of each link over time."""
 
     def __init__(self, link_losses: list[tuple[float, dict[Link, float]]], slack_s: float) -> None:
         self._slack_s = slack_s
@@ -76,7 +76,7 @@ class _LossHistory:
                 self._losses[link].append(loss)
 
     def range_at(self, link: Link, sent_s: float) -> tuple[float, float]:
-        """Return the least and the greatest loss within the slack of this time."""
+        """Return the smallest and the largest loss rate of the link around this time."""
         times, losses = self._times[link], self._losses[link]
         if len(losses) == 1:
             return losses[0], losses[0]
@@ -86,7 +86,7 @@ class _LossHistory:
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each receiver whose messages cannot have been lost as recorded."""
+    """Yield each receiver that lost more or fewer messages than the recorded loss rates can explain."""
     links = evidence.requested_links
     if not links or not evidence.link_losses or evidence.has_fates or evidence.injected.messages:
         return
@@ -134,7 +134,7 @@ def _is_impossible_at(seen: _Expected, sides: tuple[bool, ...]) -> bool:
 
 
 def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) -> dict[int, _Expected]:
-    """Return the messages to each receiver that a right agent handles if they arrive.
+    """Return, for each receiver, the messages that a correct agent handles if they arrive.
 
     `over_cuts` replaces the least and the greatest loss of a message whose link is cut.
     """
@@ -165,7 +165,7 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
 
 
 class _ReadyTimes:
-    """The times at which an agent in virtual time handles each arriving message that is never withheld."""
+    """The times at which an agent in virtual time would handle certain messages if they arrived."""
 
     def __init__(self, evidence: Evidence, agent_id: int) -> None:
         self._latest_s = LATENCY.mean_s + LATENCY.jitter_s
@@ -185,7 +185,7 @@ class _ReadyTimes:
         self._end_s = evidence.end_of(agent_id) or 0.0
 
     def handles(self, message: str, sent_s: float) -> bool:
-        """Return true if the agent is ready at each possible time of arrival."""
+        """Return true if the agent would handle the message at each time at which it may arrive."""
         arrives_s = sent_s + self._latest_s
         if message not in NEVER_WITHHELD or arrives_s >= self._end_s:
             return False
@@ -194,7 +194,7 @@ class _ReadyTimes:
 
 
 def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterator[Contradiction]:
-    """The kernel lost as many packets as the loss explains.
+    """Yield each receiver for which the kernel lost more or fewer packets than the loss rates can explain.
 
     It counts packets that a partition cut apart from lost ones, but packets to a killed vehicle as any others.
     """
@@ -223,7 +223,7 @@ def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterato
 
 
 def _is_impossible(count: int, number: int, means: tuple[float, float], *, fewer: bool) -> bool:
-    """Return true if such a count, or a more extreme one, has no practical chance in `number` draws.
+    """Return true if this count, or a more extreme one, is practically impossible in `number` random draws.
 
     `means` are the least and the greatest mean of the draws.
     """
@@ -235,7 +235,7 @@ def _is_impossible(count: int, number: int, means: tuple[float, float], *, fewer
 
 
 def _relative_entropy(share: float, mean: float) -> float:
-    """Return KL(share, mean) in nats. It is infinite if the share is impossible at this mean."""
+    """Return the relative entropy of `share` and `mean` in nats. It is infinite if the share is impossible."""
     if mean in (0.0, 1.0):
         return 0.0 if share == mean else float("inf")
     parts = ((share, mean), (1 - share, 1 - mean))

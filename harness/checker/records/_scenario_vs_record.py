@@ -1,4 +1,4 @@
-"""Compare the scenario in run.json with the changes, the agents and the duration that run.json records.
+"""Compare the scenario with the changes, agents and duration that run.json records.
 
 The scenario determines all network changes, faults and injections before the run. A record that lacks one of them, or
 has another one, describes a different run. Three changes are not in the scenario: those of flight, the end of scripted
@@ -53,7 +53,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
 def _compare_changes(
     evidence: Evidence, scenario: Scenario, record: JudgedRecord, mission_s: float
 ) -> Iterator[Contradiction]:
-    """Each planned change has a record at its planned time, and each recorded change was planned."""
+    """Yield each planned change that is not recorded at its time, and each recorded change that was not planned."""
     first = min(record.roster, default=0)
     latest = max(map(slack_s, evidence.traces.values()), default=ROUNDED_S)
     late_s = 0.0 if any(map(in_virtual_time, evidence.traces.values())) else LATE_WALL_S * scenario.speedup
@@ -79,7 +79,7 @@ def _compare_changes(
 
 
 def _recorded(record: JudgedRecord) -> Iterator[NetworkState | FaultRecord]:
-    """Yield each recorded change once. `faults` also contains the network changes, except the initial state."""
+    """Yield each recorded change once. The list `faults` repeats all network changes except the initial one."""
     yield from (state for state in record.network if state.what not in NOT_IN_A_SCENARIO)
     yield from (fault for fault in record.faults if fault.fully_connected is None)
 
@@ -99,7 +99,7 @@ def _in_words(change: Change) -> str:
 
 
 def _compare_settings(evidence: Evidence, scenario: Scenario) -> Iterator[Contradiction]:
-    """The header of each trace has all settings, with the values of the scenario."""
+    """Yield each trace header with missing settings, or with values that differ from the scenario."""
     for agent_id, trace in evidence.traces.items():
         if agent_id not in scenario.roster:
             continue

@@ -1,4 +1,4 @@
-"""Compare the times of exports, events and handler runs with the end of the run.
+"""Compare the times of exports, events and handler runs with the time at which the run ended.
 
 An agent exports its chain at its own end: when it is switched off, or when the run ends. An event has the timestamp of
 its logging. Virtual time has one clock, so these times are equal. Processes export one after another and on a machine
@@ -26,7 +26,7 @@ ROUNDED_END_S = 0.1
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each export, handler run and event whose time contradicts the end of the run or the agent's clock."""
+    """Yield each export, handler run and event with a time that the end of the run or the agent's clock contradicts."""
     as_logged = not _has_recorded_events(evidence)
     for agent_id, trace in evidence.traces.items():
         end_s = evidence.end_of(agent_id)
@@ -41,7 +41,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _around_the_end(trace: Trace, end_s: float) -> tuple[float, float]:
-    """Return the earliest time of the export, and the latest time of an export or a handler run."""
+    """Return the earliest possible time of the export, and the latest possible time of an export or handler run."""
     speedup = trace.header.clock.get("speedup")
     if in_virtual_time(trace) or not isinstance(speedup, int | float):
         return end_s - SAME_TIME_S, end_s + SAME_TIME_S
@@ -69,7 +69,7 @@ def _compare_export(
 
 
 def _has_recorded_events(evidence: Evidence) -> bool:
-    """Return true if the scenario gives events the timestamps of another run."""
+    """Return true if the events of the scenario keep the timestamps of an earlier run."""
     return evidence.scenario is None or any(event.timestamp_us is not None for event in evidence.scenario.events.script)
 
 

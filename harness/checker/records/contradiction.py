@@ -22,7 +22,7 @@ class Contradiction:
 
 
 def of_agent(agent_id: int, detail: str, touches: str | None = None, *, short: bool = False) -> Contradiction:
-    """Return a contradiction that concerns no block."""
+    """Return a contradiction about an agent that concerns no particular block."""
     return Contradiction(Finding(agent_id, detail), touches, short)
 
 
@@ -31,12 +31,14 @@ ROUNDED_S = 2e-6
 
 
 def in_virtual_time(trace: Trace) -> bool:
-    """Return true if mission second 0 is the Unix epoch, as in virtual time."""
+    """Return true if the clock of the trace starts at the Unix epoch, which shows that the run was simulated."""
     return trace.header.clock.get("epoch_us") == 0
 
 
 def slack_s(trace: Trace) -> float:
-    """Return the tolerance, in mission seconds, for the clocks of two processes. Virtual time has one clock."""
+    """Return the tolerance, in mission seconds, for differences between clocks. A simulated run has one clock and needs
+    none.
+    """
     speedup = trace.header.clock.get("speedup")
     if in_virtual_time(trace) or not isinstance(speedup, int | float):
         return ROUNDED_S
@@ -44,7 +46,9 @@ def slack_s(trace: Trace) -> float:
 
 
 def mission_s(timestamp_us: int, header: Header) -> float | None:
-    """Return the mission second at which the agent's clock showed this time. None if the header lacks the clock."""
+    """Return the mission second at which the agent's clock showed this time, or None if the header does not describe
+    the clock.
+    """
     clock = header.clock
     told = [clock.get("epoch_us"), clock.get("offset_s", 0), clock.get("drift", 0)]
     epoch_us, offset_s, drift = (float(part) if isinstance(part, int | float) else None for part in told)

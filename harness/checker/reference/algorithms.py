@@ -1,4 +1,4 @@
-"""The reference: a literal transcription of Algorithms 1-20 (Chapter 3 of the thesis).
+"""The reference implementation: a literal transcription of Algorithms 1-20 (Chapter 3 of the thesis).
 
 Recorded runs of other implementations are judged by this module, so it favours the order and the words of the
 pseudo-code over short code. Its author worked from the thesis and the readings of the thesis, and did not see `ucp`.
@@ -53,7 +53,7 @@ def _algorithm(
     local_event: str = "",
     tally: str | None = None,
 ) -> Callable[[_Run], _Run]:
-    """Register a function as the handler of a message, of a timer's expiration or of a local event."""
+    """Return a decorator that registers a function as the handler of a message, an expired timer or a local event."""
 
     def register(run: _Run) -> _Run:
         handler = Handler(run.__name__, number, run, tally)
@@ -187,7 +187,7 @@ def receive_commit_block(state: State, sender: int, message: CommitBlock) -> str
 
 @_algorithm(7, local_event="Reconcile Begin")
 def reconcile_begin(state: State) -> str:
-    """Algorithm 7, Reconcile Begin (Section 3.6.3). The voting timer, if active, runs on (reading 10)."""
+    """Algorithm 7, Reconcile Begin (Section 3.6.3). An active voting timer continues (reading 10)."""
     if state.reconcile_in_progress:
         return "already in progress"
     state.reconcile_in_progress = True
@@ -199,7 +199,7 @@ def reconcile_begin(state: State) -> str:
 
 @_algorithm(8, local_event="Reconcile Phase 1", tally="reconcile_vote_count")
 def reconcile_phase_1(state: State) -> str:
-    """Algorithm 8, Reconcile Phase 1 (Section 3.6.3): ask which chains contain the own top."""
+    """Algorithm 8, Reconcile Phase 1 (Section 3.6.3): ask which neighbours' chains contain the own top block."""
     state.reconcile_vote_count = {"yes": 0, "no": 0}
     state.reconcile_responders = set()
     state.send(ChainContainQuery(state.chain.top_chain_hash))
@@ -388,7 +388,7 @@ def receive_response_block_for_hash(state: State, sender: int, message: BlockRes
 
 @_algorithm(19, timer="phase three")
 def reconcile_phase_3_timer_expiration(state: State) -> str:
-    """Algorithm 19, Reconcile Phase 3 Timer Expiration (Section 3.6.3): give up the chosen block (reading 13)."""
+    """Algorithm 19, Reconcile Phase 3 Timer Expiration (Section 3.6.3): abandon the chosen block (reading 13)."""
     state.majority_response_block_hash = None
     state.trigger("Reconcile Finalize")
     return "gave up"
@@ -396,7 +396,7 @@ def reconcile_phase_3_timer_expiration(state: State) -> str:
 
 @_algorithm(20, timer="finalize gap", local_event="Reconcile Finalize")
 def reconcile_finalize(state: State) -> str:
-    """Algorithm 20, Reconcile Finalize (Section 3.6.3): commit the rest of the reconcile stack again.
+    """Algorithm 20, Reconcile Finalize (Section 3.6.3): commit the remaining blocks of the reconcile stack again.
 
     Reading 14 pauses between two commits; the flag `reconcile_in_progress` stays set meanwhile. The setting
     `asks_after_commit` extends the thesis.
@@ -417,7 +417,9 @@ def reconcile_finalize(state: State) -> str:
 
 
 def tally_of(state: State, handler: Handler) -> Tally | None:
-    """Return a copy of the votes or candidates that a handler counts, or of its choice. Hashes are in hex."""
+    """Return a copy of the votes or candidates that a handler counts, or the candidate that it chose. Hashes are
+    hexadecimal.
+    """
     dictionary = state.reconcile_response_dictionary
     if handler.tally == "majority_response_block_hash":
         chosen = state.majority_response_block_hash

@@ -1,4 +1,4 @@
-"""The reference as an agent without I/O, with the inputs and outputs of `ucp.agent.Agent`.
+"""The reference implementation as an agent without I/O. It has the same interface as `ucp.agent.Agent`.
 
 `prove` puts it into the state of an agent and gives both the same input. `conformance` runs it beside the agent under
 test.
@@ -18,7 +18,8 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 
 
 class ReferenceAgent:
-    """An agent that does as the reference. All times are mission seconds; `state` may be looked at and set.
+    """An agent that follows the reference implementation. All times are mission seconds. Callers may read and set
+    `state`.
 
     `after_each` is called after each handler run.
     """
@@ -41,7 +42,7 @@ class ReferenceAgent:
     # Inputs
 
     def receive_datagram(self, data: bytes, now: float) -> None:
-        """Handle a datagram from the broadcast port. Datagrams that are not messages are dropped."""
+        """Handle a datagram from the broadcast port. Invalid datagrams are dropped."""
         try:
             sender, sequence, message = decode(data)
         except MalformedDatagramError:
@@ -49,13 +50,13 @@ class ReferenceAgent:
         self.receive_message(sender, sequence, message, now)
 
     def receive_message(self, sender: int, sequence: int, message: Message, now: float) -> None:
-        """Handle a message. Messages that are not for this agent are dropped."""
+        """Handle a message. Messages for other agents are dropped."""
         if why_not_handled(self.agent_id, self.roster, sender, message) is None:
             trigger = MessageTrigger(message.NAME, sender, sequence)
             self._handle(now, trigger, ON_MESSAGE[type(message)], sender, message)
 
     def add_event(self, event: LoggableEvent, now: float) -> None:
-        """Log an event of the vehicle."""
+        """Add an event of the vehicle to the block under construction."""
         self._handle(now, EventTrigger(event.event_id), ON_LOCAL_EVENT["Build Data Block"], event)
 
     def next_timer(self) -> float | None:
@@ -69,33 +70,33 @@ class ReferenceAgent:
             self.end_timer(timer, now)
 
     def end_timer(self, timer: Timer, now: float) -> None:
-        """End a running timer at `now`, and run its handler."""
+        """End a running timer at the time `now`, and run its handler."""
         timer.stop()
         self._handle(now, TimerTrigger(timer.name), ON_TIMER[timer.name])
 
     def boot(self, stored: StoredState, now: float) -> None:
-        """Continue with the state that an earlier incarnation stored on disk."""
+        """Start with the state that the agent stored on disk before it lost power."""
         self.state.now = now
         self.state.restore(stored.completed, stored.chain, stored.deque, stored.stack)
         self._handle(now, BootTrigger(len(self.state.chain)), ON_LOCAL_EVENT["Reconcile Finalize"])
 
     def begin_reconcile(self, now: float) -> None:
-        """Begin a reconcile by the operator's command."""
+        """Begin a reconcile because the operator requested it."""
         self._handle(now, OperatorTrigger("reconcile"), ON_LOCAL_EVENT["Reconcile Begin"])
 
     # Outputs
 
     def messages_to_send(self) -> list[tuple[int, Message]]:
-        """Return the messages to broadcast as (sequence, message), and empty the outbox."""
+        """Return the messages to broadcast with their sequence numbers, and empty the list of waiting messages."""
         sent, self._outbox = self._outbox, []
         return sent
 
     def datagrams_to_send(self) -> list[bytes]:
-        """Return the datagrams to broadcast, and empty the outbox."""
+        """Return the datagrams to broadcast, and empty the list of waiting messages."""
         return [encode(self.agent_id, sequence, message) for sequence, message in self.messages_to_send()]
 
     def trace(self) -> list[HandlerRun]:
-        """Return the handler runs since the last call."""
+        """Return the handler runs since the last call of this method."""
         trace, self._trace = self._trace, []
         return trace
 
@@ -107,7 +108,7 @@ class ReferenceAgent:
         return soonest
 
     def _handle(self, now: float, trigger: Trigger, handler: Handler, *inputs: object) -> None:
-        """Run a handler, then the handlers of the local events that were triggered, in order."""
+        """Run a handler, then the handlers of all local events that it triggered, in order."""
         state = self.state
         state.now = now
         self._run(trigger, handler, *inputs)

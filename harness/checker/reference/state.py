@@ -1,4 +1,5 @@
-"""The memory of an agent in the reference: settings, timers, the chain, and the variables of the pseudo-code.
+"""The state of one agent in the reference implementation: settings, timers, chain, and the variables of the
+pseudo-code.
 
 `algorithms` has the 20 handlers that read and change it. "Reading 4" in a docstring means number 4 of
 docs/reference/readings.md.
@@ -14,7 +15,7 @@ from ucp.messages import Message
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of an agent. The defaults are the values of the thesis and the first choice of each reading."""
+    """The protocol settings of an agent. The defaults are the values in the thesis."""
 
     vote_timeout_s: float = 10.0
     phase1_timeout_s: float = 5.0
@@ -33,12 +34,12 @@ class Settings:
 
     @classmethod
     def of(cls, settings: object) -> "Settings":
-        """Return the settings of an agent, which has attributes of the same names."""
+        """Return the settings of an agent as they are named here. Any object with these attributes can be passed."""
         return cls(**{setting.name: getattr(settings, setting.name) for setting in fields(cls)})
 
 
 class Timer:
-    """A timer that can be paused (Section 3.2). `deadline` is in mission seconds, None while the timer is stopped."""
+    """A timer that can be paused (Section 3.2). `deadline` is a mission second, or None while the timer is stopped."""
 
     __slots__ = ("_paused_at", "deadline", "name")
 
@@ -63,13 +64,15 @@ class Timer:
             self._paused_at = now
 
     def resume(self, now: float) -> None:
-        """Continue a paused timer. The deadline moves by the time that has passed during the pause."""
+        """Continue a paused timer. Its deadline moves by the duration of the pause."""
         if self.deadline is not None and self._paused_at is not None:
             self.deadline, self._paused_at = self.deadline + (now - self._paused_at), None
 
 
 class Chain:
-    """The local chain (Section 3.4). Length and iteration exclude the inception block; the oldest block is first."""
+    """The local chain (Section 3.4), from the oldest to the newest block. Length and iteration exclude the inception
+    block.
+    """
 
     def __init__(self, inception: InceptionBlock) -> None:
         self.inception = inception
@@ -94,16 +97,16 @@ class Chain:
         return self._blocks.get(block_hash)
 
     def successor(self, chain_hash: bytes) -> Block | None:
-        """Return the block after `chain_hash`. None if that is the top's chain hash or is not in the chain."""
+        """Return the block that follows `chain_hash`, or None if the chain does not contain such a block."""
         return self._successors.get(chain_hash)
 
     @property
     def top_timestamp_us(self) -> int:
-        """The timestamp of the top block; 0 for the inception block (reading 9)."""
+        """The timestamp of the top block in microseconds. It is 0 if the chain is empty (reading 9)."""
         return next(reversed(self._blocks.values())).timestamp_us if self._blocks else 0
 
     def append(self, block: Block) -> None:
-        """Put a block on top. Its chain hash is H(top chain hash || block hash) (eq. 3.2)."""
+        """Append a block to the chain. Its chain hash is H(top chain hash || block hash) (eq. 3.2)."""
         if block.block_hash in self._blocks:
             raise ValueError(f"the chain holds block {block.block_hash.hex()} already; append each block once")
         self._blocks[block.block_hash] = self._successors[self.top_chain_hash] = block
@@ -112,7 +115,7 @@ class Chain:
         self._successors[self.top_chain_hash] = None
 
     def pop(self) -> Block:
-        """Remove the top block and return it."""
+        """Remove the newest block of the chain and return it."""
         if not self._blocks:
             raise IndexError("only the inception block is left, and it stays; check len(chain) first")
         _, block = self._blocks.popitem()
@@ -124,7 +127,7 @@ class Chain:
 
 @dataclass(frozen=True, eq=False)
 class Handler:
-    """An event handler.
+    """An event handler of the protocol, with its Algorithm number.
 
     `algorithm` is its number in the thesis. `run` is the function of the algorithm. `tally` names the attribute of the
     state in which the handler counts or into which it chooses.
@@ -137,7 +140,7 @@ class Handler:
 
 
 class State:
-    """The memory of one agent: the variables of the pseudo-code, and records of the running handler's effects."""
+    """The state of one agent: the variables of the pseudo-code, and the recorded effects of the current handler."""
 
     running: Handler
     """The handler that runs. The driver sets it before each run."""
@@ -182,7 +185,9 @@ class State:
 
     @property
     def idle(self) -> bool:
-        """True if no timer is armed, no reconcile is in progress and no local event waits (reading 17)."""
+        """True if no timer is active, no reconcile is in progress, and no local event waits for its handler (reading
+        17).
+        """
         if self.reconcile_in_progress:
             return False
         for timer in self.timers:  # this is read after nearly every step, and a loop takes a third of the time of any()
@@ -191,19 +196,19 @@ class State:
         return not self.triggered
 
     def holds(self, block_hash: bytes) -> bool:
-        """Return whether the block is in the chain, in the deque or on the reconcile stack (characteristic 3)."""
+        """Return true if the block is in the chain, in the deque or on the reconcile stack (characteristic 3)."""
         return block_hash in self.chain or block_hash in self._off_chain
 
     def note_held(self) -> None:
-        """Note which blocks are held, after the deque or the stack was set directly."""
+        """Update the set of held blocks after the deque or the reconcile stack was replaced."""
         self._off_chain = {block.block_hash for block in (*self.blocks_to_be_committed, *self.reconcile_stack)}
 
     def event_data(self, timestamp_us: int) -> bytes:
-        """Return the event data of the block that is being completed. `timestamp_us` is the block's timestamp."""
+        """Return the event data of the block under construction, which gets the timestamp `timestamp_us`."""
         return bytes(self.current_block)
 
     def send(self, message: Message) -> None:
-        """Broadcast a message to the local UVS ("Network send")."""
+        """Broadcast a message to all vehicles in range ("Network send" in the thesis)."""
         self.outbox.append((self.sequence, message))
         self.sequence += 1
 
@@ -212,11 +217,11 @@ class State:
         self.started[timer.name] = duration_s
 
     def trigger(self, local_event: str) -> None:
-        """Queue a local event. Its handler runs after the running one."""
+        """Queue a local event. Its handler runs after the current handler."""
         self.triggered.append((local_event, self.running.name))
 
     def changed(self, operation: str, block: Block) -> None:
-        """Record that a block entered or left a structure."""
+        """Record that a block was added to or removed from the chain, the deque or the reconcile stack."""
         self.changes.append((operation, block.block_hash.hex()))
 
     def commit(self, block: Block) -> None:
@@ -225,7 +230,7 @@ class State:
         self.changed("chain+", block)
 
     def push_deque(self, block: Block) -> None:
-        """Put a block at the back of the deque."""
+        """Append a block to the back of the deque."""
         self.blocks_to_be_committed.append(block)
         self._off_chain.add(block.block_hash)
         self.changed("deque+", block)
@@ -244,7 +249,7 @@ class State:
         self.changed("stack+", block)
 
     def pop_stack(self, index: int = -1) -> Block:
-        """Remove a block from the reconcile stack and return it; the top block by default."""
+        """Remove a block from the reconcile stack and return it. The default is the top block."""
         block = self.reconcile_stack.pop(index)
         self._off_chain.discard(block.block_hash)
         self.changed("stack-", block)
@@ -253,7 +258,7 @@ class State:
     def restore(
         self, completed: Iterable[bytes], chain: Iterable[Block], deque: Iterable[Block], stack: Iterable[Block]
     ) -> None:
-        """Take over the stored state of an agent that lost power, and boot as in a reconcile.
+        """Load the stored state of an agent that lost power, and start it as if a reconcile were in progress.
 
         `completed` holds block hashes. Recording "complete" bypasses `changed`, since the agent may no longer hold
         these blocks.

@@ -1,4 +1,4 @@
-"""The step judge decides whether each handler run of each agent follows Algorithms 1 to 20.
+"""Compare each handler run of each agent with Algorithms 1 to 20.
 
 The judge feeds the record of each agent, step by step, into the independent reference (`harness.checker.reference`). It
 compares branch, changes, messages, timers, tallies and state. It needs only the record, so it judges agents in any
@@ -28,7 +28,9 @@ NAME = "every step"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Return `deviates` for any difference, `not applicable` if a step cannot be judged, else `as specified`."""
+    """Return the verdict on all steps: `deviates` after any difference, `not applicable` if a step could not be judged,
+    else `as specified`.
+    """
     if evidence.steps is not None:
         return evidence.steps
     blocks = Blocks(block for export in evidence.exports.values() for block in export.blocks())
@@ -80,7 +82,9 @@ def _why(unjudged: dict[int, str]) -> str:
 
 
 def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: Blocks) -> list[Follower]:
-    """Return a follower for each incarnation."""
+    """Return an object for each incarnation of the agent (the time between two restarts) that compares it with the
+    reference.
+    """
 
     def was_paused(since: float, until: float) -> bool:
         return evidence.was_paused(header.agent_id, since, until)
@@ -90,7 +94,7 @@ def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: 
 
 
 def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Follower]) -> None:
-    """Follow each incarnation of the agent through its steps, up to the first step with an unknown name."""
+    """Compare each incarnation of the agent with the reference, up to the first step with an undefined name."""
     understood = not evidence.unknown.get(agent_id, {}).keys() - IGNORED_KINDS
     for follower, life in zip(followers, trace.incarnations(), strict=True):
         if evidence.watch is not None:
@@ -106,7 +110,7 @@ def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Fol
 
 
 def wrongly_dropped(header: CheckedHeader, line: int, aside: DroppedDatagram | CommandEntry) -> Deviation | None:
-    """Return a deviation if the agent dropped a datagram that it should have handled, else None."""
+    """Return a deviation if the agent dropped a datagram that it had to handle, else None."""
     if not isinstance(aside, DroppedDatagram) or header.secured:
         return None  # a secured agent drops datagrams before it decrypts them
     try:
@@ -120,7 +124,7 @@ def wrongly_dropped(header: CheckedHeader, line: int, aside: DroppedDatagram | C
 
 
 def deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost: list[str]) -> Judgement:
-    """Return the judgement for these deviations in a number of steps. `lost` has reasons why others were not judged."""
+    """Return the judgement for these deviations. `lost` contains reasons why some steps could not be judged."""
     deviations.sort(key=lambda deviation: (deviation.t, deviation.agent_id, deviation.line))
     first_unknown: dict[tuple[int, str | None], Deviation] = {}
     for deviation in deviations:
@@ -140,10 +144,10 @@ def deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost: 
 
 
 def _known(deviation: Deviation) -> str | None:
-    """Return the handler of the deviation if it is one of the 20 handlers, else None."""
+    """Return the handler of the deviation if it is one of the 20 handlers of the protocol, else None."""
     return deviation.handler if deviation.handler in HANDLERS else None
 
 
 def _title(handler: str | None) -> str:
-    """Return a title such as "Algorithm 5, vote_timer_expiration"."""
+    """Return a title of a handler, such as "Algorithm 5, vote_timer_expiration"."""
     return f"Algorithm {HANDLERS[handler].algorithm}, {handler}" if handler else "an unknown handler"

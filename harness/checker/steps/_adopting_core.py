@@ -1,4 +1,5 @@
-"""The core of the step judge: it can also be put into the state that an agent records.
+"""An agent core that can take over the state that another agent recorded, so that a comparison continues after a
+deviation.
 
 After a deviation the judge compares the agent from the agent's own state. `Adopting` adds this to any core that has the
 attributes of the reference's `State`: to the reference, by which agents are judged, and to the core in use, for a
@@ -25,7 +26,7 @@ from ucp.trace import HandlerRun, SentMessage
 
 
 class Before(NamedTuple):
-    """The part of the state before a step that the changes of the step do not show."""
+    """The parts of the state before a step that the step's recorded changes do not restore."""
 
     stack: list[Block]
     current_block: bytes | None
@@ -40,7 +41,9 @@ else:
 
 
 class Adopting(_Core):
-    """A step begins with `before`. `undo` takes the step back, and `adopt` takes over the agent's own step instead."""
+    """An agent core whose last step can be undone with `undo`, and replaced with `adopt` by the recorded step of
+    another agent.
+    """
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Any) -> None:
         super().__init__(agent_id, initial_data, settings)
@@ -52,7 +55,9 @@ class Adopting(_Core):
         """Every block that the core has held, by hash."""
 
     def event_data(self, timestamp_us: int) -> bytes:
-        """Return the sealed data that the agent recorded, if the mission seals event data and the length is right."""
+        """Return the event data of a completed block. If the mission encrypts event data, return the recorded encrypted
+        data.
+        """
         events = bytes(self.current_block)
         sealed = self.told_sealed
         return sealed if self._seals and sealed and len(sealed) == len(events) + SEAL_BYTES else events
@@ -63,12 +68,12 @@ class Adopting(_Core):
         self.changes.append((operation, block_hash))
 
     def unchanging(self) -> Iterator[object]:
-        """Yield the objects that never change. A copy of the core can share them."""
+        """Yield the objects that never change, so that copies of the core can share them."""
         yield from (self.settings, self.chain.inception, self._moved, *self._moved.values())
         yield from (message for _, message in self.outbox)
 
     def be_idle_with(self, chain: Iterable[Block], current_block: bytes, sequence: int) -> None:
-        """Begin as an idle agent with this chain and no other blocks."""
+        """Set the state to that of an idle agent that holds only this chain."""
         for block in chain:
             self.commit(block)
             if block.agent_id == self.agent_id:
@@ -78,14 +83,14 @@ class Adopting(_Core):
         self.step_is_over()
 
     def before(self, run: HandlerRun) -> Before | None:
-        """Return the data that `undo` needs beside the changes of the step, or None if it needs no more."""
+        """Return the data that `undo` needs in addition to the step's recorded changes, or None if it needs none."""
         logs, phase_three_ends = run.handler == "build_data_block", self.phase_three_timer.deadline
         if not (logs or self.reconcile_stack or phase_three_ends is not None):
             return None
         return Before(list(self.reconcile_stack), bytes(self.current_block) if logs else None, phase_three_ends)
 
     def step_is_over(self) -> None:
-        """Forget the changes, messages and timers of the step."""
+        """Forget the recorded changes, messages and timers of the last step."""
         if self.changes:
             self.changes = []
         if self.outbox:
@@ -94,7 +99,7 @@ class Adopting(_Core):
             self.started = {}
 
     def has_sent(self, sent: Sequence[SentMessage]) -> bool:
-        """Return whether the step has sent these messages."""
+        """Return true if the last step sent exactly these messages."""
         if len(sent) != len(self.outbox):
             return False
         for number, told in enumerate(sent):
@@ -111,11 +116,13 @@ class Adopting(_Core):
         return True
 
     def sent_in_full(self) -> list[SentMessage]:
-        """Return the messages of the step in the form of a trace."""
+        """Return the messages of the last step in the format of a trace."""
         return [SentMessage.of(self.agent_id, sequence, message) for sequence, message in self.outbox]
 
     def go_along(self, run: HandlerRun) -> None:
-        """Take the block of phase 3 from a run that the agent, after a deviation, triggered by itself."""
+        """Set the block to request in phase 3 to the one in the agent's recorded run. The agent started this phase by
+        itself after a deviation.
+        """
         if run.handler == "reconcile_phase_3":
             hashes = [block_hash for operation, block_hash in run.changes if operation == "chain+"]
             hashes += [sent.block for sent in run.sent if sent.block is not None]
@@ -123,7 +130,7 @@ class Adopting(_Core):
                 self.majority_response_block_hash = bytes.fromhex(hashes[0])
 
     def undo(self, before: Before | None) -> None:
-        """Undo the step's changes of blocks and timers. `adopt` then replaces the tallies.
+        """Undo the last step's changes of blocks and timers. Afterwards `adopt` replaces the counted votes.
 
         `before` is None if the changes of the step are sufficient.
         """
@@ -155,7 +162,9 @@ class Adopting(_Core):
         self.step_is_over()
 
     def adopt(self, run: HandlerRun, blocks: Blocks) -> None:
-        """Take the state that the agent recorded after `run`. Raises NotOnRecordError if that is impossible."""
+        """Set the state to the one that the agent recorded after `run`. Raises NotOnRecordError if the records are
+        insufficient.
+        """
         for operation, block_hash in run.changes:
             self._adopt_change(operation, self._moved.get(block_hash) or blocks.get(block_hash))
         if run.handler == "build_data_block" and run.changes:
@@ -208,7 +217,7 @@ class Adopting(_Core):
             self.chain.top_chain_hash = chain_hash
 
     def _adopt_sent(self, sent: Iterable[SentMessage]) -> None:
-        """Start the timers of the questions that the agent sent."""
+        """Start the timers that belong to the queries and requests that the agent sent."""
         for announced in sent:
             self.sequence = announced.seq + 1
             try:
@@ -219,7 +228,9 @@ class Adopting(_Core):
                 timer.start(self.now, self._duration(timer))
 
     def _asked(self, message: Message) -> Timer | None:
-        """Wait for the answers to `message`. Return the timer that runs meanwhile, or None if it is no question."""
+        """Prepare to count the answers to `message`. Return the timer that limits the wait, or None if the message asks
+        for no answer.
+        """
         match message:
             case BlockAddRequest():
                 waiting = (*self.blocks_to_be_committed, *self.reconcile_stack, *self.chain)
@@ -284,7 +295,7 @@ class Adopting(_Core):
 
 
 def _as_hash(text: str) -> bytes:
-    """Raises NotOnRecordError."""
+    """Return the hash as bytes. Raises NotOnRecordError if the text is not a hash."""
     try:
         return bytes.fromhex(text)
     except ValueError:

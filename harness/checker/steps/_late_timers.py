@@ -1,4 +1,4 @@
-"""Find timers that are later than the measured lag of the machine explains.
+"""Find timers of an agent that expired later than the measured delays of the machine can explain.
 
 A right agent runs a timer late only if the machine wakes it late, or if its process is busy or waits for a processor.
 The harness measures both during a run (`lag.jsonl`). The lag is an upper bound, so a single timer shows only a large
@@ -26,21 +26,25 @@ ENOUGH = 8
 
 @dataclass
 class JudgedTimers:
-    """The expiries of all agents: their number, and the number of those for which no lag was measured."""
+    """The number of judged timers of all agents, and the number of those for which no delay of the machine was
+    measured.
+    """
 
     expiries: int = 0
     unmeasured: int = 0
 
     @property
     def remark(self) -> str:
-        """The limit of the judgement, for its reason. Empty if each timer was compared with the measured lag."""
+        """A remark about timers that could not be judged. It is empty if all were compared with the machine's measured
+        delays.
+        """
         if not self.unmeasured:
             return ""
         which = "timers" if self.unmeasured == self.expiries else f"{self.unmeasured} of {self.expiries} timers"
         return f"; the lag of the machine is not recorded for {which}, so they may be up to 1 s of wall time late"
 
     def judge(self, evidence: Evidence, trace: Trace, expiries: Sequence[Expiry]) -> Iterator[Deviation]:
-        """Yield the timers of an agent that the measured lag does not explain."""
+        """Yield the timers of an agent that expired later than the machine's measured delays explain."""
         speedup = trace.header.clock.get("speedup")
         if in_virtual_time(trace) or not isinstance(speedup, int | float) or speedup <= 0:
             return
@@ -59,7 +63,7 @@ class JudgedTimers:
 
 
 def _of_kind(agent_id: int, timer: str, expiries: list[tuple[Expiry, float]], speedup: float) -> Iterator[Deviation]:
-    """Yield each timer that is too late by itself; otherwise the last one, if all are too late on average."""
+    """Yield each timer that expired too late. If only the mean of all timers is too late, yield the last one."""
     late = [(expiry, lag_s) for expiry, lag_s in expiries if expiry.late_s > lag_s + SINGLE_WALL_S * speedup]
     for expiry, lag_s in late:
         what = (

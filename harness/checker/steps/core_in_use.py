@@ -1,4 +1,4 @@
-"""The core of this installation as an implementation that can follow a record.
+"""Make the installed agent core `ucp.agent` comparable with the records of an agent.
 
 Agents are judged by the reference. The core in use also follows a record where its own behaviour matters: in a
 debugger, which stops in the handlers of `ucp`, and in `bisect`, which compares the cores of commits.

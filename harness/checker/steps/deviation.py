@@ -1,4 +1,4 @@
-"""Describe a step that differs from the reference: the actual and the expected behaviour."""
+"""Describe a step that differs from the reference, with the actual and the expected behaviour."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """A difference between an agent and the reference.
+    """A difference between a step of an agent and the same step of the reference implementation.
 
     `run` and `expected` are the recorded and the expected handler run. If no run can be compared, `what` has the text.
     """
@@ -33,13 +33,13 @@ class Deviation:
     expected: HandlerRun | None = None
 
     def sentence(self, name: NameOf) -> str:
-        """Return the place, the handler, and the actual and expected behaviour."""
+        """Return a sentence with the place, the handler, and the actual and expected behaviour."""
         known = HANDLERS.get(self.handler or "")
         handler = f"Algorithm {known.algorithm}, {known.name}: " if known else ""
         return f"trace line {self.line}, t={self.t:g} s: {handler}{self.difference(name)}"
 
     def difference(self, name: NameOf) -> str:
-        """Return the actual and the expected behaviour."""
+        """Return a phrase with the actual and the expected behaviour."""
         if self.run is None or self.expected is None:
             return self.what
         did, should = zip(*differences(self.run, self.expected, name), strict=True)
@@ -47,7 +47,7 @@ class Deviation:
 
 
 def differences(run: HandlerRun, expected: HandlerRun, name: NameOf) -> Iterator[tuple[str, str]]:
-    """Yield (actual, expected) for each differing part of the step."""
+    """Yield the actual and the expected behaviour for each part of the step that differs."""
     if run.branch != expected.branch:
         yield f"took the branch '{run.branch[:60]}'", f"taken '{expected.branch}'"
     as_changed = run.changes == expected.changes
@@ -98,7 +98,7 @@ def _message(message: SentMessage, others: Sequence[SentMessage], name: NameOf) 
 
 
 def _content(message: SentMessage, other: SentMessage) -> str:
-    """Return the content that differs from another message of the same type about the same block."""
+    """Return the content in which a message differs from another message of the same type about the same block."""
     try:
         content = decoded(message.datagram).message
     except MalformedDatagramError as malformed:

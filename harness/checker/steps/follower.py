@@ -1,4 +1,4 @@
-"""Follow one incarnation of an agent: give each recorded input to the reference, and compare the results.
+"""Give each recorded input of an agent to the reference implementation, and compare the results.
 
 The follower holds a reference agent in the state of the judged agent. After a difference it adopts the recorded state
 of the judged agent, so that one mistake does not cause further differences.
@@ -51,11 +51,11 @@ Paused = Callable[[float, float], bool]
 
 
 class NotHandledError(Exception):
-    """The reference does not run this handler now. The message completes "it ..."."""
+    """An error: the protocol does not run this handler now. The message completes a sentence that begins with "it"."""
 
 
 class Expiry(NamedTuple):
-    """A timer whose handler ran at mission second `t`, `late_s` mission seconds after the timer expired."""
+    """The expiry of a timer. Its handler ran at mission second `t`, which was `late_s` mission seconds late."""
 
     line: int
     t: float
@@ -65,7 +65,9 @@ class Expiry(NamedTuple):
 
 
 class OptionalParts(NamedTuple):
-    """The optional parts that a trace has: tallies of these handlers, and started timers."""
+    """The optional fields that occur in a trace: the handlers with recorded vote counts, and whether timers are
+    recorded.
+    """
 
     tallying: frozenset[str]
     timers: bool
@@ -77,7 +79,7 @@ class OptionalParts(NamedTuple):
 
 
 class AnotherHandlerError(NotHandledError):
-    """The input is for `handler`, but another handler ran."""
+    """An error: the input belongs to the handler `handler`, but the agent ran another one."""
 
     def __init__(self, run: HandlerRun, handler: Handler) -> None:
         ran = HANDLERS[run.handler].algorithm if run.handler in HANDLERS else run.algorithm
@@ -85,7 +87,7 @@ class AnotherHandlerError(NotHandledError):
 
 
 class Follower:
-    """Compares the handler runs of one incarnation of an agent with the reference."""
+    """Compares the handler runs of one agent between two restarts with the reference implementation."""
 
     def __init__(
         self,
@@ -125,7 +127,7 @@ class Follower:
         """The last recorded state, while the reference is still in this state."""
 
     def follow(self, line: int, run: HandlerRun) -> None:
-        """Compare this run, and the runs that should have come before it, with the reference."""
+        """Compare this handler run with the reference, and also check that the agent skipped no run before it."""
         if self.lost is not None:
             return
         core, trigger = self._core, run.trigger
@@ -180,13 +182,15 @@ class Follower:
         self._adopt(line, run, before)
 
     def begin_at(self, chain: Iterable[Block], current_block: bytes, sequence: int) -> None:
-        """Begin with an idle agent that has this chain, block under construction, and next sequence number."""
+        """Set the reference to an idle agent with this chain, this block under construction, and this next sequence
+        number.
+        """
         self._core.be_idle_with(chain, current_block, sequence)
         self._began = True
 
     @property
     def state(self) -> State:
-        """The present state of the reference. The caller must not change it."""
+        """The present state of the reference implementation. Callers must not change it."""
         return self._core
 
     @property
@@ -194,21 +198,23 @@ class Follower:
         return self._header.roster
 
     def mission_s(self, local_s: float) -> float:
-        """Return the mission second at which the agent's clock shows this time."""
+        """Return the mission second at which the agent's clock shows `local_s`."""
         return (local_s - self._header.offset_s) / self._header.rate
 
     def block(self, block_hash: str) -> Block:
-        """Return a block on record. Raises NotOnRecordError."""
+        """Return the block with this hash. Raises NotOnRecordError if no record contains it."""
         return self._blocks.get(block_hash)
 
     # Lines that may be lost
 
     def play_lost_message(self, sender: int, message: Message, at_s: float) -> bool:
-        """Handle a message that no line shows. Return whether its line could be lost: it changed no block."""
+        """Handle a message that has no line in the trace. Return true if its line could be lost, because it changed no
+        block.
+        """
         return self._play_lost(self._on_message[type(message)], at_s, sender, message)
 
     def play_lost_expiry(self, timer_name: str, at_s: float) -> bool:
-        """End a timer whose line is lost. Return whether it was due, and its line could be lost."""
+        """Let a timer expire that has no line in the trace. Return true if it was due and its line could be lost."""
         timer = self._timers[timer_name]
         if timer.deadline is None or timer.deadline > self._header.local(at_s) + self._header.early_s:
             return False
@@ -216,14 +222,14 @@ class Follower:
         return self._play_lost(self._implementation.on_timer[timer_name], at_s)
 
     def play_lost_local_event(self, at_s: float) -> bool:
-        """Run the handler of the next triggered event. Return whether there was one, and its line could be lost."""
+        """Run the handler of the next local event. Return true if there was one and its line could be lost."""
         if not self._core.triggered:
             return False
         event, _ = self._core.triggered.popleft()
         return self._play_lost(self._implementation.on_local_event[event], at_s)
 
     def stop_timer(self, timer_name: str) -> None:
-        """Stop a timer whose handler never ran."""
+        """Stop a timer whose handler the agent never ran."""
         self._timers[timer_name].stop()
         self._none_ends_before = self._soonest_end()
 
@@ -243,7 +249,7 @@ class Follower:
         return is_hidden
 
     def copy(self) -> "Follower":
-        """Return an independent copy without the differences so far."""
+        """Return an independent copy of this object, without the differences found so far."""
         keep = [self._header, self._parts, self._blocks, self._was_paused, self._state, self._implementation]
         keep.append(self._on_message)
         keep += (*self._implementation.handlers.values(), *self._core.unchanging())
@@ -253,14 +259,14 @@ class Follower:
         return deepcopy(self, memo)
 
     def foresee(self, line: int, run: HandlerRun) -> list[Deviation]:
-        """Return the differences in triggered handlers that the next run reveals. Run no handler."""
+        """Return the differences in triggered handlers that the next handler run shows. This runs no handler."""
         foreseeing = self.copy()
         if foreseeing.lost is None:
             foreseeing._triggered(line, run, _triggered_by(run))
         return foreseeing.deviations
 
     def end(self, at_s: float | None) -> None:
-        """Report handlers that should have run until the end of the run at `at_s`, for an agent that ran until then."""
+        """Report the handlers that the agent should still have run before the run ended at `at_s`."""
         if self.lost is not None:
             return
         self._not_run()
@@ -271,7 +277,7 @@ class Follower:
     # Runs that should have come before
 
     def _triggered(self, line: int, run: HandlerRun, by: str | None) -> None:
-        """Check that triggered handlers run, and no others."""
+        """Report triggered handlers that did not run, and handlers that ran without a trigger."""
         self._state = None
         triggered = self._core.triggered
         if self._adopted:
@@ -302,7 +308,7 @@ class Follower:
         self._adopted = True
 
     def _not_run(self) -> None:
-        """Report a triggered handler that did not run before the next input."""
+        """Report a triggered handler that did not run before the agent's next input."""
         triggered = self._core.triggered
         if triggered and not self._adopted:
             event, by = triggered[0]
@@ -310,7 +316,7 @@ class Follower:
         triggered.clear()
 
     def _overdue(self, line: int, at_s: float, now: float) -> None:
-        """Report timers that expired long ago, and whose handlers did not run."""
+        """Report timers that expired long ago and whose handlers did not run."""
         self._state = None
         late = now - self._header.late_s
         for timer in self._core.timers:
@@ -325,7 +331,7 @@ class Follower:
         self._none_ends_before = self._soonest_end()
 
     def _due(self, run: HandlerRun, now: float) -> list[Timer]:
-        """Return the timers that are due, and whose handlers have not run."""
+        """Return the timers that have expired but whose handlers have not yet run."""
         due_before = now - self._header.early_s
         return [
             timer
@@ -334,7 +340,7 @@ class Follower:
         ]
 
     def _callback_is_lost(self, line: int, run: HandlerRun, due: Iterable[Timer]) -> bool:
-        """Report timers that no longer run according to the agent, although they were due and their handlers never ran.
+        """Report timers that expired, but that the agent stopped without running their handlers.
 
         The lost callback is the cause of the differences that follow. Returns whether there is one.
         """
@@ -348,7 +354,7 @@ class Follower:
         return is_lost
 
     def _after_a_pause(self, deadline: float) -> str:
-        """Return the handler that paused the phase 3 timer since its start, for the end of a sentence."""
+        """Return the handler that paused the phase 3 timer after its start. The text ends a sentence."""
         line, paused_at = self._paused
         if paused_at < deadline - self._header.settings.phase3_timeout_s:
             return ""
@@ -365,7 +371,9 @@ class Follower:
     # Inputs
 
     def _input(self, line: int, run: HandlerRun, now: float) -> tuple[Handler, tuple[Any, ...]]:
-        """Return the handler and its arguments for an input other than a message. Raises NotHandledError."""
+        """Return the handler for an input other than a message, with its arguments. Raises NotHandledError if none
+        fits.
+        """
         trigger, on_local_event = run.trigger, self._implementation.on_local_event
         handler: Handler
         inputs: tuple[Any, ...]
@@ -395,7 +403,7 @@ class Follower:
         return handler
 
     def _message(self, run: HandlerRun, trigger: MessageTrigger) -> tuple[Handler, int, Message]:
-        """Return the handler for a message, the sender and the message. Raises NotHandledError."""
+        """Return the handler for a message, the sender and the decoded message. Raises NotHandledError if none fits."""
         try:
             sender, sequence, message = decoded(run.input)
         except MalformedDatagramError as malformed:
@@ -441,7 +449,7 @@ class Follower:
         return (event,)
 
     def _boot(self, run: HandlerRun) -> None:
-        """Restore the recorded data of the disk before the handler runs: the blocks of the input, in their places."""
+        """Load the recorded blocks from the agent's disk into the reference before the first handler runs."""
         if self._began:
             raise NotHandledError("booted after other steps; a boot must be the first step")
         try:
@@ -515,7 +523,7 @@ class Follower:
         return expected
 
     def _adopt(self, line: int, run: HandlerRun, before: Before | None) -> None:
-        """Continue from the recorded state of the agent."""
+        """Replace the state of the reference by the state that the agent recorded."""
         self._adopted = True
         self._state = None
         try:
@@ -536,5 +544,5 @@ def _differ_only_in_idle(run: HandlerRun, expected: HandlerRun) -> bool:
 
 
 def _triggered_by(run: HandlerRun) -> str | None:
-    """Return the handler whose local event triggered the run. None for another trigger."""
+    """Return the handler that triggered this run by a local event, or None if the run has another trigger."""
     return run.trigger.handler if isinstance(run.trigger, LocalTrigger) else None

@@ -1,4 +1,4 @@
-"""An implementation of the 20 handlers that can follow a record: a core, and its tables of handlers."""
+"""An implementation of the 20 handlers that can be compared with records: an agent core with its tables of handlers."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -10,11 +10,11 @@ from harness.checker.steps.trace_header import CheckedHeader
 
 
 class ReferenceCore(Adopting, State):
-    """The independent reference, which can adopt the state of an agent."""
+    """The reference implementation, extended so that it can take over the recorded state of an agent."""
 
 
 class Implementation(NamedTuple):
-    """A core and its handlers: by message type, timer name, local event, and name."""
+    """An agent core with its handlers by message type, by timer, by local event and by name."""
 
     core: Callable[[CheckedHeader], Adopting]
     on_message: Mapping[Any, Any]

@@ -1,4 +1,4 @@
-"""Find out whether damage to one line of a trace explains a difference from the reference.
+"""Decide whether damage to one line of a trace explains a difference from the reference.
 
 A file from the field may lack a line, or have a damaged line that still reads as a line. Then the difference proves no
 mistake of the agent. Three kinds of damage are tried:
@@ -45,7 +45,7 @@ MAX_LOCAL = 4
 def damage_that_explains(
     before: Follower, deviation: Deviation, line: Line, following: Sequence[Line], datagrams: Datagrams
 ) -> str | None:
-    """Return the damage that explains the difference, such as "a line is missing". None if there is none.
+    """Return the damage to a trace that explains the difference, such as "a line is missing", or None.
 
     `before` is a follower in the state before the line. It stays unchanged.
     """
@@ -120,7 +120,7 @@ def _as_it_may_have_been(
 
 
 def _was_received(before: Follower, run: HandlerRun, datagrams: Datagrams) -> bool:
-    """Return whether another agent received a message of the run as this line has it. Then the line is not damaged."""
+    """Return true if another agent received a message exactly as this line shows it. Then the line is not damaged."""
     for sent in run.sent:
         if sent.datagram is not None:
             with suppress(ValueError):
@@ -147,7 +147,9 @@ def _is_malformed(run: HandlerRun) -> bool:
 
 
 def _damage_to_events(before: Follower, run: HandlerRun) -> str | None:
-    """Compare the events of the block that the run completed with the logged ones. Return damage that explains them."""
+    """Compare the events of the completed block with the logged events. Return the damage that explains a difference,
+    or None.
+    """
     completed = next((block_hash for operation, block_hash in run.changes if operation == "complete"), None)
     if run.handler != LOGS or completed is None:
         return None
@@ -167,7 +169,7 @@ def _damage_to_events(before: Follower, run: HandlerRun) -> str | None:
 
 
 def _with_a_line_more(before: Follower, run: HandlerRun) -> Iterator[Follower]:
-    """Yield followers in the states that one lost line may have led to, with the handlers that it triggered."""
+    """Yield copies of the reference in the states that one lost trace line may have led to."""
     trial = before.copy()
     for _ in range(MAX_LOCAL):
         if not trial.play_lost_local_event(run.t):
@@ -189,7 +191,7 @@ def _with_a_line_more(before: Follower, run: HandlerRun) -> Iterator[Follower]:
 
 
 def _answers(state: State, run: HandlerRun) -> Iterator[Message]:
-    """Yield the possible answers to the question that the agent has asked."""
+    """Yield the possible answers to the query or request that the agent has sent."""
     top = state.chain.top_chain_hash
     if state.voting_timer.active and state.candidate_block is not None:
         named = state.top_chain_hash_at_initiation if state.settings.vote_names_chain else None

@@ -1,4 +1,4 @@
-"""Check the header of a trace, and derive the mission of the agent from it."""
+"""Check the header of a trace, and read the agent's mission from it."""
 
 import base64
 import math
@@ -21,16 +21,18 @@ _SETTINGS = {setting.name for setting in fields(Settings)}
 
 
 class ImpossibleHeaderError(Exception):
-    """Settings or a clock that no agent can have. The message is one sentence."""
+    """An error: the header contains settings or a clock that no agent can have. The message is one sentence."""
 
 
 class UnknownSettingError(ImpossibleHeaderError):
-    """The agent uses a setting that the reference does not implement, so its steps cannot be judged."""
+    """An error: the agent uses a setting that the reference does not implement, so its steps cannot be judged."""
 
 
 @dataclass(frozen=True)
 class CheckedHeader:
-    """The mission of a trace. A timer may be handled `early_s` before to `late_s` after its end, in mission seconds."""
+    """The mission of a trace. A timer may expire up to `early_s` mission seconds early and `late_s` mission seconds
+    late.
+    """
 
     agent_id: int
     roster: frozenset[int]
@@ -45,12 +47,12 @@ class CheckedHeader:
     """A function that seals event data as the agent did, as far as it is on record. None without sealing."""
 
     def local(self, mission_s: float) -> float:
-        """Return the timestamp that the agent's clock shows at this mission second."""
+        """Return the time that the agent's clock shows at this mission second."""
         return self.offset_s + self.rate * mission_s
 
 
 def checked(header: Header) -> CheckedHeader:
-    """Raises ImpossibleHeaderError."""
+    """Return the mission that the header describes. Raises ImpossibleHeaderError if its values are invalid."""
     try:
         initial_data = base64.b64decode(header.initial_data or "", validate=True)
         settings = Settings(**{name: value for name, value in header.settings.items() if name in _SETTINGS})
@@ -77,7 +79,7 @@ def checked(header: Header) -> CheckedHeader:
 
 
 def _unknown_to_reference(settings: Settings) -> list[str]:
-    """Return the settings that differ from their defaults and that the reference lacks."""
+    """Return the settings that the reference does not implement and that differ from their defaults."""
     lacking = _SETTINGS - {setting.name for setting in fields(ReferenceSettings)}
     usual = Settings()
     return sorted(name for name in lacking if getattr(settings, name) != getattr(usual, name))
