@@ -77,7 +77,8 @@ def check(evidence: Evidence) -> Judgement:
         )
     damaged = [agent_id for agent_id, trace in evidence.traces.items() if trace.problem]
     if damaged:
-        return Judgement(NAME, "not applicable", f"the trace of {agents(damaged)} is incomplete")
+        why = f"the trace of {agents(damaged)} is incomplete: {evidence.traces[damaged[0]].problem}"
+        return Judgement(NAME, "not applicable", why)
     return Judgement(NAME, "holds", f"{runs} handler runs, each triggered locally or by a message that its sender sent")
 
 

@@ -8,6 +8,7 @@ from harness.archive.exports import Export, ExportedBlock
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, agents, violated
+from harness.checker.missing_incarnations import may_be_of_missing_incarnation
 from ucp.block import Block, InceptionBlock, next_chain_hash
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def check(evidence: Evidence) -> Judgement:
                 detail = f"holds block {name} of agent {block.agent_id}, which is not on the roster"
             elif wrong_signature:
                 detail = f"holds block {name}, {wrong_signature}"
-            elif block.agent_id not in known or _may_be_of_earlier_incarnation(evidence, block):
+            elif block.agent_id not in known or may_be_of_missing_incarnation(evidence, block):
                 if not signatures:
                     unknown.add(block.agent_id)
                 continue
@@ -132,12 +133,7 @@ def check(evidence: Evidence) -> Judgement:
     if not evidence.exports:
         return Judgement(NAME, "not applicable", "the run has no chain exports")
     if unknown:
-        return Judgement(
-            NAME,
-            "not applicable",
-            f"neither an export nor a trace lists the completed blocks of {agents(unknown)}, so the makers of their "
-            "blocks are unknown",
-        )
+        return Judgement(NAME, "not applicable", _explain_unknown_makers(evidence, unknown))
     made = "signed" if signatures else "completed"
     reason = f"all hashes recompute, and each of {blocks} blocks was {made} by the agent that it names"
     if not signatures and any(block.signature for export in evidence.exports.values() for block in export.blocks()):
@@ -145,16 +141,17 @@ def check(evidence: Evidence) -> Judgement:
     return Judgement(NAME, "holds", reason)
 
 
-def _may_be_of_earlier_incarnation(evidence: Evidence, block: ExportedBlock) -> bool:
-    """Return true if a block may come from an incarnation of its agent (the time between two restarts) that left no
-    records.
-
-    An agent that lost its data and restarted holds its earlier blocks, but its export does not list them as completed.
-    """
-    trace, export = evidence.traces.get(block.agent_id), evidence.exports.get(block.agent_id)
-    if evidence.record is not None or (trace is not None and not trace.problem) or export is None:
-        return False
-    return any(held.block_hash == block.block_hash for held in export.blocks())
+def _explain_unknown_makers(evidence: Evidence, unknown: set[int]) -> str:
+    if silent := unknown - {*evidence.exports, *evidence.traces}:
+        return (
+            f"neither an export nor a trace lists the completed blocks of {agents(silent)}, so the makers of their "
+            "blocks are unknown"
+        )
+    problem = next((trace.problem for agent_id in sorted(unknown) if (trace := evidence.traces.get(agent_id))), None)
+    why = f" ({problem})" if problem else ""
+    return (
+        f"the records of {agents(unknown)} do not show all incarnations{why}, so the makers of some blocks are unknown"
+    )
 
 
 def _describe_arrival(trace: Trace | None, block_hash: str) -> str:

@@ -4,7 +4,6 @@ Each trace is judged as `replay` judges it. The other checks read a trace only u
 missing.
 """
 
-from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,20 +11,20 @@ from harness.archive.traces import Trace
 from harness.checker import Evidence, steps
 from harness.checker.judgement import Judgement
 from harness.checker.lost_lines import lost_lines
+from harness.checker.missing_incarnations import lacking_traces
 from harness.checker.steps.deviation import Deviation
 from harness.errors import FieldError
 from harness.field.ingest import Flight
 from harness.field.replay._agent_record import Record
 from harness.field.replay._player import Player
 from harness.field.replay._record_search import IngestedRecords
-from ucp.trigger import MessageTrigger
 
 
 def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
     """Return the evidence with the traces of a flight in place of its own."""
     traces = {agent_id: _up_to_loss(trace) for agent_id, trace in flight.traces.items()}
-    for agent_id, number in _unrecorded_messages(traces):
-        traces[agent_id].problem = f"it lacks message {number}, which another agent received"
+    for agent_id, why in lacking_traces(traces):
+        traces[agent_id].problem = traces[agent_id].problem or why
     for agent_id, export in evidence.exports.items():
         trace = traces.get(agent_id)
         if trace is not None and not trace.problem and trace.runs and trace.runs[-1].state.top != export.top_chain_hash:
@@ -53,18 +52,6 @@ def _up_to_loss(trace: Trace) -> Trace:
     )
 
 
-def _unrecorded_messages(traces: Mapping[int, Trace]) -> Iterator[tuple[int, int]]:
-    """Yield senders with the number of a message that another agent received, but that their own trace lacks."""
-    sent = {agent_id: {each.seq for run in trace.runs for each in run.sent} for agent_id, trace in traces.items()}
-    for trace in traces.values():
-        for run in trace.runs:
-            trigger = run.trigger
-            if not isinstance(trigger, MessageTrigger) or traces.get(trigger.sender, trace).problem:
-                continue
-            if trigger.sequence not in sent.get(trigger.sender, (trigger.sequence,)):
-                yield trigger.sender, trigger.sequence
-
-
 def _judge_steps(evidence: Evidence, flight: Flight) -> Judgement:
     deviations: list[Deviation] = []
     judged, unjudged, lost = 0, 0, list[str]()
@@ -79,6 +66,10 @@ def _judge_steps(evidence: Evidence, flight: Flight) -> Judgement:
         lost += [f"agent {agent_id}: {sentence}" for sentence in result.lost]
     if deviations:
         return steps.deviates(evidence, deviations, judged, [])
+    if not lost:
+        lost += [
+            f"agent {trace.header.agent_id}: {trace.problem}" for trace in evidence.traces.values() if trace.problem
+        ]
     untraced = sorted({*(evidence.roster or ()), *evidence.exports} - {*flight.traces})
     lost += [f"there is no trace of agent {agent_id}" for agent_id in untraced]
     if lost or not judged:

@@ -1,5 +1,6 @@
 """Damaged records of right agents lead to no accusation, no traceback, and true reasons."""
 
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,11 +12,13 @@ import pytest
 from benchmarks.field_damage import DAMAGES, Undamaged, bring_home, conclude
 from harness.archive.archive import RunArchive
 from harness.archive.traces import read_trace
-from harness.checker import check
+from harness.checker import Result, check, gather
 from harness.checker.lost_lines import lost_lines
+from harness.checker.missing_incarnations import may_be_of_missing_incarnation
 from harness.checker.steps.trace_header import checked
 from harness.field.ingest import ingest_files
 from harness.field.replay import Player, open_record
+from harness.field.replay.field_evidence import field_evidence
 from tests.harness.field.flights import flown, trace_of
 from tests.harness.virtual import scenario
 from ucp.agent import Agent
@@ -58,6 +61,55 @@ def test_damage_causes_no_accusation(name: str, whole: tuple[Path, Undamaged], t
     concluded = conclude(home, name, whole[1])
     assert concluded.accusations == []
     assert concluded.tracebacks == []
+
+
+def _lose_incarnation(path: Path, number: int) -> None:
+    lines = path.read_bytes().splitlines(keepends=True)
+    starts = [position for position, line in enumerate(lines) if b'"schema"' in line]
+    path.write_bytes(b"".join([*lines[: starts[number]], *lines[[*starts, len(lines)][number + 1] :]]))
+
+
+def _judge(home: Path) -> Result:
+    return check(field_evidence(gather(RunArchive(home)), ingest_files([home]).largest()))
+
+
+def test_first_incarnation_is_missing_if_others_received_its_messages(
+    whole: tuple[Path, Undamaged], tmp_path: Path
+) -> None:
+    shutil.copytree(whole[0], tmp_path / "home")
+    judged = _judge(tmp_path / "home").judgements
+    assert judged["1"].verdict == judged["4"].verdict == "holds"
+    _lose_incarnation(tmp_path / "home" / "2.trace.jsonl", 0)
+    judged = _judge(tmp_path / "home").judgements
+    assert judged["1"].verdict == judged["4"].verdict == judged["steps"].verdict == "not applicable"
+    for key in ("1", "4", "steps"):
+        assert re.search(
+            r"agent 2\b.*it does not have the .* that agent \d received at t=.*, so lines or an incarnation are",
+            judged[key].reason,
+        ), judged[key].reason
+
+
+def test_boot_from_disk_proves_an_earlier_incarnation(tmp_path: Path) -> None:
+    timeline = [{"at_s": 80, "reboot": [2], "down_s": 10, "disk": "kept"}]
+    bring_home(scenario(**FLIGHT | {"timeline": timeline}), 1, "sim", tmp_path / "run", tmp_path / "home")
+    _lose_incarnation(tmp_path / "home" / "2.trace.jsonl", 0)
+    judged = _judge(tmp_path / "home").judgements
+    assert judged["1"].reason.startswith(
+        "the trace of agent 2 is incomplete: an incarnation is missing, from whose disk the agent booted at t=90"
+    )
+    assert judged["4"].verdict in ("not applicable", "holds")
+
+
+def test_forged_block_during_a_recorded_incarnation_is_not_genuine(
+    whole: tuple[Path, Undamaged], tmp_path: Path
+) -> None:
+    """The trace of agent 1 has the time of the block, so no missing incarnation can have completed it."""
+    evidence = field_evidence(gather(RunArchive(whole[0])), ingest_files([whole[0]]).largest())
+    trace, export = evidence.traces[1], evidence.exports[2]
+    held = next(block for block in export.chain if block.agent_id == 1)
+    assert may_be_of_missing_incarnation(evidence, held) is False
+    later = held.model_copy(update={"timestamp_us": round((trace.runs[-1].t + 1) * 1e6)})
+    assert may_be_of_missing_incarnation(evidence, later) is True
 
 
 def _without(path: Path, *numbers: int) -> Path:
