@@ -1,4 +1,4 @@
-"""Proof by exhaustion: explore every state that a small swarm can reach within bounds. See docs/explanation/proof.md.
+"""Prove properties of a small swarm: explore every state that its agents can reach. See docs/explanation/proof.md.
 
 The agents in a state are real agents (`ucp.agent`), so a proof is about the code that runs. `bounds` has the size of
 the swarm and the behaviour of the network. The sub-packages:

@@ -1,4 +1,4 @@
-"""The progress of an exploration, its final figures, and its limits of memory and time."""
+"""The progress of a state space exploration, its final figures, and its limits of memory and time."""
 
 import resource
 import sys
@@ -17,7 +17,8 @@ Ended = Literal["complete", "flaw", "memory", "time", "interrupted"]
 
 @dataclass(frozen=True)
 class Progress:
-    """The known states, the explored ones of them, the transitions, and the depth in instants.
+    """The progress of an exploration: the numbers of known states, explored states and transitions, and the search
+    depth.
 
     `asked` is the present question to the whole graph, after all states are explored.
     """
@@ -32,7 +33,8 @@ class Progress:
 
 @dataclass(frozen=True)
 class Figures:
-    """The size of an exploration. All figures except `steps` and the times are the same on any number of cores.
+    """The size of an exploration. All figures except `steps` and the times are the same for any number of processor
+    cores.
 
     `local_states` and `zones` count those that occur in states. `steps` is the number of steps that real agents
     computed in all processes. `seconds` is wall time, and `processor_s` is the processor time of all processes.
@@ -50,7 +52,7 @@ class Figures:
 
 
 class GivenUpError(Exception):
-    """The limit of memory or time was reached."""
+    """An error: the exploration reached its limit of memory or time."""
 
     def __init__(self, ended: Ended) -> None:
         super().__init__(ended)
@@ -58,7 +60,7 @@ class GivenUpError(Exception):
 
 
 class Budget:
-    """The limits of an exploration: memory in bytes, and time in seconds from now."""
+    """The limits of an exploration: memory in bytes, and time in seconds from its start."""
 
     def __init__(self, most_bytes: float, most_s: float) -> None:
         self._began = time.monotonic()
@@ -71,13 +73,13 @@ class Budget:
         return time.monotonic() - self._began
 
     def ended(self, elsewhere_bytes: float = 0.0) -> Ended | None:
-        """Return the limit that is reached, or None. Other processes use `elsewhere_bytes` of memory."""
+        """Return the limit that is reached, or None. The other processes use `elsewhere_bytes` of memory."""
         if memory_bytes() + elsewhere_bytes > self._most_bytes:
             return "memory"
         return "time" if self.seconds > self._most_s else None
 
     def check(self, elsewhere_bytes: float = 0.0) -> bool:
-        """Check the limits, at most once per LOOK_EVERY_S. Return whether they were checked.
+        """Check the limits at most once per LOOK_EVERY_S seconds. Return true if they were checked.
 
         Raises GivenUpError if a limit is reached.
         """
@@ -91,7 +93,9 @@ class Budget:
 
 
 def memory_bytes() -> int:
-    """Return the memory of this process in bytes (proc_pid_statm(5)). Without this file, return its peak."""
+    """Return the memory that this process uses, in bytes (proc_pid_statm(5)). If Linux does not report it, return the
+    peak.
+    """
     try:
         return int(_STATM.read_text().split()[1]) * resource.getpagesize()
     except OSError:

@@ -1,4 +1,4 @@
-"""Prove properties within bounds: explore the states, examine the graph, and write the findings as scenarios."""
+"""Prove properties within bounds: explore all states, examine the state graph, and write violations as scenarios."""
 
 import time
 from collections.abc import Callable
@@ -68,7 +68,9 @@ PLAYED = {
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a proof: memory of all processes in bytes, and time in seconds. `cores` is the number of processes."""
+    """The limits of a proof: memory of all processes in bytes, time in seconds, and the number of worker processes
+    (`cores`).
+    """
 
     most_bytes: float = 4e9
     most_s: float = float("inf")
@@ -115,7 +117,7 @@ class Proof:
 
     @property
     def claims(self) -> dict[str, str]:
-        """The properties that the proof checks in every state, as key -> sentence."""
+        """The properties that the proof checks in every state. Each key has a sentence."""
         claims = CLAIMS if self.bounds.steps else {kind: claim for kind, claim in CLAIMS.items() if kind != "steps"}
         if self.bounds.captured is None:
             return claims
@@ -127,13 +129,13 @@ class Proof:
 
     @property
     def decided(self) -> bool:
-        """True if every property was decided: no limit and no violation ended the search."""
+        """True if every property was decided, that is, if neither a limit nor a violation ended the search early."""
         whole = self.whole_ended == "complete" and (self.liveness is None or self.liveness.decided)
         return self.complete and whole
 
     @property
     def findings(self) -> dict[str, str]:
-        """The violations, as key -> sentence. The same violation of another core has the same key.
+        """The violations as sentences by key. Proofs of different agent cores use the same key for the same violation.
 
         A crash is known by its exception, a wrong step by its handler, and a livelock by its form.
         """
@@ -205,7 +207,7 @@ def prove(
     *,
     watch: Callable[[Progress], None] = lambda progress: None,
 ) -> Proof:
-    """Explore every state that agents can reach within `bounds`, and check each one.
+    """Explore every state that agents can reach within `bounds`, check each one, and return the result.
 
     - `limits`: when to give up.
     - `out`: the new file of the scenario that shows a violation. Without it, a new file under `runs/`.
@@ -249,12 +251,14 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Pr
 
 
 def _with_instants(bounds: Bounds) -> Bounds:
-    """Return bounds with lost and duplicated messages at one instant each. A path within them is a possible run."""
+    """Return the same bounds, with up to one lost and one duplicated message per step. Each path within them is a
+    possible run.
+    """
     return replace(bounds, network="lossy", faults=tuple(dict.fromkeys((*bounds.faults, "duplicate"))))
 
 
 def _claimed(bounds: Bounds, out: Path | None) -> tuple[str, Path]:
-    """Name and file of a scenario."""
+    """Return the name and the file of the scenario to write."""
     name = f"proof {bounds.agents} agents {bounds.blocks} blocks"
     return name, choose_path(out or default_path(name).with_suffix(".yaml"), name)
 
@@ -295,7 +299,7 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
 
 
 def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
-    """Write the findings as scenarios, the first one to `path`."""
+    """Write a scenario for each violation, the first one to `path`."""
     live = proof.liveness
     ways_round = live.cycles if live is not None else cycles(graph) if proof.ended in ("memory", "time") else []
     for key, number in graph.shown.items():

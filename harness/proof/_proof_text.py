@@ -1,4 +1,4 @@
-"""The result of a proof as text. A property "holds" only if all states were explored."""
+"""Print the result of a proof. A property "holds" only if all states were explored."""
 
 from collections.abc import Iterator
 
@@ -52,7 +52,7 @@ def in_words(proof: Proof) -> Iterator[str]:
 
 
 def _tighter(bounds: Bounds) -> list[str]:
-    """Return options that make the state space smaller."""
+    """Return the command-line options that would reduce the number of states."""
     if bounds.network == "any" or bounds.timers_any:
         return []
     options = ["--losses 1"] if bounds.network == "lossy" and bounds.losses is None else []

@@ -1,4 +1,4 @@
-"""The bounds of a proof."""
+"""The bounds of a proof: the number of agents and blocks, the network, and the faults."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -23,12 +23,12 @@ EVENT_FILLS_BLOCK = {"max_block_bytes": 267}
 
 
 class BoundsError(HarnessError):
-    """The bounds of a proof are impossible."""
+    """An error: the bounds of a proof are impossible."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """The bounds of a proof: `agents` agents (1 to 9) that complete `blocks` blocks in all (1 to 9).
+    """The bounds of a proof: `agents` agents (1 to 9) complete `blocks` blocks in all (1 to 9).
 
     - `network`: `lossless`; `lossy`, where any agent may lose any message; `any`, where messages may also be late,
       repeated and out of order.
@@ -131,7 +131,7 @@ class Bounds:
 
     @property
     def nameless(self) -> bool:
-        """True if states are stored without IDs, so that each agent counts as the first from its own view.
+        """True if states are stored without agent IDs, so that each agent counts itself as the first one.
 
         False with a captured agent, and in the network `any`, where messages depend on the sender's ID.
         """
@@ -139,17 +139,17 @@ class Bounds:
 
     @property
     def alike(self) -> bool:
-        """True if two states that differ only by an exchange of agents count as one state."""
+        """True if states that differ only by an exchange of agents count as one state."""
         return self.nameless and not self.stagger
 
     @property
     def blocks_alike(self) -> bool:
-        """True if two states that differ only by an exchange of blocks count as one state."""
+        """True if states that differ only by an exchange of blocks count as one state."""
         return self.nameless and self.clocks_any
 
     @property
     def settles(self) -> bool:
-        """True if all answers to a question arrive, or are lost, at the instant of the question."""
+        """True if all answers to a query arrive, or are lost, at the same moment as the query."""
         return self.reduced and self.captured is None
 
     def agent_settings(self, agent_id: int = 1) -> Settings:

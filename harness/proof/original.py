@@ -1,4 +1,4 @@
-"""The same bounds proven for another core: which findings of a proof does the original agent not have?
+"""Run the same proof for the unmodified agent core, to find which violations a modified core adds.
 
 `prove` reports each violation, and the published protocol has some of its own. After a change of the core, only the new
 violations matter. The original is the `ucp` of a commit or of another checkout. A process of its own explores it with
@@ -33,12 +33,12 @@ EXIT_S = 60.0
 
 
 class OriginalError(HarnessError):
-    """The original cannot be found or explored."""
+    """An error: the original agent core cannot be found or explored."""
 
 
 @dataclass(frozen=True)
 class Original:
-    """The proof of the original. `findings` maps a key to a sentence. `lines` is the printed result."""
+    """The proof of the original agent core. `findings` contains a sentence by key, and `lines` the printed result."""
 
     name: str
     findings: dict[str, str]
@@ -48,19 +48,19 @@ class Original:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A proof of the core in use beside the proof of the original."""
+    """A proof of the agent core in use, next to a proof of the original core."""
 
     proof: Proof
     original: Original
 
     @property
     def new(self) -> dict[str, str]:
-        """The findings that the original does not have."""
+        """The violations that only the core in use has."""
         return {key: text for key, text in self.proof.findings.items() if key not in self.original.findings}
 
     @property
     def shared(self) -> dict[str, str]:
-        """The findings that the original has as well."""
+        """The violations that both cores have."""
         return {key: text for key, text in self.proof.findings.items() if key in self.original.findings}
 
     @property
@@ -95,7 +95,7 @@ class Comparison:
 
 @contextmanager
 def code_of(original: str) -> Iterator[Path]:
-    """Yield the directory with the code of `original`.
+    """Yield a directory with the code of the agent core that `original` names.
 
     It is "installed" (the core of this installation, for a proof with a variant), a directory with `ucp/` in it, or a
     commit of this clone.
@@ -120,7 +120,9 @@ def code_of(original: str) -> Iterator[Path]:
 
 
 def prove_original(name: str, code: Path, bounds: Bounds, limits: Limits) -> Original:
-    """Explore the core in `code` within the same bounds and limits. Raises OriginalError if that is impossible."""
+    """Explore the agent core in the directory `code` within the same bounds and limits. Raises OriginalError if that
+    fails.
+    """
     with TemporaryDirectory(prefix="ucp-original-") as temporary:
         place = Path(temporary)
         (place / "core").mkdir()
@@ -144,12 +146,12 @@ def prove_original(name: str, code: Path, bounds: Bounds, limits: Limits) -> Ori
 
 
 def is_edited(code: Path) -> bool:
-    """Return whether the core in `code` differs from the released one."""
+    """Return true if the agent core in the directory `code` differs from the released one."""
     return bool(edited_files(code / "ucp"))
 
 
 def main() -> None:
-    """Explore the core that this process imports, and print the findings."""
+    """Explore the agent core that this process imports, and print the violations."""
     asked = json.load(sys.stdin)
     most_bytes, most_s, cores = asked["limits"]
     bounds = Bounds(**{**asked["bounds"], "faults": tuple(asked["bounds"]["faults"])})

@@ -1,1 +1,1 @@
-"""The attacker of a proof: the messages that the holder of a vehicle's keys can send."""
+"""The attacker in a proof: the messages that the holder of a captured vehicle's keys can send."""

@@ -1,4 +1,5 @@
-"""The messages that an attacker with the keys of one vehicle can send in each global state, and their receivers.
+"""Compute the messages that an attacker with the keys of one vehicle can send in each state of the swarm, and their
+receivers.
 
 The attacker receives all messages. It therefore knows each block that an agent has committed, and the hash of each
 proposed block. It can make blocks in the name of its vehicle. They differ only in their timestamps.
@@ -24,7 +25,7 @@ MOST_KNOWN = 200_000
 
 
 class _AgentKnowledge(NamedTuple):
-    """The knowledge that the attacker has from one agent."""
+    """The blocks, hashes and queries that the attacker knows from one agent."""
 
     asked: PendingQuestions
     committed: frozenset[Block]
@@ -33,7 +34,9 @@ class _AgentKnowledge(NamedTuple):
 
 
 class Ages:
-    """Timestamps around those of `blocks` honest blocks, so that `lies` forged blocks can have any order with them."""
+    """Timestamps before, between and after those of `blocks` honest blocks. They let up to `lies` forged blocks have
+    any age.
+    """
 
     def __init__(self, blocks: int, lies: int) -> None:
         part = MICROSECONDS // (2 * lies + 2)
@@ -43,7 +46,9 @@ class Ages:
 
 
 class Attacker:
-    """The messages that an attacker can send in the name of vehicle `bounds.captured`, by their numbers in `local`."""
+    """The messages that an attacker can send in the name of the captured vehicle. Each message is a number in
+    `local`.
+    """
 
     def __init__(self, bounds: Bounds, local: LocalStates) -> None:
         assert bounds.captured is not None, "a vehicle is captured"
@@ -59,7 +64,9 @@ class Attacker:
         self._forgeries: dict[tuple[int, Material], tuple[int, ...]] = {}
 
     def lies(self, locals_: tuple[int, ...]) -> Iterator[tuple[Action, ...]]:
-        """Yield the actions of the attacker that have an effect: each message, with each set of affected receivers."""
+        """Yield the actions of the attacker that have an effect: each message with each set of receivers that it
+        affects.
+        """
         messages = dict.fromkeys(
             message for place, material in self.material(locals_) for message in self._to(locals_[place], material)
         )
@@ -77,7 +84,9 @@ class Attacker:
         return step.local != local or bool(step.sent or step.started)
 
     def material(self, locals_: tuple[int, ...]) -> Iterator[tuple[int, Material]]:
-        """Yield the place of each living agent, and the material of the messages to it."""
+        """Yield each living agent's index, with the blocks and hashes from which the attacker can form messages to
+        it.
+        """
         looks = {place: self._look(local) for place, local in enumerate(locals_) if local != DEAD}
         blocks = self._own.union(*(look.committed for look in looks.values()))
         named = frozenset(block.block_hash for block in blocks).union(*(look.named for look in looks.values()))
@@ -103,7 +112,7 @@ class Attacker:
 
 
 class AttackerKnowledge:
-    """The messages that an attacker can send, in the network `any` (each agent is explored alone).
+    """The knowledge of an attacker when each agent is explored alone (in the network model `any`).
 
     The attacker can send each message to each agent any number of times.
 
@@ -121,7 +130,7 @@ class AttackerKnowledge:
         self._times_us = Ages(bounds.blocks, 0).said
 
     def hears(self, sender: int, message: Message) -> None:
-        """Add the knowledge from a message that an agent sent."""
+        """Add the blocks and hashes in a message that an agent sent to the attacker's knowledge."""
         if isinstance(message, BlockAddRequest):
             self._named.add(message.block_hash)
             self._proposals.setdefault(sender, set()).add(PendingQuestions((message.block_hash, message.chain_hash)))
@@ -130,17 +139,17 @@ class AttackerKnowledge:
             self._blocks.add(message.block)
 
     def material(self, agent_id: int) -> Material:
-        """Return the material of the messages to an agent."""
+        """Return the blocks and hashes from which the attacker can form messages to an agent."""
         others = [asked for sender, proposals in self._proposals.items() if sender != agent_id for asked in proposals]
         return Material(frozenset(self._blocks), frozenset(self._named), frozenset(others), self._times_us)
 
     def forgeries(self, state: AgentState, material: Material) -> list[Message]:
-        """Return the messages to an agent in this state that can have an effect."""
+        """Return the attacker's messages that can have an effect on an agent in this state."""
         return list(forgeries(state, self._captured, material))
 
 
 def looked_at(state: AgentState) -> _AgentKnowledge:
-    """Return the knowledge that the attacker has from an agent in this state."""
+    """Return the knowledge that the attacker gains from an agent in this state."""
     committed = frozenset((*state.chain, *state.reconcile_stack))
     return _AgentKnowledge(
         asked(state), committed, frozenset(block.block_hash for block in state.blocks_to_be_committed)

@@ -1,4 +1,4 @@
-"""The messages that an attacker can send to an agent: one of each kind that the agent can distinguish.
+"""List the messages that an attacker can send to an agent: one for each kind of effect on the agent.
 
 Handlers check only whether they hold a hash of the message, which of two timestamps is older, and yes or no.
 docs/explanation/proof.md explains why these messages are enough. A test compares their effects with those of random
@@ -26,7 +26,7 @@ from ucp.state import AgentState
 
 
 class PendingQuestions(NamedTuple):
-    """The answers that an agent waits for.
+    """The queries and requests of an agent that still wait for answers.
 
     `vote` is the block and the chain hash of its proposal. The other fields are the chain hash or block hash of its
     query in phases 1, 2 and 3.
@@ -39,7 +39,7 @@ class PendingQuestions(NamedTuple):
 
 
 class Material(NamedTuple):
-    """The contents of an attacker's messages: blocks, block hashes, questions of other agents, and timestamps."""
+    """The contents of an attacker's messages: blocks, block hashes, queries of other agents, and timestamps."""
 
     blocks: frozenset[Block]
     named: frozenset[bytes]
@@ -48,7 +48,7 @@ class Material(NamedTuple):
 
 
 def asked(state: AgentState) -> PendingQuestions:
-    """Return the answers that an agent waits for."""
+    """Return the queries and requests of an agent that still wait for answers."""
     candidate, top = state.candidate_block, state.chain.top_chain_hash
     voting = state.voting_timer.active and candidate is not None
     return PendingQuestions(
@@ -60,7 +60,9 @@ def asked(state: AgentState) -> PendingQuestions:
 
 
 def forgeries(state: AgentState, captor: int, material: Material) -> Iterator[Message]:
-    """Yield the messages of `captor` that can affect the agent, or affect other agents through its answer."""
+    """Yield the messages in the name of vehicle `captor` that can affect the agent, or affect other agents through its
+    answer.
+    """
     yield from _answers(state, captor, material)
     if not state.reconcile_in_progress:
         yield from _commits(state, material.blocks)
@@ -69,7 +71,7 @@ def forgeries(state: AgentState, captor: int, material: Material) -> Iterator[Me
 
 
 def _answers(state: AgentState, captor: int, material: Material) -> Iterator[Message]:
-    """Yield answers to the agent's own questions. An agent counts each responder once."""
+    """Yield forged answers to the agent's own queries. An agent counts each sender of answers once."""
     waits = asked(state)
     if waits.vote is not None and captor not in state.voters:
         block_hash, chain_hash = waits.vote
@@ -90,14 +92,14 @@ def _answers(state: AgentState, captor: int, material: Material) -> Iterator[Mes
 
 
 def _commits(state: AgentState, blocks: Iterable[Block]) -> Iterator[Message]:
-    """Yield a Commit Block for each block that the agent does not hold, on top of its chain."""
+    """Yield a forged Commit Block message for each block that the agent does not hold."""
     for block in sorted(blocks, key=lambda block: block.block_hash):
         if not state.holds(block.block_hash):
             yield CommitBlock(block, next_chain_hash(state.chain.top_chain_hash, block.block_hash))
 
 
 def _questions(state: AgentState, others: Iterable[PendingQuestions]) -> Iterator[Message]:
-    """Yield questions to which the agent gives an answer that another agent waits for."""
+    """Yield forged queries whose answer from this agent is an answer that another agent waits for."""
     chain = state.chain
     for waits in sorted(others, key=repr):
         if waits.vote is not None:

@@ -1,4 +1,4 @@
-"""Secured agents, and datagrams that an attacker seals with the bundle of a captured vehicle.
+"""Create agents that check signatures, and datagrams that an attacker signs with the keys of a captured vehicle.
 
 `ucp.secure` decides which datagrams an agent accepts. This module makes no assumption about it.
 """
@@ -21,7 +21,9 @@ ATTACKERS_BOOT = b"later than that".ljust(16, b"\0")
 
 
 class SecurityGate:
-    """The keys of a mission. The attacker has those of vehicle `captured`. Raises MachineError without cryptography."""
+    """The keys of a secured mission. The attacker has those of vehicle `captured`. Raises MachineError without a
+    cryptography library.
+    """
 
     def __init__(self, roster: Iterable[int], captured: int) -> None:
         try:
@@ -36,7 +38,9 @@ class SecurityGate:
         """Sender -> session in which the attacker sends in the sender's name."""
 
     def agent(self, agent_id: int, *arguments: Any, revoked: bool = False, **options: Any) -> Agent:
-        """Return a secured agent. The other arguments are those of Agent. If `revoked`, it knows the revocation."""
+        """Return an agent that checks signatures. If `revoked` is true, it knows that the captured vehicle is
+        excluded.
+        """
         from ucp.secure.secured_agent import SecuredAgent
         from ucp.secure.session import Session
 
@@ -46,7 +50,7 @@ class SecurityGate:
         return agent
 
     def sealed(self, message: Message, now: float, *, sender: int | None = None, genuine: bool = False) -> bytes:
-        """Return a new datagram with this message, in the name of the captured vehicle or of `sender`.
+        """Return a new encrypted datagram with this message, in the name of the captured vehicle or of `sender`.
 
         A `genuine` block has its maker's signature, which the attacker received with the block. Any other block is
         signed with the captured key. An answer names a request that no agent has received, so no agent knows a newer
@@ -72,7 +76,8 @@ class SecurityGate:
         return session.seal(self._sequence, message, request, signature, 0)
 
     def forged(self, message: Message, receiver: int, now: float) -> Iterator[bytes]:
-        """Yield forgeries of the message: in the name of another vehicle, and with a block in the receiver's name.
+        """Yield forged datagrams with this message: one in the name of another vehicle, and one with a block in the
+        receiver's name.
 
         The attacker has the keys of neither.
         """

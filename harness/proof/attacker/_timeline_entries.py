@@ -1,4 +1,4 @@
-"""Write the messages of an attacker as entries of a scenario's timeline, with names of blocks and mission seconds."""
+"""Write the messages of an attacker as timeline entries of a scenario, with block names and mission seconds."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ Document = dict[str, Any]
 
 
 class AttackEntries:
-    """The timeline entries of one path, with the names of its blocks. The attacker `made` blocks, by block hash."""
+    """The timeline entries for one path through the states. `made` contains the attacker's own blocks by hash."""
 
     def __init__(self, local: LocalStates, captured: int, made: Mapping[bytes, Block]) -> None:
         self._local = local
@@ -29,13 +29,13 @@ class AttackEntries:
         """Mission second of the completion of each block, after that of the inception block."""
 
     def completed(self, agent_id: int, ordinal: int, at_s: float) -> None:
-        """Record that an agent completed a block. `ordinal` is its number among all blocks."""
+        """Record that an agent completed a block. `ordinal` is its number among all blocks of the path."""
         self._count[agent_id] += 1
         self._names[self._local.blocks.completed_by(agent_id, ordinal)] = f"{agent_id}.{self._count[agent_id]}"
         self._completed_s.append(at_s)
 
     def sees(self, local: int) -> None:
-        """Record the chains of an agent in this state."""
+        """Record the chain hashes of an agent in this state, so that entries can refer to them."""
         chain = self._local.state(local).chain
         below: tuple[bytes, ...] = ()
         self._chains[chain.inception.chain_hash] = below
@@ -43,7 +43,7 @@ class AttackEntries:
             below = self._chains[chain_hash] = (*below, block.block_hash)
 
     def lie(self, receiver: int, number: int, at_s: float) -> list[Document]:
-        """Add a message of the attacker. Return its entry in a list; `word` completes it later.
+        """Add a message of the attacker, and return its entry in a list. The method `word` completes the entry later.
 
         If the last message was the same at the same time, its entry gets the receiver, and the list is empty.
         """
@@ -56,7 +56,7 @@ class AttackEntries:
         return [entry]
 
     def word(self) -> None:
-        """Complete all entries, at the end of the path."""
+        """Complete all entries, after the whole path is known."""
         for entry, message in self._lies:
             entry["lie"] |= self._said(message)
 
@@ -79,7 +79,7 @@ class AttackEntries:
         return said
 
     def _below(self, commit: CommitBlock) -> bytes:
-        """Return the chain hash of the chain on which a Commit Block puts its block."""
+        """Return the hash of the chain to which a Commit Block message wants to add its block."""
         return next(
             (below for below in self._chains if next_chain_hash(below, commit.block.block_hash) == commit.chain_hash),
             NOBODYS,
@@ -93,7 +93,7 @@ class AttackEntries:
         return MADE + second.rstrip("0").rstrip(".")
 
     def _second(self, timestamp_us: int) -> float:
-        """Return the mission second on this path for a timestamp that lies between those of completed blocks.
+        """Return the mission second for a timestamp that lies between the timestamps of completed blocks.
 
         A timestamp after all blocks gives a mission second after the last completion.
         """

@@ -1,4 +1,4 @@
-"""Coverage: the share of the protocol's local states, inputs and branches that runs have reached.
+"""Measure coverage: the share of the protocol's local states, inputs and branches that runs have reached.
 
 See docs/explanation/coverage.md.
 

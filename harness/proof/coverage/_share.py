@@ -1,4 +1,4 @@
-"""The share of the existing local states and inputs that runs have reached."""
+"""Compute the share of all existing states and inputs of an agent that runs have reached."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +17,9 @@ from harness.proof.model._shape import Held, Shape, shape_of
 
 @dataclass
 class Existing:
-    """The numbers of local states and of pairs that exist within `bounds`. They are all if `ended` is "complete"."""
+    """The agent states and (state, input) pairs that exist within `bounds`. They are complete if `ended` is
+    "complete".
+    """
 
     bounds: Bounds
     states: set[int]
@@ -26,7 +28,9 @@ class Existing:
 
 
 def existing(bounds: Bounds, *, most_bytes: float = 4e9, most_s: float = float("inf")) -> Existing:
-    """Return all local states and pairs within the bounds, or those found within the limits of memory and time."""
+    """Return all agent states and (state, input) pairs within the bounds, or those found before a limit of memory or
+    time.
+    """
     there = Existing(bounds, set(), set())
     if bounds.network == "any":
         collected = collect(bounds, most_bytes=most_bytes, most_s=most_s, keep=lambda local: _add(there, local))
@@ -61,7 +65,9 @@ SCHEMA = "ucp-coverage/1"
 
 @dataclass(frozen=True)
 class Share:
-    """The number of existing things that were `reached`, and the number that were reached outside the bounds."""
+    """The number of existing states, inputs or branches that runs reached, and the number reached outside the
+    bounds.
+    """
 
     reached: int
     exist: int
@@ -74,7 +80,7 @@ class Share:
 
     @property
     def percent(self) -> str:
-        """The share as text, for example "35 %". It is 100 % or 0 % only if it is exactly that."""
+        """The share as text, for example "35 %". Rounding never gives 0 % or 100 %."""
         if self.reached == self.exist:
             return "100 %"
         share = 100 * self.reached / self.exist
@@ -89,12 +95,12 @@ class Share:
 
 
 def not_taken(reached: Reached) -> list[Branch]:
-    """Return the branches of the contract that no run has taken."""
+    """Return the branches in the agent contract that no run has taken."""
     return [branch for branch in BRANCHES if not reached.branches[branch]]
 
 
 def to_json(reached: Reached, there: Existing | None) -> dict[str, Any]:
-    """Return the document. It has shares of the states in `there`, if given."""
+    """Return the coverage as a JSON document. With `there`, it also contains the shares of all existing states."""
     missing = not_taken(reached)
     document = {
         "schema": SCHEMA,
@@ -127,7 +133,7 @@ def to_json(reached: Reached, there: Existing | None) -> dict[str, Any]:
 
 
 def in_words(reached: Reached, there: Existing | None) -> Iterator[str]:
-    """Yield a few lines about the coverage."""
+    """Yield lines of text about the coverage."""
     yield (
         f"{reached.steps:,} handler runs: {len(reached.states):,} local states, {len(reached.pairs):,} pairs of one "
         f"with an input"

@@ -1,4 +1,4 @@
-"""Local states, inputs and branches that runs reached, collected while a simulated run is judged.
+"""Collect the states, inputs and branches of agents that runs reach, while their traces are judged.
 
 The reference core of the step judge (`harness.checker.steps`) follows the steps of each agent. Foreign agents and
 recorded runs therefore count like our agents and simulated runs.
@@ -36,7 +36,7 @@ KEPT = 20_000
 
 @dataclass
 class Reached:
-    """The reached local states, and the reached pairs of a local state and an input that changes it or is answered."""
+    """The agent states that runs reached, and the (state, input) pairs whose input had an effect or an answer."""
 
     states: set[int] = field(default_factory=set)
     pairs: set[int] = field(default_factory=set)
@@ -47,7 +47,7 @@ class Reached:
     """The reason why some steps are unknown. None if all are known."""
 
     def add(self, other: "Reached") -> None:
-        """Add the states, pairs and branches of another object."""
+        """Add the states, pairs and branches of another object to this one."""
         for mine, its in ((self.states, other.states), (self.pairs, other.pairs)):
             if len(mine) < MOST:
                 mine |= its
@@ -59,7 +59,9 @@ class Reached:
 
 
 class Watcher:
-    """Records the reached states, pairs and branches of each followed step. `reached` may be replaced at any time."""
+    """Records the reached states, pairs and branches after each judged step of an agent. Callers may replace
+    `reached`.
+    """
 
     def __init__(self) -> None:
         self.reached = Reached()
@@ -71,7 +73,7 @@ class Watcher:
         self._answers = False
 
     def step(self, state: State, run: HandlerRun | None) -> None:
-        """Record the state of an agent after a handler run. `run` is None at the start of an incarnation."""
+        """Record the state of an agent after a handler run. `run` is None when the agent has just started."""
         reached = self.reached
         if run is None:
             self._held_before = None
@@ -107,7 +109,9 @@ class Watcher:
 
 
 def _given(run: HandlerRun | None, held: Held) -> tuple[Any, ...] | None:
-    """Return the shape of an input for an agent that held these blocks. None for an input outside all bounds."""
+    """Return the abstract form of an input for an agent that held these blocks, or None if no bounds contain such an
+    input.
+    """
     if run is None:
         return None
     trigger = run.trigger
@@ -119,7 +123,7 @@ def _given(run: HandlerRun | None, held: Held) -> tuple[Any, ...] | None:
 
 
 def reached_in(evidence: Evidence) -> Reached:
-    """Return the states, pairs and branches that the agents of a run reached, from their traces."""
+    """Return the states, pairs and branches that the agents of a run reached, according to their traces."""
     watcher = Watcher()
     evidence.watch = watcher.step
     judgement = check(evidence)
@@ -129,7 +133,7 @@ def reached_in(evidence: Evidence) -> Reached:
 
 
 def simulate_watched(scenario: Scenario, seed: int, watch: Watch, **options: Any) -> Simulated:
-    """Simulate with traces, and deliver messages without effect too, so that branches without effect are recorded."""
+    """Simulate a run with traces. Messages without effect are delivered too, so that traces show their branches."""
     return simulate_in_memory(_Watched(watch), scenario, seed, deliver_all=True, **options)
 
 

@@ -1,1 +1,1 @@
-"""Examples of a proof: a path through the graph, written as a scenario and played by the simulation."""
+"""Write examples of a violation: a path through the state graph becomes a scenario that the simulation plays."""

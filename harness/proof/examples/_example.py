@@ -1,4 +1,4 @@
-"""A path through the graph, played by the simulation and written as a scenario."""
+"""Play a path through the state graph in the simulation, and write it as a scenario."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ Document = dict[str, Any]
 
 @dataclass(frozen=True)
 class Example:
-    """A path to a finding as a scenario in `path`. `judged` has the bad judgements of its simulated run."""
+    """A path to a violation as a scenario file. `judged` contains the bad verdicts on its simulated run."""
 
     path: Path
     instants: int
@@ -50,7 +50,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Played:
-    """A simulated run: its bad judgements, and the cycle at its end, if there is one."""
+    """A simulated run: its bad verdicts, and the endless cycle of its agents, if there is one."""
 
     document: Document
     judged: dict[str, Judgement]
@@ -72,7 +72,7 @@ def _bad(result: Result) -> dict[str, Judgement]:
 
 
 def keep(played: Played, path: Path, bounds: Bounds, instants: int, sentences: Sequence[str]) -> Example:
-    """Write a played scenario to `path`, with `sentences` as its comment."""
+    """Write a played scenario to `path`, with `sentences` as its comment, and return it as an example."""
     comment = [
         *sentences,
         f"A shortest path within {bounds.in_words()}.",

@@ -1,4 +1,4 @@
-"""Write a path through the graph as a scenario.
+"""Write a path through the state graph as a scenario.
 
 Scripted events, fates and lateness make the simulation take the same path. A message takes LATENCY_S. If the order of
 arrivals on the path requires it, or if the next instant follows soon, a fate gives the message another delay. A message
@@ -40,7 +40,7 @@ Document = dict[str, Any]
 
 @dataclass(eq=False)
 class _Broadcast:
-    """One broadcast. `count` is its number among the sender's messages with this name."""
+    """A broadcast message on the path. `count` numbers the messages of this sender with the same name."""
 
     sender: int
     message: int
@@ -52,7 +52,9 @@ class _Broadcast:
 
 @dataclass
 class _Agent:
-    """An agent on the path. `timers` maps each running timer to its number among all its timers, and to its expiry."""
+    """An agent on the path. `timers` maps each running timer to its number among all started timers and to its
+    expiry.
+    """
 
     agent_id: int
     local: int
@@ -61,7 +63,7 @@ class _Agent:
 
 
 class Completion(NamedTuple):
-    """The interval in which an agent may complete a block on the path, in seconds after the path's first instant."""
+    """The interval in which an agent may complete a block, in seconds after the start of the path."""
 
     agent: int
     earliest_s: float
@@ -69,7 +71,7 @@ class Completion(NamedTuple):
 
 
 class Script:
-    """Follows a path step by step, and collects the entries of the scenario."""
+    """Follows a path through the state graph step by step, and collects the entries of a scenario."""
 
     def __init__(self, graph: Graph, path: Sequence[int]) -> None:
         self._graph = graph
@@ -100,7 +102,7 @@ class Script:
         )
 
     def document(self, name: str) -> Document:
-        """Return the scenario."""
+        """Return the scenario as a document."""
         instants = instants_s(len(self._moves), list(self._runs()))
         for move, at_s, next_s in zip(self._moves, instants, [*instants[1:], inf], strict=True):
             self._latency_s = LATENCY_S if next_s - at_s > NEXT_INSTANT_SOON_S else MOMENT_S
@@ -129,7 +131,7 @@ class Script:
         }
 
     def completions(self) -> Iterator[Completion]:
-        """Yield the possible times of the completions, if only the durations of timers limit them."""
+        """Yield the interval for the completion of each block that the timer durations allow."""
         agents = [agent.agent_id for agent in self._agents]
         for move, (earliest_s, latest_s) in zip(
             self._moves, windows_s(len(self._moves), list(self._runs())), strict=True
@@ -140,7 +142,7 @@ class Script:
             agents = [agents[old] for old in move.places]
 
     def _move(self, before: int, after: int) -> Move:
-        """Return the move from one state to the next, without losses if possible."""
+        """Return a transition from one state to the next, without message losses if there is one."""
         state, wanted = self._graph.states[before], self._graph.states[after]
         for lossy in (False, True) if self._swarm.bounds.network == "lossy" else (False,):
             for actions in self._swarm.actions(state):
@@ -176,7 +178,7 @@ class Script:
     # Events
 
     def _play(self, move: Move, at_s: float) -> None:
-        """Play one instant: first the actions of the agents, then the reception of all messages."""
+        """Play one moment of the path: first the actions of the agents, then the reception of all messages."""
         earliest = self._end_s + MOMENT_S if self._end_s else 0.0
         ends = [
             max(self._agents[action.place].timers[action.number][1], earliest)
@@ -231,7 +233,7 @@ class Script:
         return Step(DEAD, (), ())
 
     def _apply(self, agent: _Agent, step: Step, now: float) -> list[_Broadcast]:
-        """Apply a step to an agent, and return the broadcasts of the step."""
+        """Apply a step to an agent, and return the messages that it broadcasts."""
         agent.local = step.local
         if self._attack_entries is not None and step.local != DEAD:
             self._attack_entries.sees(step.local)
@@ -251,7 +253,7 @@ class Script:
         return flights
 
     def _in_wave_order(self, wave: Wave, flights: Sequence[_Broadcast]) -> list[_Broadcast]:
-        """Return the broadcasts in the order of the wave."""
+        """Return the broadcasts in the order in which the round of messages lists them."""
         left, ordered = list(flights), []
         for place, message in wave.air:
             sender = self._agents[place].agent_id
@@ -261,7 +263,7 @@ class Script:
         return ordered
 
     def _hear(self, wave: Wave, air: Sequence[_Broadcast], acted_s: float) -> list[_Broadcast]:
-        """Let each agent receive its messages of the wave, and return the answers."""
+        """Let each agent receive its messages of one round, and return their answers."""
         answers: dict[int, list[_Broadcast]] = {}
         received: set[int] = set()
         for place, heard in enumerate(wave.heard):
@@ -304,7 +306,7 @@ class Script:
         self._fates.append({"message": flight.name, "sender": flight.sender, **whom, "count": flight.count, **what})
 
     def _delay_open_timers(self) -> None:
-        """Let timers that are open at the end of the path expire after it."""
+        """Extend each timer that still runs at the end of the path beyond this end."""
         for agent in self._agents:
             for number, ends_s in agent.timers.values():
                 if ends_s <= self._end_s:

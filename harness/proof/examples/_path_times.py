@@ -1,4 +1,4 @@
-"""Compute the mission second of each instant on a path, and timestamps of its blocks.
+"""Compute the mission second of each step of a path, and the timestamps of its blocks.
 
 Each instant is a variable, and each duration is a bound on the difference of two variables. The longest paths over
 these bounds are a solution (Bellman and Ford), if a solution exists.
@@ -22,7 +22,9 @@ FIRST_INSTANT_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class TimerRun:
-    """A timer that ran from one instant to another. If it has not `ended`, it ran at least until then."""
+    """A timer that ran from one step of a path to another. If it has not `ended`, it ran at least until the later
+    step.
+    """
 
     started: int
     duration_s: float
@@ -31,7 +33,7 @@ class TimerRun:
 
 
 def instants_s(count: int, runs: Sequence[TimerRun]) -> list[float]:
-    """Return the mission second of each of `count` instants.
+    """Return the mission second of each of the `count` steps of a path.
 
     If no solution with punctual timers exists (timers may expire in any order), timers may be late.
     """
@@ -45,7 +47,7 @@ def instants_s(count: int, runs: Sequence[TimerRun]) -> list[float]:
 
 
 def windows_s(count: int, runs: Sequence[TimerRun]) -> list[tuple[float, float]]:
-    """Return the earliest and latest second of each of `count` instants after the first instant."""
+    """Return the earliest and the latest second of each of the `count` steps, measured from the first step."""
     later = _bounds(count, runs, 0.0, punctual=True)
     begin = [0.0, *[-inf] * (count - 1)]
     earliest = _longest_paths(begin, later)
@@ -56,13 +58,15 @@ def windows_s(count: int, runs: Sequence[TimerRun]) -> list[tuple[float, float]]
 
 
 def _solve(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: bool) -> list[float] | None:
-    """Return the earliest times with these distances. None if there is no solution."""
+    """Return the earliest times that satisfy all timers, or None if there are none."""
     later = _bounds(count, runs, apart_s, punctual=punctual)
     return _longest_paths([FIRST_INSTANT_S] * count, later)
 
 
 def _longest_paths(at_least: Sequence[float], later: Sequence[tuple[int, int, float]]) -> list[float] | None:
-    """Return the longest path to each instant over the bounds `later`. None if a cycle makes it infinite."""
+    """Return the length of the longest path to each step in the graph of constraints `later`, or None if a cycle makes
+    it infinite.
+    """
     longest = [*at_least]
     for _ in range(len(longest) + 1):
         changed = False
@@ -76,7 +80,7 @@ def _longest_paths(at_least: Sequence[float], later: Sequence[tuple[int, int, fl
 
 
 def _bounds(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: bool) -> list[tuple[int, int, float]]:
-    """Return the bounds as (instant, other instant, minimum seconds from the first to the other)."""
+    """Return the constraints as (step, other step, minimum number of seconds from the first to the other)."""
     later: list[tuple[int, int, float]] = [(number - 1, number, apart_s) for number in range(1, count)]
     for run in runs:
         if run.ended:
@@ -89,7 +93,7 @@ def _bounds(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: b
 
 
 class Ages:
-    """The required order of the timestamps of the blocks on a path.
+    """The required order of the timestamps of all blocks on a path.
 
     Blocks are identified by their ordinals in the states of the path. The ordinals change along the path.
     """
@@ -101,24 +105,26 @@ class Ages:
         """Index of an event -> indices of the events that complete older blocks."""
 
     def completed(self, ordinal: int) -> None:
-        """Record that the next event completes this block."""
+        """Record that the next event completes the block with this number."""
         assert ordinal == len(self._events) + 1, "blocks are numbered as they are completed"
         self._older[len(self._events)] = set()
         self._events.append(len(self._events))
 
     def renumber(self, blocks: Ordinals) -> None:
-        """Renumber the blocks: these become 1, 2 and so on. Blocks that no agent has follow them."""
+        """Renumber the blocks. The given blocks become 1, 2 and so on, and blocks that no agent holds follow them."""
         if blocks:
             rest = [ordinal for ordinal in range(1, len(self._events) + 1) if ordinal not in blocks]
             self._events = [self._events[ordinal - 1] for ordinal in (*blocks, *rest)]
 
     def require_older(self, oldest: int, others: Collection[int]) -> None:
-        """Require that one block is older than others. The inception block (0) is always the oldest."""
+        """Require that one block is older than the others. Block 0 is the inception block, which is always the
+        oldest.
+        """
         for other in others if oldest else ():
             self._older[self._events[other - 1]].add(self._events[oldest - 1])
 
     def date(self, events: list[dict[str, Any]]) -> bool:
-        """Give the events timestamps that meet the requirements, if their times do not meet them already.
+        """Set the timestamps of the events so that they meet the requirements, and return true.
 
         Return False if no timestamps meet them, because they contradict each other or an agent's clock would go back.
         """

@@ -1,1 +1,1 @@
-"""The graph of a proof: all global states within the bounds, explored breadth first on all cores."""
+"""Build the state graph of a proof: all states of the swarm within bounds, explored breadth first on all cores."""

@@ -1,4 +1,4 @@
-"""The successors of one state, and compact sequences of states and successors."""
+"""Compute the successors of a state, and store states and successors compactly."""
 
 import gc
 from array import array
@@ -18,7 +18,7 @@ _Following = dict[Actions, dict[int, None]]
 
 
 class Expansion(NamedTuple):
-    """The successors of one state. `ways` is the number of its transitions.
+    """The successors of one state of the swarm. `ways` is the number of transitions that lead to them.
 
     The other fields have the numbers of successors without losses and without new blocks. `by_timer` has, for each
     timer that may expire next, the possible successors: the timer expires alone, or timers that must expire at the same
@@ -31,7 +31,7 @@ class Expansion(NamedTuple):
 
 
 def expanded(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
-    """Return the expansion of a state. `number_of` returns the number of each successor, and is called in order."""
+    """Return the successors of a state. `number_of` is called for each successor in order, and returns its number."""
     lossy = swarm.bounds.network == "lossy"
     ways = 0
     losing_nothing: _Following = {}
@@ -45,12 +45,12 @@ def expanded(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
 
 
 def quiet(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
-    """Return the expansion of a state without losses and without new blocks. Its `ways` is 0."""
+    """Return the successors of a state that need no lost message and no new block. The number of transitions is 0."""
     return _quiet(swarm, state, number_of, [*swarm.ending(state)], {})
 
 
 def _quiet(swarm: Swarm, state: State, number_of: NumberOf, ending: Sequence[Actions], known: _Following) -> Expansion:
-    """Return the expansion without losses and new blocks. `known` may contain some of the successors."""
+    """Return the successors without message losses and new blocks. `known` may already contain some of them."""
     after = {
         actions: known[actions]
         if actions in known
@@ -68,7 +68,7 @@ def _quiet(swarm: Swarm, state: State, number_of: NumberOf, ending: Sequence[Act
 
 @contextmanager
 def cycles_left_alone() -> Iterator[None]:
-    """Switch off Python's garbage collector. It stays off in processes that are forked inside the context."""
+    """Switch off Python's garbage collection. Processes that are forked inside the context keep it off."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -79,7 +79,7 @@ def cycles_left_alone() -> Iterator[None]:
 
 
 class States(Sequence[State]):
-    """The states of a swarm of `agents` agents, numbered in the order of their addition. Each is stored as bytes."""
+    """The states of a swarm, numbered in the order in which they were added. Each one is stored as bytes."""
 
     def __init__(self, agents: int) -> None:
         self._form = Struct(f"={AGENTS + agents}i")
@@ -87,7 +87,7 @@ class States(Sequence[State]):
         self._numbers: dict[bytes, int] = {}
 
     def add(self, state: State) -> int:
-        """Return the number of a state. A new state gets the next number."""
+        """Return the number of a state. A new state is added with the next number."""
         row = self._form.pack(*state)
         number = self._numbers.setdefault(row, len(self._rows))
         if number == len(self._rows):
@@ -108,7 +108,9 @@ class States(Sequence[State]):
 
 
 class Followers(Sequence[ByTimer]):
-    """The successors of each state by timer, in one flat array. The successors of a timer follow their count."""
+    """The successors of each state, grouped by the timer that expires. One flat array holds them all: a count, then
+    that many successors.
+    """
 
     def __init__(self) -> None:
         self._flat = array("i")

@@ -1,4 +1,4 @@
-"""Explore all reachable global states, breadth first. The first state with a flaw is therefore a nearest one.
+"""Explore all reachable states of a swarm, breadth first. The first violation found therefore has a shortest path.
 
 The graph also keeps the successors of each state without losses and new blocks (`quiet`), for
 `../questions/_convergence.py`.
@@ -20,7 +20,8 @@ NO_PARENT = -1
 
 @dataclass
 class Graph:
-    """The explored states by number, and the parent of each. `ended` is "complete" if these are all reachable states.
+    """The explored states by number, and the predecessor of each. They are all reachable states if `ended` is
+    "complete".
 
     `quiet` and `crossing` have the fields `by_timer` and `crossing` of the expansion of each state.
     """
@@ -51,7 +52,7 @@ class Graph:
         return None if self.flawed is None else self.swarm.flaw(self.states[self.flawed])
 
     def reach(self, state: State, parent: int) -> int:
-        """Return the number of a state. A new state is added, and checked for flaws."""
+        """Return the number of a state. A new state is added and checked for violations."""
         number = self.states.add(state)
         if number == len(self.parents):
             self.parents.append(parent)
@@ -63,7 +64,7 @@ class Graph:
         return number
 
     def take_in(self, expansion: Expansion) -> None:
-        """Add the expansion of the next state."""
+        """Add the successors of the next state in the order of numbers."""
         number = len(self.quiet)
         self.transitions += expansion.ways
         self.quiet.append(expansion.by_timer)
@@ -74,7 +75,7 @@ class Graph:
         return Progress(len(self.states), self.looked_at, self.transitions, self.depth, seconds, asked)
 
     def path(self, number: int) -> list[int]:
-        """Return the states on the path to this one, from the initial state."""
+        """Return the states on the path from the initial state to this one."""
         path = [number]
         while (parent := self.parents[path[-1]]) != NO_PARENT:
             path.append(parent)
@@ -90,7 +91,7 @@ def explore(
     workers: Workers | None = None,
     watch: Callable[[Progress], None] = lambda progress: None,
 ) -> Graph:
-    """Explore all states, or as many as memory and time allow, or up to the first state with a flaw.
+    """Explore all states, until a limit of memory or time is reached or a state shows a violation.
 
     The result is the same with and without workers.
     """
@@ -124,7 +125,7 @@ def _all(graph: Graph, budget: Budget, workers: Workers | None) -> Iterator[Prog
 
 
 def _expansions(graph: Graph, budget: Budget, workers: Workers | None) -> Iterator[Expansion]:
-    """Yield the expansion of each state in order, also of states that are added meanwhile.
+    """Yield the successors of each state in order. States that are added during the loop are included.
 
     Workers compute many states.
     """

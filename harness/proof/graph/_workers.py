@@ -1,4 +1,4 @@
-"""Explore states and further votes on all cores.
+"""Explore states in worker processes on all cores.
 
 The workers are forked processes. Each starts with the agents and steps that are known at the fork, and continues to
 number local states and zones itself. A message between two processes uses the receiver's number if the sender knows it.
@@ -43,7 +43,7 @@ Definitions = list[tuple[int, Any]]
 
 
 class StateBatch(NamedTuple):
-    """States that one process sends to another, as a flat array, with the definitions that are needed to read them."""
+    """States that one process sends to another, in a flat array, with the definitions that the receiver lacks."""
 
     locals: Definitions
     zones: Definitions
@@ -52,13 +52,14 @@ class StateBatch(NamedTuple):
 
 
 class Forks(NamedTuple):
-    """Idle states with several chains. The worker returns the number of votes that each one needs."""
+    """A task for a worker: idle states in which agents have different chains. The answer is a `NeededVotes`."""
 
     batch: StateBatch
 
 
 class Successors(NamedTuple):
-    """The successors of some states. `batch` has the successors that this worker has not reported before, in order.
+    """A worker's answer: the successors of some states. `batch` contains the successors that this worker has not sent
+    before.
 
     `expansions` has for each state the number of new successors in `batch`, and its expansion with the worker's
     numbers.
@@ -69,13 +70,15 @@ class Successors(NamedTuple):
 
 
 class NeededVotes(NamedTuple):
-    """The number of votes that each fork needs, as `ExtraVotes` returns it. None if it is not decided."""
+    """A worker's answer: the number of further votes that each state needs until all chains are equal. None means
+    unknown.
+    """
 
     votes: list[int | None] | None
 
 
 class Answer(NamedTuple):
-    """An answer of a worker, with the resources that the worker has used so far."""
+    """An answer of a worker process, with the time and memory that it has used so far."""
 
     answer: Successors | NeededVotes
     memory_bytes: float
@@ -84,7 +87,7 @@ class Answer(NamedTuple):
 
 
 class _NumberTranslator:
-    """The mapping between the numbers of two processes, in one of them. Numbers below `alike` are equal in both."""
+    """The mapping between the state numbers of two processes. Numbers below `alike` are the same in both."""
 
     def __init__(self, alike: int, content: Callable[[int], Any], adopt: Callable[[Any], int]) -> None:
         self._content = content
@@ -94,7 +97,7 @@ class _NumberTranslator:
         self._new_definitions: Definitions = []
 
     def code(self, ours: int) -> int:
-        """Return the other process's number for our number. Values below -1 stand for our own number."""
+        """Return the other process's number for our number. A value below -1 means our own number."""
         code = self._codes.get(ours)
         if code is None:
             code = self._codes[ours] = -ours - 2
@@ -135,7 +138,7 @@ class _StateTranslator:
         return StateBatch(self._locals.definitions(), self._zones.definitions(), completed, flat)
 
     def decode(self, batch: StateBatch) -> list[State]:
-        """Return the states with our numbers."""
+        """Return the received states with the numbers of this process."""
         self._swarm.local.blocks.note_completed(batch.completed)
         self._completed = len(self._swarm.local.blocks.completed)
         self._locals.learn(batch.locals)
@@ -152,7 +155,9 @@ class _StateTranslator:
 
 
 class _WorkerFunction:
-    """The function of a worker process. It returns the successors or votes of the states in a task."""
+    """The function of a worker process. It returns the successors of the states in a task, or the votes that they
+    need.
+    """
 
     def __init__(self, swarm: Swarm) -> None:
         self._swarm = swarm
@@ -193,7 +198,7 @@ class _WorkerFunction:
 
 
 class _WorkerHandle:
-    """A worker process, in the main process."""
+    """A worker process, as the main process sees it."""
 
     def __init__(self, swarm: Swarm) -> None:
         self.memory_bytes = 0.0
@@ -233,7 +238,9 @@ class _WorkerHandle:
         return answer.answer
 
     def expansions_of(self, answer: Successors, first: int, add: Callable[[State, int], int]) -> Iterator[Expansion]:
-        """Yield the expansion of each state from number `first` on. `add` adds new states to the graph."""
+        """Yield the successors of each state in the answer, beginning with state number `first`. `add` stores new
+        states in the graph.
+        """
         fresh = iter(self._translator.decode(answer.batch))
         numbers = self._numbers
         for parent, (new, expansion) in enumerate(answer.expansions, first):
@@ -253,7 +260,7 @@ Give = Callable[["_WorkerHandle", Sequence[State]], None]
 
 
 class Workers:
-    """`size` worker processes. They start at the first task, and stop at the end of the context."""
+    """A pool of `size` worker processes. They start with the first task and stop when the context ends."""
 
     def __init__(self, swarm: Swarm, size: int) -> None:
         self._swarm = swarm
@@ -277,23 +284,25 @@ class Workers:
 
     @property
     def steps(self) -> int:
-        """Number of steps that the workers have computed."""
+        """The number of agent steps that all workers have computed."""
         return sum(other.steps for other in self._handles)
 
     def pays_off(self, waiting: int) -> bool:
-        """Return whether to use the workers for this number of waiting states."""
+        """Return true if this number of waiting states is large enough to use the workers."""
         return self._size > 1 and waiting >= WORTH_WORKERS
 
     def expansions(
         self, states: Sequence[State], first: int, add: Callable[[State, int], int], check: Check = lambda: None
     ) -> Iterator[Expansion]:
-        """Yield the expansion of each state from number `first` on, in order. `states` may grow meanwhile."""
+        """Yield the successors of each state in order, beginning with number `first`. `states` may grow during the
+        loop.
+        """
         for other, number, answer in self._answers(_WorkerHandle.give, states, check, first):
             assert isinstance(answer, Successors)
             yield from other.expansions_of(answer, number, add)
 
     def needed(self, forks: Sequence[State], check: Check) -> Iterator[int | None]:
-        """Yield the number of votes that each state needs, as `ExtraVotes` returns it. Raises UndecidedError."""
+        """Yield the number of further votes that each state needs until all chains are equal. Raises UndecidedError."""
         for _, _, answer in self._answers(_WorkerHandle.give_forks, forks, check):
             assert isinstance(answer, NeededVotes)
             if answer.votes is None:
@@ -303,7 +312,7 @@ class Workers:
     def _answers(
         self, give: Give, states: Sequence[State], check: Check, first: int = 0
     ) -> Iterator[tuple[_WorkerHandle, int, Successors | NeededVotes]]:
-        """Yield each answer with its worker and the number of its first state, in order.
+        """Yield each answer in the order of the tasks, with its worker and the number of its first state.
 
         `states` may grow meanwhile.
         """
@@ -336,6 +345,8 @@ class Workers:
 
 
 def _answered(busy: Mapping[int, _WorkerHandle], *, wait_for_one: bool) -> list[int]:
-    """Return the answered tasks by the number of their first state. Empty if no answer arrives within WAIT_S."""
+    """Return the finished tasks, each as the number of its first state. The list is empty if none finishes within
+    WAIT_S seconds.
+    """
     ready = wait([other.connection for other in busy.values()], timeout=WAIT_S if wait_for_one else 0)
     return [number for number, other in busy.items() if other.connection in ready]

@@ -1,1 +1,1 @@
-"""The model of a proof: local and global states, and the steps that the real agents take in them."""
+"""The model of a proof: the states of one agent and of the swarm, and the steps that real agents take between them."""

@@ -1,4 +1,4 @@
-"""Explore each agent alone in the network `any`, with all messages that any agent can ever have sent.
+"""Explore each agent alone. It may receive every message that any agent can ever have sent (network model `any`).
 
 A message may be lost, duplicated, delayed for any time and overtaken. An agent can therefore receive each sent message
 at any moment, any number of times, and depends on other agents in no other way. The only exception: no agent can
@@ -33,7 +33,7 @@ Said = tuple[int, int]
 
 @dataclass
 class Collected:
-    """The collected figures, over all divisions of the blocks among the agents. `said` counts messages by sender."""
+    """The figures of an exploration of single agents. `said` counts the different messages of all senders."""
 
     bounds: Bounds
     states: int = 0
@@ -61,7 +61,7 @@ def collect(
     watch: Callable[[Progress], None] = lambda progress: None,
     keep: Callable[[LocalStates], None] = lambda local: None,
 ) -> Collected:
-    """Collect all local states and messages, or as many as memory and time allow, or up to the first flaw.
+    """Collect all agent states and messages, until a limit of memory or time is reached or a violation is found.
 
     `keep` is called with the local states of each division of the blocks.
     """
@@ -93,7 +93,7 @@ def collect(
 
 
 def divisions(agents: int, blocks: int, captured: int | None = None) -> Iterator[tuple[int, ...]]:
-    """Yield each division of the blocks: the agents that complete them in order.
+    """Yield each distribution of the blocks: a tuple with the agent that completes each block.
 
     Agents that are alike are interchangeable, except the captured one.
     """
@@ -109,7 +109,7 @@ def divisions(agents: int, blocks: int, captured: int | None = None) -> Iterator
 
 
 class _Division:
-    """The exploration of one division of the blocks among the agents."""
+    """The exploration of one distribution of the blocks among the agents."""
 
     def __init__(self, collected: Collected, makers: tuple[int, ...]) -> None:
         self._collected = collected
@@ -135,7 +135,7 @@ class _Division:
         """Number of states whose own actions have been explored."""
 
     def collect(self, began: float) -> Iterator[Progress]:
-        """Collect states and messages until no new ones appear."""
+        """Explore until no new states or messages appear. Yield the progress."""
         collected = self._collected
         earlier = collected.states
         for agent_id in self._by_agent:
@@ -171,7 +171,7 @@ class _Division:
                 busy |= self._lied_to(agent_id, states)
 
     def count(self) -> None:
-        """Add the figures of this division, complete or not, to those of all divisions."""
+        """Add the figures of this distribution to the totals, even if it is incomplete."""
         collected = self._collected
         collected.states += len(self._came_from)
         collected.looked_at += self._looked_at
@@ -196,7 +196,7 @@ class _Division:
             collected.shown.add("4")
 
     def _act(self, state: Alone) -> None:
-        """Explore the actions of an agent that need no message."""
+        """Explore the actions that an agent takes without a message, such as the expiry of a timer."""
         agent_id, local, zone, completed = state
         if self._known_flaw(local):
             return
@@ -227,7 +227,9 @@ class _Division:
             self._heard.hears(said[0], self.local.messages[said[1]])
 
     def _lied_to(self, agent_id: int, states: list[Alone]) -> bool:
-        """Give an agent all messages of the attacker in each of these states. Return whether any of them is new."""
+        """Deliver all messages of the attacker to an agent in each of these states. Return true if any message is
+        new.
+        """
         if self._heard is None:
             return False
         material, before = self._heard.material(agent_id), self._lied.get(agent_id)
@@ -252,7 +254,7 @@ class _Division:
         return self.local.known[local].flaw is not None
 
     def _named(self, message: int) -> frozenset[int]:
-        """Return the blocks that must be completed before a message that contains or implies them."""
+        """Return the blocks that must be complete before any agent can send this message."""
         named = self._names.get(message)
         if named is None:
             named = self._names[message] = self.local.blocks.named_in(self.local.messages[message])

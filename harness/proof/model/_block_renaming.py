@@ -1,4 +1,4 @@
-"""Find the blocks that a local state contains, and exchange them for other blocks.
+"""Find the blocks that an agent's state contains, and exchange them for other blocks.
 
 Agents compare blocks for equality. Only a tie of phase 2 (Algorithm 15) compares their ages. If any of two blocks may
 be the older one (`Bounds.clocks_any`), the identity of blocks makes no difference.
@@ -19,7 +19,7 @@ Completed = tuple[bytes, int, int]
 
 
 class Blocks:
-    """The known blocks and chains, by number and by hash."""
+    """An index of all known blocks and chains by number and by hash."""
 
     def __init__(self, inception: InceptionBlock, make: Callable[[int], Block]) -> None:
         self.numbers: dict[bytes, int] = {}
@@ -34,7 +34,7 @@ class Blocks:
         self._block = cache(make)
 
     def note_completed(self, blocks: Iterable[Completed]) -> None:
-        """Add blocks that were completed in this or another process."""
+        """Add blocks that an agent completed in this or in another process."""
         for block_hash, agent_id, ordinal in blocks:
             if block_hash not in self.makers:
                 self.makers[block_hash] = agent_id
@@ -42,11 +42,11 @@ class Blocks:
                 self.completed.append((block_hash, agent_id, ordinal))
 
     def completed_by(self, agent_id: int, ordinal: int) -> bytes:
-        """Return the hash of the block with this ordinal, which this agent has completed."""
+        """Return the hash of the block with this number, which this agent has completed."""
         return next(made for made, maker, number in self.completed if (maker, number) == (agent_id, ordinal))
 
     def in_words(self, block_hash: str) -> str:
-        """Return the name of a block for messages, by its hash."""
+        """Return the name of the block with this hash, for printed text."""
         ordinal = self.numbers.get(bytes.fromhex(block_hash))
         return f"#{ordinal}" if ordinal else block_hash[:12]
 
@@ -59,7 +59,8 @@ class Blocks:
         self._chains[chain_hash] = ordinals
 
     def named(self, digest: bytes) -> Ordinals:
-        """Return the ordinals of the blocks that a hash stands for: one block, or all blocks of a chain.
+        """Return the numbers of the blocks that belong to a hash: one block for a block hash, all blocks of the chain
+        for a chain hash.
 
         Empty for other hashes.
         """
@@ -67,14 +68,14 @@ class Blocks:
         return self._chains.get(digest, ()) if number is None else (number,)
 
     def named_in(self, message: Message) -> frozenset[int]:
-        """Return the ordinals of the blocks that a message contains or whose chain it names."""
+        """Return the numbers of the blocks that a message contains, or whose chain it mentions."""
         fields = (getattr(message, name) for name in message.__slots__)
         hashes = [field.block_hash if isinstance(field, Block) else field for field in fields]
         return frozenset().union(*(self.named(digest) for digest in hashes if isinstance(digest, bytes)))
 
     def of(self, snapshot: Snapshot) -> Ordinals:
-        """Yield the ordinals of the blocks in a state, in an order that is equal for states that differ only in their
-        blocks. An ordinal can occur repeatedly.
+        """Yield the numbers of the blocks in a state. The order is the same for all states that differ only in their
+        blocks. Numbers may repeat.
         """
         return tuple(dict.fromkeys(self._all(snapshot)))
 
@@ -92,7 +93,7 @@ class Blocks:
         yield from sorted(numbers[candidate] for candidate in candidates if candidate)
 
     def exchanged(self, snapshot: Snapshot, exchange: Mapping[int, int]) -> Snapshot:
-        """Return the state after an exchange of its blocks. `exchange` maps old ordinals to new ones."""
+        """Return the state after an exchange of its blocks. `exchange` maps old block numbers to new ones."""
         us = {self._block(old).timestamp_us: self._block(new).timestamp_us for old, new in exchange.items()}
 
         def block_of(block: Block) -> Block:

@@ -1,5 +1,5 @@
-"""Choose one order of the agents that represents all orders. Agents that are alike are interchangeable, and so are
-blocks.
+"""Choose one order of the agents to represent all equivalent orders, because equal agents and blocks are
+interchangeable.
 
 The order is chosen by the states of the agents and the relations of their timers, and never by the numbers of states
 and zones. It is therefore the same on all machines, and for any order of exploration.
@@ -21,7 +21,7 @@ Places = tuple[int, ...]
 
 
 class Ordered(NamedTuple):
-    """Agents in order, the zone with their timers in this order, and their previous places.
+    """Agents in their chosen order, their timers in this order, and the previous position of each agent.
 
     `blocks` has the previous ordinal of each block, from 1. It is empty if the blocks keep their ordinals.
     """
@@ -42,7 +42,9 @@ Above it, equivalent states may count as several states.
 
 
 class Order:
-    """Puts agents into their canonical order. `name_of` returns the ID that the agent at one place uses for another."""
+    """Puts agents into their canonical order. `name_of` returns the ID by which the agent at one position knows another
+    agent.
+    """
 
     def __init__(self, local: LocalStates, zones: Zones, name_of: Callable[[int, int], int]) -> None:
         self._as_they_are = tuple(range(local.bounds.agents))
@@ -83,7 +85,7 @@ class Order:
         return Ordered(agents, zone, places, blocks)
 
     def _blocks(self, agents: Sequence[int]) -> Ordinals:
-        """Return the ordinals of the agents' blocks in order of their occurrence.
+        """Return the numbers of the agents' blocks in the order in which they first occur.
 
         Empty if blocks keep their ordinals.
         """
@@ -92,7 +94,7 @@ class Order:
         return tuple(dict.fromkeys(chain.from_iterable(map(self._local.about, agents))))
 
     def _timers(self, locals_: Sequence[int]) -> list[range]:
-        """Return the timers of each agent in the zone, by place."""
+        """Return, for each agent, the range of its timers in the swarm's list of timers."""
         timers, first = [], 1
         for local in locals_:
             end = first if local == DEAD else first + len(self._local.known[local].running)
@@ -101,7 +103,9 @@ class Order:
         return timers
 
     def _orders(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range]) -> Iterator[Places]:
-        """Yield all orders of the agents by their descriptions. Agents with equal descriptions come in any order."""
+        """Yield all orders in which the descriptions of the agents ascend. Agents with equal descriptions appear in
+        every order.
+        """
         known, pattern = self._local.known, self._local.pattern
         bounds = self._zones.bounds(zone) if zone else [()]
         looks: list[tuple[Any, ...]] = [
@@ -137,11 +141,13 @@ class Order:
             yield tuple(place for group in chosen for place in group)
 
     def _are_one(self, group: Sequence[int], locals_: Sequence[int], timers: Sequence[range]) -> bool:
-        """Return whether agents are in the same local state, without timers."""
+        """Return true if these agents are in the same state and have no running timers."""
         return not timers[group[0]] and len({locals_[place] for place in group}) == 1
 
     def _with_blocks(self, locals_: Sequence[int], looks: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-        """Return the descriptions of the agents, extended by the other agents that share their blocks."""
+        """Return the descriptions of the agents, extended with the positions of the agents that hold the same
+        blocks.
+        """
         ranks = {look: rank for rank, look in enumerate(sorted(set(looks)))}
         where: dict[int, list[tuple[int, int]]] = defaultdict(list)
         for local, look in zip(locals_, looks, strict=True):
@@ -155,7 +161,7 @@ class Order:
     def _change_places_freely(
         self, group: Sequence[int], timers: Sequence[range], named: Sequence[Sequence[set[int]]]
     ) -> bool:
-        """Return whether agents that look alike differ only in their blocks.
+        """Return true if these agents with equal descriptions differ only in their blocks.
 
         Then they have no timers, and are in no tally or in the same ones.
         """
@@ -168,18 +174,18 @@ class Order:
         )
 
     def _named(self, local: int, place: int) -> list[set[int]]:
-        """Return, for each kind of tally, the places of its members in the state of the agent at `place`."""
+        """Return, for each kind of vote count, the positions of the agents that the agent at `place` has counted."""
         if local == DEAD:
             return [set() for _ in NAMES_OF_OTHERS]
         snapshot = self._local.known[local].snapshot
         return [{self._place_of(other, place) for other in snapshot[name]} for name in NAMES_OF_OTHERS]
 
     def _place_of(self, name: int, place: int) -> int:
-        """Return the place of the agent that the agent at `place` calls by this ID."""
+        """Return the position of the agent that the agent at `place` knows by this ID."""
         return name - 2 if name - 2 < place else name - 1
 
     def _looks(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places) -> tuple[Any, ...]:
-        """Return a key that distinguishes this order from others."""
+        """Return a key of this order of the agents. Different keys belong to different states."""
         new_place = {old: new for new, old in enumerate(places)}
         named = [
             [sorted(new_place[other] for other in part) for part in self._named(locals_[old], old)] for old in places
@@ -191,7 +197,7 @@ class Order:
         return named, about, [[matrix[i][j] for j in order] for i in order]
 
     def _renamed(self, local: int, new: int, places: Places) -> int:
-        """Return the local state of an agent at its new place, with the new IDs of the other agents."""
+        """Return the state of an agent at its new position, with the new IDs of the other agents."""
         if local == DEAD:
             return local
         if not self._local.known[local].names_others:
@@ -204,13 +210,13 @@ class Order:
 
 
 def _groups(looks: Sequence[Any]) -> list[list[int]]:
-    """Return the places of agents that look alike, in the order of their descriptions."""
+    """Return groups of agents with equal descriptions, as positions, in ascending order of their descriptions."""
     in_order = sorted(range(len(looks)), key=looks.__getitem__)
     return [list(group) for _, group in groupby(in_order, looks.__getitem__)]
 
 
 def _unlike(group: Sequence[int], locals_: Sequence[int]) -> Iterator[Places]:
-    """Yield all orders of these places that differ in the local states."""
+    """Yield all orders of these positions that lead to different sequences of states."""
     if not group:
         yield ()
     for first in {locals_[place]: place for place in reversed(group)}.values():

@@ -1,4 +1,4 @@
-"""The flaws that are visible in the state of one agent."""
+"""Find violations that are visible in the state of one agent."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from ucp.state import AgentState
 
 @dataclass(frozen=True, slots=True)
 class Flaw:
-    """A flaw: its kind and a sentence.
+    """A violation: its kind, and a sentence that describes it.
 
     The kind is a characteristic ("2", "3", "4"), "hang", "crash" or "steps". With an attacker it can also be "name" (an
     agent accepted a message in the name of another vehicle), "revoked" (of a revoked vehicle), or "honest" (a block in
@@ -27,7 +27,7 @@ FLAWS_OF_STEPS = ("crash", "steps", "name", "revoked")
 
 
 def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> Flaw | None:
-    """Return the flaw of an agent's state, or None.
+    """Return the violation in an agent's state, or None.
 
     `completed` maps each completed block hash to the agent that completed the block. Blocks in the name of the
     `captured` agent need not have been completed.
@@ -54,13 +54,13 @@ def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | N
 
 
 def is_deceived(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> bool:
-    """Return whether the agent holds a block in the name of the `captured` agent that this agent never completed."""
+    """Return true if the agent holds a block in the name of the captured agent that this agent never completed."""
     if captured is None:
         return False
     return any(maker == captured and made not in completed for made, maker in _makers(state).items())
 
 
 def _makers(state: AgentState) -> dict[bytes, int]:
-    """Return the makers of the blocks that an agent holds, by hash, as the blocks name them."""
+    """Return the author of each block that an agent holds, by block hash, as the blocks name them."""
     held = (*state.chain, *state.blocks_to_be_committed, *state.reconcile_stack)
     return {block.block_hash: block.agent_id for block in held}

@@ -1,4 +1,4 @@
-"""Global states and their successors.
+"""Compute the states of a whole swarm and their successors.
 
 A global state is a tuple of small numbers: the completed blocks, the remaining faults, the zone of the running timers,
 and the local states of the agents. If `bounds.alike`, agents that are alike are interchangeable, and one order of the
@@ -45,7 +45,8 @@ BLOCKS, LEFT, ZONE, AGENTS = 0, 1, 2, 3
 
 
 class Move(NamedTuple):
-    """One transition: its actions, its result, and the previous places of the agents.
+    """A transition between two states of the swarm: its actions, the new state, and the previous positions of the
+    agents.
 
     `wave` is the last round of received messages.
     """
@@ -61,7 +62,7 @@ class Move(NamedTuple):
 
 
 class _Outcome(NamedTuple):
-    """The agents after an instant.
+    """The states of all agents after one instant of simultaneous actions and all messages that they cause.
 
     `running` has the previous number of each running timer. The other fields describe how the outcome came about.
     """
@@ -73,8 +74,8 @@ class _Outcome(NamedTuple):
 
 
 class _Instant(NamedTuple):
-    """The outcomes of an instant for any zone: the expired timers, the completed blocks, the remaining faults, and the
-    agents.
+    """The results of one instant, independent of the exact timer values: expired timers, new blocks, remaining faults,
+    and agents.
     """
 
     ended: tuple[int, ...]
@@ -85,7 +86,7 @@ class _Instant(NamedTuple):
 
 
 class Swarm:
-    """The global states within `bounds`, and their successors.
+    """The states of a swarm within `bounds`, and the transitions between them.
 
     If `every_count`, all existing local states are explored: answers are received in each order although they are only
     counted, and counts are kept although they decide nothing.
@@ -111,11 +112,11 @@ class Swarm:
     # Actions of an instant
 
     def firsts(self, state: State) -> list[Action]:
-        """Return the actions of the timers that may expire next, one for each possible result."""
+        """Return the next possible timer expiries, one action for each possible result."""
         return [action for actions in self._firsts(state) for action in actions]
 
     def _firsts(self, state: State) -> list[list[Action]]:
-        """Return the actions of the timers that may expire next: a list for each timer."""
+        """Return the next possible timer expiries: for each timer, a list of actions with the possible results."""
         running = self._running(state[AGENTS:])
         if not self.bounds.timers_any:
             running = tuple([running[first - 1] for first in self.zones.firsts(state[ZONE])])
@@ -125,7 +126,7 @@ class Swarm:
         ]
 
     def alternatives(self, state: State) -> Iterator[tuple[Action, frozenset[Action]]]:
-        """Yield each timer that may expire next, with all timers that must expire at the same moment, itself included.
+        """Yield each timer that may expire next, with the set of all timers that must expire at the same moment.
 
         The ages of blocks are chosen for all results, because no agent can choose the older one of two blocks.
         """
@@ -137,8 +138,8 @@ class Swarm:
                 yield actions[0], frozenset(actions)
 
     def ending(self, state: State) -> Iterator[Actions]:
-        """Yield all sets of timers that may expire in one instant, with at most one timer per agent. Some sets may be
-        impossible.
+        """Yield all sets of timers that may expire at the same moment, with at most one timer per agent. Some sets may
+        be impossible.
 
         Without crossing, timers expire one by one.
         """
@@ -153,8 +154,7 @@ class Swarm:
                         yield actions
 
     def actions(self, state: State, ending: Iterable[Actions] | None = None) -> Iterator[Actions]:
-        """Yield all sets of actions that may happen in one instant: simultaneous timers, and blocks completed
-        meanwhile.
+        """Yield all sets of actions that may happen at the same moment: expiring timers, and the completion of blocks.
 
         `ending` has the sets of timers, if they are known.
         """
@@ -185,7 +185,9 @@ class Swarm:
             yield from self._of_the_captor(self.captor, state)
 
     def _of_the_captor(self, captor: Attacker, state: State) -> Iterator[Actions]:
-        """Yield the actions of the attacker: the capture, and then messages one after the other, to any receivers."""
+        """Yield the actions of the attacker: first the capture of a vehicle, then each forged message with any set of
+        receivers.
+        """
         assert self.bounds.captured is not None, "it has somebody's keys"
         if state[LEFT] >> ONCE.index("captured") & 1:
             yield (Action(self.bounds.captured - 1, "captured"),)
@@ -198,7 +200,7 @@ class Swarm:
         return self.coincidences(state, actions) <= state[LEFT] % LOSSES // COINCIDENCES
 
     def coincidences(self, state: State, actions: Sequence[Action]) -> int:
-        """Return the number of coincidences that are needed for these actions to happen next, in one instant."""
+        """Return how many independent events must coincide so that these actions happen next and at the same moment."""
         if self.bounds.timers_any:
             return 0
         ended = self._ended(state[AGENTS:], actions)
@@ -211,7 +213,7 @@ class Swarm:
         return self.zones.coincidences(state[ZONE], ended) + len(actions) - len(ended)
 
     def _unlike(self, state: State, choices: Iterable[tuple[int, ...]]) -> Iterator[tuple[int, ...]]:
-        """Yield one of all equivalent choices of agents.
+        """Yield one representative of each group of equivalent choices of agents.
 
         Idle agents in the same local state are equivalent, unless a tally distinguishes them.
         """
@@ -230,7 +232,9 @@ class Swarm:
     # Results of an instant
 
     def after(self, state: State, actions: Actions, lossy: bool) -> Iterator[State]:
-        """Yield the possible states after these actions in one instant. None if their timers cannot expire at once."""
+        """Yield the possible states after these simultaneous actions. There are none if their timers cannot expire
+        together.
+        """
         key = state[AGENTS:], actions, self._most_lost(state, lossy)
         instant = self._known.get(key)
         if instant is None:
@@ -244,7 +248,7 @@ class Swarm:
                 yield (state[BLOCKS] + instant.completed, still, there.zone, *there.agents)
 
     def moves(self, state: State, actions: Actions, lossy: bool) -> Iterator[Move]:
-        """Yield the transitions to the possible states after these actions."""
+        """Yield the transitions that these simultaneous actions can cause."""
         instant = self._instant(state[AGENTS:], actions, self._most_lost(state, lossy), tell=True)
         if self._can_be(state, instant):
             left = self._left(state, actions, instant)
@@ -255,13 +259,15 @@ class Swarm:
                 yield Move(actions, after, there.places, outcome.way.wave, outcome.started, there.blocks)
 
     def _most_lost(self, state: State, lossy: bool) -> int:
-        """Return the maximum number of messages that may be lost in an instant."""
+        """Return the maximum number of messages that may be lost at one moment."""
         if not lossy:
             return 0
         return ANY_NUMBER if self.bounds.losses is None else state[LEFT] // LOSSES
 
     def _can_be(self, state: State, instant: _Instant) -> bool:
-        """Return whether these timers can expire at once, before all others. Each of them must be able to by itself."""
+        """Return true if these timers can expire together and before all others. Each must already be able to expire
+        first alone.
+        """
         if len(instant.ended) < 2 or self.bounds.timers_any:
             return True
         return self.zones.after(state[ZONE], instant.ended, ()) is not None
@@ -281,7 +287,7 @@ class Swarm:
                 yield self._order.of(outcome.agents, zone)
 
     def _left(self, state: State, actions: Sequence[Action], instant: _Instant) -> int:
-        """Return the remaining faults after these actions."""
+        """Return the number of faults that may still occur after these actions."""
         left = (state[LEFT] & instant.left) - instant.lies * LIES
         if self.bounds.coincidences:
             left -= self.coincidences(state, actions) * COINCIDENCES
@@ -305,7 +311,7 @@ class Swarm:
         )
 
     def _running_after(self, at: dict[tuple[int, int], int], there: Agents) -> tuple[int, ...]:
-        """Return the previous number of each running timer.
+        """Return, for each timer that runs after a step, its number before the step.
 
         For a timer that was just started, return -1 minus its duration.
         """
@@ -322,35 +328,37 @@ class Swarm:
         return tuple(running)
 
     def _ended(self, locals_: tuple[int, ...], actions: Sequence[Action]) -> tuple[int, ...]:
-        """Return the expired timers, numbered from 1, in the order of the zone."""
+        """Return the numbers of the expired timers in the list of the swarm's timers, counted from 1."""
         ended = [(action.place, action.number) for action in actions if action.what == "timer"]
         running = self._running(locals_)
         return tuple(sorted([running.index(timer) + 1 for timer in ended]))
 
     def _running_of(self, locals_: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
-        """Return (place, timer) of all running timers, in the order of the zone."""
+        """Return all running timers of the swarm in order, each as (position of the agent, timer)."""
         known = self.local.known
         return tuple(
             [(place, timer) for place, local in enumerate(locals_) if local != DEAD for timer in known[local].running]
         )
 
     def name_of(self, other: int, place: int) -> int:
-        """Return the ID that the agent at `place` uses for the one at `other`."""
+        """Return the ID by which the agent at position `place` knows the agent at position `other`."""
         return self._instants.name_of(other, place)
 
     def order_matters(self, local: int, place: int, wave: Wave, heard: Sequence[int]) -> bool:
-        """Return whether the order of the received messages of the wave matters to the agent at `place`."""
+        """Return true if the state of the agent at `place` depends on the order of the messages that it receives in
+        this round.
+        """
         return self._instants.order_matters(local, place, wave, heard)
 
     # Properties of a state
 
     def flaw(self, state: State) -> Flaw | None:
-        """Return the flaw of one of the agents, or None."""
+        """Return the violation in the state of one of the agents, or None."""
         known = self.local.known
         return next((flaw for local in state[AGENTS:] if local != DEAD and (flaw := known[local].flaw)), None)
 
     def violated(self, state: State) -> Iterator[str]:
-        """Return the characteristics that an attacker has violated without a flaw of the agents.
+        """Yield the characteristics that an attacker has violated although all agents follow the protocol.
 
         An agent accepted a message that the vehicle never sent, or holds a block in its name that it never completed.
         """
@@ -363,10 +371,10 @@ class Swarm:
         return all(local == DEAD or self.local.known[local].idle for local in state[AGENTS:])
 
     def chains(self, state: State) -> set[tuple[int, ...]]:
-        """Return the different chains of the agents."""
+        """Return the different chains that the agents hold."""
         return {self.local.known[local].chain for local in state[AGENTS:] if local != DEAD}
 
 
 def _lies(state: State) -> int:
-    """Return the number of remaining lies."""
+    """Return the number of forged messages that the attacker may still send."""
     return state[LEFT] % COINCIDENCES // LIES

@@ -1,4 +1,5 @@
-"""Compute the outcomes of an instant: timers expire and blocks are completed, and then all messages are received.
+"""Compute the possible results of one moment: timers expire or blocks are completed, and then all messages are
+received.
 
 Some agents act before they receive messages of the others, so their messages cross. The messages are received, in any
 order of their senders. Then the answers to them are received, and so on until no agent sends a message. A lossy
@@ -33,7 +34,7 @@ MOST_SEEN = 500
 
 
 class Action(NamedTuple):
-    """An action of an agent: "timer" with its number, "complete" with the block's ordinal, or a fault.
+    """An action of one agent: "timer" with the timer's number, "complete" with the block's number, or a fault.
 
     It can also be an action of the attacker: the agent is "captured", or receives a "lie", a message with this number.
     If a timer has several possible results because any block may be the older one, `way` selects the result.
@@ -50,14 +51,15 @@ Actions = tuple[Action, ...]
 
 
 class Agents(NamedTuple):
-    """The local states of the agents, and the timers that each has started in this instant."""
+    """The states of all agents, and the timers that each agent started in the present moment."""
 
     locals: tuple[int, ...]
     started: tuple[Started, ...]
 
 
 class Wave(NamedTuple):
-    """One round of messages: the sent messages as (place of the sender, message), and the received ones.
+    """A round of messages: the sent messages as (position of the sender, message), and the messages that each agent
+    received.
 
     `heard` has, for each place, the indices of the received messages in `air`, in order.
     """
@@ -68,7 +70,7 @@ class Wave(NamedTuple):
 
 
 class Way(NamedTuple):
-    """The last round of messages that leads to an outcome.
+    """The last round of messages that leads to a result.
 
     `lost` is the number of lost messages, counted for each receiver. It is 0 if losses are not counted.
     """
@@ -93,7 +95,7 @@ _Outcome = tuple[Step, tuple[int, ...]]
 
 
 class Instants:
-    """Computes and caches the outcomes of instants."""
+    """Computes and caches the possible results of simultaneous actions."""
 
     def __init__(self, local: LocalStates, bounds: Bounds, *, every_order: bool = False) -> None:
         self._local = local
@@ -111,18 +113,21 @@ class Instants:
         ]
 
     def name_of(self, other: int, place: int) -> int:
-        """Return the ID that the agent at `place` uses for the one at `other`."""
+        """Return the ID by which the agent at position `place` knows the agent at position `other`."""
         return self._names[place][other]
 
     def order_matters(self, local: int, place: int, wave: Wave, heard: Sequence[int]) -> bool:
-        """Return whether the order of the received messages of the wave matters to the agent at `place`."""
+        """Return true if the state of the agent at `place` depends on the order of the messages that it receives in
+        this round.
+        """
         reached = tuple((self.name_of(wave.air[number][0], place), wave.air[number][1]) for number in sorted(heard))
         return len(self._outcomes_of(local, reached, lossy=False, answered=wave.before is not None)) > 1
 
     def outcomes(
         self, locals_: tuple[int, ...], actions: Sequence[Action], most_lost: int, *, tell: bool
     ) -> dict[Agents, Way]:
-        """Yield the outcomes of the actions, each with the fewest losses.
+        """Return the possible results of these actions. For each result, keep the rounds of messages with the fewest
+        losses.
 
         The rounds of messages are included if requested.
         """
@@ -191,7 +196,7 @@ class Instants:
     def _choices(
         self, known: dict[_Agent, list[_Choice]], agent: _Agent, said: _Said, lossy: bool, answered: bool
     ) -> list[_Choice]:
-        """Return the possible results for one agent, and cache them."""
+        """Return the possible results of a round of messages for one agent, and cache them."""
         place, local, before = agent
         if local == DEAD:
             return [(DEAD, (), (), (), 0)]
@@ -211,7 +216,7 @@ class Instants:
         return choices
 
     def _still(self, before: Started, step: Step) -> Started:
-        """Return the timers that an agent has started in this instant and that still run."""
+        """Return the timers that an agent started in the present moment and that still run."""
         if not before and not step.started:
             return ()
         if step.local == DEAD:
@@ -223,7 +228,9 @@ class Instants:
         return tuple([item for item in started if item[0] in running])
 
     def _outcomes_of(self, local: int, heard: ReceivedMessages, lossy: bool, answered: bool) -> list[_Outcome]:
-        """Return the outcomes of the messages that reach an agent, each with an order of them, as indices."""
+        """Return the possible steps of an agent that receives these messages, each with an order of messages that leads
+        to it.
+        """
         key = local, heard, lossy, answered
         outcomes = self._outcomes.get(key)
         if outcomes is None:
@@ -253,10 +260,10 @@ class Instants:
         return outcomes
 
     def _when_counting(self, local: int, heard: ReceivedMessages, lossy: bool) -> list[_Outcome] | None:
-        """Return the outcomes if the agent only counts the messages, each of a different sender. Their order makes no
-        difference then.
+        """Return the possible steps if the agent only counts these messages, so that their order has no effect.
+        Otherwise return None.
 
-        None if it does more. Whether an answer counts depends on parts of the state that are no tally, and on whether
+        Whether an answer counts depends on parts of the state that are no tally, and on whether
         its sender is in the tally already (docs/explanation/proof.md).
         """
         hear, only_counts, lets_be = self._local.hear, self._local.only_counts, self._local.lets_be
@@ -323,8 +330,8 @@ class Instants:
             yield step, (*way, *others)
 
     def _that_matter(self, local: int, heard: ReceivedMessages) -> list[int]:
-        """Return the indices of the messages that may change the agent or cause an answer, after any of the other
-        messages.
+        """Return the indices of the messages that may change the agent or cause an answer, possibly after some of the
+        other messages.
 
         All of them, if a wrong agent reaches more and more states by the same messages.
         """
@@ -345,21 +352,21 @@ class Instants:
 
 
 def _keep(ways: dict[Agents, Way], there: Agents, way: Way) -> None:
-    """Keep the way to an outcome with fewer losses."""
+    """Store this way to a result if it is the first one, or loses fewer messages than the stored one."""
     known = ways.get(there)
     if known is None or way.lost < known.lost:
         ways[there] = way
 
 
 def _keep_fullest(ways: dict[_Key, tuple[int, ...]], there: _Key, way: tuple[int, ...]) -> None:
-    """Keep the way to an outcome with more different received messages."""
+    """Store this way to a result if it is the first one, or receives more different messages than the stored one."""
     known = ways.get(there)
     if known is None or len(set(way)) > len(set(known)):
         ways[there] = way
 
 
 def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[_Choice, ...]]:
-    """Yield all combinations with at most this number of losses."""
+    """Return all combinations of the agents' choices that lose at most this number of messages in all."""
     combined: list[tuple[int, tuple[_Choice, ...]]] = [(0, ())]
     for of_one in choices:
         combined = [
@@ -372,7 +379,9 @@ def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[
 
 
 def _is_covered(step: Step, outcomes: Sequence[_Outcome]) -> bool:
-    """Return whether another outcome is equal except for more sent messages. All receivers may lose these."""
+    """Return true if another possible step differs only by more sent messages. The network may lose these, so the
+    result is covered.
+    """
     return any(
         other.local == step.local
         and other.started == step.started
@@ -383,6 +392,6 @@ def _is_covered(step: Step, outcomes: Sequence[_Outcome]) -> bool:
 
 
 def _is_part(some: tuple[int, ...], of: tuple[int, ...]) -> bool:
-    """Return whether `of` contains the elements of `some` in order."""
+    """Return true if `of` contains the elements of `some` in the same order."""
     rest = iter(of)
     return all(message in rest for message in some)

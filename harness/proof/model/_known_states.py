@@ -1,4 +1,4 @@
-"""The known local states by number. Each state is examined once, when it gets its number.
+"""Number all known states of single agents. Each state is examined once, when it gets its number.
 
 A local state is the whole state of a `ucp.agent.Agent` (`_snapshot.py`).
 """
@@ -28,7 +28,7 @@ WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us":
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """A local state of the agent with this ID.
+    """A known state of the agent with this ID.
 
     `waits` is true if the agent reconciles. `chain` has the numbers of its chain's blocks. `deceived` is true if it
     holds a block in the captured vehicle's name that this vehicle never completed.
@@ -51,7 +51,7 @@ class Known:
 
 
 class KnownStates:
-    """All known local states.
+    """An index of all known states of single agents.
 
     If `bounds.reduced`, parts of the state that no handler reads before they are written again count as initial.
     docs/explanation/proof.md explains why this is sound.
@@ -70,7 +70,7 @@ class KnownStates:
         self._renamed: dict[tuple[int, Names], int] = {}
 
     def number(self, agent_id: int, state: AgentState, taken: Snapshot, flaw: Flaw | None) -> int:
-        """Return the number of an agent's state. `taken` is its snapshot, made of interned parts."""
+        """Return the number of an agent's state. `taken` is its snapshot, in which equal parts are shared."""
         snapshot = taken
         if self.bounds.reduced:
             forgotten = WHAT_ONLY_CHECKS_READ | dead(state)
@@ -100,7 +100,7 @@ class KnownStates:
         return number
 
     def with_tallies(self, local: int, tallies: Snapshot) -> int:
-        """Return the local state with other values in these tallies."""
+        """Return the number of the state that has other vote counts but is otherwise equal."""
         known = self.known[local]
         snapshot = known.snapshot | {name: self._parts.part(name, value) for name, value in tallies.items()}
         key = self._parts.key(known.agent_id, known.flaw, snapshot)
@@ -114,7 +114,7 @@ class KnownStates:
     # Names of other agents
 
     def renamed(self, local: int, names: Names) -> int:
-        """Return the local state after a renaming of the other agents."""
+        """Return the number of the state in which the other agents have new IDs."""
         if not self.known[local].names_others or self.known[local].flaw is not None:
             return local
         key = local, names
@@ -127,12 +127,12 @@ class KnownStates:
         return number
 
     def renamed_back(self, local: int, names: Names) -> int:
-        """Return the local state before it was `renamed` with these names."""
+        """Return the number of the state before it was `renamed` with these IDs."""
         return self.renamed(local, _back(names))
 
     def names_in_order(self, local: int, sender: int) -> Names | None:
-        """Return the names that put the other agents in order: those in tallies first, then the sender. None if they
-        are in order.
+        """Return new IDs for the other agents, so that counted agents come first and the sender follows. Return None if
+        no change is needed.
 
         If IDs make no difference, the behaviour of an agent is the same except for these names
         (docs/explanation/proof.md).
@@ -145,7 +145,8 @@ class KnownStates:
         return None if tuple(in_order) == self.others else _back(tuple(in_order))
 
     def first_names(self, local: int, senders: Sequence[int]) -> Names | None:
-        """Return the names that make the senders the first of the other agents, in their order. None if they are.
+        """Return new IDs for the other agents, so that these senders come first in their order. Return None if no
+        change is needed.
 
         It is also None if the agent already distinguishes other agents in its tallies.
         """
@@ -156,11 +157,11 @@ class KnownStates:
         return None if in_order == self.others else _back(in_order)
 
     def _names_others(self, snapshot: Snapshot) -> bool:
-        """Return whether the state distinguishes some of the other agents from the rest."""
+        """Return true if the state contains the ID of any other agent."""
         return any(0 < len(snapshot[name]) < len(self.others) for name in NAMES_OF_OTHERS)
 
 
 def _back(names: Names) -> Names:
-    """Return the names that undo a renaming."""
+    """Return the IDs that undo a renaming of agents."""
     before = {name: other for other, name in enumerate(names, FIRST_OTHER)}
     return tuple(before[name] for name in sorted(names))

@@ -1,4 +1,4 @@
-"""Compute the step of the real agent for each local state and input, once, and cache it.
+"""Compute and cache the step that the real agent takes for each of its states and each input.
 
 To compute a step, the agent is put into the state and given the input, and its new state is taken. This module contains
 no protocol logic.
@@ -45,7 +45,7 @@ COUNTED = ("reconciles", "sent", "chain_changed_at")
 
 
 class LocalStates(KnownStates):
-    """The known local states, and the steps between them."""
+    """The known states of single agents, and the steps between them."""
 
     def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
         self.agents = Agents(bounds)
@@ -84,7 +84,7 @@ class LocalStates(KnownStates):
     # Steps
 
     def hear(self, local: int, sender: int, message: int) -> Step:
-        """Return the step of an agent that receives a message. `sender` is the sender's ID for this agent."""
+        """Return the step of an agent that receives a message. `sender` is the ID by which it knows the sender."""
         key = local, sender, message
         step = self._steps.get(key)
         if step is None:
@@ -99,7 +99,7 @@ class LocalStates(KnownStates):
         return step
 
     def lets_be(self, local: int, sender: int, message: int) -> bool:
-        """Return whether a message has no effect on the agent."""
+        """Return true if the message has no effect on the agent."""
         if self._nameless and not self.known[local].names_others:
             sender = FIRST_OTHER  # it is one to the agent who says it
         key = local, sender, message
@@ -110,7 +110,7 @@ class LocalStates(KnownStates):
         return lets_be
 
     def only_counts(self, local: int, sender: int, message: int) -> bool:
-        """Return whether the agent only counts or ignores a message."""
+        """Return true if the agent ignores the message, or only counts it."""
         key = local, sender, message
         counts = self._counts.get(key)
         if counts is None:
@@ -125,11 +125,11 @@ class LocalStates(KnownStates):
         return counts
 
     def end_timer(self, local: int, timer: int, way: int = 0) -> Step:
-        """Return the step of an agent whose timer expires, with one of the results of `ends`."""
+        """Return the step of an agent whose timer expires. `way` selects one of the possible results."""
         return self.ends(local, timer)[way].step
 
     def ends(self, local: int, timer: int) -> list[End]:
-        """Return the possible results of a timer's expiry.
+        """Return the possible results of the expiry of a timer.
 
         There are several only if the agent compares the ages of blocks and any block may be the older one.
         """
@@ -147,7 +147,8 @@ class LocalStates(KnownStates):
         return ends
 
     def older(self, local: int, timer: int, way: int) -> tuple[int, frozenset[int]]:
-        """Return the block that must be older than others for this result of a timer. 0 is the inception block.
+        """Return the block that must be older than other blocks for this result of a timer, with these other blocks. 0
+        is the inception block.
 
         There are no others if the agent does not compare ages.
         """
@@ -164,7 +165,7 @@ class LocalStates(KnownStates):
         return asked[oldest], frozenset(asked.values()) - {asked[oldest]}
 
     def complete(self, local: int, ordinal: int) -> Step:
-        """Return the step of an agent that completes the block with this ordinal."""
+        """Return the step of an agent that completes the block with this number."""
         key = local, -2, ordinal
         step = self._steps.get(key)
         if step is None:
@@ -172,7 +173,7 @@ class LocalStates(KnownStates):
         return step
 
     def reboot(self, local: int) -> Step:
-        """Return the step of an agent that has a brown-out and continues from its disk."""
+        """Return the step of an agent that loses power and restarts from its disk."""
         key = local, -3, 0
         step = self._steps.get(key)
         if step is None:
@@ -181,7 +182,7 @@ class LocalStates(KnownStates):
         return step
 
     def lie(self, local: int, message: int) -> Step:
-        """Return the step of an agent that receives a datagram of the attacker through the security gate."""
+        """Return the step of an agent that receives an encrypted datagram from the attacker."""
         key = local, -4, message
         step = self._steps.get(key)
         if step is None:
@@ -197,8 +198,8 @@ class LocalStates(KnownStates):
         return step
 
     def _got_in(self, local: int, message: int) -> Flaw | None:
-        """Return the kind of a message that the agent must not accept but accepts: of a revoked vehicle, in another
-        name, or with another's block.
+        """Return a violation if the agent accepts a forged message: of an excluded vehicle, in another vehicle's name,
+        or with another vehicle's block.
         """
         known, said = self.known[local], self.messages[message]
         revoked = self.agents.revoked[known.agent_id]
@@ -213,17 +214,17 @@ class LocalStates(KnownStates):
         return None
 
     def _sealed(self, message: int) -> bytes:
-        """Return a new datagram of the attacker with this message."""
+        """Return a new encrypted datagram of the attacker with this message."""
         said = self.messages[message]
         genuine = type(said) in CARRY_A_BLOCK and said.block.block_hash in self.blocks.makers  # type: ignore[union-attr]
         return self.agents.gate.sealed(said, NOW_S, genuine=genuine)
 
     def state(self, local: int) -> AgentState:
-        """Return the complete state of a local state. It is valid until the next step is computed."""
+        """Return the agent in this state. The object is valid until the next step is computed."""
         return self._restored(local).state
 
     def inputs(self) -> Iterator[tuple[int, Message | str | None, Step]]:
-        """Yield each local state with each input that it got, and the resulting step.
+        """Yield each known state with each input that was tried in it, and the resulting step.
 
         The input is a received message, the name of an expired timer, or None for a completed block.
         """
@@ -248,7 +249,7 @@ class LocalStates(KnownStates):
         flaw: Flaw | None = None,
         to_reference: Give | None = None,
     ) -> Step:
-        """Compute a step. `to_reference` gives the reference an input that the gate opens for the agent."""
+        """Compute a step of the agent. `to_reference` gives the same input to the reference, in decrypted form."""
         self.steps += 1
         before = self.known[local]
         agent = self.agents.new(before.agent_id) if boots else self._restored(local)
@@ -297,7 +298,7 @@ class LocalStates(KnownStates):
     def _check_counts(
         self, agent_id: int, before: Snapshot, give: Give, after: Snapshot, sent: tuple[int, ...]
     ) -> None:
-        """Raise UncoveredError if the step differs after the agent has counted more reconciles or messages."""
+        """Raise UncoveredError if the step differs when the agent has counted more reconciles or messages."""
         for count in OTHER_COUNTS:
             agent = self._counting[agent_id]
             put_back(agent, before)
@@ -316,7 +317,7 @@ class LocalStates(KnownStates):
                 )
 
     def message(self, message: Message) -> int:
-        """Return the number of a message."""
+        """Return the number that stands for this message."""
         number = self._message_numbers.setdefault(message, len(self.messages))
         if number == len(self.messages):
             self.messages.append(message)
@@ -325,7 +326,7 @@ class LocalStates(KnownStates):
     # Blocks
 
     def pattern(self, local: int) -> int:
-        """Return the local state that represents all states that differ only in their blocks."""
+        """Return a state that represents all states that differ only in their blocks."""
         if not self.bounds.blocks_alike or local == DEAD:
             return local
         pattern = self._patterns.get(local)
@@ -334,7 +335,9 @@ class LocalStates(KnownStates):
         return pattern
 
     def about(self, local: int) -> Ordinals:
-        """Return the ordinals of the blocks of a state, each once. The order is equal for all states of one pattern."""
+        """Return the numbers of the blocks in a state, each once. The order is the same for all states that differ only
+        in their blocks.
+        """
         about = self._about.get(local)
         if about is None:
             nothing = local == DEAD or self.known[local].flaw is not None
@@ -342,7 +345,7 @@ class LocalStates(KnownStates):
         return about
 
     def exchanged(self, local: int, blocks: Ordinals) -> int:
-        """Return the local state after its blocks (`about`) are exchanged for these."""
+        """Return the state in which these blocks replace the blocks that `about` lists."""
         if blocks == self.about(local):
             return local
         key = self.pattern(local), blocks
@@ -362,7 +365,7 @@ class LocalStates(KnownStates):
     # States
 
     def settled(self, local: int) -> int:
-        """Return the local state with reduced tallies, after all answers have arrived or are lost."""
+        """Return the state with simplified vote counts, for the time after all answers have arrived or are lost."""
         return self._tallies.settled(local)
 
     def _intern(
@@ -375,8 +378,8 @@ class LocalStates(KnownStates):
         *,
         keep: bool = True,
     ) -> int:
-        """Return the number of an agent's state. `taken` is its snapshot, and `before` the number of its state before
-        the step.
+        """Store an agent's state and return its number. `taken` is its snapshot, and `before` the number of the state
+        before the step.
 
         If `keep`, the agent gets further inputs in this state.
         """
@@ -386,7 +389,7 @@ class LocalStates(KnownStates):
         return self.number(agent_id, agent.state, snapshot, flaw)
 
     def content(self, local: int) -> Content:
-        """Return the definition of a local state for another process."""
+        """Return the definition of a state, which another process can read."""
         known = self.known[local]
         flaw = known.flaw if known.flaw is not None and known.flaw.kind in FLAWS_OF_STEPS else None
         initiated = self.blocks.named(known.snapshot["top_chain_hash_at_initiation"])

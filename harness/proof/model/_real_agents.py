@@ -1,4 +1,4 @@
-"""The real agents. They are put into the explored states and get inputs there."""
+"""Put real agents into the explored states, and give them inputs."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,7 +24,7 @@ MOST_AT_ONCE = 100
 
 
 class Agents:
-    """One agent for each ID on the roster. With a captured vehicle they are secured agents.
+    """One real agent for each ID. If a vehicle is captured, they are agents that check signatures.
 
     If agents are `nameless`, each has its own settings, and the ID of the first agent.
     """
@@ -43,12 +43,14 @@ class Agents:
 
     @property
     def gate(self) -> SecurityGate:
-        """The security gate. A vehicle must be captured."""
+        """The keys of the mission and of the attacker. Only valid if a vehicle is captured."""
         assert self._gate is not None, "a vehicle is captured"
         return self._gate
 
     def new(self, agent_id: int, after_each: Callable[[], None] | None = None, *, revoked: bool = False) -> Agent:
-        """Return a new agent. It traces its handler runs if `after_each` is to be called after each."""
+        """Return a new agent. If `after_each` is given, it is called after each handler run, and the agent writes
+        traces.
+        """
         handlers = wrong_handlers(self._bounds.quirks, Random(0))
         if after_each is not None:
             all_handlers = HANDLERS | {handler.name: handler for handler in handlers}
@@ -59,17 +61,17 @@ class Agents:
         return make(own_id, self._roster, INITIAL_DATA, settings, handlers=handlers, tracing=tracing)
 
     def put_into(self, agent_id: int, snapshot: Snapshot) -> Agent:
-        """Put an agent into a state, and return it."""
+        """Put the agent with this ID into a state, and return it."""
         agent = self.by_id[agent_id]
         put_back(agent, snapshot, self._left_in.pop(agent_id, None))
         return agent
 
     def leave_in(self, agent_id: int, snapshot: Snapshot) -> None:
-        """Note that the agent is in this state, until it is put into another."""
+        """Record that the agent is now in this state, so that the next change of its state can be smaller."""
         self._left_in[agent_id] = snapshot
 
     def made(self, ordinal: int) -> Block:
-        """Return the block that an agent completes as the block with this ordinal."""
+        """Return the block that an agent completes as block number `ordinal`."""
         agent = self.new(FIRST)
         log(agent, ordinal)
         if agent.state.current_block:
@@ -79,7 +81,7 @@ class Agents:
 
 
 def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHandler[Any]:
-    """Return a handler that runs this one and then calls `after`."""
+    """Return a handler that runs the given one and then calls `after`."""
 
     def run(*inputs: Any) -> str:
         branch = handler.run(*inputs)
@@ -90,7 +92,7 @@ def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHand
 
 
 def log(agent: Agent, ordinal: int) -> None:
-    """Log events until the block with this ordinal is complete."""
+    """Log events on an agent until the block with this number is complete."""
     completed = len(agent.state.completed)
     data = bytes(min(MAX_EVENT_BYTES, agent.state.settings.max_event_bytes) - EVENT_HEADER_BYTES)
     for number in range(MOST_AT_ONCE):
@@ -100,7 +102,9 @@ def log(agent: Agent, ordinal: int) -> None:
 
 
 def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
-    """End a timer. `oldest` becomes the oldest candidate of phase 2, except for the inception block."""
+    """End a timer of an agent. `oldest` becomes the oldest candidate of reconcile phase 2, except for the inception
+    block.
+    """
     if oldest is not None:
         counted = agent.state.reconcile_response_dictionary[oldest]
         counted[1] = min(counted[1], 1)
@@ -108,7 +112,7 @@ def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
 
 
 def end_at_once(agent: Agent) -> str | None:
-    """End the timers that expire before any message can arrive. Return the exception of a handler as text, or None."""
+    """End the timers that expire before any message can arrive. Return the text of a handler's exception, or None."""
     try:
         for _ in range(MOST_AT_ONCE):
             soon = [t for t in agent.state.timers if t.deadline is not None and t.deadline <= NOW_S + AT_ONCE_S]
@@ -121,7 +125,7 @@ def end_at_once(agent: Agent) -> str | None:
 
 
 def is_heard(agent: Agent, datagram: bytes, before: Snapshot) -> bool:
-    """Return whether a datagram has any effect in this state. The agent should drop it."""
+    """Return true if a datagram, which the agent should drop, changes its state."""
     dropped = agent.dropped.total()
     agent.receive_datagram(datagram, NOW_S)
     unchanged = all(value is before[name] for name, value in take(agent, before).items())

@@ -1,4 +1,4 @@
-"""Comparison of one step of an agent with the step of the independent reference.
+"""Compare one step of an agent with the same step of the independent reference implementation.
 
 The reference is put into the state of the agent and given the same input. Each step is therefore judged by itself, even
 a wrong step without consequences. With the core in use this compares core and reference in every state within the
@@ -27,14 +27,14 @@ Make = Callable[[int, Callable[[], None]], Agent]
 
 
 class _Run(NamedTuple):
-    """A handler run, and the state after it."""
+    """A handler run, and the state of the agent after it."""
 
     run: HandlerRun
     left: tuple[Any, ...]
 
 
 class Reference:
-    """The reference in the place of each agent within the bounds."""
+    """The reference implementation, as the counterpart of each agent within the bounds."""
 
     def __init__(self, bounds: Bounds, make: Make) -> None:
         self._bounds = bounds
@@ -50,7 +50,7 @@ class Reference:
         to_reference: Give,
         name_of: Callable[[str], str],
     ) -> tuple[str, str] | None:
-        """Return the handler and a sentence if the agent's step is not that of the reference, otherwise None.
+        """Return the handler and a sentence if the agent's step differs from the reference's step, otherwise None.
 
         `before` is the state in which the agent was given the input, None if it had just been switched on. `give` gives
         the input to an agent, `to_reference` to the reference. `name_of` returns the name of a block, given its hash.
@@ -79,7 +79,7 @@ class Reference:
     def _reference(
         self, agent_id: int, before: Snapshot | None, after_each: Callable[[], None] | None = None
     ) -> ReferenceAgent:
-        """Return the reference in the agent's state."""
+        """Return the reference implementation, set to the agent's state."""
         roster = range(1, self._bounds.agents + 1)
         own_id = FIRST if self._bounds.nameless else agent_id
         settings = Settings.of(self._bounds.agent_settings(agent_id))
@@ -121,7 +121,7 @@ COPIED = (
 
 
 def _put_into(state: State, before: Snapshot) -> None:
-    """Give the reference the state of an agent, as a snapshot has it."""
+    """Set the reference implementation to the state of an agent's snapshot."""
     for name in COPIED:
         value = before[name]
         setattr(state, name, value.copy() if hasattr(value, "copy") else value)
@@ -141,7 +141,7 @@ TIMERS = ("voting_timer", "phase_one_timer", "phase_two_timer", "phase_three_tim
 
 
 def _state(state: State | AgentState) -> tuple[Any, ...]:
-    """Return what determines all later steps. A tally counts only while its timer runs, because it is reset before."""
+    """Return the parts of a state that affect later steps. Vote counts matter only while their timer runs."""
     votes, phase_1, phase_2, phase_3, _ = (timer.active for timer in state.timers)
     return (
         [block.block_hash for block in state.chain],

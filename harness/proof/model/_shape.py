@@ -1,4 +1,5 @@
-"""The shape of a local state. States that differ only in the identity of blocks and agents have the same shape.
+"""Compute the shape of an agent's state: states that differ only in the identity of blocks and agents have the same
+shape.
 
 A shape refers to blocks by their order among the blocks that the agent holds: by timestamp, then by hash. Blocks that
 the agent does not hold are only counted. Like the reductions of `_local_steps.py`, a shape omits parts that are written
@@ -31,7 +32,7 @@ ON_TOP = "on top"
 
 
 class Held:
-    """The blocks that an agent holds in their order, and its chain. The object is immutable."""
+    """The chain of an agent and all blocks that it holds, in order. The object is immutable."""
 
     __slots__ = ("_blocks", "_heights", "_numbers", "_ordinals", "_shape", "_top")
 
@@ -55,7 +56,7 @@ class Held:
         )
 
     def number(self, shape: Shape) -> int:
-        """Return the number of a shape: 64 bits of a hash, equal on all machines.
+        """Return a number for a shape: 64 bits of its hash, which are the same on all machines.
 
         `shape` is the rest of a state that holds these blocks, or such a state together with an input.
         """
@@ -66,11 +67,13 @@ class Held:
         return number
 
     def height(self, chain_hash: bytes) -> int:
-        """Return the number of blocks of the chain below this chain hash, or ELSEWHERE."""
+        """Return the number of blocks in the chain up to this chain hash, or ELSEWHERE if the agent does not know
+        it.
+        """
         return self._heights.get(chain_hash, ELSEWHERE)
 
     def ordinal(self, block_hash: bytes) -> int:
-        """Return the ordinal of a held block, or ELSEWHERE."""
+        """Return the position of this block among the held blocks, or ELSEWHERE."""
         return self._ordinals.get(block_hash, ELSEWHERE)
 
     def between(self, timestamp_us: int, block_hash: bytes = b"") -> int:
@@ -78,7 +81,7 @@ class Held:
         return bisect_left(self._blocks, (timestamp_us, block_hash))
 
     def input_shape(self, message: Message) -> Shape:
-        """Return the shape of a message for this agent.
+        """Return the shape of a message, seen from this agent.
 
         It refers to the blocks that the agent holds, and omits the sender.
         """
@@ -105,7 +108,9 @@ class Held:
 
 
 def shape_of(state: AgentState | State, held: Held) -> Shape:
-    """Return the shape of `state` without the blocks that it holds (`held`). The numbers of both distinguish states."""
+    """Return the shape of a state, apart from the held blocks. Together with the shape of `held`, it identifies the
+    state.
+    """
     shape: list[Any] = [state.reconcile_in_progress]
     for timer in state.timers:
         shape.append(1 if timer.deadline is not None else 2 if timer.active else 0)

@@ -1,4 +1,5 @@
-"""The complete state of an agent as a snapshot of interned parts, and a step of an agent.
+"""Store the complete state of an agent as a snapshot whose equal parts are shared, and describe steps between
+snapshots.
 
 The key of a snapshot omits only parts that never affect the agent's behaviour: the time of its last input, counters
 that are only reported, and its pending output. All other attributes of `ucp.state.AgentState` are in the key, including
@@ -56,7 +57,7 @@ _DEAD_PHASE_3: Snapshot = {"majority_response_block_hash": None}
 
 
 def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
-    """Return a snapshot of the agent's state. Parts that equal those of `like` are shared with it."""
+    """Return a snapshot of the agent's state. Parts that are equal to parts of `like` are shared with it."""
     state = vars(agent.state)
     if like is None:
         return {name: _copied(value) for name, value in state.items() if name not in LEFT_OUT}
@@ -68,7 +69,7 @@ def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
 
 
 def dead(state: AgentState) -> Snapshot:
-    """Return the parts that every handler of a correct agent writes before it reads them, with their initial values."""
+    """Return the initial values of the parts that every handler of a correct agent writes before it reads them."""
     parts: Snapshot = {}
     if not state.voting_timer.active:
         parts |= _DEAD_VOTE
@@ -84,7 +85,7 @@ def dead(state: AgentState) -> Snapshot:
 
 
 def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) -> None:
-    """Put the agent into the state of a snapshot. Its running timers have the deadline RUNNING_S.
+    """Set the agent to the state of a snapshot. Its running timers get the deadline RUNNING_S.
 
     `since` is the agent's present state, if it is known. Parts that both have are not changed.
     """
@@ -105,21 +106,21 @@ def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) ->
 
 
 def set_counts(agent: Agent, count: int) -> None:
-    """Set everything that the agent only counts to `count`."""
+    """Set all counters of the agent that do not affect its steps to `count`."""
     state = vars(agent.state)
     state.update(dict.fromkeys(COUNTS, count))
     state["sent"] = Counter(dict.fromkeys(MESSAGE_NAMES, count) if count else ())
 
 
 def _is_part(part: Any, value: Any) -> bool:
-    """Return whether a part of the state is unchanged."""
+    """Return true if the value equals the stored part of a state."""
     if isinstance(part, _TimerState | _ChainState):
         return part.is_of(value)
     return bool(part == value)
 
 
 def replaced(value: Any, hash_of: Callable[[bytes], bytes], block_of: Callable[[Block], Block]) -> Any:
-    """Return a part of the state with other hashes and blocks."""
+    """Return a part of the state in which hashes and blocks are replaced."""
     if isinstance(value, bytes):
         return hash_of(value)
     if isinstance(value, Block):
@@ -134,13 +135,13 @@ def replaced(value: Any, hash_of: Callable[[bytes], bytes], block_of: Callable[[
 
 
 def keyed(value: Any, name_of: NameOf) -> Any:
-    """Return a part of the state as numbers and tuples. They are equal for equal parts, on all machines."""
+    """Return a part of the state as numbers and tuples. Equal parts give equal results on all machines."""
     key = _KEYED.get(type(value))
     return value if key is None else key(value, name_of)
 
 
 def key_of(snapshot: Snapshot, name_of: NameOf) -> tuple[Any, ...]:
-    """Return a key of a state. It is equal only for equal states."""
+    """Return a key of a state. Different states have different keys."""
     return tuple(keyed(value, name_of) for value in snapshot.values())
 
 
@@ -156,7 +157,7 @@ class _TimerState:
         return self.running or self.paused
 
     def is_of(self, timer: Timer) -> bool:
-        """Return whether a timer is unchanged. A timer that was started again is not."""
+        """Return true if the timer is unchanged. A timer that was started again counts as changed."""
         return (timer.deadline == RUNNING_S) == self.running and timer.active == (self.running or self.paused)
 
     def put_back(self, timer: Timer) -> None:
@@ -190,7 +191,7 @@ class _ChainState:
 
 
 def _copied(value: Any) -> Any:
-    """Return a copy that shares no mutable object."""
+    """Return a copy that shares no mutable object with the original."""
     copy = _COPIED.get(type(value))
     if copy is None:
         copy = next((way for kind, way in _COPIED.items() if isinstance(value, kind)), None)
@@ -239,7 +240,7 @@ Started = tuple[tuple[int, int], ...]
 
 
 class Step(NamedTuple):
-    """The result of an input: the new state, the sent messages, and the started timers."""
+    """The result of an input to an agent: the new state, the sent messages, and the started timers."""
 
     local: int
     sent: tuple[int, ...]
@@ -247,7 +248,9 @@ class Step(NamedTuple):
 
 
 class End(NamedTuple):
-    """A possible result of a timer's expiry, with the candidate of phase 2 that is the oldest in this case."""
+    """A possible result of the expiry of a timer. `oldest` is the phase 2 candidate that must be the oldest for this
+    result.
+    """
 
     step: Step
     oldest: bytes | None
@@ -258,7 +261,7 @@ NAMES_OF_OTHERS = ("voters", "reconcile_responders")
 
 
 class Parts:
-    """The interned parts of all known states."""
+    """A store of the parts of all known states, in which equal parts exist once."""
 
     def __init__(self) -> None:
         self._parts: dict[tuple[str, Any], Any] = {}
@@ -269,7 +272,7 @@ class Parts:
         self._hashes: dict[int, bytes] = {}
 
     def part(self, name: str, value: Any) -> Any:
-        """Return the interned part that represents all equal parts."""
+        """Return the stored part that is equal to this one."""
         key = name, keyed(value, self.name)
         part = self._parts.setdefault(key, value)
         if part is value:
@@ -278,19 +281,19 @@ class Parts:
         return part
 
     def of(self, snapshot: Snapshot, like: Snapshot) -> Snapshot:
-        """Return the state made of interned parts. All parts of `like` are interned."""
+        """Return the state made of stored parts. All parts of `like` must be stored already."""
         return {
             name: value if like.get(name, self) is value else self.part(name, value) for name, value in snapshot.items()
         }
 
     def key(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> tuple[Any, ...]:
-        """Return a key of a state made of interned parts. It is equal for equal states."""
+        """Return a key of a state that consists of stored parts. Equal states have equal keys."""
         numbers = self._numbers
         return (agent_id, flaw, *[numbers[id(part)] for part in snapshot.values()])
 
     def anonymous(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> int:
-        """Return a number that is equal for states that differ only in the identity of voters and responders, on all
-        machines.
+        """Return a number for a state that does not depend on the identity of voters and responders. It is the same on
+        all machines.
         """
         parts = [
             len(value) if name in NAMES_OF_OTHERS else self._digests[id(value)] for name, value in snapshot.items()
@@ -298,22 +301,22 @@ class Parts:
         return int.from_bytes(blake2b(repr((agent_id, flaw, parts)).encode(), digest_size=8).digest())
 
     def name(self, digest: bytes) -> int:
-        """Return the number of a hash. It is equal on all machines."""
+        """Return a number for a hash. It is the same on all machines."""
         name = int.from_bytes(digest[:8])
         assert self._hashes.setdefault(name, digest) == digest, "no two hashes that there are begin alike"
         return name
 
 
 class UncoveredError(Exception):
-    """An error: the agent depends on something that is not part of a state, so no proof covers it."""
+    """An error: the agent depends on data that are not part of a state, so no proof can cover it."""
 
 
 class ReductionError(Exception):
-    """An error: the agent does something that the argument for a reduction excludes."""
+    """An error: the agent breaks an assumption that allows states to be merged."""
 
 
 def check_that_nothing_is_lost(before: Snapshot, state: AgentState) -> None:
-    """Raise ReductionError if a block is lost.
+    """Raise ReductionError if the agent has lost a block.
 
     Otherwise the completed blocks could not be forgotten (characteristic 2).
     """

@@ -1,4 +1,4 @@
-"""Reduce the tallies of local states to their decisions.
+"""Simplify the vote counts in an agent's state to the decision that they lead to.
 
 Agents whose tallies differ, but always lead to the same decision, count as one local state. See
 docs/explanation/proof.md.
@@ -15,7 +15,7 @@ TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "re
 
 
 class Tallies:
-    """The reduced tallies of each local state at the end of an instant.
+    """The simplified vote counts of each agent state after all messages of a moment.
 
     `ends` returns the possible results of a timer's expiry for a state's number and the timer's index in `timers`. The
     real agent computes them. If `every_count`, the counts of a reconcile are kept.
@@ -37,7 +37,7 @@ class Tallies:
         self._settled: dict[int, int] = {}
 
     def settled(self, local: int) -> int:
-        """Return the local state with reduced tallies.
+        """Return the number of the state with simplified vote counts.
 
         At the end of an instant, all answers have arrived or are lost, so the voters no longer matter.
         """
@@ -49,7 +49,7 @@ class Tallies:
         return number
 
     def _left(self, local: int) -> Snapshot:
-        """Return the reduced tallies of a state."""
+        """Return the simplified vote counts of a state."""
         known = self._states.known[local]
         snapshot = known.snapshot
         left: Snapshot = {}
@@ -69,7 +69,7 @@ class Tallies:
         return left
 
     def _of_phase_1(self, local: int) -> Snapshot:
-        """Return the reduced tally of phase 1, if the missing answers cannot change its result.
+        """Return the simplified vote count of phase 1, if the missing answers cannot change its result.
 
         Otherwise it is empty.
         """
@@ -85,13 +85,13 @@ class Tallies:
         return {"reconcile_vote_count": {"yes": yes, "no": no}, "reconcile_responders": {*self._states.others}}
 
     def _ends_with(self, local: int, yes: int, no: int) -> Sequence[End]:
-        """Return the possible results of phase 1 if it ends with these counts."""
+        """Return the possible results of phase 1 if it ends with these numbers of votes."""
         counted = self._states.with_tallies(local, {"reconcile_vote_count": {"yes": yes, "no": no}})
         return self._ends(counted, self._phase_one)
 
     def _of_phase_2(self, snapshot: Snapshot) -> Snapshot:
-        """Return the reduced tally of phase 2, with only the most named candidates, if the missing answers cannot
-        change them. Otherwise it is empty.
+        """Return the count of phase 2 reduced to the candidates with the most votes, or an empty count if missing
+        answers can change them.
         """
         candidates = snapshot["reconcile_response_dictionary"]
         most, next_most, *_ = sorted([*(count for count, _ in candidates.values()), 0, 0], reverse=True)
@@ -106,7 +106,7 @@ class Tallies:
         return len(self._states.others) - len(snapshot["reconcile_responders"])
 
     def _check_that_it_ends_alike(self, local: int, settled: int) -> None:
-        """Raise ReductionError if a timer's expiry gives another result after the reduction."""
+        """Raise ReductionError if a timer's expiry gives another result after the simplification."""
         if settled != local and any(
             self._settled_ends(local, timer) != self._settled_ends(settled, timer)
             for timer in self._states.known[local].running

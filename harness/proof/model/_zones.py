@@ -1,4 +1,5 @@
-"""The possible remaining times of the running timers as zones (difference bounds), with small numbers.
+"""Store the possible remaining times of all running timers as zones (difference bounds matrices), with a number for
+each.
 
 A zone is a set of possible remaining times of n timers: all times with x_i - x_j <= m[i][j], where x_0 = 0. The matrix
 is closed (no bound can be tightened), so equal sets have equal matrices. A zone is stored for any time that may have
@@ -15,7 +16,9 @@ EVER_US = 10**15
 
 
 class Zones:
-    """All zones by number, with cached results of their operations."""
+    """All zones by number, with cached results of their operations. A zone is a set of possible remaining timer
+    values.
+    """
 
     def __init__(self) -> None:
         self._matrices: list[Matrix] = []
@@ -39,17 +42,17 @@ class Zones:
         return self._intern(matrix)
 
     def firsts(self, zone: int) -> list[int]:
-        """Return the timers, numbered from 1, that may expire next."""
+        """Return the timers that may expire next, as numbers from 1."""
         least = self._matrices[zone][0]
         return [timer for timer in range(1, len(least)) if not least[timer]]
 
     def no_time_passes(self, zone: int) -> bool:
-        """Return whether a timer must expire at the moment of the last expiry."""
+        """Return true if a timer must expire at the same moment as the previous expiry."""
         return any(row[0] == 0 for row in self._matrices[zone][1:])
 
     def tied(self, zone: int) -> list[tuple[int, ...]]:
-        """Return, for each timer of `firsts`, the indices of those that must expire at the same moment if it is the
-        next.
+        """Return, for each timer that may expire next, the indices of the timers that must then expire at the same
+        moment.
         """
         tied = self._tied.get(zone)
         if tied is None:
@@ -62,7 +65,7 @@ class Zones:
         return tied
 
     def bounds(self, zone: int) -> list[tuple[int, ...]]:
-        """Return, for each timer, a description by its bounds that does not depend on the order of the timers."""
+        """Return a description of each timer by its bounds, which does not depend on the order of the timers."""
         bounds = self._bounds.get(zone)
         if bounds is None:
             matrix = self._matrices[zone]
@@ -73,7 +76,7 @@ class Zones:
         return bounds
 
     def after(self, zone: int, ended: tuple[int, ...], running: tuple[int, ...]) -> int | None:
-        """Return the zone after all of `ended` have expired in one instant. None if they cannot.
+        """Return the zone after all timers in `ended` expired at the same moment, or None if they cannot.
 
         `running` has, for each timer that runs then, its number before. For a timer that was just started, it has -1
         minus its duration in microseconds.
@@ -84,7 +87,7 @@ class Zones:
         return self._after[key]
 
     def permuted(self, zone: int, places: tuple[int, ...]) -> int:
-        """Return the zone with its timers in another order. `places` has the previous number of each timer."""
+        """Return the zone with its timers in another order. `places` contains the previous number of each timer."""
         key = zone, places
         if key not in self._permuted:
             matrix, order = self._matrices[zone], (0, *places)
@@ -92,7 +95,7 @@ class Zones:
         return self._permuted[key]
 
     def adrift(self, zone: int) -> int:
-        """Return the zone with the same differences of timers, in which all timers may run for any further time.
+        """Return the zone with the same differences between timers, in which all of them may run for any further time.
 
         If nothing can happen before the first expiry, the time until then makes no difference.
         """
@@ -105,7 +108,7 @@ class Zones:
         return self._adrift[zone]
 
     def coincidences(self, zone: int, ended: tuple[int, ...]) -> int:
-        """Return the number of coincidences that are needed for these timers to expire next, at the same time.
+        """Return how many independent events must coincide so that these timers expire next and at the same moment.
 
         This is the number of differences between timers that are open in the zone and fixed when these timers expire.
         The timers must be able to expire at the same time.
@@ -120,9 +123,9 @@ class Zones:
         return self._coincidences[key]
 
     def _ended(self, zone: int, ended: Sequence[int]) -> list[list[int]] | None:
-        """Return the bounds at the moment when these timers expire and none has expired before.
+        """Return the bounds at the moment when these timers expire and no other has expired before.
 
-        None if it is impossible.
+        Return None if that is impossible.
         """
         matrix = [list(row) for row in self._matrices[zone]]
         size = range(len(matrix))
@@ -146,7 +149,7 @@ class Zones:
         places = [0, *running]
 
         def bound(left: int, right: int) -> int:
-            """Return the bound of x_left - x_right. A timer that was just started has its whole duration left."""
+            """Return the upper bound of x_left - x_right. A newly started timer has its whole duration left."""
             left_s, left_place = (0, left) if left >= 0 else (-left - 1, 0)
             right_s, right_place = (0, right) if right >= 0 else (-right - 1, 0)
             return left_s - right_s + matrix[left_place][right_place]
@@ -164,7 +167,7 @@ class Zones:
 
 
 def _apart(matrix: Sequence[Sequence[int]], timers: range) -> int:
-    """Return the number of timers, counting only one of those with fixed distances from each other."""
+    """Return the number of timers, where timers with fixed differences count as one."""
     return sum(
         not any(matrix[timer][other] + matrix[other][timer] == 0 for other in timers if other < timer)
         for timer in timers

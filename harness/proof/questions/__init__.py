@@ -1,1 +1,3 @@
-"""The questions of a proof: livelocks, paths to one chain, and the number of further votes."""
+"""Answer questions about a complete state graph: endless cycles, ways to one common chain, and the votes that they
+need.
+"""

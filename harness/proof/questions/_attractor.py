@@ -12,7 +12,7 @@ Check = Callable[[], object]
 
 
 class Attractor:
-    """A set of states by number: the goals, and all states from which a path leads to them.
+    """A growing set of states: the goals, and all states from which a path leads to them.
 
     The durations of timers determine the next timer, but a zone may leave several timers open. All of these must
     therefore lead to the goals, unless timers expire in `any_order`. If timers must expire at the same moment, only the
@@ -43,16 +43,16 @@ class Attractor:
 
     @property
     def left(self) -> int:
-        """Number of states outside the set."""
+        """The number of states outside the set."""
         return self._inside.count(0)
 
     @property
     def first_left(self) -> int:
-        """The first state outside the set. -1 if there is none."""
+        """The first state outside the set, or -1 if there is none."""
         return self._inside.find(0)
 
     def add(self, goals: Iterable[int]) -> None:
-        """Add goals, and all states from which a path leads to them."""
+        """Add goals, and then all states from which a path leads to them."""
         waiting = [number for number in goals if not self._inside[number]]
         for number in waiting:
             self._inside[number] = 1
@@ -71,7 +71,7 @@ class Attractor:
 
 
 def _ends(by_timer: Sequence[ByTimer], check: Check) -> "array[int]":
-    """Return, for each state, the number of transitions to the states before it.
+    """Return, for each state, the index at which the list of its predecessors begins in one flat array.
 
     The last entry counts all transitions.
     """

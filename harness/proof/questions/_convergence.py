@@ -1,4 +1,4 @@
-"""Find states from which the swarm cannot become idle with one chain, and cycles that never end.
+"""Find states from which the swarm cannot become idle with one common chain, and cycles that never end.
 
 Both questions concern the successors without losses and without new blocks, except the blocks of further votes.
 """
@@ -23,7 +23,7 @@ It raises GivenUpError when the limit of memory or time is reached.
 
 @dataclass
 class Liveness:
-    """The answers to both questions.
+    """The result of the search: endless cycles, and states without a way to one common chain.
 
     - `forks`: number of idle states with several chains. `fork` is the nearest of them.
     - `cycles`: cycles as lists of their states, the nearest first.
@@ -45,7 +45,7 @@ class Liveness:
 
 @cycles_left_alone()
 def look(graph: Graph, watch: Watch = lambda asked: None, workers: Workers | None = None) -> Liveness:
-    """Answer both questions for a complete graph. `workers` compute the votes that forks need."""
+    """Search a complete state graph for both problems. `workers` compute the votes that diverged idle states need."""
     idle_states = dict(_idle_states(graph, partial(watch, "idle states")))
     forks = [number for number, chains in idle_states.items() if chains > 1]
     result = Liveness(len(forks), forks[0] if forks else None, cycles(graph, partial(watch, "cycles")))
@@ -71,7 +71,7 @@ def look(graph: Graph, watch: Watch = lambda asked: None, workers: Workers | Non
 
 
 def _idle_states(graph: Graph, check: Check) -> Iterator[tuple[int, int]]:
-    """Yield each idle state with its number of chains."""
+    """Yield each idle state with its number of different chains."""
     for number, by_timer in enumerate(graph.quiet):
         check()
         state = graph.states[number]
@@ -80,7 +80,7 @@ def _idle_states(graph: Graph, check: Check) -> Iterator[tuple[int, int]]:
 
 
 def _needed(graph: Graph, forks: Sequence[int], watch: Watch, workers: Workers | None) -> dict[int, int | None]:
-    """Return the number of votes that each state needs. None if one vote for each agent is not enough."""
+    """Return the number of further votes that each state needs, or None if one vote per agent is not enough."""
     needed: dict[int, int | None] = {}
 
     def check() -> None:

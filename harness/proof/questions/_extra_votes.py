@@ -1,4 +1,4 @@
-"""Compute the number of further votes that an idle state with several chains needs until there is one chain.
+"""Compute how many further votes an idle swarm with different chains needs until all chains are equal.
 
 A further vote is the vote on a block that an agent completes in the idle state. Its successors are first explored along
 single paths until one path leads to one chain. All successors are explored only if no such path was found.
@@ -25,11 +25,11 @@ MAX_PATH_INSTANTS = 150
 
 
 class UndecidedError(Exception):
-    """More successors exist than the limit allows to explore."""
+    """An error: there are more successors than the limit allows to explore."""
 
 
 class ExtraVotes:
-    """The numbers of further votes that idle states and their successors need."""
+    """The number of further votes that idle states and their successors need until all chains are equal."""
 
     def __init__(self, swarm: Swarm, check: Check = lambda: None) -> None:
         self._swarm = swarm
@@ -40,7 +40,7 @@ class ExtraVotes:
         self._explored = 0
 
     def needed(self, fork: State) -> int | None:
-        """Return the least number of votes. None if one for each agent is not enough. Raises UndecidedError."""
+        """Return the smallest number of votes, or None if one vote per agent is not enough. Raises UndecidedError."""
         if len(self._enough) + len(self._too_few) > MAX_CACHED:
             self._enough.clear()
             self._too_few.clear()
@@ -49,14 +49,14 @@ class ExtraVotes:
         return next((votes for votes in range(1, most + 1) if self._a_vote_leads(fork, votes)), None)
 
     def _a_vote_leads(self, fork: State, votes: int, instants: int = 0) -> bool:
-        """Return whether one vote leads to one chain, with at most `votes - 1` votes after it.
+        """Return true if one vote, followed by at most `votes - 1` further votes, leads to equal chains.
 
         `instants` is the number of instants on the path so far. It is limited because the search is recursive.
         """
         return any(self._leads(after, votes - 1, instants + 1) for after in self._after_a_vote(fork))
 
     def _after_a_vote(self, fork: State) -> Iterator[State]:
-        """Yield the successors of a vote of each agent, one of agents that are alike.
+        """Yield the states after a vote of each agent. Agents in equal states are tried once.
 
         Agents whose chain is rarest come first.
         """
@@ -69,7 +69,7 @@ class ExtraVotes:
             yield from self._swarm.after(fork, (Action(place, "complete", fork[BLOCKS] + 1),), lossy=False)
 
     def _leads(self, state: State, votes: int, instants: int) -> bool:
-        """Return whether the swarm can become idle with one chain from here, whichever timer expires next."""
+        """Return true if the swarm can become idle with equal chains from this state, whichever timer expires next."""
         if not self._find_path(state, votes, set(), instants) and self._too_few.get(state, -1) < votes:
             self._explore_all(state, votes, instants)
         return self._is_enough(state, votes)
@@ -79,7 +79,7 @@ class ExtraVotes:
         return enough is not None and enough <= votes
 
     def _find_path(self, state: State, votes: int, tried: set[State], instants: int) -> bool:
-        """Return whether a path without repeated states was found. If not, a path may exist nevertheless."""
+        """Return true if a path without repeated states was found. If not, a path may still exist."""
         if self._is_enough(state, votes):
             return True
         if state in tried or instants > MAX_PATH_INSTANTS or self._too_few.get(state, -1) >= votes:
@@ -95,7 +95,7 @@ class ExtraVotes:
         return leads
 
     def _timers_lead(self, state: State, votes: int, tried: set[State], instants: int) -> bool:
-        """Return whether a path was found for each timer of a state that may expire next.
+        """Return true if a path was found for each timer that may expire next.
 
         With timers in any order, a path for one timer is enough.
         """
@@ -115,7 +115,7 @@ class ExtraVotes:
         return len(self._swarm.chains(state)) <= 1 or (votes > 0 and self._a_vote_leads(state, votes, instants))
 
     def _by_timer(self, state: State) -> Iterator[Iterator[State]]:
-        """Yield an iterator over the successors for each timer of a state that may expire next."""
+        """Yield, for each timer that may expire next, an iterator over the successors."""
         ending = [*self._swarm.ending(state)]
         for action, tied in self._swarm.alternatives(state):
             if (action,) in ending:
@@ -127,7 +127,7 @@ class ExtraVotes:
                 )
 
     def _explore_all(self, state: State, votes: int, instants: int) -> None:
-        """Explore all successors, and record for each whether this number of votes is enough."""
+        """Explore all successors, and record whether this number of votes is enough for each one."""
         states, numbers = [state], {state: 0}
 
         def number_of(after: State) -> int:

@@ -1,4 +1,4 @@
-"""Find cycles of the graph without losses and without new blocks."""
+"""Find cycles in the state graph that need no lost messages and no new blocks."""
 
 from array import array
 from collections.abc import Iterator
@@ -8,13 +8,13 @@ from harness.proof.questions._attractor import Check
 
 
 def cycles(graph: Graph, check: Check = lambda: None) -> list[list[int]]:
-    """Return a shortest cycle of each strongly connected component, the nearest first."""
+    """Return a shortest cycle of each strongly connected component. The component nearest to the start is first."""
     parts = [part for part in _parts(graph, check) if len(part) > 1 or part[0] in _after(graph, part[0])]
     return [_shortest_cycle(graph, min(part), set(part)) for part in sorted(parts, key=min)]
 
 
 def _after(graph: Graph, number: int) -> set[int]:
-    """Return the successors of a state. In an incomplete graph, return only the explored ones."""
+    """Return the successors of a state. If the graph is incomplete, return only the explored ones."""
     following = {state for after in graph.quiet[number] for state in after} | {*graph.crossing.get(number, ())}
     if graph.ended == "complete":
         return following
@@ -41,7 +41,7 @@ def _shortest_cycle(graph: Graph, start: int, part: set[int]) -> list[int]:
 
 
 def _after_a_cycle(graph: Graph, check: Check) -> list[int]:
-    """Return the states on a cycle or after one.
+    """Return all states that lie on a cycle or can be reached from one.
 
     States without a predecessor among the remaining states are removed until none is left to remove.
     """
@@ -61,7 +61,9 @@ def _after_a_cycle(graph: Graph, check: Check) -> list[int]:
 
 
 def _parts(graph: Graph, check: Check) -> Iterator[list[int]]:
-    """Yield the strongly connected components (Tarjan) without recursion. Most components of one state are left out."""
+    """Yield the strongly connected components (Tarjan's algorithm, without recursion). Most components with a single
+    state are left out.
+    """
     index: dict[int, int] = {}
     low: dict[int, int] = {}
     stack: list[int] = []

@@ -1,4 +1,4 @@
-"""Livelocks: an example of each form of cycle, with its coincidences and a scenario.
+"""Describe endless cycles of the agents: an example of each form, with its conditions and a scenario.
 
 Two cycles have the same form if the same timers run in their states, for any agents and any chains.
 """
@@ -28,7 +28,7 @@ _Form = tuple[tuple[tuple[tuple[int, ...], bool], ...], ...]
 
 @dataclass(frozen=True)
 class Livelock:
-    """The livelocks of one form.
+    """All endless cycles of one form, with an example.
 
     - `ways`: number of components of the graph with a cycle of this form.
     - `coincidences`: number of pairs of instants on the example's path that must be equal by chance, to within the
@@ -59,7 +59,7 @@ class Livelock:
         }
 
     def in_words(self) -> str:
-        """Return the conditions of the livelock as text."""
+        """Return a text that states the conditions of the endless cycle."""
         if not self.losses:
             return self._timings_in_words()
         return f"{self._timings_in_words()}; {self.losses} loss{'es lead' if self.losses > 1 else ' leads'} there"
@@ -78,7 +78,7 @@ class Livelock:
 
 
 def forms(graph: Graph, cycles: Sequence[list[int]]) -> list[list[list[int]]]:
-    """Return the cycles grouped by form, the nearest first."""
+    """Return the cycles grouped by form. The form nearest to the initial state is first."""
     alike: dict[_Form, list[list[int]]] = defaultdict(list)
     for cycle in cycles:
         alike[_form(graph, cycle)].append(cycle)
@@ -86,7 +86,7 @@ def forms(graph: Graph, cycles: Sequence[list[int]]) -> list[list[list[int]]]:
 
 
 def _form(graph: Graph, cycle: Sequence[int]) -> _Form:
-    """Return the form of a cycle. It does not depend on the first state of the list."""
+    """Return the form of a cycle. It is the same for any choice of the cycle's first state."""
     known = graph.swarm.local.known
     looks = [
         tuple(
@@ -100,7 +100,7 @@ def _form(graph: Graph, cycle: Sequence[int]) -> _Form:
 
 
 def in_timers(graph: Graph, cycles: Sequence[list[int]]) -> list[str]:
-    """Return the forms of the cycles in words: the states of a cycle, and in each state the timers of each agent."""
+    """Return the forms of the cycles as text: for each state of the cycle, the timers of each agent."""
     names = graph.swarm.local.timers
 
     def agent(running: tuple[int, ...], waits: bool) -> str:
@@ -113,7 +113,7 @@ def in_timers(graph: Graph, cycles: Sequence[list[int]]) -> list[str]:
 
 
 class _CycleExample(NamedTuple):
-    """A path to a cycle, and one round of the cycle, with their scenario."""
+    """An example of a cycle: the path to it, one round of it, and the scenario."""
 
     begin: list[int]
     cycle: list[int]
@@ -131,7 +131,7 @@ def show(graph: Graph, cycles: Sequence[list[int]], path: Path, name: str) -> It
 
 
 def _nearest(graph: Graph, alike: Sequence[list[int]]) -> list[_CycleExample]:
-    """Return some cycles of one form, the best example first.
+    """Return some cycles of one form. The best example is first.
 
     Cycles that real clocks allow come first, then those with the fewest coincidences, then those with the fewest blocks
     of fixed time.
@@ -148,7 +148,9 @@ def _nearest(graph: Graph, alike: Sequence[list[int]]) -> list[_CycleExample]:
 
 
 def _livelock_of(graph: Graph, ways: int, rounds: Sequence[_CycleExample], path: Path, name: str) -> Livelock:
-    """Return the livelock with the first cycle that the simulation confirms. If it confirms none, the first one."""
+    """Return the first cycle that the simulation confirms, as a livelock. If the simulation confirms none, return the
+    first one.
+    """
     bounds = graph.swarm.bounds
     chosen: tuple[_CycleExample, Played] | None = None
     for each in rounds:

@@ -1,4 +1,4 @@
-"""A second opinion: the specification in TLA+ (ucp/contract/spec), checked by TLC.
+"""Compare the agents with a second model: the TLA+ specification in ucp/contract/spec, which the program TLC checks.
 
 See docs/explanation/specification.md.
 

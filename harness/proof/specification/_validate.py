@@ -1,6 +1,6 @@
-"""Recorded runs held against the specification: does TLC find that chapter 3 allows what each agent did?
+"""Check with TLC whether the TLA+ specification allows the recorded steps of agents.
 
-Many lives of agents are given to one TLC, as it takes longer to start than to look at one.
+One TLC process checks the records of many agents, because its start takes longer than the check of one agent.
 """
 
 import re
@@ -22,13 +22,13 @@ from harness.scenario import Scenario
 from ucp.agent import HANDLERS
 
 STEPS_AT_ONCE = 20_000
-"""So many handler runs, and those of the trace that passes it, are given to one TLC."""
+"""Number of handler runs after which a batch is complete. The last trace of a batch may exceed it."""
 MEMORY_MB = 2048
 
 Constants = tuple[tuple[str, object], ...]
 
 AT_END = "what it triggered has yet to run"
-"""Of a life as a whole, not of a step of it."""
+"""The difference that TLC reports if handlers are still waiting after the last step."""
 
 _REJECTED = re.compile(r'<<\s*"rejected",\s*(\d+),\s*(\d+),\s*\{([^}]*)\}\s*>>')
 _WHAT = re.compile(r'"([^"]*)"')
@@ -36,7 +36,7 @@ _WHAT = re.compile(r'"([^"]*)"')
 
 @dataclass(frozen=True)
 class Rejected:
-    """The first step of a life that the specification does not allow; `what` is what is otherwise there."""
+    """The first step of an agent that the specification does not allow. `what` lists the parts that differ."""
 
     run: str
     agent_id: int
@@ -56,9 +56,10 @@ class Rejected:
 
 @dataclass
 class Validation:
-    """`steps` are the handler runs that were looked at, of `lives` lives; `unread` says what could not be, and why.
+    """The result of a validation: numbers of runs and steps, rejected steps, and reasons why records could not be
+    checked.
 
-    `interrupted`: what came after these was not looked at.
+    `interrupted` is true if the user stopped the validation. The remaining records were not checked.
     """
 
     runs: int = 0
@@ -95,7 +96,7 @@ class Validation:
 
 @dataclass
 class _Batch:
-    """Lives that are looked at together, and where each is from."""
+    """Encoded steps of several agents that TLC checks at once, with the name of the run of each."""
 
     chains: Chains = field(default_factory=Chains)
     lives: list[Life] = field(default_factory=list)
@@ -105,7 +106,9 @@ class _Batch:
 
 @dataclass(frozen=True)
 class Recorded:
-    """A run: what it is called, its traces, whose agents came to its end, and what is missing or damaged."""
+    """A recorded run: its name, its traces, the agents that reached the end of the mission, and problems with its
+    files.
+    """
 
     name: str
     traces: Sequence[Trace]
@@ -114,7 +117,9 @@ class Recorded:
 
 
 def recorded(paths: Iterable[Path]) -> Iterator[Recorded]:
-    """Run directories, directories of what agents left, and traces. Raises RunDirectoryError for anything else."""
+    """Yield the run of each path, which is a run directory, a directory with agents' files, or a trace. Raises
+    RunDirectoryError for other paths.
+    """
     for path in paths:
         if path.is_file():
             trace = read_trace(path)
@@ -129,14 +134,14 @@ def recorded(paths: Iterable[Path]) -> Iterator[Recorded]:
 
 
 def simulated(scenario: Scenario, seeds: Iterable[int]) -> Iterator[Recorded]:
-    """The scenario played in virtual time. Raises HarnessError."""
+    """Yield a simulated run of the scenario for each seed. Raises HarnessError."""
     for seed in seeds:
         evidence = simulate(scenario, seed, tracing=True).evidence
         yield Recorded(f"seed {seed}", list(evidence.traces.values()), evidence.exports.keys())
 
 
 def validate(runs: Iterable[Recorded], *, watch: Callable[[Validation], None] = lambda validation: None) -> Validation:
-    """Hold runs against the specification. Raises NoCheckerError without TLC, and whatever `runs` raise."""
+    """Check all runs against the specification. Raises NoCheckerError without TLC."""
     command()
     validation = Validation()
     try:
@@ -172,11 +177,13 @@ def _batches(runs: Iterable[Recorded], validation: Validation) -> Iterator[tuple
 
 
 class _OutsideError(Exception):
-    """A record that cannot be held against the specification: why."""
+    """An error: a trace cannot be checked against the specification. The message is the reason."""
 
 
 def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
-    """The agent's mission, and what TLC has to know of its settings. Raises _OutsideError."""
+    """Return the mission of the agent, and the constants that TLC needs. Raises _OutsideError if the specification
+    lacks them.
+    """
     if not trace.header.has_inputs:
         raise _OutsideError("its trace has the version ucp-trace/1, which lacks received messages")
     try:
@@ -195,7 +202,9 @@ def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
 
 
 def _look(constants: Constants, batch: _Batch, validation: Validation) -> None:
-    """Let TLC look at these lives; at halves of them where it can not, so that only what it cannot look at is left."""
+    """Let TLC check a batch. If TLC fails, divide the batch until only the agents that TLC cannot check are left
+    out.
+    """
     try:
         rejected = _rejected(constants, batch)
     except CheckerError as error:
@@ -218,7 +227,9 @@ def _look(constants: Constants, batch: _Batch, validation: Validation) -> None:
 
 
 def _rejected(constants: Constants, batch: _Batch) -> dict[int, tuple[int, tuple[str, ...]]]:
-    """Of which lives, counting from 1, which step is not as specified, and what of it. Raises CheckerError."""
+    """Return the rejected agents of a batch by number (from 1), each with the first rejected step and its differing
+    parts. Raises CheckerError.
+    """
     assigned = (f"  {name} = {in_tla(value)}" for name, value in constants)
     config = "\n".join(["SPECIFICATION Spec", "VIEW Position", "CONSTANTS", *assigned, ""])
     records = {"Lives": module(batch.lives, batch.chains)}
