@@ -27,7 +27,7 @@ from typing import Annotated, Any, NamedTuple, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from harness.errors import WRONG_REQUEST, HarnessError, MachineError
+from harness.errors import WRONG_REQUEST, HarnessError, InterruptedRunError, MachineError
 from harness.gc_pause import gc_paused
 
 MAX_NAME = 200
@@ -172,6 +172,12 @@ class LazyCommandGroup(TyperGroup):
         elif args and args[0] in OLD_NAMES and not ctx.resilient_parsing:
             raise OldCommandNameError(f"`{args[0]}` is now {OLD_NAMES[args[0]]}: run that")
         return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise InterruptedRunError(f"interrupted: `{ctx.invoked_subcommand}` did not finish") from None
 
 
 def load_command(name: str) -> Any:

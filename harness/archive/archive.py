@@ -8,7 +8,7 @@ missing file that a complete run would have.
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -55,6 +55,9 @@ MAX_TRACE_BYTES = 256 * 1024 * 1024
 """Maximum size of a trace. In a swarm of 50 agents without loss, a trace grows to a tenth of it in 20 minutes."""
 _AGENT_ID = re.compile("[1-9][0-9]{0,4}")
 
+ReportProgress = Callable[[str], None]
+"""A function that gets the current step of a long job in words, such as "reading trace 3 of 50"."""
+
 
 class RecordedRun(NamedTuple):
     """A handler run in a trace.
@@ -87,10 +90,14 @@ class RunArchive:
     Files are read at first use, and once. `directory` is the first directory with a record, else the first given
     directory, else None. `exports` and `traces` have the readable files by agent. `problems` has a sentence for each
     damaged file, and `gaps` one for each missing file. With `skim`, large traces are read without the handler runs that
-    only received a message. Raises RunDirectoryError if a path does not exist, or is a directory with other content.
+    only received a message. `report_progress` receives a text before each long step of reading and judging. Raises
+    RunDirectoryError if a path does not exist, or is a directory with other content.
     """
 
-    def __init__(self, *given: Path | str, skim: bool = False) -> None:
+    def __init__(
+        self, *given: Path | str, skim: bool = False, report_progress: ReportProgress = lambda step: None
+    ) -> None:
+        self.report_progress = report_progress
         paths = [Path(path) for path in given]
         self._export_files = export_files(paths)
         self._skim = skim
@@ -230,7 +237,8 @@ class RunArchive:
         problems, gaps = [], []
         skim = self._skim and self.large
         known_agents = self.record.known_agents  # none without a record, as for exports from the field
-        for path in self._trace_files:
+        for number, path in enumerate(self._trace_files, 1):
+            self.report_progress(f"reading trace {number} of {len(self._trace_files)}")
             if path.is_file() and path.stat().st_size > MAX_TRACE_BYTES:
                 problems.append(
                     f"{path}: larger than {MAX_TRACE_BYTES} bytes, which is too large for a trace; it is left out"

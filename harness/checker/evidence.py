@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
-from harness.archive.archive import RunArchive
+from harness.archive.archive import ReportProgress, RunArchive
 from harness.archive.channel_journal import ChannelLine
 from harness.archive.connectivity import Link
 from harness.archive.exports import Export, name_blocks
@@ -154,6 +154,8 @@ class Evidence:
     """The store of the last incarnation of each agent that has one."""
     channel: list[ChannelLine] | None = None
     """The journal of the shared channel. None without a journal."""
+    report_progress: ReportProgress = lambda step: None
+    """A function that gets each long step of the judging in words."""
     _derived: dict[Callable[["Evidence"], Any], Any] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -386,6 +388,7 @@ def gather(archive: RunArchive) -> Evidence:
         link_losses=_link_losses(archive),
         stores=archive.stores,
         channel=archive.channel(),
+        report_progress=archive.report_progress,
     )
 
 

@@ -17,7 +17,7 @@ from harness import checker, report
 from harness.archive.archive import RunArchive
 from harness.checker import stored_verdict
 from harness.checker.survival import survival
-from harness.commands.terminal import complain, print_json, show_programs, show_result, show_survival
+from harness.commands.terminal import StatusLine, complain, print_json, show_programs, show_result, show_survival
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, MachineError, RunDirectoryError
 from harness.field.ingest import ingest_files
 from harness.field.replay.field_evidence import field_evidence
@@ -34,7 +34,8 @@ def report_command(run: Annotated[Path, typer.Argument(help="Run directory.")]) 
 
     The files are report.html, report.md, junit.xml and chains.svg. The run may have been killed.
     """
-    source = report.read_source(RunArchive(run, skim=True))
+    with StatusLine() as status:
+        source = report.read_source(RunArchive(run, skim=True, report_progress=status.show))
     try:
         page = report.write(source)
     except RunDirectoryError as error:
@@ -64,12 +65,13 @@ def check_command(
     file could not be read. 3: no verdict is bad, and an agent did not support the run. 4: the only bad verdict is `not
     finished`.
     """
-    archive = RunArchive(*paths)
-    evidence = checker.gather(archive)
-    directories = [path for path in paths if path.is_dir()]
-    if not archive.recorded and evidence.traces and directories:
-        evidence = field_evidence(evidence, ingest_files(directories).largest())
-    result, survived = checker.check(evidence), survival(evidence)
+    with StatusLine() as status:
+        archive = RunArchive(*paths, report_progress=status.show)
+        evidence = checker.gather(archive)
+        directories = [path for path in paths if path.is_dir()]
+        if not archive.recorded and evidence.traces and directories:
+            evidence = field_evidence(evidence, ingest_files(directories).largest())
+        result, survived = checker.check(evidence), survival(evidence)
     stored = [*stored_verdict.differences(archive.record, result, survived)]
     differing = differing_versions(archive.record.versions, versions()) if archive.record.versions else []
     if as_json:

@@ -1,4 +1,4 @@
-"""The display of an active run: elapsed mission time, chain lengths, and agents in a reconcile.
+"""The display of an active run: elapsed mission time, chain lengths, and agents in a reconcile; then its judging.
 
 A terminal shows a live table. Other outputs, such as CI logs, get a line every few seconds.
 """
@@ -35,6 +35,9 @@ class Progress(Protocol):
     """A display of the progress of a run."""
 
     def show(self, snapshot: Snapshot) -> None: ...
+    def show_judging(self, step: str) -> None:
+        """Show a step of the judging after the mission, such as "reading trace 3 of 50"."""
+
     def close(self) -> None: ...
 
 
@@ -42,6 +45,9 @@ class Silent:
     """A display without output, for programs."""
 
     def show(self, snapshot: Snapshot) -> None:
+        pass
+
+    def show_judging(self, step: str) -> None:
         pass
 
     def close(self) -> None:
@@ -72,6 +78,11 @@ class ProgressLines:
             self._console.print(line, highlight=False, soft_wrap=True)
         self._line = line
 
+    def show_judging(self, step: str) -> None:
+        if time.monotonic() - self._last >= LINE_EVERY_S:
+            self._last = time.monotonic()
+            self._console.print(step, highlight=False, soft_wrap=True)
+
     def close(self) -> None:
         pass
 
@@ -85,6 +96,9 @@ class ProgressTable:
 
     def show(self, snapshot: Snapshot) -> None:
         self._live.update(_render(snapshot), refresh=True)
+
+    def show_judging(self, step: str) -> None:
+        self._live.update(Text(step), refresh=True)
 
     def close(self) -> None:
         self._live.stop()

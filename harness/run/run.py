@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from harness import checker, report
-from harness.archive.archive import RunArchive
+from harness.archive.archive import ReportProgress, RunArchive
 from harness.archive.directory import RunDirectory, default_path
 from harness.archive.run_record import RogueInjection, RunRecord, Survival
 from harness.backend_names import BackendName
@@ -21,7 +21,7 @@ from harness.checker.injections import account
 from harness.checker.recurring_cycles import cycle_of
 from harness.checker.survival import survival
 from harness.checker.timer_lag import TimerLag, timer_lag
-from harness.errors import WRONG_REQUEST, HarnessError, MachineError, RunDirectoryError
+from harness.errors import WRONG_REQUEST, HarnessError, InterruptedRunError, MachineError, RunDirectoryError
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
@@ -95,10 +95,12 @@ def run(
     - `delivers_all`: in virtual time, traces also record messages that have no effect, as traces of processes do.
     - `interventions`: faults that the user requests during the run. They belong to this scenario.
 
-    Ctrl-C and SIGTERM end the mission early. The run is then exported and checked as far as it went. The function also
-    works inside a running event loop, for example in a notebook. Raises HarnessError if the run cannot start: the
-    scenario does not suit the backend, the machine lacks something, or `out` is not empty.
+    Ctrl-C and SIGTERM end the mission early. The run is then exported and checked as far as it went. Ctrl-C during the
+    check raises InterruptedRunError. The function also works inside a running event loop, for example in a notebook.
+    Raises HarnessError if the run cannot start: the scenario does not suit the backend, the machine lacks something, or
+    `out` is not empty.
     """
+    progress = progress or Silent()
     out = out or default_path(scenario.name)
     chosen = BACKENDS[backend]
     chosen.refuse(scenario)
@@ -112,15 +114,19 @@ def run(
     interrupted = asyncio.Event()
     try:
         played = _outcome_of(
-            _until_interrupted(
-                interrupted, chosen, scenario, seed, recording.directory, progress or Silent(), story, **options
-            ),
+            _until_interrupted(interrupted, chosen, scenario, seed, recording.directory, progress, story, **options),
             interrupted,
         )
     except HarnessError as error:
         recording.fail(error)
         raise
-    return recording.end(played)
+    try:
+        return recording.end(played, progress.show_judging)
+    except KeyboardInterrupt:
+        raise InterruptedRunError(
+            f"interrupted before the verdict; all files of the mission are in {recording.directory.path}: "
+            f"`ucp-harness check {recording.directory.path}` judges them"
+        ) from None
 
 
 class RunRecording:
@@ -185,11 +191,14 @@ class RunRecording:
             ground_station=played.ground_station,
         )
 
-    def end(self, played: RunOutcome) -> Run:
-        """Check the run, and write record and report. Raises MachineError if they cannot be written."""
+    def end(self, played: RunOutcome, report_progress: ReportProgress = lambda step: None) -> Run:
+        """Check the run, and write record and report. `report_progress` receives each long step of the check in words.
+
+        Raises MachineError if they cannot be written.
+        """
         self._record = _updated(self._record, outcome=played.outcome, outcome_detail=played.outcome_detail)
         self.record_outcome(played)
-        archive = RunArchive(self.directory.path)
+        archive = RunArchive(self.directory.path, report_progress=report_progress)
         evidence = checker.gather(archive)
         result, survived = checker.check(evidence), survival(evidence)
         wall_s = time.monotonic() - self._started
@@ -204,6 +213,7 @@ class RunRecording:
             wall_s=round(wall_s, 1),
         )
         archive.forget_record()
+        report_progress("writing the report")
         try:
             page = report.write_report(archive)
         except RunDirectoryError as error:

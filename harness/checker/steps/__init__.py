@@ -37,7 +37,8 @@ def check(evidence: Evidence) -> Judgement:
     deviations: list[Deviation] = []
     timers = JudgedTimers()
     steps, unjudged, lost = 0, dict[int, str](), list[str]()
-    for agent_id, trace in evidence.traces.items():
+    for number, (agent_id, trace) in enumerate(evidence.traces.items(), 1):
+        evidence.report_progress(f"judging the steps of agent {agent_id}, trace {number} of {len(evidence.traces)}")
         if not trace.header.has_inputs:
             unjudged[agent_id] = "the trace has the version ucp-trace/1, which lacks received messages"
             continue

@@ -1,11 +1,12 @@
 """Reconstruct a flight as a scenario, write the scenario, and verify that it replays the flight."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
+from harness.archive.archive import ReportProgress
 from harness.archive.exports import Export
 from harness.checker.judgement import agents
 from harness.errors import FieldError, MachineError
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
 SEED = 1
 """The seed of the simulation. The scenario does not depend on it."""
-
-ReportProgress = Callable[[str], None]
 
 
 @dataclass(frozen=True)

@@ -186,6 +186,9 @@ class _ProgressTee:
         self._page.set_snapshot(snapshot)
         self._progress.show(snapshot)
 
+    def show_judging(self, step: str) -> None:
+        self._progress.show_judging(step)
+
     def close(self) -> None:
         self._progress.close()
 
