@@ -12,7 +12,9 @@ their hashes.
 | `c` | an agent's blocks moved: agent, [operation, key] of each, top chain hash, cause of the commit |
 | `z` | an agent began a new incarnation without blocks: agent |
 | `s` | an agent's activity: agent, word, detail |
-| `m` | a broadcast: agent, message, key or null, receivers as a hexadecimal mask (bit n is the nth of the roster) |
+| `m` | a broadcast: agent, message, key or null, receivers as a hexadecimal mask (bit n is the nth of the roster),
+        sequence number |
+| `h` | further receivers of a broadcast of that second: agent, all receivers as a mask, sequence number |
 | `d` | an agent dropped a datagram: agent, reason |
 | `x` | a visible violation of a characteristic: agent, number, key |
 | `t` | the current mission second |
@@ -22,7 +24,7 @@ their hashes.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, islice
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -46,7 +48,10 @@ MAX_VEHICLES = 200
 LINES_AT_ONCE = 500
 """Maximum number of lines that are read from one file before the next file."""
 POLLS_UNTIL_REPORTED = 2
-"""Number of polls between the first sight of a message and its change. By then the receivers have recorded it."""
+"""Number of polls between the first sight of a message and its change. By then most receivers have recorded it. A
+receiver on a busy machine records it later, which gives a change `h`."""
+MAX_KEPT = 100_000
+"""Maximum number of reported messages that can still get a change `h`, and of messages that only receivers recorded."""
 
 
 @dataclass
@@ -58,6 +63,12 @@ class _Broadcast:
     t: float = 0.0
     message: str | None = None
     block: str | None = None
+
+    def add_receiver(self, bit: int) -> bool:
+        """Add the receiver with this bit. Return whether it is new."""
+        before = self.mask
+        self.mask |= bit
+        return self.mask != before
 
 
 class Feed:
@@ -82,6 +93,8 @@ class Feed:
         self._courses = [AgentCourse(agents, agent_id) for agent_id in self._roster]
         self._surroundings = Surroundings(directory, self._roster)
         self._broadcasts: dict[tuple[int, int], _Broadcast] = {}
+        self._reported: dict[tuple[int, int], _Broadcast] = {}
+        """The last reported messages: sender and sequence number -> message."""
         self._polls = 0
         self._reported_s = 0.0
         self._reported_problems: set[str] = set()
@@ -165,7 +178,10 @@ class Feed:
 
     def _take_changes(self) -> Iterator[Change]:
         for changes in (self._surroundings.changes, *(course.changes for course in self._courses)):
-            yield from changes
+            for change in changes:
+                if change[0] == "z":  # the new incarnation may use the same sequence numbers
+                    self._reported = {key: sent for key, sent in self._reported.items() if key[0] != change[2]}
+                yield change
             changes.clear()
 
     def _messages(self, *, report_all: bool) -> Iterator[Change]:
@@ -177,28 +193,39 @@ class Feed:
             course.sent.clear()
             course.receipts.clear()
         happened.sort(key=itemgetter(0, 1))
+        late: dict[tuple[int, int], _Broadcast] = {}
         for _, _, agent_id, what in happened:
             if isinstance(what, Receipt):
                 key = what.sender, what.seq
+                if key in self._reported and key not in self._broadcasts:
+                    if (reported := self._reported[key]).add_receiver(self._bit[agent_id]):
+                        late[key] = reported
+                    continue
                 if key not in self._broadcasts:
                     self._broadcasts[key] = _Broadcast(0, self._polls)
-                self._broadcasts[key].mask |= self._bit[agent_id]
+                self._broadcasts[key].add_receiver(self._bit[agent_id])
                 continue
             key = agent_id, what.seq
             before = self._broadcasts.get(key)
             if before is not None and before.message is not None:
-                yield self._message_change(agent_id, before)  # another incarnation reuses the number
+                yield self._message_change(key, before)  # another incarnation reuses the number
                 before = None
             mask = before.mask if before else 0
             self._broadcasts[key] = _Broadcast(mask, self._polls, what.t, what.message, what.block)
         old = self._polls if report_all else self._polls - POLLS_UNTIL_REPORTED
-        for key in [key for key, broadcast in self._broadcasts.items() if broadcast.polls <= old]:
-            broadcast = self._broadcasts.pop(key)
-            if broadcast.message is not None:
-                yield self._message_change(key[0], broadcast)
+        due = [key for key, each in self._broadcasts.items() if each.message is not None and each.polls <= old]
+        for key in due:
+            self._reported[key] = self._broadcasts.pop(key)
+            yield self._message_change(key, self._reported[key])
+        for (sender, sequence), broadcast in late.items():
+            yield ["h", broadcast.t, sender, f"{broadcast.mask:x}", sequence]
+        for kept in (self._reported, self._broadcasts):
+            for key in [*islice(kept, max(0, len(kept) - MAX_KEPT))]:
+                del kept[key]
 
-    def _message_change(self, sender: int, broadcast: _Broadcast) -> Change:
-        return ["m", broadcast.t, sender, broadcast.message, broadcast.block, f"{broadcast.mask:x}"]
+    def _message_change(self, key: tuple[int, int], broadcast: _Broadcast) -> Change:
+        sender, sequence = key
+        return ["m", broadcast.t, sender, broadcast.message, broadcast.block, f"{broadcast.mask:x}", sequence]
 
     def _notes(self) -> Iterator[Change]:
         """Yield sentences about problems that were not reported yet."""

@@ -4,7 +4,7 @@
 import { clock } from "./look.js";
 import { element } from "./panel.js";
 
-const HINT = "Click vehicles on the map to choose some.";
+const HINT = "Choose vehicles on the map: click them, or press N and Enter.";
 
 export class Hand {
   constructor(root, ask, changed) {

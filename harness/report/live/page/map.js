@@ -23,6 +23,20 @@ export class SwarmMap {
     canvas.addEventListener("pointerleave", () => { this.pointer = null; });
     this.placed = new Map();
     this.base = null;
+    this.focused = null; // the vehicle that the keyboard is at
+  }
+
+  moveBy(right, down) {
+    this.touched = true;
+    this.selection.call(this.zoom.translateBy, -right / this.transform.k, -down / this.transform.k);
+  }
+
+  // The keyboard goes to the next vehicle, or with -1 to the one before. Returns what the map tells about it.
+  focusNext(by, swarm) {
+    const { roster } = this.story.run, from = roster.indexOf(this.focused);
+    this.pointer = null;
+    this.focused = roster[from < 0 ? 0 : (from + by + roster.length) % roster.length];
+    return this.lines(this.focused, swarm).join("; ");
   }
 
   scaleBy(factor) { this.touched = true; this.selection.transition().duration(150).call(this.zoom.scaleBy, factor); }
@@ -273,19 +287,22 @@ export class SwarmMap {
     return nearest;
   }
 
-  // About the vehicle under the pointer.
-  told(context, swarm, width, height) {
-    if (!this.pointer) return;
-    const nearest = this.nearest(...this.pointer);
-    if (nearest === null) return;
-    const agent = swarm.agents.get(nearest), at = this.placed.get(nearest);
-    const type = swarm.run.types[swarm.run.roster.indexOf(nearest)];
+  lines(id, swarm) {
+    const agent = swarm.agents.get(id), at = this.placed.get(id), type = swarm.run.types[swarm.run.roster.indexOf(id)];
     const state = { down: "agent down", gone: "lost", still: "paused" }[agent.state] ?? agent.doing;
-    const lines = [
-      `vehicle ${nearest}, a ${type}${at.up === null ? "" : `, ${at.up.toFixed(0)} m up`}`,
+    return [
+      `vehicle ${id}, a ${type}${at.up === null ? "" : `, ${at.up.toFixed(0)} m up`}`,
       `${state}${agent.more && agent.state === "up" && agent.doing !== "voting" ? `: ${agent.more}` : ""}`,
       `chain of ${agent.chain.length}, waiting ${agent.deque.length}, on its stack ${agent.stack.length}`,
     ];
+  }
+
+  // About the vehicle under the pointer, or at which the keyboard is.
+  told(context, swarm, width, height) {
+    const nearest = this.pointer ? this.nearest(...this.pointer) : this.focused;
+    if (nearest === null) return;
+    const at = this.placed.get(nearest), lines = this.lines(nearest, swarm);
+    context.font = font(12);
     const wide = Math.max(...lines.map((line) => context.measureText(line).width)) + 20, tall = 18 * lines.length + 12;
     const x = Math.min(at.x + 16, width - wide - 8), y = Math.min(Math.max(at.y - tall / 2, 8), height - tall - 8);
     context.fillStyle = colour("ground");
@@ -295,7 +312,6 @@ export class SwarmMap {
     context.fill();
     context.stroke();
     context.textAlign = "left";
-    context.font = font(12);
     lines.forEach((line, row) => {
       context.fillStyle = colour(row ? "quiet" : "ink");
       context.fillText(line, x + 10, y + 19 + 18 * row);

@@ -13,6 +13,7 @@ export class Events {
   constructor(list, filters, seek) {
     this.list = list;
     this.seek = seek;
+    list.addEventListener("keydown", (event) => this.step(event));
     this.shown = new Set(KINDS.filter(([, , on]) => on).map(([kind]) => kind));
     for (const [kind, label, on] of KINDS) {
       const button = element("button", label);
@@ -30,6 +31,15 @@ export class Events {
 
   wipe() { this.list.replaceChildren(); this.waiting = []; }
 
+  // The arrow keys go from event to event.
+  step(event) {
+    const line = document.activeElement.closest("#events li");
+    const next = { ArrowDown: line ? line.nextSibling : this.list.firstChild, ArrowUp: line?.previousSibling }[event.key];
+    if (!(event.key in { ArrowDown: 0, ArrowUp: 0 })) return;
+    event.preventDefault();
+    next?.querySelector("button").focus();
+  }
+
   // Takes a change; `swarm` is as it was right after it.
   take(change, swarm) {
     const told = inWords(change, swarm);
@@ -42,10 +52,13 @@ export class Events {
   show() {
     if (!this.waiting.length) return;
     const lines = this.waiting.map(([t, kind, text]) => {
-      const line = element("li"), time = element("time", clock(t));
+      const line = element("li"), time = element("button", clock(t));
       line.className = kind;
+      time.type = "button";
+      time.tabIndex = -1;
+      time.title = "Go to this time";
+      time.addEventListener("click", () => this.seek(t));
       line.append(time, element("i"), element("span", text));
-      line.addEventListener("dblclick", () => this.seek(t));
       return line;
     });
     this.waiting = [];
@@ -112,6 +125,7 @@ export class Verdicts {
     this.list.replaceChildren(...lines.map(([, name, reason, [mark, kind]]) => {
       const line = element("li"), why = element("span", reason), sign = element("span", mark);
       line.className = kind;
+      line.tabIndex = 0;
       sign.className = "mark";
       why.className = "reason";
       why.title = reason;

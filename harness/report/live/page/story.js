@@ -1,5 +1,8 @@
 // What the server tells, kept in order of time, and the swarm as it was at any second of it.
 
+const MOST_COUNTED = 2000; // messages, in a figure
+const bits = (mask) => mask.toString(2).split("1").length - 1;
+
 const TELLS_STATE = new Set(["n", "b", "c", "z", "s", "x", "d"]);
 
 export class Story {
@@ -31,6 +34,7 @@ export class Story {
     else if (kind === "t") this.until = Math.max(this.until, second);
     else if (kind === "p") this.place(second, change[2]);
     else if (kind === "m") insert(this.messages, change);
+    else if (kind === "h") this.addReceivers(second, ...change.slice(2));
     else if (TELLS_STATE.has(kind)) {
       this.firstChanged = Math.min(this.firstChanged, insert(this.log, change));
       this.ahead.apply(change);
@@ -58,8 +62,37 @@ export class Story {
     return { north, east, up, course: Math.hypot(dn, de) > 0.5 ? Math.atan2(de, dn) : null };
   }
 
-  // What happened after one second, up to and with another.
-  messagesBetween(from, to) { return this.messages.slice(firstAfter(this.messages, from), firstAfter(this.messages, to)); }
+  // A receiver on a busy machine records a message late.
+  addReceivers(t, agent, mask, sequence) {
+    for (let at = firstAfter(this.messages, t) - 1; at >= 0 && this.messages[at][1] === t; at -= 1) {
+      const message = this.messages[at];
+      if (message[2] === agent && message[6] === sequence) message[5] = mask;
+    }
+  }
+
+  // The messages after one second, up to and with another, the newest first, each with masks of the receivers that got
+  // it and that lost it. A receiver handles messages in order. So it lost a message if it could have received it, and
+  // has received a later one, up to the second `known`. What a receiver has done with the newest messages is not known.
+  *fates(from, to, known = to) {
+    const { messages } = this, { history } = this.ahead;
+    let later = 0n;
+    for (let at = firstAfter(messages, known) - 1; at >= 0 && messages[at][1] > from; at -= 1) {
+      const [, t, sender, , , mask] = messages[at], heard = BigInt(`0x${mask}`);
+      if (t <= to) yield { message: messages[at], heard: heard & later, lost: later & ~heard & history.reach(sender, t), all: heard };
+      later |= heard;
+    }
+  }
+
+  // The share of receptions that were lost between two seconds; null if nothing is known.
+  shareLost(from, to) {
+    let heard = 0, lost = 0, left = MOST_COUNTED;
+    for (const fate of this.fates(from, to)) {
+      heard += bits(fate.heard);
+      lost += bits(fate.lost);
+      if (!(left -= 1)) break;
+    }
+    return heard + lost ? lost / (heard + lost) : null;
+  }
 }
 
 // The first whose time is later.
@@ -186,6 +219,17 @@ export class History {
     this.marks = [];
     this.gone = [];
     this.version = 0;
+    this.bit = new Map(run.roster.map((agent, index) => [agent, 1n << BigInt(index)]));
+    this.linked = new Map(run.roster.map((agent) => [agent, [[0, 0, 0n]]]));
+    this.up = [[0, 0, [...this.bit.values()].reduce((all, bit) => all | bit, 0n)]];
+  }
+
+  // The receivers that a message of that agent and second could reach, as a mask.
+  reach(agent, t) { return at(this.linked.get(agent), t) & at(this.up, t); }
+
+  link(t, from, to, loss) {
+    const steps = this.linked.get(from), before = steps.at(-1)[2], bit = this.bit.get(to);
+    push(steps, t, loss < 1 ? before | bit : before & ~bit);
   }
 
   take([kind, t, ...rest], swarm) {
@@ -200,8 +244,14 @@ export class History {
       if (kind === "z") { this.close(rest[0], t, "vote", "cut short"); this.close(rest[0], t, "reconcile", "cut short"); }
       this.countHeads(t, swarm);
     } else if (kind === "n") {
-      const [what, detail, agents, state, , parts] = rest;
+      const [what, detail, agents, state, pairs, parts] = rest;
+      for (const [low, high, there, back] of pairs) { this.link(t, low, high, there); this.link(t, high, low, back); }
       if (parts) push(this.parts, t, parts.length);
+      if (state) {
+        let up = this.up.at(-1)[2];
+        for (const agent of agents) up = swarm.agents.get(agent).state === "up" ? up | this.bit.get(agent) : up & ~this.bit.get(agent);
+        push(this.up, t, up);
+      }
       if (state === "down" || state === "gone") for (const agent of agents) {
         this.close(agent, t, "vote", "cut short"); this.close(agent, t, "reconcile", "cut short");
         this.begin(agent, t, "gone");
@@ -228,6 +278,8 @@ export class History {
     this.open.delete(`${agent} ${what}`);
   }
 }
+
+const at = (steps, t) => steps[Math.max(0, firstAfter(steps, t) - 1)][2];
 
 function push(steps, t, value) {
   const last = steps[steps.length - 1];

@@ -12,6 +12,7 @@ import { Timeline } from "./timeline.js";
 const SPEEDS = [0.25, 0.5, 1, 2, 5, 10, 20, 50, 100, 200];
 const BEHIND_WALL_S = 0.5; // so much later than the run a live page is: by then everybody has told what they did
 const MOST_PULSES = 120;
+const KNOWN_AFTER_S = 10; // by so many later mission seconds a page judges whether a receiver lost a message
 const FRAME_MS = 1000 / 30;
 
 const $ = (id) => document.getElementById(id);
@@ -42,10 +43,8 @@ function begin() {
     hand.roster = run.roster;
     hand.befall(run);
     map.chosen = hand.chosen;
-    $("map").addEventListener("click", (event) => {
-      const id = story.end ? null : map.nearest(event.offsetX, event.offsetY);
-      if (id !== null) hand.choose(id);
-    });
+    $("map").addEventListener("click", (event) => choose(map.nearest(event.offsetX, event.offsetY)));
+    $("choose-hint").hidden = false;
     if (story.hand) hand.take(story.hand);
     $("hand").hidden = false;
   }
@@ -121,24 +120,15 @@ function gather(passed) {
   if (time < told) told = time;
   if (time === told) return;
   const { run } = story;
-  for (const [, , sender, message, , mask] of story.messagesBetween(told, time).slice(-MOST_PULSES)) {
-    const bits = BigInt(`0x${mask}`);
-    const heard = [], missed = [];
-    run.roster.forEach((id, index) => {
-      if (bits >> BigInt(index) & 1n) heard.push(id);
-      else if (id !== sender && run.all_heard && linked(sender, id)) missed.push(id);
-    });
-    pulses.push({ age: 0, sender, message, heard, lost: missed });
+  const recent = [];
+  for (const { message: [, , sender, message], all, lost } of story.fates(told, time, time + KNOWN_AFTER_S)) {
+    const among = (mask) => run.roster.filter((_, index) => mask >> BigInt(index) & 1n);
+    recent.push({ age: 0, sender, message, heard: among(all), lost: run.all_heard ? among(lost) : [] });
+    if (recent.length === MOST_PULSES) break;
   }
+  pulses.push(...recent.reverse());
   if (pulses.length > MOST_PULSES) pulses = pulses.slice(-MOST_PULSES);
   told = time;
-}
-
-// Whether one could have heard the other at all.
-function linked(from, to) {
-  const { swarm } = playhead, link = swarm.links.get(from < to ? `${from}-${to}` : `${to}-${from}`);
-  if (["down", "gone", "still"].includes(swarm.agents.get(to).state)) return false;
-  return link !== undefined && (from < to ? link[2] : link[3]) < 1;
 }
 
 function show() {
@@ -173,20 +163,9 @@ function show() {
 
 const listed = (ids) => ids.length > 6 ? `${ids.slice(0, 5).join(" ")} … (${ids.length})` : ids.join(" ");
 
-// Of all that could have been heard in the last minute.
 function shareLost() {
-  const { run } = story;
-  if (!run.all_heard) return "";
-  let could = 0, did = 0;
-  for (const [, , sender, , , mask] of story.messagesBetween(time - 60, time).slice(-2000)) {
-    const bits = BigInt(`0x${mask}`);
-    run.roster.forEach((id, index) => {
-      const heard = bits >> BigInt(index) & 1n;
-      if (heard || (id !== sender && linked(sender, id))) could += 1;
-      if (heard) did += 1;
-    });
-  }
-  return could ? ` · ${percent(1 - did / could)} lost in the last minute` : "";
+  const share = story.run.all_heard ? story.shareLost(time - 60, time) : null;
+  return share === null ? "" : ` · ${percent(share)} lost in the last minute`;
 }
 
 function showStatus() {
@@ -260,14 +239,31 @@ function controls() {
   $("zoom-fit").addEventListener("click", () => { map?.fit(); changed = true; });
   addEventListener("keydown", (event) => {
     if (event.target.matches("input, select, button") && event.key !== " ") return;
-    if (event.target.matches("button, select") || playhead === null) return;
-    const steps = { ArrowLeft: -10, ArrowRight: 10, Home: -Infinity, End: Infinity };
-    if (event.key === " ") toggle(); else if (event.key in steps) seek(time + steps[event.key]); else return;
+    if (event.target.matches("button, select") || playhead === null || event.ctrlKey || event.metaKey || event.altKey) return;
+    const press = event.shiftKey && MOVES[event.key] ? () => map.moveBy(...MOVES[event.key]) : KEYS[event.key];
+    if (!press || event.defaultPrevented) return;
+    press();
+    changed = true;
     event.preventDefault();
   });
   addEventListener("resize", () => { changed = true; });
   whenColoursChange(() => { changed = true; if (story.run) drawLegend(); });
   for (const name of ["wheel", "pointermove", "pointerleave"]) $("map").addEventListener(name, () => { changed = true; }, { passive: true });
+}
+
+const MOVES = { ArrowLeft: [-60, 0], ArrowRight: [60, 0], ArrowUp: [0, -60], ArrowDown: [0, 60] };
+const next = (by) => { $("vehicle").textContent = map.focusNext(by, playhead.swarm); };
+const KEYS = {
+  " ": () => toggle(),
+  ArrowLeft: () => seek(time - 10), ArrowRight: () => seek(time + 10), Home: () => seek(-Infinity), End: () => seek(Infinity),
+  "+": () => map.scaleBy(1.5), "=": () => map.scaleBy(1.5), "-": () => map.scaleBy(1 / 1.5), 0: () => map.fit(),
+  n: () => next(1), p: () => next(-1), Enter: () => choose(map.focused),
+};
+
+function choose(id) {
+  if (id === null || !hand || story.end) return;
+  hand.choose(id);
+  $("vehicle").textContent = `vehicle ${id} ${hand.chosen.has(id) ? "chosen" : "not chosen"}`;
 }
 
 function toggle() {

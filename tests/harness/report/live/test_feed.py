@@ -100,6 +100,43 @@ def test_growing_files_give_the_same_changes(run: Path, tmp_path: Path) -> None:
     assert len(of_kind("m", told)) == len(of_kind("m", film(run)))
 
 
+def late_film(run: Path, growing: Path, lag: int = 3) -> list[Change]:
+    """Return the changes of a live run in which each agent writes its trace later than the agent before."""
+    (growing / "agents").mkdir(parents=True)
+    shutil.copy(run / "run.json", growing)
+    shutil.copy(run / "network.jsonl", growing)
+    content = {path: path.read_bytes().splitlines(keepends=True) for path in run.glob(f"agents/*{SUFFIX}")}
+    feed = Feed(growing)
+    told = [feed.run_change(live=True)]
+    for step in range(50):
+        for path, lines in content.items():
+            share = max(0, step - lag * int(path.name.partition(".")[0]))
+            (growing / "agents" / path.name).write_bytes(b"".join(lines[: len(lines) * share // 36]))
+        told += feed.poll()[0]
+    told += feed.final_changes()
+    feed.close()
+    return told
+
+
+def receivers(told: list[Change]) -> dict[tuple[int, int, float], str]:
+    """Return the mask of each message in the end: sender, sequence number and time -> mask."""
+    masks = {}
+    for kind, at_s, *rest in told:
+        if kind == "m":
+            masks[rest[0], rest[4], at_s] = rest[3]
+        elif kind == "h":
+            assert (rest[0], rest[2], at_s) in masks
+            masks[rest[0], rest[2], at_s] = rest[1]
+    return masks
+
+
+def test_message_gets_the_receivers_that_record_it_late(tmp_path: Path) -> None:
+    run = played(tmp_path / "run", timeline=[])
+    told = late_film(run, tmp_path / "live")
+    assert of_kind("h", told)
+    assert receivers(told) == receivers(film(run))
+
+
 def test_each_incarnation_of_a_process_is_read_once(run: Path, tmp_path: Path) -> None:
     killed = tmp_path / "run"
     shutil.copytree(run, killed)

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from harness.play.progress import Silent
 from harness.report.facts import link_qualities
+from harness.run.run import run as play
 from tests.harness.command import DEADLINE_S
 from tests.harness.report.browser import Browser
 from tests.harness.report.live.pages import page_of, until
 from tests.harness.report.live.runs import film, of_kind, played
-from tests.harness.report.live.test_feed import chains_of, of_report, reconcile_during_a_vote
+from tests.harness.report.live.test_feed import chains_of, late_film, of_report, reconcile_during_a_vote
+from tests.harness.virtual import scenario
 
 HOSTILE = "</title><script>document.title = 'owned'</script><img src=x onerror=\"document.title='owned'\">"
 
@@ -56,17 +59,59 @@ def test_a_film_plays_forward_and_back_and_takes_names_as_text(browser: Browser,
         assert process.wait(DEADLINE_S) == 0
 
 
+def test_keyboard_does_what_the_mouse_does(browser: Browser, run: Path) -> None:
+    with page_of("watch", run) as (_, address):
+        browser.show(address, width=1280, scheme="light")
+        until(browser, "watch.story.end")
+        browser.evaluate("watch.seek(1e9)")
+        until(browser, "document.querySelectorAll('#events button').length > 3")
+        assert browser.evaluate("document.getElementById('map-hint').innerText").startswith("Zoom: wheel or +")
+        for _ in range(2):
+            browser.press("n", "n")
+        assert browser.evaluate("document.getElementById('vehicle').textContent").startswith("vehicle 2, a copter")
+        browser.press("+", "+")
+        until(browser, "d3.zoomTransform(document.getElementById('map')).k > 1.4")
+        moved = browser.evaluate("d3.zoomTransform(document.getElementById('map')).x")
+        browser.press("ArrowRight", shift=True)
+        assert browser.evaluate("d3.zoomTransform(document.getElementById('map')).x") == pytest.approx(moved - 60)
+        browser.evaluate("document.getElementById('events').focus()")
+        for _ in range(3):
+            browser.press("ArrowDown")
+        browser.press("ArrowUp")
+        second = "document.querySelectorAll('#events button')[1]"
+        assert browser.evaluate(f"document.activeElement === {second}")
+        before = browser.evaluate("watch.time")
+        browser.press("Enter", "\r")
+        assert 0 < browser.evaluate("watch.time") < before
+
+
 def test_page_keeps_a_vote_open_when_a_reconcile_begins(browser: Browser, run: Path, tmp_path: Path) -> None:
     changes, trace = reconcile_during_a_vote(tmp_path)
     with page_of("watch", run) as (_, address):
         browser.show(address, width=1000, scheme="light")
         until(browser, "watch.story.end")
         browser.evaluate(
-            "const history = new watch.story.ahead.history.constructor(), swarm = watch.story.ahead;"
+            "const swarm = watch.story.ahead, history = new swarm.history.constructor(swarm.run);"
             f"for (const change of {json.dumps(changes)}) {{ swarm.apply(change); history.take(change, swarm); }}"
             "window.spans = history.spans.map(span => [span.what, span.from, span.to]); true"
         )
         assert sorted(browser.evaluate("window.spans")) == [list(one[:3]) for one in of_report({1: trace})]
+
+
+def test_live_page_and_film_show_the_loss_of_the_network(browser: Browser, run: Path, tmp_path: Path) -> None:
+    """Receivers record messages late, and a partition takes part of the minute."""
+    partition = [{"at_s": 50, "partition": [[1, 2, 3], [4, 5, 6]]}, {"at_s": 80, "heal": True}]
+    asked = scenario(agents=6, duration_s=150, network={"loss": 0.2}, timeline=partition, events={"mean_s": 4})
+    lossy = play(asked, 1, tmp_path / "lossy", Silent(), "sim", delivers_all=True).directory
+    stories = {"film": film(lossy), "live": late_film(lossy, tmp_path / "live", lag=1)}
+    with page_of("watch", run) as (_, address):
+        browser.show(address, width=1000, scheme="light")
+        until(browser, "watch.story.end")
+        for name, told in stories.items():
+            browser.evaluate(f"window.{name} = new watch.story.constructor()")
+            browser.evaluate(f"for (const change of {json.dumps(told)}) {name}.take(change)")
+        shares = {name: browser.evaluate(f"[70, 100, 130].map(t => {name}.shareLost(t - 60, t))") for name in stories}
+    assert shares["live"] == shares["film"] == [pytest.approx(0.2, abs=0.04)] * 3
 
 
 def test_a_film_of_a_run_that_was_killed_says_so(browser: Browser, run: Path, tmp_path: Path) -> None:
