@@ -1,1 +1,1 @@
-"""The mission of a scenario, and the backends that play it with real programs or in virtual time."""
+"""Play the mission of a scenario, either with real programs or as a simulation in virtual time."""

@@ -1,4 +1,4 @@
-"""The check before a run that the ground station of the scenario can be reached."""
+"""Check before a run that the ground station named in the scenario can be reached."""
 
 from harness.errors import ScenarioError
 from harness.scenario import Scenario

@@ -1,4 +1,4 @@
-"""The speed of virtual time: unlimited, limited by a real-time factor, or paused with single steps."""
+"""Control the speed of virtual time: unlimited, limited to a multiple of real time, or paused with single steps."""
 
 import asyncio
 import math
@@ -16,13 +16,15 @@ NEXT_RUN = math.inf
 
 
 class Pace:
-    """The pace of one run, for use in the event loop of the run only.
+    """The speed of virtual time in one run. Only the event loop of the run may use this object.
 
     Before virtual time advances, the simulation calls `allowed_until` for the time that it may reach.
     """
 
     def __init__(self, factor: float | None = None, *, paused: bool = False) -> None:
-        """`factor`: mission seconds per second of wall time. None: unlimited."""
+        """Set the initial speed. `factor` is the number of mission seconds per second of wall time, or None for
+        unlimited speed.
+        """
         self.factor = factor
         self.paused = paused
         self._step: Future[float] | None = None
@@ -35,11 +37,11 @@ class Pace:
 
     @property
     def stops_at_next_run(self) -> bool:
-        """True during a step to the next handler run."""
+        """True if the present step ends at the next handler run."""
         return self._step is not None and self._step_to_s == NEXT_RUN
 
     def set_factor(self, factor: float | None) -> None:
-        """Set the factor. None: unlimited."""
+        """Set the number of mission seconds per second of wall time. None means unlimited speed."""
         self.factor = factor
         self._change()
 
@@ -53,7 +55,7 @@ class Pace:
         self._change()
 
     def step(self, to_s: float, done: "Future[float]") -> None:
-        """Pause after a step to mission second `to_s`, or with `NEXT_RUN` to the next handler run.
+        """Continue until mission second `to_s`, or with `NEXT_RUN` until the next handler run, and then pause.
 
         `done` receives the mission second at the end of the step. It must be in the state "running".
         """
@@ -63,7 +65,9 @@ class Pace:
 
     @contextmanager
     def unlimited(self) -> Iterator[None]:
-        """Lift all limits inside the context. An intervention needs this, because it takes no mission time."""
+        """Lift all speed limits inside the context. An event that the user causes by hand needs this, because it takes
+        no mission time.
+        """
         self._limited = False
         try:
             yield
@@ -77,12 +81,12 @@ class Pace:
         self._step = None
 
     def record_run(self, now_s: float) -> None:
-        """Record that a handler has run. This ends the current step."""
+        """Record that a handler has run. If a single step waits for a handler run, the step ends."""
         self._now_s = now_s
         self.end_step()
 
     async def allowed_until(self, now_s: float) -> float | None:
-        """Return the mission second up to which time may advance.
+        """Return the mission second up to which time may advance now, or None if there is no limit.
 
         If time may not advance now, wait for a short time and return None.
         """
@@ -113,7 +117,7 @@ class Pace:
         return allowed_s if allowed_s > now_s else None
 
     def _wall_time_of(self, mission_s: float, factor: float) -> float:
-        """Return the wall time at which this mission second is due."""
+        """Return the wall time at which virtual time must reach this mission second."""
         assert self._anchor is not None
         wall_s, since_s = self._anchor
         return wall_s + (mission_s - since_s) / factor

@@ -1,4 +1,5 @@
-"""The network conditions at the current places of the vehicles: conditions of the timeline, and losses of the radio.
+"""Compute the network conditions from the timeline of the scenario and from the radio losses at the vehicles'
+positions.
 
 All backends use this module, so the same flight gives the same network. Without a radio in the scenario, the places
 have no effect.
@@ -30,14 +31,18 @@ class RadioRange:
         self._losses: dict[frozenset[int], float] = {}
 
     def change_timeline(self, change: NetworkChange) -> NetworkChange:
-        """Return a change of the timeline together with the losses of the radio at the current places."""
+        """Return the network change of a timeline entry, combined with the radio losses at the vehicles' current
+        positions.
+        """
         self._requested = change.conditions
         if change.clears_all:
             self._radio = None
         return replace(change, losses=self._set_losses({}) if change.clears_all else {}, conditions=self._conditions())
 
     def move(self, at_s: float, places: Mapping[int, Place]) -> NetworkChange | None:
-        """Move the vehicles. Return the change of the network. None if the network stays the same."""
+        """Move the vehicles to these positions. Return the resulting network change, or None if the network stays the
+        same.
+        """
         if self._radio is None:
             return None
         losses = radio.links(self._radio, places)
@@ -50,7 +55,7 @@ class RadioRange:
         )
 
     def _set_losses(self, losses: dict[frozenset[int], float]) -> dict[str, float]:
-        """Set the losses of the radio. Return the changed ones: pair of vehicles, such as "1-3" -> loss."""
+        """Set the radio losses. Return those that changed, with keys such as "1-3" for a pair of vehicles."""
         changed = {pair for pair in losses.keys() | self._losses.keys() if losses.get(pair) != self._losses.get(pair)}
         self._losses = losses
         return {"-".join(map(str, sorted(pair))): losses.get(pair, 0.0) for pair in sorted(changed, key=sorted)}
@@ -60,12 +65,12 @@ class RadioRange:
 
 
 def groups_text(components: Iterable[Iterable[int]]) -> str:
-    """Return the connected groups as text, such as "1 2 3 | 4 5"."""
+    """Return the groups of connected vehicles as text, such as "1 2 3 | 4 5"."""
     return " | ".join(" ".join(map(str, sorted(component))) for component in components)
 
 
 def tracks_of(scenario: Scenario) -> dict[int, Track]:
-    """Return the tracks of the vehicles in virtual time.
+    """Return the flight path of each vehicle in virtual time.
 
     Empty if the scenario has no flight, radio, channel or ground station that needs positions.
     """
@@ -75,7 +80,7 @@ def tracks_of(scenario: Scenario) -> dict[int, Track]:
 
 
 def track_of(scenario: Scenario, vehicle: int) -> Track:
-    """Return the computed track of a vehicle that takes off at mission second 0."""
+    """Return the computed flight path of a vehicle that takes off at mission second 0."""
     vehicles, flight = scenario.vehicles, scenario.flight_of(vehicle)
     index = scenario.roster.index(vehicle)
     if index in vehicles.swarm or vehicle in vehicles.each:

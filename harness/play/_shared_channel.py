@@ -1,4 +1,4 @@
-"""The messages of agents on a radio channel that they share, in virtual time and in real time.
+"""Simulate a radio channel that all agents share. It is used in virtual time and in real time.
 
 A message waits for the processing time of its agent, then in the queue of its radio. It arrives, if at all, when its
 frame ends. `ChannelTraffic` connects the messages with their frames, and counts their fates. It reads no clock: the
@@ -27,14 +27,14 @@ _WORD_BITS = 32
 class _Sent(Protocol):
     @property
     def sequence(self) -> int | None:
-        """The number of the message, if it is one of an agent."""
+        """The sequence number of an agent's message, or None for another sender's datagram."""
 
 
 Message = TypeVar("Message", bound=_Sent)
 
 
 class ChannelTraffic(Generic[Message]):
-    """The channel of `roster`, with its messages on the way."""
+    """A shared radio channel of all agents, with the messages that wait for it or are being sent."""
 
     def __init__(
         self, roster: Sequence[int], radio: Radio, processing_s: float, seed: int, journal: Journal | None
@@ -54,7 +54,7 @@ class ChannelTraffic(Generic[Message]):
         """Frame number -> message."""
 
     def send(self, now: float, sender: int, message: Message, data_bytes: int) -> None:
-        """Process the message, and give it to the radio after this. The order of an agent's messages stays."""
+        """Send a message on the channel as soon as the radio is free. The messages of one agent keep their order."""
         at = now + self._draws[sender].getrandbits(_WORD_BITS) * self._processing_s
         at = self._processed_at[sender] = max(at, self._processed_at[sender])
         self._order += 1
@@ -63,7 +63,7 @@ class ChannelTraffic(Generic[Message]):
             self.next_s = at
 
     def advance(self) -> list[tuple[Transmission, Message]]:
-        """Play what happens at `next_s`, and return the frames that end then."""
+        """Advance the channel to the next event, and return the frames whose transmission ends then."""
         now, processed = self.next_s, self._processed
         while processed and processed[0][0] <= now:
             at, _, sender, data_bytes, message = heappop(processed)
@@ -104,7 +104,7 @@ class ChannelTraffic(Generic[Message]):
 
 
 class ChannelTotals:
-    """Counts of frames, of their fates by receiver, and of the load over time."""
+    """Counts of sent frames, of lost and received frames by receiver, and of the channel's load over time."""
 
     def __init__(self, roster: Sequence[int]) -> None:
         self.frames = 0
@@ -134,7 +134,7 @@ class ChannelTotals:
         self._drops.setdefault(fate, Counter())[sender] += 1
 
     def _occupy(self, began_at: float, ended_at: float) -> None:
-        """Add a time in which the channel is busy to the intervals of the load."""
+        """Add an interval in which the channel was busy to the load over time."""
         while began_at < ended_at:
             index = int(began_at / LOAD_S)
             until = min(ended_at, (index + 1) * LOAD_S)
@@ -144,7 +144,7 @@ class ChannelTotals:
             began_at = until
 
     def to_json(self) -> dict[str, Any]:
-        """Return the counts as run.json has them."""
+        """Return the counts as a JSON object for run.json."""
         lost = {fate.value: self._by_id(counter.counts()) for fate, counter in sorted(self._receivers.items())}
         return {
             "frames": self.frames,
@@ -160,7 +160,7 @@ class ChannelTotals:
 
 
 class BitCounter:
-    """A count for each bit of the sets that were added.
+    """A counter for sets of small numbers. Each set is an integer whose bits are its members.
 
     The counts are kept in binary, each digit of all counts as one integer. To add a set is then a ripple-carry addition
     of all bits at once, which takes two steps on average, for any number of bits.
@@ -180,7 +180,7 @@ class BitCounter:
             self._digits.append(bits)
 
     def counts(self) -> dict[int, int]:
-        """Return the count of each bit that is not 0, by the number of the bit."""
+        """Return the number of added sets that contain each member. Members without occurrence are omitted."""
         counts: Counter[int] = Counter()
         for place, digit in enumerate(self._digits):
             for number in numbers(digit):

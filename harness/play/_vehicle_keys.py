@@ -1,4 +1,4 @@
-"""The keys of the vehicles of a secured mission, and their files for agent programs.
+"""Provide the keys of the vehicles of a secured mission, as objects and as files for agent programs.
 
 Keys are fresh, or come from a directory. Agent programs find their keys in temporary directories, which exist only
 during the run. The run directory contains no secret.
@@ -26,7 +26,7 @@ FRESH_BYTES = 32
 
 @dataclass(frozen=True)
 class MissionKeys:
-    """The keys of a secured mission: the bundle of each vehicle, and the authority that revokes keys."""
+    """The keys of a secured mission: the secret keys of each vehicle, and the authority that can exclude vehicles."""
 
     bundles: Mapping[int, "Bundle"]
     authority: "Authority"
@@ -38,16 +38,18 @@ class MissionKeys:
         return next(iter(self.bundles.values())).public
 
     def add_depot_key(self, initial_data: bytes) -> bytes:
-        """Return the data of the inception block. If event data is sealed, it contains the depot's public key."""
+        """Return the data of the inception block. If event data are encrypted, they include the public key for the
+        depot.
+        """
         return seal_to(initial_data, self.public.depot) if self.seals and self.public.depot else initial_data
 
     def revoke(self, agent_id: int) -> bytes:
-        """Return the revocation of this vehicle as the body of a message."""
+        """Return the signed message body that excludes this vehicle."""
         return self.authority.revoke(agent_id)
 
 
 def mission_keys(scenario: Scenario, secret: bytes) -> MissionKeys | None:
-    """Return the keys of the mission. None if it is not secured.
+    """Return the keys of the mission, or None if the mission is not secured.
 
     Fresh keys are derived from `secret`, which has 32 bytes. Raises ScenarioError for unusable keys, and MachineError
     if the package cryptography is missing.
@@ -75,12 +77,12 @@ def mission_keys(scenario: Scenario, secret: bytes) -> MissionKeys | None:
 
 
 def refuse_revocations(scenario: Scenario) -> None:
-    """Raise ScenarioError if the timeline has a revocation that this machine cannot sign."""
+    """Raise ScenarioError if the scenario excludes a vehicle and this machine lacks the key to sign that message."""
     mission_keys(scenario, bytes(FRESH_BYTES))
 
 
 def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
-    """Read the bundles of the vehicles from a directory of keys or of bundles. Raises ScenarioError."""
+    """Return the secret keys of the vehicles from a directory. Raises ScenarioError if files are missing or invalid."""
     from harness.play.keyring.key_directory import VEHICLES_NAME, Home, KeysError
     from ucp.secure.bundle import bundle_name, load_bundle
     from ucp.secure.keyfile import KeyFileError
@@ -106,7 +108,9 @@ def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
 
 
 def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Scenario) -> "Authority":
-    """Return the authority that signs the revocations of the timeline. Raises ScenarioError if it cannot."""
+    """Return the authority whose key signs the exclusion of vehicles. Raises ScenarioError if the directory lacks
+    it.
+    """
     from harness.play.keyring.key_directory import REVOCATION_NAME, Authority, Home, KeysError, listed
 
     revoking = [fault.agents for fault in scenario.faults_in_order() if fault.needs_keys]
@@ -124,14 +128,16 @@ def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Sc
 
 
 class KeyDirectories:
-    """A directory for each vehicle with its bundle. Other vehicles do not read it. `keys` is None without security."""
+    """A separate directory with the secret keys of each vehicle. `keys` is None if the mission is not secured."""
 
     def __init__(self, keys: MissionKeys | None, directory: Path) -> None:
         self.keys = keys
         self.directories = {agent_id: directory / str(agent_id) for agent_id in (keys.bundles if keys else ())}
 
     def write_bundle(self, agent_id: int, *, kept: bool) -> Path | None:
-        """Write the bundle of the vehicle, and return its path. `kept` keeps an existing bundle. Raises OSError."""
+        """Write the file with the vehicle's keys, and return its path. `kept` keeps an existing file. Raises
+        OSError.
+        """
         if self.keys is None:
             return None
         from ucp.secure.bundle import bundle_name, write_bundle
@@ -144,7 +150,9 @@ class KeyDirectories:
 
 @contextmanager
 def key_directories(scenario: Scenario) -> Iterator[KeyDirectories]:
-    """Create the key directories, and remove them after the run. Raises as `mission_keys`, and OSError."""
+    """Create the directories with keys for a run, and remove them afterwards. Raises OSError, and the errors of
+    `mission_keys`.
+    """
     keys = mission_keys(scenario, os.urandom(FRESH_BYTES))
     if keys is None:
         yield KeyDirectories(None, Path())

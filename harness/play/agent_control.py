@@ -1,4 +1,5 @@
-"""An agent as a program: its command line, its control socket, and its last output.
+"""Handle an agent that is a program: find its command, talk to its control socket, and read the last line of its
+output.
 
 An agent that lacks a feature of its mission ends with status 127 and a sentence on standard error
 (ucp/contract/CONTRACT.md). A shell, env(1) and the first process of a container also end with 127, if they do not find
@@ -24,7 +25,7 @@ FIRST_LINE_BYTES = 256
 
 
 def resolve_command(command: Sequence[str], what: str) -> list[str]:
-    """Return the command with absolute paths, so that it works in any directory.
+    """Return the command with absolute paths, so that it works from any directory.
 
     Raises ScenarioError, which starts with `what`, if the program does not exist.
     """
@@ -39,7 +40,7 @@ def resolve_command(command: Sequence[str], what: str) -> list[str]:
 
 
 def _interpreter(program: Path) -> Path | None:
-    """Return the interpreter in the first line of a script. None if the file is no readable script."""
+    """Return the interpreter that the first line of a script names, or None if the file is not a readable script."""
     try:
         with program.open("rb") as file:
             line = file.readline(FIRST_LINE_BYTES)
@@ -68,7 +69,7 @@ _SHELL_ERROR = re.compile(
 
 
 def last_line_in(log: Path) -> str:
-    """Return the last line of the file that has text. Empty if there is none."""
+    """Return the last line of the file that contains text, or an empty string."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, log.stat().st_size - TAIL_BYTES))
@@ -78,13 +79,13 @@ def last_line_in(log: Path) -> str:
 
 
 def last_line(text: str) -> str:
-    """Return the last line that has text, shortened and with printable characters only."""
+    """Return the last line that contains text, shortened and with printable characters only."""
     lines = ("".join(filter(str.isprintable, line)).strip() for line in reversed(text.splitlines()))
     return next(filter(None, lines), "")[:MAX_CHARACTERS]
 
 
 def is_shell_error(words: str) -> bool:
-    """Return whether this is the message of a shell, or of another starter of programs, that a program is missing."""
+    """Return true if the text is the error message of a shell, or of a similar program, about a missing program."""
     return _SHELL_ERROR.fullmatch(words) is not None
 
 
@@ -95,14 +96,14 @@ VERSION_CHARACTERS = 80
 
 
 def _version_line(version: Any) -> str | None:
-    """Return the version of an agent as one printable line. None if it is no text."""
+    """Return the version that an agent reports, as one printable line, or None if it is not text."""
     if not isinstance(version, str):
         return None
     return " ".join("".join(filter(str.isprintable, word)) for word in version.split())[:VERSION_CHARACTERS] or None
 
 
 class Status(BaseModel):
-    """The status of an agent, as ucp/contract/CONTRACT.md describes it. Optional fields have a default."""
+    """The status of an agent as it reports it (see ucp/contract/CONTRACT.md). Optional fields have a default."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -125,21 +126,21 @@ class Status(BaseModel):
 
 
 class AgentSilentError(Exception):
-    """The agent does not answer, or its socket is gone."""
+    """An error: the agent does not answer, or its control socket does not exist any more."""
 
 
 class AgentRefusedError(HarnessError):
-    """The agent refused a command. The message is the agent's sentence."""
+    """An error: the agent refused a command. The message is the sentence that the agent sent."""
 
     exit_status = VIOLATED
 
 
 class AgentUnsupportedError(AgentRefusedError):
-    """The agent answered that it does not support a command."""
+    """An error: the agent answered that it does not support a command."""
 
 
 class AgentControl:
-    """The connection to the control socket of an agent. It is opened again after a failure.
+    """The connection to the control socket of an agent. After a failure, the next command opens a new connection.
 
     One command is sent at a time.
     """
@@ -150,7 +151,7 @@ class AgentControl:
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def ask(self, command: str, *, timeout_s: float, **arguments: Any) -> dict[str, Any]:
-        """Send a command and return the answer, within `timeout_s` of wall time.
+        """Send a command to the agent and return its answer. The limit is `timeout_s` seconds of wall time.
 
         Raises AgentSilentError, AgentRefusedError, AgentUnsupportedError.
         """
@@ -195,7 +196,7 @@ class AgentControl:
 
 
 async def connect(socket_path: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """Connect to a socket that answers in lines. Raises OSError."""
+    """Open a socket whose answers are single lines. Raises OSError."""
     # The address of a socket has at most 107 bytes, and the path of a run directory may be longer.
     directory = os.open(socket_path.parent, os.O_PATH)
     try:

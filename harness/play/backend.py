@@ -1,4 +1,4 @@
-"""The interface of a backend, and the seeds that it gives its agents.
+"""Define the interface of a backend, the part of the harness that plays a scenario.
 
 Code that treats backends differently asks one of these properties, and never for the name of the backend. A new backend
 needs a folder here, its name in `harness.backend_names`, and an entry in the table `harness.play.backends`.
@@ -19,7 +19,7 @@ from harness.scenario import Scenario
 
 
 class Backend(ABC):
-    """A backend, which plays any number of scenarios."""
+    """A backend: a way to play scenarios, for example as processes or in virtual time."""
 
     name: ClassVar[BackendName]
     virtual_time: ClassVar[bool] = False
@@ -32,10 +32,10 @@ class Backend(ABC):
 
     @abstractmethod
     def refuse(self, scenario: Scenario) -> None:
-        """Raise HarnessError, a sentence with a solution, if this backend or this machine cannot play the scenario."""
+        """Raise HarnessError if this backend or this machine cannot play the scenario. The message names a solution."""
 
     def remark(self, scenario: Scenario) -> str | None:
-        """Return a sentence about a difference from the scenario, if there is one."""
+        """Return a sentence about a part of the scenario that this backend plays differently, or None."""
         return None
 
     @abstractmethod
@@ -51,7 +51,7 @@ class Backend(ABC):
         delivers_all: bool = False,
         pace: Pace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
-        """Return a context manager that opens a swarm. The swarm writes its files to `rundir`.
+        """Return a context manager that starts the agents of a scenario. They write their files to `rundir`.
 
         `refuse` must have accepted the scenario. An error that ends the mission early is raised inside the context. The
         context catches it, and records it in `played`. Raises HarnessError if the swarm cannot be opened.
@@ -64,6 +64,8 @@ class Backend(ABC):
 
 
 def agent_seed(seed: int, agent_id: int, incarnation: int = 1) -> int:
-    """Return the seed of an agent's events and quirks. It differs for each incarnation, from 1."""
+    """Return the seed for the events and deliberate errors of an agent. Each restart of the agent has a different
+    one.
+    """
     again = f" life {incarnation}" if incarnation > 1 else ""
     return Random(f"{seed}/agent {agent_id}{again}").getrandbits(63)

@@ -1,4 +1,4 @@
-"""The table of backends by their names in scenarios, in records and on the command line."""
+"""List the backends by their names in scenarios, in records and on the command line."""
 
 from typing import Any
 
@@ -14,5 +14,5 @@ BACKENDS: dict[BackendName, Backend] = {
 
 
 def in_virtual_time(name: Any) -> bool:
-    """Return whether this is the name of a backend in virtual time. False for an unknown name."""
+    """Return true if this is the name of a backend that uses virtual time, and false for an unknown name."""
     return any(backend.name == name and backend.virtual_time for backend in BACKENDS.values())

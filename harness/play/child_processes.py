@@ -1,4 +1,4 @@
-"""Processes that an agent starts, and may leave behind at its end.
+"""Find and end processes that an agent started and left behind.
 
 The harness puts a random mark into the environment of each agent, and a child inherits the environment. A process that
 has the mark after the end of its agent was left behind. The harness ends it. The mark also finds children that left
@@ -22,18 +22,18 @@ MAX_ROUNDS = 20
 
 
 class ChildProcesses:
-    """The processes of one agent and its children."""
+    """The process of one agent and all processes that it started."""
 
     def __init__(self) -> None:
         self._mark = f"{NAME}={secrets.token_hex(16)}".encode()
 
     def environment(self, inherited: Mapping[str, str]) -> dict[str, str]:
-        """Return the environment of the agent."""
+        """Return the environment variables with which the agent must be started. They identify its child processes."""
         name, _, value = self._mark.decode().partition("=")
         return {**inherited, name: value}
 
     def pids(self) -> list[int]:
-        """Return the processes that run, as this process sees them. A process that has ended is not among them."""
+        """Return the IDs of the agent's processes that still run."""
         return [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit() and self._has_mark(entry)]
 
     def _has_mark(self, entry: Path) -> bool:
@@ -43,7 +43,7 @@ class ChildProcesses:
             return False
 
     def end_left_behind(self) -> list[str]:
-        """End the processes that remain after the end of the agent, and return their names."""
+        """End the processes that still run after the agent ended, and return their names."""
         deadline = time.monotonic() + GRACE_S
         while (left := self.pids()) and time.monotonic() < deadline:
             time.sleep(RETRY_S)
@@ -52,7 +52,7 @@ class ChildProcesses:
         return names
 
     def end(self) -> None:
-        """End all of these processes at once."""
+        """Kill all processes of the agent."""
         for _ in range(MAX_ROUNDS):
             pids = self.pids()
             for pid in pids:
@@ -61,7 +61,7 @@ class ChildProcesses:
                 return
 
     def _kill(self, pid: int) -> None:
-        """Kill the process, unless another process has this number by now."""
+        """Kill the process, unless its ID now belongs to a different process."""
         with suppress(OSError):
             descriptor = os.pidfd_open(pid)
             try:

@@ -1,4 +1,4 @@
-"""The agent core that is in use: is it the released one?
+"""Find out whether the agent core in use is the released one or was edited.
 
 The core is the code of `ucp` that determines how an agent behaves. An engineer who develops the protocol edits it in
 place. Two things depend on an edit. A run records which core its agents had. And virtual time withholds messages that a
@@ -48,7 +48,7 @@ CORE = Path(ucp.__file__).parent
 
 @cache
 def edited_files(core: Path = CORE) -> tuple[str, ...]:
-    """Return the files of the core that differ from the released ones, such as "ucp/commit.py"."""
+    """Return the files of the agent core that differ from the released ones, such as "ucp/commit.py"."""
     released: dict[str, str] = {}
     for line in RELEASED.read_text("ascii").splitlines():
         digest, name = line.split()
@@ -57,7 +57,7 @@ def edited_files(core: Path = CORE) -> tuple[str, ...]:
 
 
 def core_version() -> str:
-    """Return "released" or "edited", a digest of the core, and the edited files."""
+    """Return "released" or "edited", then a digest of the agent core and the names of edited files."""
     digest = hashlib.sha256("".join(_digests().values()).encode("ascii")).hexdigest()[:12]
     edited = edited_files()
     return f"edited {digest} ({', '.join(edited)})" if edited else f"released {digest}"
@@ -65,14 +65,14 @@ def core_version() -> str:
 
 @cache
 def _digests(core: Path = CORE) -> dict[str, str]:
-    """The SHA-256 of each file of the core, in hex. A missing file counts as empty."""
+    """Return the SHA-256 of each file of the agent core in hexadecimal. A missing file counts as empty."""
     paths = {f"ucp/{name}.py": core / f"{name}.py" for name in FILES}
     contents = {name: path.read_bytes() if path.is_file() else b"" for name, path in paths.items()}
     return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
 
 
 def record() -> None:
-    """Record the core in use as the released one."""
+    """Store the digests of the agent core in use as those of the released core."""
     RELEASED.write_text("".join(f"{digest}  {name}\n" for name, digest in _digests().items()), "ascii")
 
 

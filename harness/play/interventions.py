@@ -1,4 +1,4 @@
-"""Interventions: a user's requests to a running mission, and the timeline that grows by them.
+"""Handle interventions: events that a user causes by hand while a mission runs. They are added to the timeline.
 
 `harness.run.run.run` takes an `Interventions` object. Any thread may then use it:
 
@@ -45,7 +45,7 @@ _NAMED = re.compile(r"(?P<list>timeline|fates)\.(?P<number>\d+)(?P<rest>\.|: )?"
 
 
 class GrowingTimeline:
-    """The timeline of a mission that is being played, and to which entries may be added."""
+    """The timeline of an active mission. Entries can be added while it is being played."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
@@ -54,18 +54,18 @@ class GrowingTimeline:
         """Mission second up to which the timeline has been played."""
 
     def next_instant(self, swarm: Swarm) -> float:
-        """Return the mission second of an entry that is added now. It is a whole millisecond."""
+        """Return the mission second for an entry that is added now, in whole milliseconds."""
         return math.ceil(max(swarm.now(), self._played_s + INSTANT_S) * 1000) / 1000
 
     def replace_scenario(self, document: dict[str, Any]) -> None:
-        """Replace the scenario. Raises ScenarioError if the new one is invalid."""
+        """Replace the scenario of the active mission. Raises ScenarioError if the new one is invalid."""
         try:
             self.scenario = parse(document)
         except ScenarioError as error:
             raise ScenarioError(_error_of_last_entry(str(error), document["timeline"])) from None
 
     async def until(self, swarm: Swarm, mission_s: float) -> None:
-        """Play the mission up to `mission_s`, with the changes of the timeline."""
+        """Play the mission up to `mission_s`, including the changes of the timeline."""
         for change in [change for change in timeline_of(self.scenario) if self._played_s < change.at_s <= mission_s]:
             await swarm.until(change.at_s)
             await swarm.apply(self.with_origin(change))
@@ -73,12 +73,12 @@ class GrowingTimeline:
         await swarm.until(mission_s)
 
     def with_origin(self, change: Change) -> Change:
-        """Return the change, with the mark `by_hand` if a user requested it."""
+        """Return the change. If a user requested it, it gets the mark `by_hand`."""
         return change
 
 
 def _error_of_last_entry(problem: str, timeline: list[dict[str, Any]]) -> str:
-    """Reword an error in a timeline for the user who added its last entry."""
+    """Return the error message for the user who added the last entry of the timeline."""
     last = len(timeline) - 1
 
     def name(named: re.Match[str]) -> str:
@@ -100,12 +100,14 @@ Entry = dict[str, Any]
 
 
 class Interventions(GrowingTimeline):
-    """The interventions in one run. Any thread may use the public methods and properties."""
+    """The interventions in one run. Any thread may use its public methods and properties."""
 
     def __init__(
         self, scenario: Scenario, *, virtual_time: bool, factor: float | None = None, paused: bool = False
     ) -> None:
-        """`factor` and `paused` apply to virtual time only. `paused` stops time at second 0."""
+        """Create the object. `factor` and `paused` apply to virtual time only, and `paused` stops time at mission
+        second 0.
+        """
         super().__init__(scenario)
         self._initial_scenario = scenario
         self.pace = Pace(factor, paused=paused) if virtual_time else None
@@ -126,17 +128,17 @@ class Interventions(GrowingTimeline):
 
     @property
     def by_hand(self) -> list[TimelineEntry]:
-        """The entries that were added by request so far."""
+        """The entries that the user has added by request."""
         return list(self._by_hand.values())
 
     @property
     def closed(self) -> str | None:
-        """Reason why no request is possible. None while requests are possible."""
+        """The reason why requests are impossible, or None while they are possible."""
         return self._closed
 
     @property
     def prepares_all_agents(self) -> bool:
-        """True if the run prepares all agents for requests, for example with a disk for a reboot.
+        """True if all agents are prepared for requests, for example with a disk so that they can reboot.
 
         False if the swarm has foreign agents, because they may not support this.
         """
@@ -144,21 +146,22 @@ class Interventions(GrowingTimeline):
 
     @property
     def now_s(self) -> float:
-        """Mission seconds since the start."""
+        """The number of mission seconds since the start."""
         return self._swarm.now() if self._swarm is not None else 0.0
 
     @property
     def paused(self) -> bool:
-        """True if virtual time is paused, except for steps."""
+        """True if virtual time is paused. It may still advance in single steps."""
         return self.pace is not None and self.pace.paused
 
     @property
     def factor(self) -> float | None:
-        """Mission seconds per second of wall time. None: unlimited."""
+        """The number of mission seconds per second of wall time. None means unlimited speed."""
         return self.pace.factor if self.pace is not None else self.scenario.speedup
 
     def ask(self, entry: Mapping[str, Any]) -> Future[float]:
-        """Request an entry of a timeline, without its `at_s`. The answer is the mission second at which it happens.
+        """Request an event, given as an entry of a timeline without `at_s`. The future returns the mission second at
+        which it happens.
 
         The answer raises ScenarioError if the entry is impossible. Then it changes nothing.
         """
@@ -174,7 +177,7 @@ class Interventions(GrowingTimeline):
         return answer
 
     def pause(self) -> Future[float]:
-        """Pause virtual time. The answer is the mission second.
+        """Pause virtual time. The future returns the mission second.
 
         The answers of this and the following methods raise ScenarioError in real time, and after the end of the run.
         """
@@ -184,19 +187,23 @@ class Interventions(GrowingTimeline):
         return self._change_pace(lambda pace, _: pace.resume())
 
     def set_factor(self, factor: float | None) -> Future[float]:
-        """Set the mission seconds per second of wall time, above 0. None: unlimited."""
+        """Set the number of mission seconds per second of wall time. None means unlimited speed."""
         if factor is not None and not 0 < factor <= MAX_FACTOR:
             return _refused(f"{factor:g} is not a speed: use a number above 0 and at most {MAX_FACTOR:g}")
         return self._change_pace(lambda pace, _: pace.set_factor(factor))
 
     def step(self, seconds: float) -> Future[float]:
-        """Pause after a step of this many mission seconds. The answer is the mission second at the end of the step."""
+        """Advance virtual time by this number of mission seconds, and then pause. The future returns the mission second
+        at the end.
+        """
         if not 0 < seconds <= MAX_STEP_S:
             return _refused(f"{seconds:g} s is not a step: use a time above 0 and at most {MAX_STEP_S:g} s")
         return self._change_pace(lambda pace, answer: pace.step(self.now_s + seconds, answer), answers=False)
 
     def step_to_next_run(self) -> Future[float]:
-        """Pause after the next handler run of any agent. The answer is as for `step`."""
+        """Advance virtual time to the next handler run of any agent, and then pause. The future returns the mission
+        second.
+        """
         return self._change_pace(lambda pace, answer: pace.step(NEXT_RUN, answer), answers=False)
 
     def _change_pace(self, do: Callable[[Pace, Future[float]], None], *, answers: bool = True) -> Future[float]:
@@ -221,7 +228,7 @@ class Interventions(GrowingTimeline):
     # For the thread of the run. `story` is a harness.play.mission.Story
 
     async def story(self, swarm: Swarm, scenario: Scenario) -> None:
-        """Play the mission as `harness.play.mission.play` does, with the requests."""
+        """Play the mission like `harness.play.mission.play`, and also execute the user's requests."""
         try:
             first, *_ = timeline_of(self.scenario)
             await swarm.begin(first)
@@ -267,7 +274,7 @@ class Interventions(GrowingTimeline):
         return [change for change in timeline_of(self.scenario) if change.at_s > self._played_s]
 
     async def _play_until(self, swarm: Swarm, mission_s: float) -> bool:
-        """Play until `mission_s`, or until a request arrives. Return whether `mission_s` is reached.
+        """Play until `mission_s` or until a request arrives. Return true if `mission_s` was reached.
 
         It may also return early without a new request, because the wake-up of an earlier request can arrive late.
         """
@@ -321,7 +328,7 @@ class Interventions(GrowingTimeline):
         return at_s
 
     def _end_replaced_changes(self, timeline: list[Entry]) -> None:
-        """End temporary changes that the last entry replaces permanently, such as a partition before `heal`."""
+        """End temporary changes that the newest entry replaces, such as a partition before a permanent `heal`."""
         try:
             entry = TimelineEntry.model_validate(timeline[-1])
         except ValidationError:
@@ -332,7 +339,7 @@ class Interventions(GrowingTimeline):
                 timeline[number]["for_s"] = round(entry.at_s - earlier.at_s, 6)
 
     def _refuse_unprepared(self, entry: TimelineEntry) -> None:
-        """Raise ScenarioError if the swarm was not prepared for the entry from the start of the run.
+        """Raise ScenarioError if the agents would have needed preparation at the start of the run for this entry.
 
         Also raise it for a revocation that this machine cannot sign.
         """

@@ -1,4 +1,4 @@
-"""Play a mission on any backend. `Swarm` is the interface of a backend.
+"""Play a mission with any backend. The class `Swarm` is the interface of a backend.
 
 A mission plays the timeline, stops the events, lets the agents settle, and ends with a final reconcile if the scenario
 asks for it.
@@ -24,7 +24,7 @@ Outcome = Literal["completed", "interrupted", "failed", "not supported"]
 
 @dataclass
 class RunOutcome:
-    """The outcome of a run before its verdict."""
+    """The result of playing a scenario, before the checker judges it."""
 
     outcome: Outcome = "completed"
     outcome_detail: str | None = None
@@ -47,13 +47,15 @@ class RunOutcome:
     unmatched_fates: list[str] = field(default_factory=list)
 
     def end_early(self, outcome: Outcome, error: HarnessError) -> None:
-        """Record that the mission did not end normally, because of `error`."""
+        """Record that the mission ended early because of `error`."""
         self.outcome = "not supported" if isinstance(error, UnsupportedError) else outcome
         self.outcome_detail = str(error)
         self.exit_status = error.exit_status
 
     def record(self, change: dict[str, Any]) -> None:
-        """Record a change. A movement is recorded only if it changes which vehicles are in range of each other."""
+        """Record a change. A movement of vehicles is recorded only if it changes which of them can receive each
+        other.
+        """
         if change["what"] == RANGE and self.network and _same_connections(change, self.network[-1]):
             return
         if "fully_connected" in change:
@@ -64,14 +66,14 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class SoughtRun:
-    """A handler run that a caller waits for. None means any branch, or any agent."""
+    """A description of a handler run for which a caller waits. None as the branch or agent means any."""
 
     handler: str
     branch: str | None = None
     agent: int | None = None
 
     def matches(self, agent_id: int, run: HandlerRun) -> bool:
-        """Return whether the caller waits for this run."""
+        """Return true if the handler run matches this description."""
         return run.handler == self.handler and self.branch in (None, run.branch) and self.agent in (None, agent_id)
 
 
@@ -80,57 +82,61 @@ def _same_connections(now: dict[str, Any], before: dict[str, Any]) -> bool:
 
 
 class Swarm(Protocol):
-    """The agents of a mission, and the operations on them. Times are mission seconds."""
+    """The agents of a mission, with operations on them. All times are mission seconds."""
 
     played: RunOutcome
 
     def now(self) -> float: ...
 
     def enter(self, stage: str) -> None:
-        """Show the stage of the mission to the user."""
+        """Show the current stage of the mission to the user."""
 
     async def begin(self, first: Change) -> None:
-        """Start all agents under these conditions, and the clock of the mission."""
+        """Apply the initial conditions, start all agents, and start the clock of the mission."""
 
     async def until(self, mission_s: float) -> None: ...
 
     async def until_run(self, sought: SoughtRun, mission_s: float) -> int | None:
-        """Wait as `until` does, but only until an agent runs this handler. Return its ID, or None at the end.
+        """Wait until an agent runs this handler, or until `mission_s`. Return the agent's ID, or None if no agent ran
+        it.
 
         Handler runs that the last change caused also count, and with processes all runs since the last `until`.
         """
 
     async def apply(self, change: Change) -> None:
-        """Make the change, and record it in `played`."""
+        """Apply a change of the network or a fault, and record it in `played`."""
 
     async def hold(self, fate: Fate) -> int:
-        """Keep the messages that match the scripted fate, from its `from_s` on. Return a number for `release`.
+        """Hold back the messages that match `fate`, from its `from_s` on. Return a number with which `release` ends
+        this.
 
         Raises ScenarioError if messages cannot be held here.
         """
 
     async def release(self, number: int, fate: Fate) -> None:
-        """End a hold at `until_s` and `hold_until_s` of `fate`."""
+        """Stop holding back messages at the times `until_s` and `hold_until_s` of `fate`."""
 
     async def stop_events(self) -> None: ...
 
     async def until_idle(self, limit_s: float) -> bool:
-        """Wait until all living agents are idle and no message is under way. Return false after `limit_s`."""
+        """Wait until all living agents are idle and no message is on its way. Return false if that takes until
+        `limit_s`.
+        """
 
     async def keep_chains(self) -> None:
-        """Export the chains before the final reconcile."""
+        """Export all chains before the final reconcile."""
 
     async def reconcile(self, agent_id: int) -> None:
-        """Make the agent begin a reconcile."""
+        """Let the agent begin a reconcile."""
 
     async def top_chain_hashes(self) -> dict[int, str]:
-        """Return the top chain hash of each living agent."""
+        """Return the hash of each living agent's newest chain position."""
 
     async def completed(self) -> dict[int, int]:
         """Return the number of completed blocks of each agent that is neither dead nor paused."""
 
     async def snapshot(self) -> RunOutcome:
-        """Return the outcome so far, with exports and traces up to now, to judge an active run."""
+        """Return the result so far, with exports and traces, to judge an active run."""
 
 
 Story = Callable[[Swarm, Scenario], Awaitable[None]]
@@ -138,7 +144,7 @@ Story = Callable[[Swarm, Scenario], Awaitable[None]]
 
 
 async def play(swarm: Swarm, scenario: Scenario) -> None:
-    """Play the mission with `swarm`. `swarm.played` has the outcome."""
+    """Play the mission on the agents of `swarm`. Afterwards `swarm.played` contains the result."""
     first, *changes = timeline_of(scenario)
     await swarm.begin(first)
     swarm.enter("mission")
@@ -150,14 +156,14 @@ async def play(swarm: Swarm, scenario: Scenario) -> None:
 
 
 async def play_on(opening: AbstractAsyncContextManager[Swarm], scenario: Scenario, story: Story = play) -> RunOutcome:
-    """Open the swarm, play the story with it, and return the outcome."""
+    """Start the agents, call `story` with them, and return the result."""
     async with opening as swarm:
         await story(swarm, scenario)
     return swarm.played
 
 
 async def settle(swarm: Swarm, scenario: Scenario) -> None:
-    """End a mission: stop the events, wait until the agents are idle, and play the final reconcile if asked."""
+    """End a mission: stop the events, wait until the agents are idle, and play a final reconcile if requested."""
     swarm.enter("settling")
     await swarm.stop_events()
     swarm.played.settled = await swarm.until_idle(scenario.settle.limit_s)
@@ -166,7 +172,7 @@ async def settle(swarm: Swarm, scenario: Scenario) -> None:
 
 
 async def reconcile_finally(swarm: Swarm, limit_s: float) -> None:
-    """Clear all network conditions, and let one agent after another reconcile until a round changes no chain."""
+    """Remove all network conditions. Then let each agent in turn reconcile, until a round changes no chain."""
     await swarm.keep_chains()
     swarm.enter("final reconcile")
     began_s = swarm.now()

@@ -1,4 +1,4 @@
-"""The display of an active run: elapsed mission time, chain lengths, and agents in a reconcile; then its judging.
+"""Display an active run: mission time, chain lengths and reconciling agents, and afterwards the progress of the checker.
 
 A terminal shows a live table. Other outputs, such as CI logs, get a line every few seconds.
 """
@@ -21,7 +21,7 @@ LINE_EVERY_S = 10.0
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The swarm at one moment."""
+    """The state of a swarm at one moment."""
 
     stage: str
     mission_s: float
@@ -42,7 +42,7 @@ class Progress(Protocol):
 
 
 class Silent:
-    """A display without output, for programs."""
+    """A display without output, for use by other programs."""
 
     def show(self, snapshot: Snapshot) -> None:
         pass
@@ -55,7 +55,7 @@ class Silent:
 
 
 class ProgressLines:
-    """A display that prints a line at each change of the stage, and every few seconds."""
+    """A display that prints a line when the stage of the mission changes, and every few seconds."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -88,7 +88,7 @@ class ProgressLines:
 
 
 class ProgressTable:
-    """A live table, which disappears at the end of the run."""
+    """A table that is updated during the run and removed at its end."""
 
     def __init__(self, console: Console) -> None:
         self._live = Live(console=console, transient=True, auto_refresh=False)

@@ -1,4 +1,4 @@
-"""The socket in a run directory on which other processes send requests to the active run.
+"""Accept requests from other processes to an active run, through a socket in the run directory.
 
 Requests and answers are lines of JSON, as on an agent's control socket. `ask_run` is the client:
 
@@ -38,7 +38,9 @@ FINAL_ANSWERS_S = 0.1
 
 @asynccontextmanager
 async def serve_requests(interventions: Interventions, directory: Path) -> AsyncIterator[None]:
-    """Serve requests inside the context. The user of the run may send them. Raises OSError without a socket."""
+    """Accept requests inside the context. Only the user who started the run may send them. Raises OSError if the socket
+    cannot be created.
+    """
     connections: set[asyncio.Task[Any]] = set()
 
     async def serve_connection(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -115,7 +117,7 @@ async def _answer(interventions: Interventions, line: bytes) -> dict[str, Any]:
 
 
 async def _execute(interventions: Interventions, line: bytes) -> dict[str, Any]:
-    """Execute a request. Raises ScenarioError if it is invalid or impossible."""
+    """Execute a request, and return the answer. Raises ScenarioError if the request is invalid or impossible."""
     try:
         request = from_json(line, allow_inf_nan=False)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Protocol variants: deliberate changes of the protocol, each in a Python file of the user.
+"""Load protocol variants. A variant is a Python file in which a user changes algorithms of the protocol.
 
 A variant changes some of Algorithms 1 to 20. For each changed algorithm the file holds two transcriptions: the handler
 of the agents, and the function of the reference that judges them.
@@ -37,12 +37,14 @@ LAST_ALGORITHM = 20
 
 
 class VariantError(HarnessError):
-    """A variant cannot be loaded, or a run was made with another one."""
+    """An error: a variant cannot be loaded, or a run was made with a different variant."""
 
 
 @dataclass(frozen=True)
 class CoreChange:
-    """The new handler of an algorithm in the core. The rest adds to the declarations of the original handler."""
+    """A variant's new handler for one algorithm of the agents. Its other fields add to the declarations of the original
+    handler.
+    """
 
     algorithm: int
     run: Callable[..., str]
@@ -64,7 +66,7 @@ class CoreChange:
 
 @dataclass(frozen=True)
 class ReferenceChange:
-    """The new function of an algorithm in the reference."""
+    """A variant's new function for one algorithm of the reference implementation."""
 
     algorithm: int
     run: Callable[..., str]
@@ -78,7 +80,7 @@ def of_core(
     starts: tuple[str, ...] = (),
     triggers: tuple[LocalEvent, ...] = (),
 ) -> Callable[[Callable[..., str]], CoreChange]:
-    """Declare a function to be the handler of an algorithm in the agents.
+    """Return a decorator that declares a function as the new handler of an algorithm in the agents.
 
     The keyword arguments declare abilities that the original handler lacks: branches that it returns, messages that it
     sends, timers that it starts, and local events that it triggers.
@@ -87,13 +89,13 @@ def of_core(
 
 
 def of_reference(algorithm: int) -> Callable[[Callable[..., str]], ReferenceChange]:
-    """Declare a function to be the algorithm in the reference."""
+    """Return a decorator that declares a function as the algorithm in the reference implementation."""
     return lambda run: ReferenceChange(algorithm, run)
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A protocol variant. `core` and `reference` map the number of an algorithm to its change."""
+    """A protocol variant. `core` and `reference` contain its changes by the number of the algorithm."""
 
     name: str
     file: Path
@@ -104,18 +106,18 @@ class Variant:
 
     @property
     def version(self) -> str:
-        """Name and digest, as a record has them."""
+        """The name and digest of the variant, as records contain them."""
         return f"{self.name} {self.digest}"
 
     @property
     def in_words(self) -> str:
-        """Name and changed algorithms, such as "approve_ties (Algorithm 5)"."""
+        """The name and the changed algorithms, such as "approve_ties (Algorithm 5)"."""
         numbers = [str(number) for number in sorted(self.core)]
         return f"{self.name} (Algorithm{'s' * (len(numbers) > 1)} {', '.join(numbers)})"
 
 
 def load_variant(path: Path) -> Variant:
-    """Load a variant by executing its file. Raises VariantError."""
+    """Load a variant by executing its file, and return it. Raises VariantError."""
     try:
         content = path.read_bytes()
         module = ModuleType(path.stem)
@@ -154,7 +156,7 @@ _in_use: list[Variant] = []
 
 
 def variant_in_use() -> Variant | None:
-    """Return the variant that this process plays; None for the original protocol."""
+    """Return the variant that this process uses, or None for the original protocol."""
     return _in_use[-1] if _in_use else None
 
 
@@ -167,7 +169,9 @@ class NumberedHandler(Protocol):
 
 @contextmanager
 def replaced(tables: list[MutableMapping[Any, Any]], new: Mapping[int, Callable[[Any], Any]]) -> Iterator[None]:
-    """Replace the handlers of these algorithms in all tables. Each function in `new` receives the old handler."""
+    """Replace the handlers of these algorithms in all tables inside the context. Each function in `new` receives the
+    old handler.
+    """
     before = [dict(table) for table in tables]
     made: dict[int, Any] = {}
     for table in tables:
@@ -184,7 +188,7 @@ def replaced(tables: list[MutableMapping[Any, Any]], new: Mapping[int, Callable[
 
 @contextmanager
 def core_in_force(variant: Variant) -> Iterator[None]:
-    """Let all agents that this process makes have the variant."""
+    """Apply the variant to all agents that this process creates inside the context."""
     tables = [agent.ON_MESSAGE, agent.ON_TIMER, agent.ON_LOCAL_EVENT, agent.HANDLERS]
     with replaced(tables, {number: change.in_place_of for number, change in variant.core.items()}):  # type: ignore[arg-type]
         _in_use.append(variant)

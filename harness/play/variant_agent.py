@@ -1,4 +1,4 @@
-"""The agent program of a process with a protocol variant: `ucp.node`, whose handlers the variant replaces.
+"""The agent program for a protocol variant: `ucp.node` with the handlers of the variant.
 
 python -m harness.play.variant_agent VARIANT_FILE MISSION_FILE
 """
@@ -14,7 +14,7 @@ WRONG_REQUEST = 2
 
 
 def main(arguments: list[str]) -> int:
-    """Run the agent. The exit status is that of `ucp.node`."""
+    """Run the agent, and return its exit status. The statuses are those of `ucp.node`."""
     if not arguments:
         sys.stderr.write("usage: python -m harness.play.variant_agent VARIANT_FILE MISSION_FILE\n")
         return WRONG_REQUEST

@@ -1,4 +1,4 @@
-"""A container as a program of the lab, and the options with which it is created."""
+"""Run a program of the lab in a container, and define the options of this container."""
 
 import asyncio
 import contextlib
@@ -29,14 +29,16 @@ _NO_SUCH_PROGRAM = 127
 
 
 class Output:
-    """Copies the output of a container from the stream of `docker attach` to files.
+    """Copies the output of a container from the stream of `docker attach` to two files.
 
     The stream consists of frames: number of the output, 3 unused bytes, length (u32, big-endian), content (Docker
     Engine API, "Attach to a container", stream format).
     """
 
     def __init__(self, stream: Any, stdout: Path, stderr: Path) -> None:
-        """`stream` is the result of the SDK's attach_socket. Raises OSError if a file cannot be opened."""
+        """Open the files and start to copy. `stream` comes from the Docker SDK. Raises OSError if a file cannot be
+        opened.
+        """
         self._stream = stream  # a reference keeps the HTTP response, which owns the socket, alive
         self._socket: socket.socket = stream._sock
         self._socket.setblocking(False)
@@ -84,7 +86,7 @@ class Output:
 
 
 class Container:
-    """A container as a `Program`. The lab calls `has_ended` at its end."""
+    """A container that runs one program. The lab calls `has_ended` when the container ends."""
 
     def __init__(self, engine: Engine, identity: str, name: str, output: Output, memory_mib: int | None) -> None:
         self._engine = engine
@@ -161,7 +163,7 @@ class Container:
         self.close(returncode)
 
     def close(self, returncode: int = -signal.SIGKILL) -> None:
-        """Set the return code, and close the files."""
+        """Store the exit status of the program, and close the output files."""
         self._output.close()
         if not self._ended.done():
             self._ended.set_result(returncode)
@@ -184,7 +186,7 @@ def recipe(
     network_mode: str,
     limits: DockerOptions,
 ) -> dict[str, Any]:
-    """Return keywords for the SDK's create_container.
+    """Return the keyword arguments with which the Docker SDK creates the container.
 
     The container has no capabilities. It can write only into /tmp and the directories in `kept`: the run directory, and
     the vehicle's key directory if it has one.

@@ -1,4 +1,4 @@
-"""The Docker backend. It equals the process backend, except that each vehicle and agent runs in its own container.
+"""The Docker backend. It equals the process backend, except that each vehicle and each agent has its own container.
 
 The docker SDK is imported only when containers are played, because the import is slow.
 """
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class DockerBackend(ProcessBackend):
-    """The backend that plays each vehicle and each agent in a container."""
+    """The backend that plays each vehicle and each agent in a container of its own."""
 
     name: ClassVar[BackendName] = "docker"
     not_in_uml = (

@@ -1,4 +1,4 @@
-"""The lab of the Docker backend: the network of `netem`, with containers in place of processes.
+"""The lab of the Docker backend: the usual virtual network, with containers in place of processes.
 
     async with await ContainerLab.open(scenario, rundir, say) as lab:
         agent = await lab.spawn(7, [...], role="agent", ...)
@@ -41,7 +41,7 @@ LOOK_EVERY_S = 5.0
 
 
 class ContainerLab:
-    """The lab, made by `ContainerLab.open`. Errors are DockerError and those of netem."""
+    """A virtual network whose programs run in containers. Its errors are DockerError and those of netem."""
 
     def __init__(self, engine: Engine, rundir: RunDirectory, scenario: Scenario) -> None:
         self._engine = engine
@@ -65,7 +65,7 @@ class ContainerLab:
 
     @classmethod
     async def open(cls, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "ContainerLab":
-        """Start the network with a holder for each vehicle.
+        """Start the network, with an idle container for each vehicle that keeps its network namespace.
 
         Raises DockerError, and the errors of netem.lab.Lab.open.
         """
@@ -140,7 +140,7 @@ class ContainerLab:
         self.engine = self.network.engine
 
     def _open_network(self, identity: str) -> int:
-        """Return a file descriptor of the network namespace that a holder keeps."""
+        """Return an open file descriptor of the network namespace of a container."""
         state = self._engine.do("look at a container", self._engine.api.inspect_container, identity)["State"]
         pid = state["Pid"]
         with contextlib.suppress(OSError):
@@ -162,7 +162,7 @@ class ContainerLab:
         stderr: Path,
         role: Role,
     ) -> Container:
-        """Start a program in its own container, in the vehicle's network."""
+        """Start a program in its own container, in the network of a vehicle."""
         holder = next(identity for identity, held in self._holders.items() if held == vehicle)
         image = self._named if role == "agent" and vehicle in self._in_named else self._ours
         assert image is not None, "the image was chosen before"
@@ -195,7 +195,7 @@ class ContainerLab:
         return await self.network.read()
 
     async def watch(self) -> None:
-        """Raise DockerError if the engine has stopped or does not answer, or if a holder was stopped from outside."""
+        """Raise DockerError if Docker stopped or does not answer, or if a container was stopped from outside."""
         while True:
             await asyncio.wait({self._failure}, timeout=LOOK_EVERY_S)
             if self._failure.done():
@@ -234,7 +234,7 @@ class ContainerLab:
         limits: DockerOptions,
         **settings: Any,
     ) -> tuple[str, str]:
-        """Create a container. Return its name and ID."""
+        """Create a container, and return its name and ID."""
         self._incarnations[vehicle, role] += 1
         life = self._incarnations[vehicle, role]
         name = f"{self._name}-{role}-{vehicle}" + (f"-{life}" if life > 1 else "")
@@ -261,7 +261,7 @@ class ContainerLab:
             raise SpawnError(f"the container {name} cannot be started: {error.explanation}") from None
 
     def _on_event(self, event: dict[str, Any]) -> None:
-        """Process an event of the engine about a container of this lab."""
+        """Process a message from Docker about a container of this lab."""
         if self._closed or self._failure.done():
             return
         if not event:
@@ -306,7 +306,7 @@ class ContainerLab:
             raise error
 
     def _kill_processes(self) -> None:
-        """Kill all processes in the lab's networks, because the engine does not answer."""
+        """Kill all processes in the networks of the lab. This is needed when Docker does not answer."""
         for process in Path("/proc").iterdir():
             if process.name.isdecimal():
                 with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""Check before a run that this machine can play it in containers."""
+"""Check before a run that this machine can play the scenario in containers."""
 
 import os
 import shutil
@@ -11,7 +11,7 @@ from harness.scenario import Scenario
 
 
 def check_docker(scenario: Scenario) -> None:
-    """Raise DockerError if no usable engine exists here, or if the requested image is missing."""
+    """Raise DockerError if Docker cannot be used here, or if the requested image is missing."""
     engine = Engine.connect()
     try:
         require_root()
@@ -22,13 +22,13 @@ def check_docker(scenario: Scenario) -> None:
 
 
 def refuse_variants() -> None:
-    """Raises DockerError if a protocol variant is in use. The image has no file of the user."""
+    """Raise DockerError if a protocol variant is in use, because the image cannot read the variant's file."""
     if (variant := variant_in_use()) is not None:
         raise DockerError(f"--backend docker cannot play the variant {variant.name}: choose --backend process or sim")
 
 
 def check_debuggers(scenario: Scenario) -> None:
-    """Raise DockerError if a vehicle's debugger is missing in its image.
+    """Raise DockerError if the debugger that a vehicle needs is missing in its image.
 
     The project's image has no debuggers. An image from the host has those in the shared directories.
     """
@@ -48,6 +48,6 @@ def check_debuggers(scenario: Scenario) -> None:
 
 
 def require_root() -> None:
-    """Raise DockerError unless this user is root."""
+    """Raise DockerError if the user is not root."""
     if os.geteuid() != 0:
         raise DockerError("the Docker backend must be root to add network interfaces to containers: use sudo")

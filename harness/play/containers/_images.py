@@ -1,4 +1,4 @@
-"""The images of containers.
+"""Build or choose the Docker images of vehicles and agents.
 
 project     built from the Dockerfile beside this file, with the installed packages `ucp` and `sitl`
 named       an image that the scenario names
@@ -34,7 +34,7 @@ INSTEAD = "use this machine's files (--image-from-host, `docker.image_from_host`
 
 @dataclass(frozen=True)
 class Image:
-    """An image. `python` is its interpreter, and `mounted` are directories of this machine that it shares read-only.
+    """A Docker image. `python` is its interpreter, and `mounted` lists directories of this machine that it can read.
 
     Nothing is mounted into a `foreign` image, because paths refer to files in the image.
     """
@@ -45,24 +45,24 @@ class Image:
     foreign: bool = False
 
     def command(self, argv: Sequence[str]) -> list[str]:
-        """Return the command that starts the same program inside."""
+        """Return the command that starts the same program inside the container."""
         return [self.python if word == sys.executable else word for word in argv]
 
     def environment(self, env: Mapping[str, str]) -> dict[str, str]:
-        """Return the environment inside.
+        """Return the environment variables for inside the container.
 
         Without shared directories, it has only variables that differ from this process.
         """
         return {key: value for key, value in env.items() if self.mounted or os.environ.get(key) != value}
 
     def shared(self, argv: Sequence[str]) -> list[Path]:
-        """Return the paths of this machine to mount so that `argv` can start."""
+        """Return the paths of this machine that the container must contain, so that the command `argv` can start."""
         files = [Path(word) for word in self.command(argv) if Path(word).is_absolute() and Path(word).is_file()]
         return outermost([*self.mounted, *([] if self.foreign else map(_with_environment, files))])
 
 
 def from_host(engine: Engine) -> Image:
-    """Return the image from the host, and create it if necessary. Raises DockerError."""
+    """Return an image that uses the programs of this machine, and create it if necessary. Raises DockerError."""
     if not _exists(engine, HOST_IMAGE):
         repository, tag = HOST_IMAGE.split(":")
         engine.do(
@@ -81,7 +81,7 @@ def host_image() -> Image:
 
 
 def is_shared(program: Path) -> bool:
-    """Return whether an image from the host contains this program."""
+    """Return true if an image that uses the programs of this machine contains this program."""
     mounted = host_image().mounted
     return all(any(path.is_relative_to(outer) for outer in mounted) for path in (program, program.resolve()))
 
@@ -94,14 +94,16 @@ def named(engine: Engine, name: str) -> Image:
 
 
 def agents_in_named(scenario: Scenario) -> Iterable[int]:
-    """Return the agents that run in the scenario's image: those with a command of their own if it names any, or all."""
+    """Return the agents that run in the image of the scenario: those with their own command if there are any, otherwise
+    all.
+    """
     if scenario.docker.image is None:
         return ()
     return scenario.foreign if isinstance(scenario.agent_command, dict) else scenario.roster
 
 
 def project(engine: Engine, say: Callable[[str], object]) -> Image:
-    """Return the project's image. If it is missing, build it and report each step. Raises DockerError."""
+    """Return the image of this project. If it is missing, build it and report each step. Raises DockerError."""
     name = project_name()
     if not _exists(engine, name):
         say("building the image")
@@ -110,13 +112,13 @@ def project(engine: Engine, say: Callable[[str], object]) -> Image:
 
 
 def project_name() -> str:
-    """Return a name that depends on the contents of the image."""
+    """Return a name for the image of this project. It depends on the contents of the image."""
     made_of = _tar(context()) + json.dumps(build_arguments()).encode("ascii")
     return f"{PROJECT_IMAGE}:{version('ucp-harness')}-{hashlib.sha256(made_of).hexdigest()[:12]}"
 
 
 def build_arguments() -> dict[str, str]:
-    """Return the versions of packages for the image, which equal those installed here."""
+    """Return the versions of the packages to install in the image. They equal the versions installed here."""
     arguments = {"PYMAVLINK": version("pymavlink")}
     with suppress(PackageNotFoundError):  # optional: needed only for secure missions
         arguments["CRYPTOGRAPHY"] = version("cryptography")
@@ -147,7 +149,7 @@ def _build(engine: Engine, name: str, say: Callable[[str], object]) -> None:
 
 
 def context() -> dict[str, bytes]:
-    """Return the files from which the project's image is built: the Dockerfile and the packages."""
+    """Return the files from which the image of this project is built: the Dockerfile and the Python packages."""
     files = {"Dockerfile": Path(__file__).with_name("Dockerfile").read_bytes()}
     for package in PACKAGES:
         root = _package(package)
@@ -158,7 +160,7 @@ def context() -> dict[str, bytes]:
 
 
 def _tar(files: Mapping[str, bytes]) -> bytes:
-    """Return a reproducible archive."""
+    """Return a tar archive of the files. Equal files always give an equal archive."""
     archive = io.BytesIO()
     with tarfile.open(fileobj=archive, mode="w") as tar:
         for name, content in files.items():
@@ -169,7 +171,7 @@ def _tar(files: Mapping[str, bytes]) -> bytes:
 
 
 def _with_environment(program: Path) -> Path:
-    """Return the virtual environment of the program if it has one, otherwise the program."""
+    """Return the directory of the virtual environment that contains the program, or else the program itself."""
     environment = program.parent.parent
     return environment if (environment / "pyvenv.cfg").is_file() else program
 
@@ -198,7 +200,7 @@ def _package(name: str) -> Path:
 
 
 def outermost(paths: Iterable[Path]) -> list[Path]:
-    """Return the directories without those inside other ones."""
+    """Return the directories that do not lie inside another one of them."""
     roots: list[Path] = []
     for path in sorted(set(paths)):
         if not any(path.is_relative_to(outer) for outer in roots):
@@ -207,7 +209,7 @@ def outermost(paths: Iterable[Path]) -> list[Path]:
 
 
 def idle_command() -> list[str]:
-    """Return a command that sleeps forever. Raises DockerError."""
+    """Return a command that sleeps forever. Raises DockerError if this machine has none."""
     sleep = shutil.which("sleep")
     if sleep is None:
         raise DockerError("sleep(1) is not on PATH, and containers that hold a network run it: install coreutils")

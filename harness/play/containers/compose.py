@@ -1,4 +1,4 @@
-"""Write a compose file with the vehicles and agents of a scenario, to start them by hand.
+"""Write a Docker Compose file with the vehicles and agents of a scenario, so that a user can start them by hand.
 
 The file needs no harness. A directory beside it holds the mission files and the build context of the image. Docker
 builds the network, so there are no conditions and no faults. Otherwise the containers equal those of the backend.
@@ -46,9 +46,9 @@ SECURED = """
 def write_compose(
     scenario: Scenario, seed: int, kinds: dict[int, VehicleKind], system_ids: dict[int, int], file: Path
 ) -> Path:
-    """Write `file` and the directory beside it.
+    """Write the Compose file `file`, and a directory beside it. Return the directory.
 
-    Return this directory. Raises RunDirectoryError if one of them exists.
+    Raises RunDirectoryError if one of them exists.
     """
     keys = _keys(scenario)
     if scenario.gcs:
@@ -97,7 +97,7 @@ def _keys(scenario: Scenario) -> MissionKeys | None:
 
 
 def _secrets(scenario: Scenario, keys: MissionKeys | None) -> dict[str, Any]:
-    """Return the bundles as secrets. Compose shows each one only to its agent, read-only."""
+    """Return the keys of all vehicles as Compose secrets. Each agent can read only its own keys."""
     if keys is None or scenario.security is None:
         return {}
     directory = Path(scenario.security.keys).absolute()
@@ -167,7 +167,7 @@ def _services(
 
 
 def _our_image(scenario: Scenario, folder: Path) -> tuple[Image, dict[str, Any]]:
-    """Return the image, and the build section of the compose file."""
+    """Return the image of this project, and the build section of the Compose file."""
     context = folder / "image"
     context.mkdir()
     if scenario.docker.image_from_host:

@@ -1,4 +1,4 @@
-"""The Docker engine through the docker SDK. Calls run in threads with a time limit, and errors are one sentence.
+"""Call Docker with the docker SDK. Calls run in threads with a time limit, and each error is one sentence.
 
 If the engine fails to answer once, all later calls fail at once. Otherwise each of them would wait for the time limit.
 """
@@ -34,11 +34,13 @@ T = TypeVar("T")
 
 
 class DockerError(MachineError, LabError):
-    """The engine is missing, or refuses a request."""
+    """An error: Docker is missing, or refuses a request."""
 
 
 class Engine:
-    """The engine. `api` belongs to the SDK. Call it through `do`, or through `ask` in asynchronous code."""
+    """The connection to Docker. Call its SDK object `api` only through the method `do`, or `ask` in asynchronous
+    code.
+    """
 
     def __init__(self, api: docker.APIClient) -> None:
         self.api = api
@@ -48,7 +50,7 @@ class Engine:
 
     @classmethod
     def connect(cls) -> "Engine":
-        """Connect to the engine of this machine. Raises DockerError."""
+        """Connect to Docker on this machine. Raises DockerError."""
         host = os.environ.get("DOCKER_HOST") or DEFAULT_HOST
         if not host.startswith("unix://"):
             raise DockerError(
@@ -66,7 +68,7 @@ class Engine:
         return cls(api)
 
     def do(self, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call the SDK.
+        """Call a function of the SDK, and return its result. Raises DockerError.
 
         `what` names the call in an error. Raises DockerError, or the SDK's APIError if it is refused.
         """
@@ -85,23 +87,25 @@ class Engine:
             raise self.give_up(sentence) from None
 
     def give_up(self, sentence: str) -> DockerError:
-        """Make all later calls fail. Return the first error."""
+        """Make all later calls fail with this error. Return the first such error."""
         self._failure = self._failure or DockerError(sentence)
         return self._failure
 
     async def ask(self, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run `do` in a thread."""
+        """Run the method `do` in a thread, and return its result."""
         return await self.in_thread(partial(self.do, what, call, *args, **kwargs))
 
     async def in_thread(self, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run a call in a thread. If the waiting task is cancelled, the call goes on, and `settle` waits for it."""
+        """Run a function in a thread. If the waiting task is cancelled, the function continues, and `settle` waits for
+        it.
+        """
         future = self._threads.submit(partial(call, *args, **kwargs))
         self._pending.add(future)
         future.add_done_callback(self._pending.discard)
         return await asyncio.wrap_future(future)
 
     async def settle(self) -> None:
-        """Wait for all calls, including those of cancelled tasks."""
+        """Wait for all calls to end, including those of cancelled tasks."""
         await asyncio.to_thread(concurrent.futures.wait, set(self._pending))
 
     def close(self) -> None:
@@ -110,12 +114,12 @@ class Engine:
 
 
 class Events:
-    """Follows the engine's events about containers with a label, from now on and in order."""
+    """Follows Docker's messages about containers with a certain label, in order."""
 
     def __init__(
         self, engine: Engine, label: str, on_event: Callable[[dict[str, Any]], None], loop: asyncio.AbstractEventLoop
     ) -> None:
-        """Start to follow.
+        """Start to follow Docker's messages. Each one is given to `on_event`.
 
         `on_event` is called in the loop for each event, and with an empty event when the stream ends.
         """
@@ -142,7 +146,7 @@ class Events:
 
 
 def _check_socket(path: str) -> None:
-    """Raise DockerError with the reason if no process answers at the socket."""
+    """Raise DockerError with the reason if no program answers at the socket."""
     try:
         with socket.socket(socket.AF_UNIX) as connection:
             connection.settimeout(GREETING_LIMIT_S)

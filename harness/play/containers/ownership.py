@@ -1,4 +1,4 @@
-"""Names and labels of containers, and the removal of containers that a run left behind.
+"""Choose names and labels for containers, and remove containers that earlier runs left behind.
 
 A run belongs to the process that plays it, as long as this process exists. Process IDs are reused, so a process is
 identified by boot ID, process ID and start time.
@@ -25,7 +25,7 @@ _START_TIME = 19  # index of field 22, counted after the command's name, in /pro
 
 
 def run_name(directory: Path) -> str:
-    """Return a valid container name for the run in this directory. It depends only on the directory."""
+    """Return a container name for the run in this directory. It depends only on the directory."""
     digest = hashlib.sha256(os.fsencode(directory)).hexdigest()[:6]
     words = re.sub(r"[^A-Za-z0-9_.]+", "-", directory.name).strip("-_.")[:40]
     return f"ucp-{words}-{digest}" if words else f"ucp-{digest}"
@@ -36,12 +36,12 @@ def labels(run: str, vehicle: int, role: str) -> dict[str, str]:
 
 
 def this_process() -> str:
-    """Return the identity of this process: boot ID, process ID and start time."""
+    """Return text that identifies this process: boot ID, process ID and start time."""
     return f"{_boot()} {os.getpid()} {_start_time(os.getpid())}"
 
 
 def is_alive(owner: str) -> bool:
-    """Return whether the process in a label still exists. An invalid label counts as ended."""
+    """Return true if the process that a container's label names still exists. For an invalid label return false."""
     match owner.split():
         case [boot, pid, started] if pid.isdecimal():
             return boot == _boot() and started == _start_time(int(pid))
@@ -53,7 +53,7 @@ def _boot() -> str:
 
 
 def _start_time(pid: int) -> str | None:
-    """Return the start time in clock ticks since boot, or None for an ended process or a zombie."""
+    """Return the start time of a process in clock ticks since boot, or None if the process has ended."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text()
     except OSError:
@@ -64,14 +64,14 @@ def _start_time(pid: int) -> str | None:
 
 @dataclass
 class Cleaned:
-    """Names of removed containers, and of containers that are `still` used by active runs."""
+    """The names of the removed containers, and of the containers that active runs still use."""
 
     removed: list[str] = field(default_factory=list)
     still: list[str] = field(default_factory=list)
 
 
 def clean(engine: Engine) -> Cleaned:
-    """Remove all containers of ended runs, and no others. Raises DockerError."""
+    """Remove the containers of all ended runs, and leave all others. Raises DockerError."""
     cleaned = Cleaned()
     for container in engine.do("list containers", engine.api.containers, all=True, filters={"label": RUN}):
         name = container["Names"][0].removeprefix("/")
@@ -84,7 +84,7 @@ def clean(engine: Engine) -> Cleaned:
 
 
 def remove(engine: Engine, identity: str, name: str) -> None:
-    """Kill and remove a container with its volumes. Raises DockerError."""
+    """Kill a container and remove it with its volumes. Raises DockerError."""
     try:
         engine.do(f"remove {name}", engine.api.remove_container, identity, v=True, force=True)
     except docker.errors.APIError as error:

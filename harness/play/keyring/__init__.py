@@ -1,4 +1,4 @@
-"""The keyring: the directory that holds the keys of a mission, and the files that vehicles receive from it.
+"""Manage the keys of a mission: the directory that holds them, and the files that each vehicle receives.
 
 `ucp.secure` describes how a vehicle uses its bundle.
 """

@@ -1,4 +1,4 @@
-"""Describe files of keys without revealing a secret."""
+"""Describe key files without revealing a secret."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +32,7 @@ Facts = dict[str, Any]
 
 
 def inspect(path: Path) -> list[Facts]:
-    """Return the facts about a key file, or about each in a directory. Raises KeysError for an unusable file."""
+    """Return the facts about a key file, or about each file in a directory. Raises KeysError for an unusable file."""
     files = [path]
     if path.is_dir():
         candidates = sorted(path.iterdir(), key=lambda file: (len(file.name), file.name))
@@ -43,7 +43,7 @@ def inspect(path: Path) -> list[Facts]:
 
 
 def in_words(facts: Facts) -> str:
-    """Return the facts as one line. Public keys are shortened."""
+    """Return the facts as one line of text. Public keys are shortened."""
     more = [f"{name.replace('_', ' ')} {_shown(value)}" for name, value in facts.items() if name not in _HEAD]
     return f"{facts['file']}: {facts['kind']}, mission {facts['mission']}" + "".join(f", {words}" for words in more)
 
@@ -67,7 +67,7 @@ def _shown(value: Any) -> str:
 
 def _inspect(path: Path) -> Facts:
     def private(document: Facts) -> Facts:
-        """Return the mission of a private key, and the matching public key."""
+        """Return the mission of a private key, and the public key that belongs to it."""
         mission = key_in(document, "mission", MISSION_ID_BYTES).hex()
         private_key = key_in(document, "private_key", KEY_BYTES)
         if document["schema"] == DEPOT_SCHEMA:

@@ -1,4 +1,4 @@
-"""The directory of a mission's keys, and the authority that revokes keys.
+"""Read and write the directory with the keys of a mission, and sign messages that exclude vehicles from it.
 
 The keys of the authority and of the depot never leave the directory. They are separate files, because the person who
 opens sealed events does not need the right to revoke keys. Other users can neither enter the directory nor read the
@@ -43,18 +43,20 @@ T = TypeVar("T")
 
 
 class KeysError(HarnessError):
-    """Keys that are unusable, or that must not be created."""
+    """An error: keys cannot be used, or must not be created."""
 
 
 @dataclass(frozen=True)
 class Home:
-    """A directory of keys. Methods that read raise KeysError, and methods that write raise MachineError."""
+    """A directory with the keys of a mission. Methods that read raise KeysError, and methods that write raise
+    MachineError.
+    """
 
     directory: Path
 
     @classmethod
     def new(cls, directory: Path, roster: Iterable[int], *, seals: bool, epoch_s: float) -> "Home":
-        """Create keys in a new directory. If `seals` is true, they include a depot key."""
+        """Create keys in a new directory. If `seals` is true, they include a key pair for encrypted event data."""
         keys = KeySet.derived(os.urandom(KEY_BYTES), roster, seals=seals, epoch_s=epoch_s)
         home, mission = cls(directory), keys.public.mission.hex()
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
@@ -85,11 +87,11 @@ class Home:
         return _as_keys_error(lambda: load_public(self.directory / PUBLIC_NAME))
 
     def bundle(self, agent_id: int) -> Bundle:
-        """Return the bundle of a vehicle, in epoch 0. Raises KeysError for a revoked vehicle."""
+        """Return the secret keys of a vehicle. Raises KeysError if the vehicle has been excluded."""
         return self.bundles([agent_id])[agent_id]
 
     def bundles(self, agents: Sequence[int] | None = None, *, also_revoked: bool = False) -> dict[int, Bundle]:
-        """Return the bundles of these vehicles, by default of all vehicles that are not revoked."""
+        """Return the secret keys of these vehicles. By default, return those of all vehicles that are not excluded."""
         public, path = self.public(), self.directory / VEHICLES_NAME
         revocation = None if also_revoked else self.revocation()
         revoked = revocation.revoked if revocation else frozenset[int]()
@@ -119,7 +121,7 @@ class Home:
     def write_bundles(
         self, directory: Path, agents: Sequence[int] | None = None, *, overwrite: bool = False
     ) -> list[Path]:
-        """Write a file for each vehicle, readable only by the owner. Return the paths."""
+        """Write a key file for each vehicle, which only the owner can read. Return the paths."""
         bundles = self.bundles(agents)
         paths = {agent_id: directory / bundle_name(agent_id) for agent_id in bundles}
         for path in paths.values():
@@ -134,15 +136,17 @@ class Home:
         return [*paths.values()]
 
     def revocation(self, public: PublicKeys | None = None) -> Revocation | None:
-        """Return the last revocation in the directory, checked with `public` or with the keys here;
+        """Return the newest list of excluded vehicles in the directory, after a check of its signature.
 
-        None if there is none.
+        Return None if there is no list.
         """
         path = self.directory / REVOCATION_NAME
         return load_revocation(path, public or self.public()) if path.exists() else None
 
     def revoke(self, agents: Sequence[int]) -> Revocation:
-        """Revoke further vehicles. The new revocation has the next number, and lists all vehicles revoked so far."""
+        """Exclude further vehicles. The new signed list has the next number, and contains all vehicles excluded so
+        far.
+        """
         public, last = self.public(), self.revocation()
         before = last.revoked if last else frozenset[int]()
         revoked = before.union(agents)
@@ -163,7 +167,7 @@ class Home:
         return revocation
 
     def authority(self, public: PublicKeys) -> bytes:
-        """Return the private key of the authority. It must match these public keys."""
+        """Return the private key that signs lists of excluded vehicles. It must match these public keys."""
 
         def parse(document: dict[str, Any]) -> bytes:
             key = key_in(document, "private_key", KEY_BYTES)
@@ -177,7 +181,7 @@ class Home:
 
 
 def load_depot_key(path: Path) -> Depot:
-    """Return the depot that opens sealed events, from a key file or a directory of keys. Raises KeysError."""
+    """Return the key that decrypts event data, from a key file or a directory of keys. Raises KeysError."""
     file = path / DEPOT_NAME if path.is_dir() else path
 
     def parse(document: dict[str, Any]) -> Depot:
@@ -187,7 +191,7 @@ def load_depot_key(path: Path) -> Depot:
 
 
 def load_revocation(path: Path, public: PublicKeys) -> Revocation:
-    """Return the revocation in a file, if the authority of this mission signed it. Raises KeysError."""
+    """Return the list of excluded vehicles in a file, if its signature is valid for this mission. Raises KeysError."""
 
     def parse(document: dict[str, Any]) -> Revocation:
         _check_mission(document, public)
@@ -202,7 +206,7 @@ def load_revocation(path: Path, public: PublicKeys) -> Revocation:
 
 
 def write_revocation(path: Path, revocation: Revocation, public: PublicKeys) -> None:
-    """Write a revocation. Raises OSError."""
+    """Write a signed list of excluded vehicles. Raises OSError."""
     message = base64.b64encode(revocation.encode()).decode("ascii")
     document = {"schema": REVOCATION_SCHEMA, "mission": public.mission.hex(), "message": message}
     write_key_file(path, document, secret=False)
@@ -214,7 +218,7 @@ def _check_mission(document: Mapping[str, Any], public: PublicKeys) -> None:
 
 
 def _as_keys_error(read: Callable[[], T]) -> T:
-    """Return the result of `read`. Raises KeysError in place of KeyFileError."""
+    """Return the result of `read`. A KeyFileError is converted to a KeysError."""
     try:
         return read()
     except KeyFileError as error:
@@ -230,14 +234,14 @@ def _unknown_agent(agent_id: int, public: PublicKeys) -> KeysError:
 
 
 def listed(agents: Iterable[int]) -> str:
-    """Return the agents as text."""
+    """Return the agents as a list in words."""
     first, *others = sorted({*agents})
     shown = ", ".join(map(str, [first, *others[:MOST_NAMED]])) + (", ..." if len(others) > MOST_NAMED else "")
     return f"agents {shown}" if others else f"agent {shown}"
 
 
 class Authority:
-    """The authority that signs revocations. Each revocation lists all vehicles revoked so far; `last` is the latest.
+    """The authority that excludes vehicles. It signs lists of all vehicles excluded so far. `last` is the newest list.
 
     Without a `private_key`, only `last` is available. New revocations are not stored, because a mission must not change
     the directory of its keys.
@@ -250,12 +254,12 @@ class Authority:
 
     @classmethod
     def of(cls, keys: KeySet) -> "Authority":
-        """Return the authority of newly made keys."""
+        """Return the authority for newly created keys."""
         return cls(keys.public, keys.authority)
 
     @classmethod
     def in_directory(cls, home: Home, public: PublicKeys) -> "Authority":
-        """Return the authority of a directory, which may lack the private key, a revocation, or both.
+        """Return the authority of a key directory. The directory may lack its private key, its list, or both.
 
         Raises KeysError.
         """
@@ -264,11 +268,11 @@ class Authority:
 
     @property
     def revoked(self) -> frozenset[int]:
-        """The vehicles revoked so far."""
+        """The vehicles that are excluded so far."""
         return self._last.revoked if self._last else frozenset()
 
     def refuse(self, agents: Iterable[int], directory: object) -> None:
-        """Raise KeysError if the authority cannot revoke these agents. `directory` appears in the message."""
+        """Raise KeysError if the authority cannot exclude these agents. The message names `directory`."""
         lacking = {*agents} - self.revoked
         if self._private_key is not None or not lacking:
             return
@@ -280,7 +284,7 @@ class Authority:
         )
 
     def revoke(self, agent_id: int) -> bytes:
-        """Return a revocation of this agent as the body of a message. A new one is made only if needed."""
+        """Return a message body with a signed list that excludes this agent. A new list is made only if needed."""
         if self._last is None or agent_id not in self._last.revoked:
             assert self._private_key is not None, "was refused"
             signer = Ed25519PrivateKey.from_private_bytes(self._private_key)

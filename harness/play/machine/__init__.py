@@ -1,1 +1,1 @@
-"""Properties of this machine: the doctor, the calibration of the network, and User Mode Linux."""
+"""Examine this machine: its requirements, the accuracy of its network, and its support for User Mode Linux."""

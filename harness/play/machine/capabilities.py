@@ -1,4 +1,4 @@
-"""Examine what this machine can play, and measure how exactly its network applies conditions."""
+"""Find out which runs this machine can play, and measure how accurately its network applies conditions."""
 
 import contextlib
 import os
@@ -25,7 +25,7 @@ from sitl.vehicle import VehicleError
 
 @dataclass(frozen=True)
 class Requirement:
-    """A property of the machine that runs need. `way_out` is the remedy if it is missing.
+    """A property of the machine that runs need. `way_out` is the user's remedy if it is missing.
 
     Without a `needed` property, no run is possible.
     """
@@ -41,7 +41,9 @@ class Requirement:
 
 
 def examine() -> list[Requirement]:
-    """Return all requirements. Builds and removes a small lab to test the kernel."""
+    """Return all requirements, and whether they are met. This builds and removes a small virtual network to test the
+    kernel.
+    """
     python = Requirement(
         "Python", sys.version_info >= (3, 11), True, platform.python_version(), "install Python 3.11 or newer"
     )
@@ -96,7 +98,9 @@ _SHOWN = {"": (100.0, "%"), "s": (1000.0, "ms"), "bit/s": (0.001, "kbit/s"), "pa
 
 
 def measure_engines(requirements: Iterable[Requirement], say: Callable[[str], None]) -> list[EngineMeasurement]:
-    """Measure each working engine, 10 to 30 seconds each. Raises MachineError if the machine is too busy."""
+    """Measure the accuracy of each network engine that works here, 10 to 30 seconds each. Raises MachineError if the
+    machine is too busy.
+    """
     working = {requirement.name for requirement in requirements if requirement.ok}
     engines = [engine for engine in get_args(EngineName) if engine in working]
     try:
@@ -106,7 +110,7 @@ def measure_engines(requirements: Iterable[Requirement], say: Callable[[str], No
 
 
 def _with_progress(engine: str, observe: Observer, say: Callable[[str], None]) -> Observer:
-    """Return an observer that also reports each study."""
+    """Return an observer of measurements that also reports which measurement is running."""
 
     def observe_and_report(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         asked = len(study.questions)
@@ -118,7 +122,7 @@ def _with_progress(engine: str, observe: Observer, say: Callable[[str], None]) -
 
 @contextlib.contextmanager
 def progress_line(console: Console) -> Iterator[Callable[[str], None]]:
-    """Yield a function that prints progress: on a temporary line of a terminal, or else as lines."""
+    """Yield a function that prints progress, on a temporary line of a terminal or otherwise as lines."""
     if not console.is_terminal:
         yield lambda words: console.print(words, highlight=False, soft_wrap=True)
         return
@@ -127,7 +131,7 @@ def progress_line(console: Console) -> Iterator[Callable[[str], None]]:
 
 
 def render(engines: Sequence[EngineMeasurement]) -> RenderableType:
-    """Return a table for each engine. It has a row for each measured condition, and the lateness of the machine."""
+    """Return a table for each network engine, with a row for each measured condition and the delays of the machine."""
     return Group(*(part for measured in engines for part in (_table(measured), Text(_lateness(measured), style="dim"))))
 
 

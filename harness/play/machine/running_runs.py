@@ -1,4 +1,4 @@
-"""Find the active runs of this machine from the working directories of processes.
+"""Find the active runs on this machine by looking at the working directories of processes.
 
 A vehicle works in RUN/vehicles/ID. An agent works in RUN/agents, and in a later incarnation in RUN/agents/ID-NUMBER;
 its last argument is ID.mission.json. Both are in the network namespace of their vehicle, as a process or in a
@@ -17,7 +17,7 @@ _MISSION = re.compile(rb"(?:.*/)?([1-9][0-9]{0,4})\.mission\.json")
 
 
 def running(proc: Path = Path("/proc")) -> dict[Path, dict[int, int]]:
-    """Return for each visible run directory: vehicle -> process ID of one of its programs."""
+    """Return, for each active run directory, the ID of one process of each vehicle."""
     runs: defaultdict[Path, dict[int, int]] = defaultdict(dict)
     for entry in proc.iterdir():
         if not entry.name.isdigit():
@@ -32,19 +32,21 @@ def running(proc: Path = Path("/proc")) -> dict[Path, dict[int, int]]:
 
 
 def _agent_of(entry: Path) -> bytes | None:
-    """Return the agent ID in the name of the process's mission file, or None."""
+    """Return the agent ID in the file name of the process's mission file, or None."""
     *_, last = (entry / "cmdline").read_bytes().removesuffix(b"\0").split(b"\0")
     named = _MISSION.fullmatch(last)
     return named[1] if named else None
 
 
 def _in_another_network(entry: Path, proc: Path) -> bool:
-    """Return whether the process is in another network than this one. A user's shell in the directory is not."""
+    """Return true if the process is in a different network than this one. This excludes a user's shell in the run
+    directory.
+    """
     return (entry / "ns/net").readlink() != (proc / "self/ns/net").readlink()
 
 
 def enter_command(pid: int) -> list[str]:
-    """Return the nsenter(1) command that runs a command in the network and user namespace of a process."""
+    """Return the nsenter(1) command that runs another command in the network and user namespace of a process."""
     target, ours = Path(f"/proc/{pid}/ns/user"), Path("/proc/self/ns/user")
     user = ["--user", "--preserve-credentials"] if target.readlink() != ours.readlink() else []
     return ["nsenter", f"--target={pid}", *user, "--net", "--"]

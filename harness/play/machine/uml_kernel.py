@@ -1,4 +1,4 @@
-"""`--kernel uml`: run the same command line in User Mode Linux, on machines without netem or without root."""
+"""Implement `--kernel uml`: run the same command inside User Mode Linux, for machines without netem or root."""
 
 import contextlib
 import os
@@ -21,7 +21,7 @@ class Kernel(StrEnum):
 
 
 def run_inside(arguments: list[str]) -> int:
-    """Run `ucp-harness` with these arguments in User Mode Linux, in the current directory. Return its exit status.
+    """Run `ucp-harness` with these arguments in User Mode Linux, in the current directory. Return the exit status.
 
     Raises MachineError if User Mode Linux is missing or fails.
     """
@@ -32,7 +32,7 @@ def run_inside(arguments: list[str]) -> int:
 
 
 def runs_inside() -> dict[Path, Path]:
-    """Return the directories of visible active runs in User Mode Linux, with the folders of their guests."""
+    """Return the run directories of active runs in User Mode Linux, with the folder of each virtual machine."""
     runs: dict[Path, Path] = {}
     for folder in uml_shell.guests():
         with contextlib.suppress(OSError, ValueError):
@@ -42,7 +42,9 @@ def runs_inside() -> dict[Path, Path]:
 
 
 def enter(folder: Path, arguments: list[str]) -> int:
-    """Run `ucp-harness` with these arguments in a running guest. Return its exit status. Raises MachineError."""
+    """Run `ucp-harness` with these arguments in a running virtual machine. Return the exit status. Raises
+    MachineError.
+    """
     try:
         return uml_shell.enter(folder, _command(arguments), cwd=Path.cwd(), env=_environment())
     except UmlError as error:
@@ -54,6 +56,6 @@ def _command(arguments: list[str]) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    """Return an environment in which the command inside imports the same package."""
+    """Return the environment variables with which the command inside imports the same Python packages."""
     path = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")]))
     return {**os.environ, "PYTHONPATH": path}

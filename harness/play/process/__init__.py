@@ -1,1 +1,1 @@
-"""Vehicles and agents as real processes in a real, private network."""
+"""Play vehicles and agents as real processes in a private virtual network."""

@@ -1,4 +1,4 @@
-"""One agent under test: a program in the network namespace of its vehicle.
+"""Run an agent under test as a program in the network namespace of its vehicle.
 
 The harness starts the program, sends commands to its control socket, and collects its files. An agent that starts
 again after a kill or a brown-out is a new incarnation: a new process in a directory of its own. The new process cannot
@@ -52,7 +52,7 @@ END_LIMIT_S = 0.5
 
 
 def agent_command(scenario: Scenario, agent_id: int) -> list[str]:
-    """Return the command of the agent without the mission file. Paths in it are absolute.
+    """Return the command of the agent with absolute paths. The caller appends the name of the mission file.
 
     Raises ScenarioError if the program does not exist.
     """
@@ -67,7 +67,7 @@ def agent_command(scenario: Scenario, agent_id: int) -> list[str]:
 
 @dataclass
 class _Incarnation:
-    """The time of an agent from a start to the next end, with its files."""
+    """The files and the status of an agent between a start and the next end of its process."""
 
     directory: Path
     store: Path
@@ -89,7 +89,9 @@ class _Incarnation:
     """Number of bytes of its trace that the trace of the first incarnation already contains."""
 
     def handler_runs(self) -> dict[str, int | float] | None:
-        """Return the number of handler runs in the last status, with the time of the status, for run.json."""
+        """Return the number of handler runs that the agent last reported, with the time of the report. None without a
+        report.
+        """
         if self.status is None:
             return None
         from_s, until_s = self.status_between_s
@@ -97,10 +99,12 @@ class _Incarnation:
 
 
 class AgentProcess:
-    """The process of one agent, with its earlier incarnations."""
+    """The process of one agent, including its earlier starts."""
 
     def __init__(self, agent_id: int, rundir: RunDirectory, command: Sequence[str], now: Callable[[], float]) -> None:
-        """`command` starts the agent when the name of its mission file is appended. `now` returns mission seconds."""
+        """Create the object. `command` starts the agent with its mission file as last argument. `now` returns mission
+        seconds.
+        """
         self.agent_id = agent_id
         self._command = command
         self._now = now
@@ -117,7 +121,7 @@ class AgentProcess:
 
     @property
     def incarnations(self) -> int:
-        """The number of incarnations so far, including the current one."""
+        """The number of times the agent was started so far."""
         return len(self._incarnations)
 
     @property
@@ -127,7 +131,7 @@ class AgentProcess:
 
     @property
     def status(self) -> Status | None:
-        """The last status of the current incarnation. None if the agent neither runs nor is paused."""
+        """The newest status report since the last start, or None if the agent is neither running nor paused."""
         return self._incarnations[-1].status if self.outcome in ("running", "paused") else None
 
     # Start and end of an incarnation
@@ -208,13 +212,13 @@ class AgentProcess:
                 await asyncio.sleep(RETRY_S)
 
     async def watch(self) -> None:
-        """Wait for the end of the process, then raise AgentFailedError or UnsupportedError."""
+        """Wait for the process to end by itself, then raise AgentFailedError or UnsupportedError."""
         assert self._process is not None
         await self._process.wait()
         raise self._end_error(self._process)
 
     async def kill(self, *, disk_kept: bool = False) -> None:
-        """Kill the process with SIGKILL. `disk_kept` lets the next incarnation start with the data on its disk.
+        """Kill the process with SIGKILL. `disk_kept` lets the next start use the data on its disk.
 
         Cancel `watch` first. Raises AgentFailedError if the agent has already failed.
         """
@@ -231,7 +235,8 @@ class AgentProcess:
             self._control_path.unlink(missing_ok=True)
 
     async def switch_off(self) -> None:
-        """End the process with SIGTERM, on which an agent exports its chain. Cancel `watch` first.
+        """End the process with SIGTERM. An agent exports its chain when it receives it. Cancel the task that runs
+        `watch` first.
 
         Raises AgentFailedError if the agent ends with an error, or not at all.
         """
@@ -250,7 +255,7 @@ class AgentProcess:
             self._rundir.copy_export(self.agent_id, self._incarnations[-1].directory)
 
     async def pause(self) -> None:
-        """Suspend the process. Incoming messages wait in its socket buffer, and are lost when it is full."""
+        """Suspend the process. Messages wait in its socket buffer, and are lost when the buffer is full."""
         assert self._process is not None
         async with self._control_lock:
             await self._process.pause()
@@ -264,7 +269,7 @@ class AgentProcess:
     # Commands
 
     async def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
-        """Send a command and return the answer.
+        """Send a command to the agent, and return its answer.
 
         Raises AgentFailedError if the agent does not answer, AgentRefusedError if it refuses the command, and
         UnsupportedError if it does not support the command.
@@ -281,13 +286,15 @@ class AgentProcess:
             raise self._failure("hung", f"stopped answering: {error}") from None
 
     async def _has_ended(self, process: Program) -> bool:
-        """Return whether the process has ended. Its end may become known a moment after its connection is lost."""
+        """Return true if the process has ended. It waits a moment, because the connection can end before the process
+        does.
+        """
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(process.wait(), END_LIMIT_S)
         return process.returncode is not None
 
     async def poll(self) -> Status | None:
-        """Request the status. Return None if the agent is dead or paused. Raises as `ask`."""
+        """Request the status of the agent. Return None if the agent is dead or paused. Raises the errors of `ask`."""
         async with self._control_lock:
             return await self._ask_status() if self.awake else None
 
@@ -309,7 +316,7 @@ class AgentProcess:
         return status
 
     async def export(self) -> None:
-        """Make the agent export its chain, and copy the export to the place where the checker reads it.
+        """Request a chain export from the agent, and copy it to the file that the checker reads.
 
         Raises AgentFailedError, or MachineError if the agent could not write the export.
         """
@@ -322,7 +329,7 @@ class AgentProcess:
         self._rundir.copy_export(self.agent_id, self._incarnations[-1].directory)
 
     async def export_at_end(self) -> None:
-        """Export the chain for the last time, if the agent is alive. Raises as `export`."""
+        """Export the chain for the last time if the agent is alive. Raises the errors of `export`."""
         if self.outcome == "paused":
             await self.resume()
         if self.awake:
@@ -330,7 +337,8 @@ class AgentProcess:
             self.outcome = "exported"
 
     def handler_runs_since(self, mission_s: float, handler: str) -> list[HandlerRun]:
-        """Return the runs of this handler after `mission_s` from the trace of the current incarnation, oldest first.
+        """Return the runs of this handler after `mission_s` in the agent's trace, since its last start. The oldest is
+        first.
 
         Lines that cannot be parsed are skipped, because the checker reports them.
         """
@@ -366,7 +374,7 @@ class AgentProcess:
         return await asyncio.to_thread(self._incarnations[-1].processes.end_left_behind)
 
     def collect_files(self) -> None:
-        """Join the traces of all incarnations, and copy the last export, to the files that the checker reads.
+        """Join the traces of all starts of the agent, and copy its last export, to the files that the checker reads.
 
         A repeated call adds only new lines. Raises OSError.
         """
@@ -417,7 +425,7 @@ class AgentProcess:
         return self._incarnations[-1].directory / f"{self.agent_id}.log"
 
     def _end_error(self, process: Program) -> HarnessError:
-        """Return the error for an agent that ended by itself.
+        """Return the error for an agent whose process ended by itself.
 
         Exit status 127 before the start of the mission means that the agent lacks a feature of the mission. A shell
         also ends with 127, if it does not find a program.
@@ -442,5 +450,5 @@ class AgentProcess:
 
 
 def reboots_with_disk(agent_id: int, scenario: Scenario) -> bool:
-    """Return whether a fault of the scenario reboots the agent with the data on its disk."""
+    """Return true if a fault of the scenario restarts the agent with the data on its disk."""
     return any(fault.disk_after == "kept" and agent_id in fault.agents for fault in scenario.faults_in_order())

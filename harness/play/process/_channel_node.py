@@ -1,4 +1,4 @@
-"""The process of a shared channel: `python -m harness.play.process._channel_node`, in the lab's own network.
+"""Simulate a shared radio channel in a process of its own: `python -m harness.play.process._channel_node`.
 
 It takes over the broadcasts of all vehicles from the switch (`netem.relay`), and delivers them as `LiveChannel`
 decides. Its working directory is the run directory: it contains the socket `channel.control` for the commands below,
@@ -66,7 +66,7 @@ ANSWER_TO = {
 
 
 class ChannelNode:
-    """The process in `directory`. It writes the journal to `journal`. Raises OSError without access to packets."""
+    """The process that simulates the radio channel. It logs to `journal`. Raises OSError if it may not read packets."""
 
     def __init__(self, directory: Path, journal: Path, port: int) -> None:
         self._directory = directory
@@ -90,7 +90,7 @@ class ChannelNode:
         self._control = ControlServer(directory / CONTROL, commands, self._loop)
 
     def run(self) -> None:
-        """Serve until SIGTERM or SIGINT."""
+        """Run until the process receives SIGTERM or SIGINT."""
         self._loop.stop_on(signal.SIGTERM, signal.SIGINT)
         self._control.start()
         self._loop.run()
@@ -99,7 +99,7 @@ class ChannelNode:
         self._loop.close()
 
     def _turn(self) -> None:
-        """Read the broadcasts that wait, deliver the frames that are due, and set a timer for the next event."""
+        """Read the waiting broadcasts, deliver the frames that are due, and set a timer for the next event."""
         channel, relay, clock = self._channel, self._relay, self._clock
         if channel is None or relay is None:
             return
@@ -132,7 +132,7 @@ class ChannelNode:
             channel.send(at_s, heard.vehicle, heard.frame, len(data), _sequence(data, heard.vehicle))
 
     def _deliver_to_all(self, relay: Relay, heard: Heard) -> None:
-        """Deliver a broadcast of a rogue node at once. It does not use the channel."""
+        """Deliver a broadcast of the rogue node (a sender outside the swarm) at once, without use of the channel."""
         for vehicle in self._roster:
             relay.deliver(vehicle, heard.frame)
 
@@ -171,7 +171,7 @@ class ChannelNode:
         return {}
 
     def _clear(self, request: dict[str, Any]) -> dict[str, Any]:
-        """End the channel. Messages on it are lost, and the switch floods later broadcasts."""
+        """End the simulation of the channel. Messages on it are lost, and the switch delivers all later broadcasts."""
         if self._relay is not None:
             self._lateness.missed = self._relay.count_missed()
             self._loop.watch(self._relay.input)
@@ -180,7 +180,7 @@ class ChannelNode:
         return {}
 
     def _totals(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Write what `run.json` has of the channel to the file of values."""
+        """Write the channel's data for `run.json` to a file."""
         if self._relay is not None:
             self._lateness.missed = self._relay.count_missed()
         self._journal.flush()
@@ -195,7 +195,7 @@ class ChannelNode:
 
 
 class Lateness:
-    """How late the deliveries were, in mission seconds."""
+    """Measure how late the channel delivered frames, in mission seconds."""
 
     def __init__(self) -> None:
         self.missed = 0
@@ -207,7 +207,7 @@ class Lateness:
         """Greatest lateness in each interval of the load."""
 
     def add(self, due_s: float, now: float) -> None:
-        """Count a delivery that was due at `due_s`."""
+        """Count a delivery at the time `now` that was due at `due_s`."""
         late_s = max(0.0, now - due_s)
         self._all.append(late_s)
         index = int(due_s / LOAD_S)
@@ -232,7 +232,7 @@ class Lateness:
 
 
 class AnswerTimes:
-    """How long agents take from the delivery of a question to their answer, in mission seconds.
+    """Measure the time from the delivery of a query to the agent's answer, in mission seconds.
 
     In virtual time, an agent answers at once, and `processing_s` follows. A process first waits for a processor. If
     many agents share few processors, they answer one after another, and fewer answers collide.
@@ -246,7 +246,7 @@ class AnswerTimes:
         """(Vehicle, type code of an answer) -> when the vehicle got the latest question."""
 
     def sent(self, heard: Heard, data: bytes, at_s: float) -> None:
-        """Note that a vehicle sent this datagram."""
+        """Record that a vehicle sent this datagram."""
         code = data[TYPE_AT] if len(data) > TYPE_AT else None
         if code in ANSWER_TO:
             self._question[heard.frame] = ANSWER_TO[code]
@@ -256,7 +256,7 @@ class AnswerTimes:
             self._all.append(max(0.0, at_s - asked_s))
 
     def delivered(self, frame: bytes, vehicle: int, now: float) -> None:
-        """Note that a vehicle got this frame."""
+        """Record that this frame was delivered to a vehicle."""
         answer = self._question.get(frame)
         if answer is not None:
             self._asked_s[vehicle, answer] = now
@@ -266,14 +266,16 @@ class AnswerTimes:
 
 
 def _quantiles(ordered: list[float]) -> dict[str, float]:
-    """Return the median and the quantile of 95 % of values in ascending order; 0 without values."""
+    """Return the median and the 95 % quantile of the values, which are in ascending order. Both are 0 without
+    values.
+    """
     count = len(ordered)
     shares = {"median_s": count // 2, "p95_s": count * 95 // 100}
     return {name: round(ordered[index], 6) if ordered else 0.0 for name, index in shares.items()}
 
 
 def _sequence(data: bytes, vehicle: int) -> int | None:
-    """Return the number of a message; None if it is no message of the vehicle's agent."""
+    """Return the sequence number of a message, or None if the data are not a message of the vehicle's agent."""
     if len(data) < HEADER.size:
         return None
     magic, _, _, sender, sequence, _ = HEADER.unpack_from(data)
@@ -281,7 +283,7 @@ def _sequence(data: bytes, vehicle: int) -> int | None:
 
 
 def main() -> int:
-    """Run the node. Return exit status 1 if it has no access to the network."""
+    """Run the radio channel until it is stopped. Return exit status 1 if it has no access to the network."""
     with contextlib.suppress(OSError):  # an ordinary user may not run before all other programs
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(os.sched_get_priority_min(os.SCHED_RR)))
     try:

@@ -1,4 +1,4 @@
-"""Start the process of a shared channel in the lab's own network, forward each change to it, and stop it.
+"""Start the process that simulates a shared radio channel, forward each change to it, and stop it.
 
 It belongs to the harness and not to the system under test. If it fails, the machine or the harness has failed, and the
 run ends.
@@ -32,7 +32,7 @@ LOG = "channel.log"
 
 
 class ChannelProcess:
-    """The channel of one run, whose scenario has one."""
+    """The process that simulates the shared radio channel of one run."""
 
     def __init__(self, scenario: Scenario, seed: int, rundir: RunDirectory) -> None:
         assert scenario.network.channel is not None, "the caller checks this"
@@ -69,7 +69,7 @@ class ChannelProcess:
             await asyncio.sleep(ASK_AGAIN_S)
 
     async def begin(self, epoch_us: int, places: Mapping[int, Place]) -> None:
-        """Take over the broadcasts of all vehicles from the switch. Mission second 0 is `epoch_us`."""
+        """Start to deliver the broadcasts of all vehicles, in place of the switch. Mission second 0 is `epoch_us`."""
         roster = list(self._scenario.roster)
         figures = dataclasses.asdict(self._model.radio())
         await self._ask(
@@ -88,13 +88,15 @@ class ChannelProcess:
         await self.apply(self._conditions)
 
     async def move(self, places: Mapping[int, Place]) -> None:
-        """Put the vehicles at these places."""
+        """Set the positions of the vehicles."""
         ordered = [places[vehicle] for vehicle in self._scenario.roster]
         coordinates = [value for place in ordered for value in dataclasses.astuple(place)]
         await self._ask("move", places=coordinates)
 
     async def apply(self, conditions: NetworkConditions) -> None:
-        """Apply these conditions to frames that end later, and from the beginning if it is still to come."""
+        """Apply these network conditions to all frames whose transmission ends later. If the mission has not begun,
+        apply them at its start.
+        """
         self._conditions = conditions
         if not self._begun:
             return
@@ -104,11 +106,11 @@ class ChannelProcess:
             self._value.unlink()
 
     async def clear(self) -> None:
-        """End the channel, so that the switch delivers all later broadcasts."""
+        """End the simulation of the channel, so that the switch delivers all later broadcasts."""
         await self._ask("clear")
 
     async def totals(self) -> dict[str, Any] | None:
-        """Return what run.json has of the channel so far; None before it began."""
+        """Return the channel's data for run.json, or None if the mission has not begun."""
         if not self._begun:
             return None
         async with self._asking:
@@ -118,7 +120,7 @@ class ChannelProcess:
         return {"model": self._model.to_json(), **totals}
 
     async def watch(self) -> None:
-        """Wait until the process ends by itself, then raise MachineError."""
+        """Wait for the process to end by itself, then raise MachineError."""
         assert self._process is not None, "it is watched after its start"
         await self._process.wait()
         raise self._ended(self._process)

@@ -1,4 +1,4 @@
-"""The vehicles of a run as programs. Start them, fly them, connect them to a ground station, and replace lost ones."""
+"""Start the vehicle programs of a run, fly them, connect them to a ground station, and replace lost ones."""
 
 import asyncio
 import math
@@ -26,7 +26,7 @@ AWAY_M = 5.0
 
 
 class Fleet:
-    """The vehicles of a run, one for each agent of the roster. Without vehicles (`kinds` is empty) the fleet is false.
+    """The vehicles of a run, one for each agent. In a run without vehicles the object counts as false.
 
     The watchers end the mission with VehicleFailedError when a vehicle fails.
     """
@@ -56,7 +56,7 @@ class Fleet:
         return VehicleProcess(vehicle_id, self._sysids[vehicle_id], self._kinds[vehicle_id], self._rundir, incarnation)
 
     async def start(self, lab: MissionLab, show: Callable[[str], None]) -> None:
-        """Start all vehicles, and wait until all are ready to arm. `show` receives the progress as text.
+        """Start all vehicles, and wait until all can be armed. `show` receives the progress as text.
 
         Raises VehicleFailedError, and ScenarioError if the ground station cannot be reached.
         """
@@ -90,7 +90,7 @@ class Fleet:
             self._vehicles[vehicle_id].hand_over()
 
     async def _supervise(self, vehicle: VehicleProcess, lab: MissionLab) -> None:
-        """Watch a vehicle that has just started, give it its flight, and connect it to the ground station."""
+        """Watch a vehicle that has just started, give it its flight plan, and connect it to the ground station."""
         self._watchers.start(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
         flight = self._scenario.flight_of(vehicle.vehicle_id)
         vehicle.prepare(flight, self._scenario.vehicles.takeoff_altitude_m)
@@ -108,14 +108,14 @@ class Fleet:
         self._watchers.start(vehicle.fly(), of=f"flight {vehicle.vehicle_id}")
 
     def places(self) -> dict[int, Place]:
-        """Return the last reported positions, in metres from the middle of the field."""
+        """Return the last reported positions of the vehicles, in metres from the middle of the field."""
         field = self._scenario.vehicles.field
         return {vehicle_id: vehicle.place(field) for vehicle_id, vehicle in self._vehicles.items()}
 
     # Faults
 
     async def shoot_down(self, vehicle_id: int) -> None:
-        """Kill a vehicle. A fleet without vehicles does nothing."""
+        """Kill the program of a vehicle. In a run without vehicles, do nothing."""
         if not self._vehicles:
             return
         self._watchers.stop(f"flight {vehicle_id}")
@@ -123,7 +123,9 @@ class Fleet:
         await self._vehicles[vehicle_id].kill()
 
     async def replace(self, vehicle_id: int, lab: MissionLab, incarnation: int) -> None:
-        """Kill a vehicle, and start a new one with the same flight. A fleet without vehicles does nothing."""
+        """Kill the program of a vehicle, and start a new one with the same flight. In a run without vehicles, do
+        nothing.
+        """
         if not self._vehicles:
             return
         await self.shoot_down(vehicle_id)  # a fallen vehicle still holds its ports
@@ -136,7 +138,7 @@ class Fleet:
         self._watchers.start(self._vehicles[vehicle_id].fall(), of=f"flight {vehicle_id}")
 
     async def simulate(self, vehicle_id: int, what: str, circumstance: Circumstance, at_s: float) -> str | None:
-        """Make a vehicle simulate a circumstance, as `VehicleProcess.simulate` does."""
+        """Make a vehicle simulate an event such as a GPS failure. See `VehicleProcess.simulate`."""
         if self._station is not None and circumstance.station_is_heard is not None:
             self._station.reach(self._sysids[vehicle_id], reachable=circumstance.station_is_heard)
         return await self._vehicles[vehicle_id].simulate(what, circumstance, at_s)
@@ -144,20 +146,22 @@ class Fleet:
     # End of the run
 
     def shortfalls(self, mission_s: float) -> list[str]:
-        """Return a sentence for each vehicle that should have left its home, and has not."""
+        """Return a sentence for each vehicle that should have left its home position and has not."""
         sentences = (
             vehicle.shortfall() for vehicle in self._vehicles.values() if self._should_have_left(vehicle, mission_s)
         )
         return [sentence for sentence in sentences if sentence is not None]
 
     def _should_have_left(self, vehicle: VehicleProcess, mission_s: float) -> bool:
-        """Return whether the computed track leaves home more than LATE_S seconds before the end."""
+        """Return true if the vehicle's computed flight path leaves home more than LATE_S seconds before `mission_s`."""
         track = track_of(self._scenario, vehicle.vehicle_id)
         flown_s = mission_s - LATE_S - self._flies_since_s.get(vehicle.vehicle_id, mission_s)
         return any(math.hypot(*track.at(second)) > AWAY_M for second in range(max(0, math.ceil(flown_s))))
 
     def close_station(self) -> dict[str, Any] | None:
-        """Disconnect the ground station, and return its record for run.json. None if the run has no ground station."""
+        """Disconnect the ground station, and return its record for run.json. Return None if the run has no ground
+        station.
+        """
         if self._station is None:
             return None
         done = self._station.to_json()

@@ -1,4 +1,4 @@
-"""Start and stop the program that measures lag during a mission."""
+"""Start and stop a program that measures how late this machine runs programs during a mission."""
 
 import asyncio
 import json
@@ -11,14 +11,15 @@ END_LIMIT_S = 5.0
 
 
 class LagMeter:
-    """One run of `_lag_probe.py`. The program ends when this process ends, or before."""
+    """A running measurement of the machine's delays. It ends when this process ends, or earlier."""
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self._process = process
 
     @classmethod
     async def start(cls, path: Path, epoch_us: int, speedup: float, networks: Mapping[int, int]) -> "LagMeter":
-        """Measure from now on, and write to `path`. `networks` has the inode number of each agent's network namespace.
+        """Start to measure, and write the results to `path`. `networks` contains the inode number of each agent's
+        network namespace.
 
         Raises OSError if the program cannot be started.
         """

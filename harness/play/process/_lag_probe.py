@@ -1,4 +1,4 @@
-"""Measure how late this machine wakes programs, and how long each agent waits for a processor.
+"""Measure how late this machine wakes up programs, and how long each agent waits for a processor.
 
 The harness starts this program beside a mission. It writes JSON lines to the file in its first argument, and ends when
 its standard input ends. `harness.archive.lag` describes a line.
@@ -33,17 +33,17 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class Counters:
-    """The counters of the kernel. Each method returns seconds of wall time since its previous call."""
+    """Counters of the kernel. Each method returns the number of seconds of wall time since it was last called."""
 
     def __init__(self, networks: dict[int, str]) -> None:
-        """`networks`: inode number of a network namespace -> the agent in it."""
+        """Create the counters. `networks` maps the inode number of a network namespace to the agent in it."""
         self._networks = {f"net:[{inode}]": agent for inode, agent in networks.items()}
         self._agent_of: dict[str, str | None] = {}
         self._busy: dict[str, dict[str, int]] = {}
         self._stalled = self._read_stalled()
 
     def busy(self) -> dict[str, float]:
-        """Return agent -> time in which its processes ran or waited for a processor."""
+        """Return, for each agent, the time in which its processes ran or waited for a processor."""
         present = [entry.name for entry in os.scandir("/proc") if entry.name.isdigit()]
         self._agent_of = {pid: self._agent_of[pid] if pid in self._agent_of else self._agent(pid) for pid in present}
         before, self._busy = self._busy, {}
@@ -62,7 +62,7 @@ class Counters:
         return busy
 
     def stalled(self) -> float:
-        """Return how long the machine ran no program, because of a disk or a hypervisor."""
+        """Return the time in which this machine ran no program because of a disk or a hypervisor."""
         before, self._stalled = self._stalled, self._read_stalled()
         return sum(self._stalled) - sum(before)
 
@@ -88,7 +88,9 @@ def _busy_ns(thread: str) -> int:
 
 
 def measure(file: TextIO, started: float, speedup: float, counters: Counters, ended: threading.Event) -> None:
-    """Write a line for each slice until `ended`. `started` is the monotonic time of mission second 0."""
+    """Measure until `ended` is set, and write a line for each interval. `started` is the monotonic time of mission
+    second 0.
+    """
     slice_s = min(MAX_SLICE_S, max(MIN_SLICE_S, SLICE_MISSION_S / speedup))
     began = awake = time.monotonic()
     late = 0.0

@@ -1,4 +1,4 @@
-"""A shared channel in real time: which broadcast reaches which vehicle when. No I/O, and no clock.
+"""Decide when each broadcast on a shared radio channel reaches each vehicle. This module uses no I/O and no clock.
 
 The model and the random draws are those of virtual time. A message of an agent waits for its processing time and in the
 queue of its radio. When its frame ends, the conditions of the network apply to each copy that the channel delivers.
@@ -39,7 +39,9 @@ class Delivery(NamedTuple):
 
 
 class LiveChannel:
-    """The channel of `roster`. Times are mission seconds. No call may go back in time."""
+    """The shared radio channel of the agents in `roster`. Times are mission seconds, and must not decrease between
+    calls.
+    """
 
     def __init__(self, roster: Sequence[int], radio: Radio, processing_s: float, seed: int, journal: Journal) -> None:
         self._roster = tuple(roster)
@@ -56,22 +58,22 @@ class LiveChannel:
 
     @property
     def next_s(self) -> float:
-        """When the next event takes place; NEVER without one."""
+        """The mission second of the next event, or NEVER if there is none."""
         return min(self._traffic.next_s, self._due[0].at_s if self._due else NEVER)
 
     def send(self, at_s: float, vehicle: int, frame: bytes, data_bytes: int, sequence: int | None) -> None:
-        """Let a vehicle send this frame, with a message of this length, on the channel."""
+        """Let a vehicle send this frame on the channel. `data_bytes` is the length of the message in it."""
         at_s = max(at_s, self._played_s)
         self._traffic.send(at_s, self._number[vehicle], _Message(frame, sequence), data_bytes)
 
     def pass_by(self, at_s: float, vehicle: int, frame: bytes) -> None:
-        """Let a vehicle broadcast this frame without the channel."""
+        """Let a vehicle broadcast this frame without use of the channel."""
         sender = self._number[vehicle]
         everyone = (1 << len(self._roster)) - 1
         self._copy(at_s, self._medium.draw(sender, at_s, len(frame)), everyone, frame)
 
     def advance(self, now: float) -> list[Delivery]:
-        """Play all events up to `now`, and return the deliveries that are due, in order."""
+        """Play all events up to the time `now`, and return the deliveries that are due, in order."""
         self._play(now)
         deliveries = []
         while self._due and self._due[0].at_s <= now:
@@ -79,12 +81,14 @@ class LiveChannel:
         return deliveries
 
     def move(self, places: Sequence[Place], now: float) -> None:
-        """Put the vehicles at these places, in the order of the roster."""
+        """Set the positions of the vehicles, in the order of the roster."""
         self._play(now)
         self._traffic.move(places, now)
 
     def apply(self, conditions: NetworkConditions, now: float) -> None:
-        """Apply these conditions to frames that end later. A partition puts vehicles on different channels."""
+        """Apply these network conditions to all frames whose transmission ends later. In a partition, each group has
+        its own channel.
+        """
         self._play(now)
         self._medium.apply(conditions)
         groups = conditions.groups(self._roster)
@@ -102,7 +106,9 @@ class LiveChannel:
         self._played_s = max(self._played_s, now)
 
     def _copy(self, at_s: float, draws: RandomDraws, receivers: int, frame: bytes) -> None:
-        """Let the copies of a frame arrive at these receivers, given as bits, as the draws of the conditions decide."""
+        """Deliver copies of a frame to these receivers, after random losses and delays. `receivers` has a bit for each
+        receiver.
+        """
         for receiver in numbers(receivers):
             for delay_s in draws.copies_to(receiver):
                 heappush(self._due, Delivery(at_s + delay_s, next(self._order), self._roster[receiver], frame))

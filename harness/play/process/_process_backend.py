@@ -1,4 +1,4 @@
-"""The process backend. Vehicles and agents are programs on this machine, in a private network.
+"""The process backend. It plays vehicles and agents as programs on this machine, in a private network.
 
 The modules for networks and vehicles are imported only when a run needs them, because these imports are slow.
 """
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class ProcessBackend(Backend):
-    """The backend that plays each vehicle and each agent as a process."""
+    """The backend that plays each vehicle and each agent as a process on this machine."""
 
     name: ClassVar[BackendName] = "process"
 
@@ -34,17 +34,19 @@ class ProcessBackend(Backend):
         self.agent_commands(scenario)
 
     def agent_command(self, scenario: Scenario, agent_id: int) -> list[str]:
-        """Return the command of the agent without the mission file. Raises HarnessError if it cannot be run."""
+        """Return the command of the agent without its mission file. Raises HarnessError if it cannot be executed."""
         from harness.play.process._agent_process import agent_command
 
         return agent_command(scenario, agent_id)
 
     def agent_commands(self, scenario: Scenario) -> dict[int, list[str]]:
-        """Return the command of each agent. Raises as `agent_command`."""
+        """Return the command of each agent. Raises the errors of `agent_command`."""
         return {agent_id: self.agent_command(scenario, agent_id) for agent_id in scenario.roster}
 
     async def open_lab(self, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "MissionLab":
-        """Open the lab that runs the vehicles and agents. See `harness.play.process._run_lab.OpenLab`."""
+        """Open the virtual network in which the vehicles and agents run. See
+        `harness.play.process._run_lab.OpenLab`.
+        """
         from harness.play.process.process_preflight import network_needs
         from netem.lab import Lab
 

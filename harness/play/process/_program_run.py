@@ -1,4 +1,4 @@
-"""One run with real programs in a real, private network. The programs are processes or containers.
+"""Play one run with real programs in a private network. The programs are processes or containers.
 
 A run opens the lab, starts the vehicles, the agents and the mission clock, and plays the mission. Meanwhile it watches
 all programs. At the end it exports the chains, stops the programs and closes the lab. A crash, a hang or Ctrl-C ends
@@ -49,7 +49,9 @@ MIN_FOLLOW_S = 0.1
 
 
 class ProgramRun:
-    """One run, which implements `Swarm` and `AgentOperations`. Open it once."""
+    """One run with real programs. It implements the interfaces `Swarm` and `AgentOperations`, and can be opened
+    once.
+    """
 
     def __init__(
         self,
@@ -108,7 +110,7 @@ class ProgramRun:
 
     @asynccontextmanager
     async def opened(self) -> AsyncIterator[Self]:
-        """Open the lab for the mission in this context, and end the run afterwards.
+        """Open the virtual network inside this context, and end the run afterwards.
 
         Raises HarnessError if the lab cannot be opened. Later errors are recorded in `played`.
         """
@@ -178,7 +180,7 @@ class ProgramRun:
             self._fleet.take_off()
 
     async def _log_script(self) -> None:
-        """Make each running agent log its scripted events at their times."""
+        """Let each running agent log its scripted events at their times."""
         for event in sorted(self.scenario.events.script, key=lambda event: event.at_s):
             await self.until(event.at_s)
             agent = self._agent(event.agent)
@@ -199,7 +201,7 @@ class ProgramRun:
             self._watchers.start(self._rogue.watch(), of="rogue")
 
     async def _start_agent(self, agent: AgentProcess, lab: MissionLab) -> None:
-        """Start the agent. If the mission is active, the agent joins it."""
+        """Start the agent. If the mission has already begun, the agent joins it."""
         with_vehicle = bool(self._fleet)
         keeps_disk = self._keeps_disks or reboots_with_disk(agent.agent_id, self.scenario)
         epoch_us = self.clock.epoch_us
@@ -244,7 +246,7 @@ class ProgramRun:
         self.rundir.append_network(record)
 
     async def _strike_all(self, fault: Fault) -> None:
-        """Apply the fault to its agents at the same time.
+        """Apply the fault to all its agents at the same time.
 
         Raises ScenarioError if it is possible for no agent. If it is impossible for some agents, record the reasons.
         """
@@ -314,12 +316,12 @@ class ProgramRun:
         await agent.kill(disk_kept=disk_kept)
 
     async def _restart_with_vehicle(self, agent: AgentProcess) -> None:
-        """Start a new vehicle in place of the lost one, and a new incarnation of the agent on it."""
+        """Start a new vehicle program in place of the lost one, and a new agent program on it."""
         await self._fleet.replace(agent.agent_id, self._lab, incarnation=agent.incarnations + 1)
         await self._start_agent(agent, self._lab)
 
     async def _apply_conditions(self, change: NetworkChange, asked: NetworkConditions | None = None) -> None:
-        """Apply the conditions of a change, and record it.
+        """Apply and record the network conditions of a change.
 
         The timeline passes the requested conditions in `asked`, and the record shows them with the applied ones. A
         change by flight is recorded as the change alone.
@@ -337,14 +339,14 @@ class ProgramRun:
         self.rundir.append_network(record)
 
     def _without_rogue(self, applied: Applied) -> dict[str, Any]:
-        """Return the conditions and counters of the kernel as JSON, without the rogue node."""
+        """Return the network conditions and packet counters as JSON, without those of the rogue node."""
         figures = applied.to_json()
         if self._rogue is not None:
             figures["receivers"].pop(str(self._rogue.vehicle), None)
         return figures
 
     async def _follow_flight(self) -> None:
-        """Record the positions of the vehicles, and adapt the network to them."""
+        """Record the positions of the vehicles, and adapt the radio losses to them."""
         radio = self.scenario.network.radio
         every_s = max(MIN_FOLLOW_S, self.clock.wall_s(radio.update_s if radio else TRACK_S))
         while True:
@@ -438,7 +440,9 @@ class ProgramRun:
         self.played.end_early("interrupted" if isinstance(error, InterruptedRunError) else "failed", error)
 
     async def _end_run(self, lab: MissionLab) -> None:
-        """Export the chains of the living agents, stop all programs, and close the lab. Record errors of programs."""
+        """Export the chains of the living agents, stop all programs, and close the network. Record errors of
+        programs.
+        """
         self._show("exporting")
         self.played.mission_s = round(self.clock.now(), 1)
         if self._lag is not None:
@@ -475,7 +479,7 @@ class ProgramRun:
         self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
 
     def _datagram_counters(self, counted: Mapping[int, UdpCounters]) -> dict[str, dict[str, int]]:
-        """Return the datagrams of each agent whose vehicle does not use UDP itself, for run.json."""
+        """Return the datagram counters of each agent whose vehicle does not use UDP itself, for run.json."""
         agents = [agent for agent in self._udp_before_start if agent in self.scenario.roster]
         return {
             str(agent): {

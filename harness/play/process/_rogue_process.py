@@ -1,4 +1,4 @@
-"""The rogue node as a process in a network namespace of its own.
+"""Run the rogue node, a sender of forged messages outside the swarm, as a process in its own network namespace.
 
 The harness starts it, orders injections, and stops it. The rogue node is part of the harness and not under test. If it
 fails, the run fails with a MachineError.
@@ -24,7 +24,7 @@ RETRY_S = 0.02
 
 
 class RogueProcess:
-    """The process of the rogue node. `vehicle` is its ID in the lab, which no agent has."""
+    """The process of the rogue node. `vehicle` is its ID in the network, which no agent has."""
 
     def __init__(self, vehicle: int, scenario: Scenario, seed: int, rundir: RunDirectory) -> None:
         self.vehicle = vehicle
@@ -60,7 +60,7 @@ class RogueProcess:
                 await asyncio.sleep(RETRY_S)
 
     async def begin(self, epoch_us: int, captured: Path | None) -> None:
-        """Start the mission. `captured` is the file with the keys of a captured vehicle."""
+        """Start the mission of the rogue node. `captured` is the file with the keys of a captured vehicle."""
         scenario = self._scenario
         roster, keys = list(scenario.roster), None if captured is None else str(captured)
         await self._ask(
@@ -68,19 +68,19 @@ class RogueProcess:
         )
 
     async def inject(self, injected: TimedInjection) -> None:
-        """Order an injection. Raises MachineError."""
+        """Request an injection of messages. Raises MachineError."""
         await self._ask(
             "inject", what=injected.what, number=injected.number, injection=injected.injection.model_dump(mode="json")
         )
 
     async def watch(self) -> None:
-        """Wait for the end of the process, then raise MachineError."""
+        """Wait for the process to end by itself, then raise MachineError."""
         assert self._process is not None, "`start` comes first"
         await self._process.wait()
         raise self._end_error(self._process)
 
     async def stop(self) -> None:
-        """Read the numbers of sent datagrams into `sent`, and end the process. Raises MachineError if it has failed."""
+        """Store the numbers of sent datagrams in `sent`, and end the process. Raises MachineError if it has failed."""
         if self._process is None or self._process.returncode is not None:
             return
         answer = await self._ask("status")

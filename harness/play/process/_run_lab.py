@@ -1,4 +1,4 @@
-"""The interface of a lab that runs the vehicles and agents of a mission.
+"""Define the interface of a virtual network that runs the vehicles and agents of a mission.
 
 `netem.lab.Lab` implements it with processes, and `harness.play.containers._container_lab.ContainerLab` with containers.
 """
@@ -19,21 +19,23 @@ Role = Literal["agent", "vehicle"]
 
 
 class Program(Protocol):
-    """A program that runs in the lab. The methods raise NetemError if the lab fails."""
+    """A program that runs in the virtual network. Its methods raise NetemError if the network fails."""
 
     @property
     def returncode(self) -> int | None:
-        """The exit status, or the negative number of the signal that killed the program. None while it runs."""
+        """The exit status, or the negative number of the signal that killed the program. It is None while the program
+        runs.
+        """
 
     @property
     def end(self) -> str:
-        """A phrase for the user that describes how the program ended."""
+        """A phrase that describes to the user how the program ended."""
 
     async def wait(self) -> int:
-        """Wait for the end of the program. Its output is complete in its files then. Return `returncode`."""
+        """Wait for the program to end and for all its output to be in its files. Return `returncode`."""
 
     async def send_signal(self, number: int) -> None:
-        """Send a signal. A program that has ended is ignored."""
+        """Send a signal to the program. If it has ended, do nothing."""
 
     async def pause(self) -> None:
         """Suspend the program until `resume`."""
@@ -45,7 +47,7 @@ class Program(Protocol):
 
 
 class MissionLab(Protocol):
-    """A lab of vehicles. The methods raise NetemError if the lab fails.
+    """A virtual network with vehicles. Its methods raise NetemError if the network fails.
 
     Methods without a docstring are documented in `netem.lab.Lab`.
     """
@@ -61,7 +63,7 @@ class MissionLab(Protocol):
 
     @property
     def network(self) -> NetworkLab:
-        """The lab of `netem` with the switch. Programs of the harness, for example captures, run in it as processes."""
+        """The underlying network of `netem`. The harness runs its own programs in it, such as packet captures."""
 
     async def spawn(
         self,
@@ -82,17 +84,17 @@ class MissionLab(Protocol):
     async def read(self) -> Applied: ...
 
     async def watch(self) -> None:
-        """Wait until the lab fails by itself, then raise NetemError."""
+        """Wait until the network fails by itself, then raise NetemError."""
 
     async def close(self) -> None:
-        """End all programs, and remove the lab. A repeated call does nothing."""
+        """End all programs, and remove the network. A second call does nothing."""
 
     async def __aenter__(self) -> Self: ...
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the lab. Errors are ignored."""
+        """Close the network. Errors are ignored."""
 
 
 OpenLab = Callable[[Scenario, RunDirectory, Callable[[str], None]], Awaitable[MissionLab]]

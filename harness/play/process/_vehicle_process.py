@@ -1,4 +1,4 @@
-"""One vehicle: a program in a network namespace of its own, and the pilot that flies it."""
+"""Run one vehicle: a program in its own network namespace, and the pilot that flies it."""
 
 import asyncio
 import contextlib
@@ -31,11 +31,11 @@ PARAMETERS = "parameters.parm"
 
 
 class VehicleFailedError(HarnessError):
-    """A vehicle could not be started or flown, or ended by itself."""
+    """An error: a vehicle could not be started or flown, or its program ended by itself."""
 
 
 class VehicleProcess:
-    """One vehicle. `sysid` is its MAVLink system ID. The replacement of a lost vehicle has the next `incarnation`."""
+    """The program of one vehicle. `sysid` is its MAVLink system ID. A replacement has the next number `incarnation`."""
 
     def __init__(
         self, vehicle_id: int, sysid: int, kind: VehicleKind, rundir: RunDirectory, incarnation: int = 1
@@ -108,24 +108,26 @@ class VehicleProcess:
         self.pilot.link.plays_station = False
 
     def hand_over(self) -> None:
-        """Let an operator fly the vehicle from now on."""
+        """Stop the automatic flight, so that an operator can fly the vehicle."""
         assert self.pilot is not None
         self.pilot.hand_over()
 
     def place(self, field: Home) -> Place:
-        """Return the last reported position relative to the middle of the field, or home if there is no report yet."""
+        """Return the last reported position relative to the middle of the field. Without a report, return the home
+        position.
+        """
         position = self.pilot.state.position if self.pilot else None
         if position is None:
             return Place(*field.metres_to(self._home.lat_deg, self._home.lon_deg, self._home.alt_m))
         return Place(*field.metres_to(position.lat_deg, position.lon_deg, position.alt_m))
 
     def prepare(self, flight: Flight | None, altitude_m: float) -> None:
-        """Set the flight: the plan, or a climb to `altitude_m` if there is no plan."""
+        """Set the flight of the vehicle: the given plan, or a climb to `altitude_m` metres without a plan."""
         assert self.pilot is not None
         self._flight = self.pilot.flight(flight.to_plan(), flight.by) if flight else self.pilot.ascent(altitude_m)
 
     async def _introduce(self) -> None:
-        """Set the given parameters, and read version and parameters of the vehicle into the record. Do this once.
+        """Set the requested parameters, and record the version and all parameters of the vehicle. Call this once.
 
         Raises VehicleFailedError after a kill.
         """
@@ -139,20 +141,22 @@ class VehicleProcess:
             (self._directory / PARAMETERS).write_text(in_lines(known), encoding="utf-8")
 
     async def get_ready(self) -> None:
-        """Prepare the vehicle until it can be armed. Raises VehicleFailedError after a kill."""
+        """Prepare the vehicle until it can be armed. Raises VehicleFailedError if it was killed."""
         assert self.pilot is not None and self._flight is not None
         await self._introduce()
         await self._run_pilot(self.pilot.get_ready(self._flight))
 
     async def fly(self) -> None:
-        """Fly, and then read the telemetry until the mission ends. Raises VehicleFailedError after a kill."""
+        """Fly the vehicle, and then read its telemetry until the mission ends. Raises VehicleFailedError if it was
+        killed.
+        """
         assert self.pilot is not None and self._flight is not None
         await self._introduce()
         await self._run_pilot(self.pilot.fly(self._flight))
         await self._run_pilot(self.pilot.stay_in_touch())
 
     async def _run_pilot(self, flight: Coroutine[Any, Any, None]) -> None:
-        """Run an operation of the pilot. If the vehicle fails in it, kill the vehicle and raise VehicleFailedError."""
+        """Run an operation of the pilot. If it fails, kill the vehicle and raise VehicleFailedError."""
         try:
             await flight
         except VehicleError as error:
@@ -165,14 +169,14 @@ class VehicleProcess:
             raise VehicleFailedError("; ".join(filter(None, (str(error), self.kind.lack)))) from None
 
     async def watch(self) -> None:
-        """Wait for the end of the process. Raises VehicleFailedError if it ends by itself."""
+        """Wait for the process to end. Raises VehicleFailedError if it ended by itself."""
         assert self._process is not None
         await self._process.wait()
         if not self._abandoned:
             raise self._end_error(self._process)
 
     async def kill(self) -> None:
-        """Kill the process with SIGKILL. Cancel `watch` and `fly` first."""
+        """Kill the process with SIGKILL. Cancel the tasks that run `watch` and `fly` first."""
         assert self._process is not None
         await self._process.send_signal(signal.SIGKILL)
         await self._process.wait()
@@ -185,13 +189,13 @@ class VehicleProcess:
         await self._run_pilot(self.pilot.terminate_flight())
 
     def shortfall(self) -> str | None:
-        """Return a sentence if it still flies and has not left its home."""
+        """Return a sentence if the vehicle still flies but has not left its home position. Otherwise return None."""
         if self.pilot is None or self._flight is None or self._process is None or self._process.returncode is not None:
             return None
         return self.pilot.shortfall(self._flight)
 
     async def simulate(self, what: str, circumstance: Circumstance, at_s: float) -> str | None:
-        """Make the vehicle simulate a circumstance. If the vehicle cannot, return the reason as a sentence."""
+        """Make the vehicle simulate an event such as a GPS failure. If it cannot, return the reason as a sentence."""
         assert self.pilot is not None
         entry: dict[str, Any] = {"at_s": at_s, "what": what, "parameters": {}}
         self._circumstances.append(entry)
@@ -230,7 +234,9 @@ class VehicleProcess:
         return record
 
     def _firmware(self) -> dict[str, Any]:
-        """Return the reported version, type and parameters. File names are relative to the run directory."""
+        """Return the version, type and parameters that the vehicle reported. File names are relative to the run
+        directory.
+        """
         given: dict[str, Any] = {"frame": self.kind.frame, "binary_sha256": self.kind.sha256}
         if self.pilot is not None:
             state, parameters = self.pilot.state, self.pilot.link.parameters

@@ -1,4 +1,4 @@
-"""Tasks that run beside a mission, for example watchers of programs. An error in a task ends the mission."""
+"""Run tasks beside a mission, for example to watch programs. An error in a task ends the mission."""
 
 import asyncio
 from collections import defaultdict
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Watchers:
-    """A group of tasks beside a mission.
+    """A group of tasks that run beside a mission.
 
     An exception in a task ends the mission. A task ends with the mission at the latest, and earlier through `stop`.
     """
@@ -24,7 +24,9 @@ class Watchers:
 
     @asynccontextmanager
     async def guard(self, *watched: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
-        """Run the mission in this context, with `watched` as tasks. If any of them fails, raise the root error."""
+        """Run the mission in this context, together with the tasks in `watched`. If one of them fails, raise its
+        error.
+        """
         try:
             async with self._group:
                 for coroutine in watched:
@@ -43,7 +45,7 @@ class Watchers:
             task.cancel()
 
     def create_task(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Start a task without a name, which `stop` does not end. The mission waits for its end.
+        """Start a task for whose end the mission waits. `stop` does not cancel it.
 
         Raises RuntimeError if a failure is already ending the mission.
         """
@@ -55,7 +57,9 @@ class Watchers:
 
 
 async def open_unless_interrupted(opening: Awaitable[T], interrupted: asyncio.Event) -> T:
-    """Return the result of `opening`. If the run is interrupted, cancel `opening` and raise InterruptedRunError."""
+    """Return the result of `opening`. If the user interrupts the run, cancel `opening` and raise
+    InterruptedRunError.
+    """
     opened = asyncio.ensure_future(opening)
     interruption = asyncio.create_task(interrupted.wait())
     await asyncio.wait({opened, interruption}, return_when=asyncio.FIRST_COMPLETED)
@@ -69,7 +73,7 @@ async def open_unless_interrupted(opening: Awaitable[T], interrupted: asyncio.Ev
 
 
 def _root_error(errors: BaseExceptionGroup[BaseException]) -> BaseException:
-    """Return the error to report: a failed agent first, then other HarnessErrors, then the consequences."""
+    """Return the error that caused the others: the failure of an agent if there is one, then any other HarnessError."""
     flat: list[BaseException] = []
     for error in errors.exceptions:
         flat += [_root_error(error)] if isinstance(error, BaseExceptionGroup) else [error]

@@ -1,4 +1,4 @@
-"""The mission file that an agent reads at its start (`ucp-mission/1`, see ucp/contract/CONTRACT.md)."""
+"""Write the mission file that an agent reads at its start (`ucp-mission/1`, see ucp/contract/CONTRACT.md)."""
 
 import base64
 from typing import Any
@@ -29,7 +29,7 @@ def mission_file(
     store: str | None = None,
     bundle: str | None = None,
 ) -> dict[str, Any]:
-    """Return the mission file of an agent as JSON.
+    """Return the mission file of an agent as a JSON object.
 
     - `seed`: seed of the run. The file has a seed derived from it, which differs for each agent and incarnation.
     - `epoch_us`: start time of the mission, if the agent joins an active mission.
@@ -66,7 +66,8 @@ def mission_file(
 
 
 def _source(events: EventOptions, with_vehicle: bool) -> str:
-    """Return the event source. The harness sends scripted events by the command `log`, so their source is "none".
+    """Return the source of the agent's events. For scripted events it is "none", because the harness sends them to the
+    agent.
 
     An agent without a vehicle draws its events at random.
     """

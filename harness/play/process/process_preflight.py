@@ -1,4 +1,4 @@
-"""Checks before a run with processes or containers, which reject a scenario that this machine cannot play."""
+"""Check before a run with processes or containers that this machine can play the scenario."""
 
 import asyncio
 import tempfile
@@ -17,7 +17,7 @@ from netem.tc import may_refuse
 
 
 def refuse_unplayable(scenario: Scenario) -> None:
-    """Raise HarnessError if real programs, or this machine, cannot play the scenario."""
+    """Raise HarnessError if the scenario needs virtual time, or if this machine cannot play it."""
     refuse_virtual_time_keys(scenario)
     refuse_unsupported_network(scenario)
     choose_vehicles(scenario)
@@ -25,7 +25,7 @@ def refuse_unplayable(scenario: Scenario) -> None:
 
 
 def refuse_virtual_time_keys(scenario: Scenario) -> None:
-    """Raise ScenarioError if the scenario has keys that need virtual time. The message lists them."""
+    """Raise ScenarioError if the scenario contains keys that only work in virtual time. The message lists them."""
     keys = [
         *(["fates"] if scenario.fates else []),
         *(["datagrams"] if scenario.datagrams else []),
@@ -41,7 +41,7 @@ def refuse_virtual_time_keys(scenario: Scenario) -> None:
 
 
 def network_needs(scenario: Scenario) -> list[str]:
-    """Return the network features that the scenario needs beyond loss and partitions, each once.
+    """Return the network features, in addition to loss and partitions, that the scenario needs.
 
     Raises ScenarioError for conditions that are impossible at the speedup of the scenario.
     """
@@ -49,12 +49,12 @@ def network_needs(scenario: Scenario) -> list[str]:
 
 
 def add_rogue_listener(conditions: NetworkConditions, scenario: Scenario) -> NetworkConditions:
-    """Return these conditions for the vehicles, and perfect links to the rogue node if the scenario has one."""
+    """Return the network conditions, extended by perfect links to the rogue node if the scenario has one."""
     return conditions.with_listener(scenario.rogue, scenario.roster) if scenario.rogue else conditions
 
 
 def _network_states(scenario: Scenario) -> list[NetworkConditions]:
-    """Return each state of the network once, at the speedup of the scenario and without partitions.
+    """Return each state of the network in the scenario once, at the scenario's speed and without partitions.
 
     With a radio model, one link of each state loses more than the others, because links differ during the flight.
     """
@@ -74,7 +74,7 @@ def _network_states(scenario: Scenario) -> list[NetworkConditions]:
 
 
 def refuse_unsupported_network(scenario: Scenario) -> None:
-    """Raise MachineError, with a solution, if no engine of this machine supports the network of the scenario.
+    """Raise MachineError with a solution if this machine cannot create the network conditions of the scenario.
 
     If the scenario needs more than loss and partitions, open a lab for a fraction of a second. Some kernels with netem
     reject certain conditions. Apply these conditions in the lab.

@@ -1,4 +1,4 @@
-"""The choice between ArduPilot and the embedded vehicle for each vehicle of a scenario."""
+"""Choose for each vehicle of a scenario between ArduPilot and the embedded vehicle model."""
 
 import os
 
@@ -11,7 +11,7 @@ from sitl.vehicle import NoBinaryError, NoProgramError, VehicleError, VehicleKin
 
 
 def choose_vehicles(scenario: Scenario) -> dict[int, VehicleKind]:
-    """Return the kind of each vehicle. The result is empty if the scenario has no vehicles.
+    """Return the program of each vehicle. The result is empty if the scenario has no vehicles.
 
     Unless the scenario names a kind, all vehicles are ArduPilot if the binaries of all of them are found. Otherwise all
     are embedded vehicles. Raises VehicleFailedError for an unusable binary or an impossible vehicle set-up, and
@@ -34,7 +34,7 @@ def choose_vehicles(scenario: Scenario) -> dict[int, VehicleKind]:
 
 
 def _ardupilots(scenario: Scenario) -> dict[int, VehicleKind] | None:
-    """Return ArduPilot for each vehicle, or None for embedded vehicles.
+    """Return the ArduPilot program of each vehicle, or None if the scenario uses the embedded vehicle model.
 
     Raises NoBinaryError if the scenario requires ArduPilot, and a binary is missing.
     """

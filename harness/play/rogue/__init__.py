@@ -1,4 +1,4 @@
-"""The rogue node: it receives every datagram, and sends the injections of the timeline in the names of agents.
+"""The rogue node: a sender outside the swarm that receives every datagram and sends messages in the names of agents.
 
 `_rogue` decides what to send, and does no I/O. `_crafted` makes messages that no agent has sent, and `_captured_bundle`
 seals them with the keys of a captured vehicle. Two drivers exist: the process `__main__` in a lab, and

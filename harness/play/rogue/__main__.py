@@ -1,4 +1,4 @@
-"""The rogue node as a process in the lab: `python -m harness.play.rogue`.
+"""Run the rogue node as a process in the virtual network: `python -m harness.play.rogue`.
 
 It receives UCP broadcasts on a UDP socket, and sends complete Ethernet frames (packet(7)) with the MAC and IP addresses
 of the agents that it imitates. Its working directory contains `rogue.control`, a socket for the commands `start` and
@@ -35,7 +35,7 @@ MAX_READ_BYTES = 65536
 
 
 class RogueNode:
-    """The process in `directory`. Raises OSError if a socket or a file cannot be opened."""
+    """The process of the rogue node, in the run directory. Raises OSError if a socket or a file cannot be opened."""
 
     def __init__(self, directory: Path) -> None:
         self._rogue: Rogue | None = None
@@ -56,7 +56,7 @@ class RogueNode:
         )
 
     def run(self) -> None:
-        """Serve until SIGTERM or SIGINT."""
+        """Run until the process receives SIGTERM or SIGINT."""
         self._loop.stop_on(signal.SIGTERM, signal.SIGINT)
         self._loop.watch(self._receiver, readable=self._read_datagrams)
         self._control.start()
@@ -83,7 +83,7 @@ class RogueNode:
         self._send()
 
     def _send(self) -> None:
-        """Send all pending datagrams, and set a timer for the next ones."""
+        """Send all datagrams that are due, and set a timer for the next ones."""
         assert self._rogue is not None, "no messages to send before the start"
         for injected in self._rogue.to_send():
             now = self._clock.now()
@@ -137,7 +137,7 @@ def _load_keys(path: Path) -> "CapturedKeys":
 
 
 def main() -> int:
-    """Run the node. Return exit status 1 if it has no access to the network."""
+    """Run the rogue node until it is stopped. Return exit status 1 if it has no access to the network."""
     try:
         RogueNode(Path.cwd()).run()
     except OSError as error:

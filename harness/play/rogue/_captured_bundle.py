@@ -1,4 +1,4 @@
-"""The abilities of an attacker with the bundle of a captured vehicle: open datagrams, and seal new ones.
+"""Let an attacker use the keys of a captured vehicle to decrypt datagrams and to sign new ones.
 
 The group secret opens the datagrams of all senders, and derives the sealing keys of any sender. It does not contain the
 signature keys of other vehicles. A block sealed in another vehicle's name is therefore signed with the captured
@@ -18,7 +18,7 @@ from ucp.secure.session import Session
 
 
 class CapturedKeys:
-    """The keys of a captured vehicle. `random_bytes` returns 8 bytes for each forged incarnation.
+    """The keys of a captured vehicle. `random_bytes` returns 8 random bytes for each forged restart of a vehicle.
 
     Times are mission seconds; `now_us` is UTC in microseconds.
     """
@@ -34,9 +34,9 @@ class CapturedKeys:
         """Block hash -> the genuine signature, from received datagrams."""
 
     def opened(self, datagram: bytes, now: float) -> tuple[Message, Request] | None:
-        """Return the message of a datagram, and the identification that an answer needs.
+        """Return the message in a datagram, and the identification that an answer must contain.
 
-        Return None if it cannot be opened.
+        Return None if the datagram cannot be decrypted.
         """
         self._receiver.epochs.set_clock(now)
         try:
@@ -52,7 +52,9 @@ class CapturedKeys:
     def sealed(
         self, sender: int, sequence: int, message: Message, request: Request | None, now: float, now_us: int
     ) -> bytes:
-        """Return a datagram in the name of `sender`, as genuine as these keys allow. Each sequence may be used once."""
+        """Return a datagram in the name of `sender` that is as close to genuine as these keys allow. Use each sequence
+        number once.
+        """
         session = self._sessions.get(sender)
         if session is None:
             session = self._sessions[sender] = self._session(sender, now_us)
@@ -65,5 +67,7 @@ class CapturedKeys:
         return session.seal(sequence, message, request, signature, 0)
 
     def _session(self, sender: int, now_us: int) -> Session:
-        """Return a forged incarnation of the sender that begins now, and is therefore newer than the genuine one."""
+        """Return a session that imitates a restart of the sender now, and is therefore newer than the genuine
+        session.
+        """
         return Session(replace(self._bundle, agent_id=sender), make_boot(now_us, self._random_bytes()))

@@ -1,4 +1,4 @@
-"""Datagrams that no agent sent, made with `ucp.scapy`."""
+"""Create datagrams that no agent sent, with the packet library `ucp.scapy`."""
 
 from collections.abc import Callable, Sequence
 from random import Random
@@ -22,18 +22,18 @@ def datagram(sender: int, sequence: int, message: Message | Packet) -> bytes:
 
 
 def forged_block(agent_id: int, timestamp_us: int) -> Block:
-    """Return a block in the agent's name."""
+    """Return a forged block in the name of the agent."""
     event = LoggableEvent(timestamp_us=timestamp_us, event_id=FORGED_EVENT_ID, data=FORGED_DATA)
     return Block(agent_id=agent_id, events=[event])
 
 
 def forged_commit(block: Block, chain_hash: bytes) -> CommitBlock:
-    """Return a Commit Block. `chain_hash` is the chain hash of the block's own position."""
+    """Return a Commit Block message. `chain_hash` is the chain hash directly after the block."""
     return CommitBlock(chain_hash=chain_hash, block=block)
 
 
 def random_message(name: str | None, roster: Sequence[int], timestamp_us: int, rng: Random) -> Packet:
-    """Return a well-formed message with random content, of type `name` or of any type.
+    """Return a valid message with random content. Its type is `name`, or random if that is None.
 
     Its block is in a roster agent's name.
     """
@@ -55,7 +55,7 @@ def random_message(name: str | None, roster: Sequence[int], timestamp_us: int, r
 
 
 def corrupted(data: bytes, bits: int, rng: Random) -> bytes:
-    """Return the datagram with `bits` random bits flipped."""
+    """Return the datagram with `bits` randomly chosen bits inverted."""
     flipped = bytearray(data)
     for bit in rng.sample(range(8 * len(data)), min(bits, 8 * len(data))):
         flipped[bit // 8] ^= 1 << bit % 8

@@ -1,4 +1,4 @@
-"""The journal of the rogue node, `rogue.jsonl`.
+"""Write `rogue.jsonl`, the log of the datagrams that the rogue node sends.
 
 The first LINES datagrams of an injection have one line each. Later datagrams are counted by mission second. Such a line
 has `count` and `bytes`, and `messages` and `refused` by type and reason.

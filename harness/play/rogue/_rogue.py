@@ -1,4 +1,4 @@
-"""The rogue node without I/O: it makes the datagrams of injections from the messages that it receives.
+"""The logic of the rogue node without I/O: it creates forged datagrams from the messages that it receives.
 
 Like `ucp.agent`, it is driven by calls (`receive`, `begin`, `handle_timer`), and `to_send` returns the results. Times
 are mission seconds. Equal inputs and seeds give equal outputs.
@@ -54,7 +54,9 @@ QUERY_OF_ANSWER = {NAMES[answer]: NAMES[query] for answer, query in REQUEST_OF.i
 
 @dataclass(frozen=True, slots=True)
 class RogueDatagram:
-    """A datagram of the rogue node. `what` is its kind, `injection` its number, and `source` the imitated address."""
+    """A datagram that the rogue node sends. `what` is its kind, `injection` its number, and `source` the imitated
+    sender address.
+    """
 
     injection: int
     what: str
@@ -72,7 +74,9 @@ class RogueDatagram:
 
 @dataclass(frozen=True, slots=True)
 class _ReceivedDatagram:
-    """A received datagram. `message` is None if it is sealed. `request` identifies it in an answer."""
+    """A datagram that the rogue node received. `message` is None if it is encrypted. An answer to it must contain
+    `request`.
+    """
 
     sender: int
     name: str
@@ -83,7 +87,7 @@ class _ReceivedDatagram:
 
 @dataclass(slots=True)
 class _Window:
-    """An injection that lasts until `until`. A flood sends its next message at `next_at`."""
+    """An injection of messages that lasts until `until`. A flood sends its next message at `next_at`."""
 
     number: int
     injection: Injection
@@ -92,7 +96,7 @@ class _Window:
 
 
 class Rogue:
-    """The state of the rogue node.
+    """The state of the rogue node: received messages, active injections, and datagrams to send.
 
     `epoch_us` is mission second 0 on the agents' clocks, in microseconds. `captured` are the keys of a captured
     vehicle. `initial_data` is that of the mission, and is needed for lies about chains.
@@ -126,7 +130,7 @@ class Rogue:
         self._made = 0
 
     def receive(self, datagram: bytes, now: float) -> None:
-        """Receive a datagram of an agent. Datagrams that are no UCP messages are ignored."""
+        """Process a datagram of an agent. Datagrams that are not UCP messages are ignored."""
         try:
             sender, name, message, request = self._read(datagram, now)
         except MalformedDatagramError:
@@ -146,7 +150,7 @@ class Rogue:
                 self._react(window, _ReceivedDatagram(sender, name, message, request, datagram), now)
 
     def _read(self, datagram: bytes, now: float) -> tuple[int, str, Message | None, "Request | None"]:
-        """Return sender and type, and the message with its identification if it can be read.
+        """Return the sender and the type of a datagram, with its message and identification if it can be decrypted.
 
         Raises MalformedDatagramError.
         """
@@ -159,7 +163,9 @@ class Rogue:
         return clear.sender, NAMES.get(clear.type, ""), *(opened or (None, None))
 
     def begin(self, number: int, injection: Injection, now: float) -> None:
-        """Begin the injection with this number, counted from 1. Some end at once, and others last."""
+        """Begin the injection with this number, which counts from 1. Some injections end at once, and others last for a
+        time.
+        """
         self.sent[number] += 0
         if isinstance(injection, Replay):
             self._replay(number, injection)
@@ -172,12 +178,12 @@ class Rogue:
             self.handle_timer(now)
 
     def next_timer(self) -> float | None:
-        """Return the time of the next `handle_timer`, or None."""
+        """Return the time at which `handle_timer` must be called next, or None."""
         times = [window.next_at for window in self._windows if isinstance(window.injection, Flood)]
         return min([*times, *(at for at, _, _ in self._waiting[:1])], default=None)
 
     def handle_timer(self, now: float) -> None:
-        """Queue the datagrams that are due."""
+        """Add the datagrams that are due to the queue."""
         while self._waiting and self._waiting[0][0] <= now:
             self._outbox.append(heappop(self._waiting)[2])
         for window in list(self._windows):
@@ -185,7 +191,7 @@ class Rogue:
                 self._flood(window, window.injection, now)
 
     def to_send(self) -> list[RogueDatagram]:
-        """Return the queued datagrams in order, and clear the queue."""
+        """Return the queued datagrams in order, and empty the queue."""
         outbox, self._outbox = self._outbox, []
         return outbox
 
@@ -216,7 +222,7 @@ class Rogue:
             heappush(self._waiting, (now + injection.by_s, self._made, copy))
 
     def _answer(self, forge: Forgery, query: Message) -> Message | None:
-        """Return the forged answer to a message, or None if this forgery does not answer it."""
+        """Return the forged answer to a query, or None if this kind of forgery does not answer it."""
         approve = bool(forge.approve)
         match query:
             case BlockAddRequest() if forge.message == BlockAddResponse.NAME:

@@ -1,4 +1,6 @@
-"""Turn a lie of the timeline into a message. Blocks and chains are given by name, as the rogue node knows them."""
+"""Create the forged message that a timeline entry `lie` describes. The entry names blocks and chains as the rogue node
+knows them.
+"""
 
 from collections.abc import Sequence
 
@@ -25,11 +27,11 @@ MADE = "made "
 
 
 class UnknownBlockError(Exception):
-    """A block or chain of a lie that the rogue node has not received."""
+    """An error: a forged message refers to a block or chain that the rogue node has not received."""
 
 
 class KnownBlocks:
-    """The known blocks by name, in the order in which each agent proposed them.
+    """An index of the blocks that the rogue node has received, by agent and in the order of their proposals.
 
     `initial_data` belongs to the inception block. `epoch_us` is mission second 0 on the agents' clocks, in
     microseconds.
@@ -42,7 +44,7 @@ class KnownBlocks:
         self._blocks: dict[bytes, Block] = {}
 
     def receive(self, sender: int, message: Message) -> None:
-        """Receive a message of an agent."""
+        """Store the blocks and hashes of a message that an agent sent."""
         if isinstance(message, BlockAddRequest):
             proposed = self._proposed.setdefault(sender, [])
             if message.block_hash not in proposed:
@@ -51,7 +53,9 @@ class KnownBlocks:
             self._blocks[message.block.block_hash] = message.block
 
     def message(self, lie: Lie) -> Message:
-        """Return the message of a lie. Raises UnheardError."""
+        """Return the forged message that a timeline entry describes. Raises UnknownBlockError if it refers to unknown
+        blocks.
+        """
         of_block = NOBODYS if lie.block is None else self._hash(lie.sender, lie.block)
         of_chain = None if lie.chain is None else self._chain_hash(lie.sender, lie.chain)
         approve = bool(lie.approve)
@@ -105,5 +109,5 @@ class KnownBlocks:
 
 
 def made_block(agent_id: int, timestamp_us: int) -> Block:
-    """Return a block in the agent's name that the agent never completed."""
+    """Return a block in the name of an agent that the agent never completed."""
     return Block(agent_id, timestamp_us, LoggableEvent(timestamp_us, 1, b"made by its captor").encode())

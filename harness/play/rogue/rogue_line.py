@@ -1,4 +1,4 @@
-"""A line of the rogue node's journal, and the sequence numbers that identify an injection."""
+"""Define the lines of the log `rogue.jsonl`, and the sequence numbers that mark forged messages."""
 
 from typing import Any
 
@@ -11,7 +11,9 @@ OF_NO_INJECTION = -1
 
 
 def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes) -> dict[str, Any]:
-    """Return the record of a datagram sent at `at_s`. `refused` is the reason why every agent drops it."""
+    """Return the log entry of a datagram that was sent at `at_s`. Its field `refused` is the reason why agents drop the
+    datagram.
+    """
     record = {"at_s": round(at_s, 6), "injection": injection, "what": what, "source": source}
     if datagram[2:3] == bytes([SECURED]):
         return {**record, "bytes": len(datagram), **_secured(datagram)}
@@ -25,7 +27,7 @@ def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes
 
 
 def _secured(datagram: bytes) -> dict[str, Any]:
-    """Return the unencrypted fields of a sealed datagram."""
+    """Return the unencrypted fields of an encrypted datagram."""
     try:
         clear = read_clear_header(datagram)
     except MalformedDatagramError as malformed:
@@ -42,10 +44,10 @@ _EACH = 1 << 17
 
 
 def forged_sequence(injection: int, count: int) -> int:
-    """Return the sequence number of datagram `count` (from 0) of injection `injection` (from 1)."""
+    """Return the sequence number of datagram number `count` (from 0) of injection number `injection` (from 1)."""
     return FORGED_FROM + (injection - 1) * _EACH + count % _EACH
 
 
 def injection_of(sequence: int) -> int | None:
-    """Return the number of the injection that forged a datagram, or None if an agent sent it."""
+    """Return the number of the injection that created a datagram, or None if an agent sent it."""
     return (sequence - FORGED_FROM) // _EACH + 1 if sequence >= FORGED_FROM else None

@@ -1,1 +1,1 @@
-"""The simulation backend. The agents of the process backend run in virtual time, on a simulated network."""
+"""The simulation backend: it runs the same agents as the process backend, in virtual time on a simulated network."""

@@ -1,4 +1,4 @@
-"""Captures in virtual time: an air that writes a capture file for the interface of each vehicle.
+"""Write packet capture files of a simulated run, one for the network interface of each vehicle.
 
 The files have the format of `netem.capture`, and contain the frames that a kernel would send. Mission second 0 is the
 Unix epoch, at speedup 1. Frames also reach the interface of a paused or dead agent. A copy that the network corrupts
@@ -23,7 +23,7 @@ FRAMES_KEPT = 4096
 
 
 class VirtualCapture:
-    """The capture files of the vehicles in `folder`. The methods that write raise OSError."""
+    """The packet capture files of all vehicles, in `folder`. Methods that write raise OSError."""
 
     def __init__(self, folder: Path, roster: Sequence[int]) -> None:
         self._roster = roster
@@ -35,11 +35,11 @@ class VirtualCapture:
             self._open = opened.pop_all()
 
     def air(self, *arguments: Any, deliver_all: bool) -> "CapturedAir":
-        """Return an air that writes to these files."""
+        """Return a simulated network that writes to these files."""
         return CapturedAir(self, *arguments, deliver_all=deliver_all)
 
     def record(self, mission_s: float, number: int, frame: bytes, *, outbound: bool) -> None:
-        """Record a frame that the vehicle with this number sends or receives."""
+        """Record a frame that this vehicle sends or receives."""
         self._files[number].packet(round(mission_s * NANOSECONDS), frame, outbound=outbound)
 
     def end(self, mission_s: float) -> dict[str, dict[str, int]]:
@@ -53,7 +53,7 @@ class VirtualCapture:
 
 
 class CapturedAir(VirtualAir):
-    """An air that delivers all messages and records them."""
+    """A simulated network that delivers all messages and records them as packets."""
 
     def __init__(self, capture: VirtualCapture, *arguments: Any, deliver_all: bool) -> None:
         super().__init__(*arguments, deliver_all=True)

@@ -1,4 +1,4 @@
-"""A crash of an agent that plays in the harness's own process.
+"""Detect that an agent crashed although it runs in the harness's own process.
 
 An engineer edits the core in place, and in virtual time the core runs in the process of the harness. An exception that
 comes out of `ucp` is a failure of the agent, like the end of an agent's process. Any other exception is the harness's.
@@ -17,7 +17,7 @@ MAX_WORDS = 200
 
 
 def core_crash(incarnation: Incarnation | None, error: Exception) -> AgentFailedError | None:
-    """Return the failure of the agent if the exception came out of its core, otherwise None."""
+    """Return the failure of the agent if its own code raised the exception, otherwise None."""
     frames = [(Path(frame.filename), frame.lineno) for frame in extract_tb(error.__traceback__)]
     ours = [(path, line) for path, line in frames if path.is_relative_to(CORE) or path.is_relative_to(HARNESS)]
     if incarnation is None or incarnation.state is None or not ours or not ours[-1][0].is_relative_to(CORE):

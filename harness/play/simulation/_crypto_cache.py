@@ -1,4 +1,4 @@
-"""A cache of cryptographic results that all secured agents of a simulated mission share.
+"""Cache cryptographic results for all agents of a simulated mission.
 
 All agents receive the same bytes. The header, the sender's keys, the plaintext and the validity of the signature are
 functions of keys and bytes alone. The cache stores the results of these functions by their arguments. A receiver with
@@ -28,7 +28,7 @@ VERIFIED_EVERY = 128
 
 
 def cached_crypto() -> CryptoFunctions:
-    """Return the cryptographic functions, with caches, for all sessions of a mission."""
+    """Return the cryptographic functions, with caches, for all agents of a mission."""
     signatures = RecordedSignatures()
     return CryptoFunctions(
         read=lru_cache(DATAGRAMS_CACHED)(read_clear_header),
@@ -41,7 +41,7 @@ def cached_crypto() -> CryptoFunctions:
 
 
 class CachedSenderKeys(SenderKeys):
-    """Keys of a sender with a cache of keystreams. The sender and all its receivers need the same keystream."""
+    """The keys of a sender, with cached keystreams. The sender and all its receivers use the same keystream."""
 
     __slots__ = ("_keystreams",)
 
@@ -54,7 +54,7 @@ class CachedSenderKeys(SenderKeys):
 
 
 class RecordedSignatures:
-    """The signatures that were made in this process by a `signer` of this object."""
+    """A record of all signatures made in this process, so that they can be verified without computation."""
 
     def __init__(self) -> None:
         self._made: dict[bytes, tuple[bytes, bytes]] = {}
@@ -65,13 +65,13 @@ class RecordedSignatures:
         return RecordingSigner(private_key, self._made)
 
     def verified(self, claim: SignatureClaim) -> bool:
-        """Return whether the signature is valid, as `ucp.secure.crypto_suite.verify` does."""
+        """Return true if the signature is valid, with the same result as `ucp.secure.crypto_suite.verify`."""
         made_here = self._made.get(claim.signature) == (claim.public_key, claim.signed)
         return (made_here and next(self._number) % VERIFIED_EVERY != 0) or verify(claim)
 
 
 class RecordingSigner:
-    """A signer that records its signatures."""
+    """A signing key that records its signatures."""
 
     def __init__(self, private_key: bytes, made: dict[bytes, tuple[bytes, bytes]]) -> None:
         self._private_key = Ed25519PrivateKey.from_private_bytes(private_key)

@@ -1,4 +1,4 @@
-"""The event loop of virtual time. It gives each agent its inputs in order of time, and sends the agents' messages.
+"""Run all agents in virtual time: give each agent its inputs in order of time, and deliver the messages of the agents.
 
 Inputs are messages, events to log, and the ends of timers. `simulation.py` plays a mission with this loop.
 """
@@ -48,7 +48,7 @@ KEPT_MESSAGES = 10_000
 
 
 class EventLoop:
-    """The agents of a scenario on a virtual air. The number of an agent is its index in the roster.
+    """The agents of a scenario on a simulated network. The number of an agent is its index in the roster.
 
     `deliver_all`: deliver also the messages that a released agent would ignore. This takes longer and changes only the
     traces. Every message is delivered if an agent has quirks, is not the harness's own, or has an edited core
@@ -134,12 +134,14 @@ class EventLoop:
 
     @property
     def public_keys(self) -> "PublicKeys | None":
-        """The public keys of the vehicles. None if the mission is not secured."""
+        """The public keys of the vehicles, or None if the mission is not secured."""
         return self._keys.mission.public if self._keys else None
 
     @property
     def verified(self) -> "Callable[[SignatureClaim], bool] | None":
-        """A function that verifies a signature, fast if it was made in this run. None if the mission is not secured."""
+        """A function that verifies signatures, with a cache of those made in this run. None if the mission is not
+        secured.
+        """
         return self._keys.crypto.verify if self._keys else None
 
     def _keys_of_agents(self, *, interactive: bool) -> "SimulatedKeys":
@@ -155,7 +157,7 @@ class EventLoop:
         return VirtualRogue(self.roster, self.seed, self._air, number, write, captured, self._initial_data)
 
     def _late_rogue(self) -> "VirtualRogue":
-        """Return a rogue node that has received the last messages of the run, as if it had always listened."""
+        """Return a rogue node that starts late, but has received the last messages of the run."""
         assert self._recent_messages is not None, "a scenario that injects has a rogue node from the beginning"
         rogue = self._rogue_node()
         for sender, sequence, message, sent_at in self._recent_messages:
@@ -165,7 +167,7 @@ class EventLoop:
     # Inputs
 
     def run(self, until: float) -> None:
-        """Play all inputs up to `until`, or up to the sought handler run."""
+        """Play all inputs up to the time `until`, or up to a handler run for which a caller waits."""
         self._recent_runs = None
         with gc_paused():
             self._play(until)
@@ -198,7 +200,7 @@ class EventLoop:
             raise crash from error
 
     def _handle_message(self, number: int, incarnation: Incarnation, flight: MessageInFlight) -> None:
-        """Give a message to the agent, if it matters to the agent."""
+        """Give a message to the agent, if it can affect the agent."""
         sender, message = flight.sender, flight.message
         if self._tracing or incarnation.secured is not None or type(message) in ONLY_COUNTED:
             self._tally_answers(number, incarnation)
@@ -219,7 +221,9 @@ class EventLoop:
             agent.receive_datagram(flight.sealed, now)
 
     def _handle_other_input(self, number: int, incarnation: Incarnation, what: DueEvent | StrayDatagram | None) -> None:
-        """Give another input to the agent: the end of a timer, an event, or a stray datagram."""
+        """Give the agent an input that is not a message of another agent: a timer expiry, an event, or a foreign
+        datagram.
+        """
         agent = incarnation.agent
         if what is None:
             self._end_timer(number, incarnation)
@@ -260,7 +264,7 @@ class EventLoop:
         self._finish_input(number, incarnation)
 
     def _tally_answers(self, number: int, incarnation: Incarnation) -> None:
-        """Give the agent the answers that have arrived and that it only tallies.
+        """Give the agent those answers that have arrived and that it only counts.
 
         The loop calls this before the tally is read, and before other inputs if a trace is written, so that the lines
         of the trace are in order.
@@ -277,7 +281,7 @@ class EventLoop:
                     self._write_trace(incarnation, at)
 
     def _finish_input(self, number: int, incarnation: Incarnation) -> None:
-        """Complete an input: send the agent's messages, write its trace, and schedule its next timer."""
+        """Complete an input: send the agent's messages, write its trace, and schedule its next timer expiry."""
         self._send_and_trace(number, incarnation)
         self._schedule_timer(number, incarnation)
 
@@ -302,7 +306,7 @@ class EventLoop:
                 self._recent_messages.append((incarnation.agent.agent_id, sequence, message, self._now))
 
     def _send_sealed(self, number: int, incarnation: Incarnation, agent: KeyedAgent) -> None:
-        """Send the sealed messages of the agent. A rogue node that starts later does not know them."""
+        """Send the encrypted messages of the agent. A rogue node that starts later does not receive them."""
         for sealed, sequence, message, plain in agent.sealed_to_send():
             if message is None:
                 self._send_stray(number, incarnation, sealed)
@@ -313,12 +317,12 @@ class EventLoop:
                 self._rogue.receive_datagram(sealed, self._now)
 
     def _send_stray(self, number: int, incarnation: Incarnation, datagram: bytes) -> None:
-        """Send a datagram that is not a message of the agent. The rogue node does not receive it."""
+        """Send a datagram that is not a valid message of the agent. The rogue node does not receive it."""
         incarnation.bytes_sent += len(datagram)
         self._air.broadcast_stray(self._now, number, datagram)
 
     def _schedule_timer(self, number: int, incarnation: Incarnation) -> None:
-        """Schedule the end of the agent's next timer."""
+        """Schedule the expiry of the agent's next timer."""
         agent = incarnation.agent
         soonest = agent.next_timer()
         deadline = None if soonest is None else max(self._now, self._timer_end(number, incarnation, soonest))
@@ -330,7 +334,7 @@ class EventLoop:
         self._air.busy_until[number] = 0.0 if busy_until is None else incarnation.mission_s(busy_until)
 
     def _timer_end(self, number: int, incarnation: Incarnation, soonest: float) -> float:
-        """Return the mission second at which the next timer ends, or the next waiting answer is due.
+        """Return the mission second at which the next timer expires, or at which the agent next needs waiting answers.
 
         `soonest` is this time by the agent's clock, if none of its timers is late.
         """
@@ -357,7 +361,7 @@ class EventLoop:
         agent.end_timer(timer, max(deadline, incarnation.local_s(self._now)))
 
     def _write_trace(self, incarnation: Incarnation, mission_s: float) -> None:
-        """Write the agent's new handler runs into its trace."""
+        """Write the agent's new handler runs to its trace."""
         agent_id, entries = incarnation.agent.agent_id, incarnation.agent.trace()
         searching = self._recent_runs is not None or self._sought is not None
         for entry in entries:
@@ -369,7 +373,9 @@ class EventLoop:
         self._recorder.write(agent_id, entries)
 
     def _check_sought(self, agent_id: int, run: HandlerRun) -> None:
-        """Check whether this is the sought run. After a change of the timeline, keep the run for a later search."""
+        """Check whether a caller waits for this handler run. If the timeline has just changed, store the run for a
+        later check.
+        """
         if self._recent_runs is not None:
             self._recent_runs.append((agent_id, run))
         elif self._sought is not None and self._found is None and self._sought.matches(agent_id, run):
@@ -378,7 +384,7 @@ class EventLoop:
     # Incarnations
 
     def _start(self, number: int, stored: DiskContents | None = None) -> None:
-        """Start an incarnation, with the contents of the agent's disk if `stored` is given."""
+        """Start an agent. If `stored` is given, the agent starts with these contents of its disk."""
         agent_id = self.roster[number]
         incarnations = self._incarnations[number]
         clock = self.scenario.clocks.get(agent_id)
@@ -425,7 +431,8 @@ class EventLoop:
             self._air.schedule(max(self._now, incarnation.started_at + due), number, (current, event_id, data, None))
 
     def _resume(self, number: int, incarnation: Incarnation, waiting: list[ScheduledInput]) -> None:
-        """Handle the inputs that waited during a pause, in the order of a process: datagrams, timers, events.
+        """Let the agent handle the inputs that waited during a pause, in the order of a real process: datagrams,
+        timers, events.
 
         Each datagram is handled at its position in the order of inputs. If the agent sends a query meanwhile, a later
         datagram of the pause can be an answer to it.

@@ -1,4 +1,4 @@
-"""Proof that a swarm in virtual time is in a cycle: its global state recurs, and no other input is to come.
+"""Prove that a simulated swarm repeats a cycle forever: the state of all agents recurs, and no other input will come.
 
 The search compares the swarm at moments without messages in flight, just before the next timer ends. A state consists
 of the protocol state of every agent, its timers relative to this moment, and the order of the timers. From this moment
@@ -33,7 +33,7 @@ MAX_STEPS = 1000
 
 @dataclass(frozen=True, slots=True)
 class AgentAtRest:
-    """An agent at a moment without messages in flight."""
+    """An agent at a moment at which no message is on its way."""
 
     state: AgentState
     local_s: float
@@ -43,7 +43,7 @@ class AgentAtRest:
 
 
 class Recurrence:
-    """The search for a cycle. The simulation calls `check` whenever no message is in flight.
+    """The search for a repeated state of the swarm. The simulation calls `check` whenever no message is on its way.
 
     `delays`: minimum and maximum delay of a message, in seconds.
     """
@@ -70,7 +70,7 @@ class Recurrence:
     def check(
         self, swarm: Sequence[AgentAtRest], order: Sequence[object], fates: tuple[int, ...], fate_at: float
     ) -> bool:
-        """Return whether the swarm is in a cycle. No message may be in flight, and a timer must run.
+        """Return true if the swarm repeats a cycle. At this moment no message may be on its way, and a timer must run.
 
         - `order`: order of the next ends of timers, for late timers also within an agent.
         - `fates`: number of messages that each scripted fate has matched.
@@ -96,7 +96,7 @@ class Recurrence:
         return False
 
     def record_timer_ends(self, now: float, local_s: float, state: AgentState) -> None:
-        """Record that timers of an agent are about to end. All answers have been counted."""
+        """Record that timers of an agent are about to expire. All answers have been counted by now."""
         if now != self._next_s:
             self._delays_matter = True
         for timer in state.timers:
@@ -109,11 +109,11 @@ class Recurrence:
             self._answered_by[state.agent_id] |= state.reconcile_responders
 
     def record_state_after_timers(self, swarm: Sequence[AgentAtRest]) -> None:
-        """Record the state after all timers of an instant have ended, before their messages arrive."""
+        """Record the state after all timers of this moment have expired, and before their messages arrive."""
         self._state_after_timers = _changeable_by_messages(swarm)
 
     def cycle(self, swarm: Sequence[AgentAtRest]) -> Cycle:
-        """Return the cycle that the last `check` has found."""
+        """Return the cycle that the last call of `check` has found."""
         agents = {agent.state.agent_id for agent in swarm}
         acted = {step.agent_id for step in self._steps}
         return Cycle(
@@ -131,7 +131,7 @@ class Recurrence:
 
 
 def _changeable_by_messages(swarm: Sequence[AgentAtRest]) -> list[object]:
-    """Return the parts of the states that messages can change, without the tallies of answers."""
+    """Return the parts of the states that messages can change, without the counted answers."""
     return [
         (
             state.chain.top_chain_hash,
@@ -145,7 +145,7 @@ def _changeable_by_messages(swarm: Sequence[AgentAtRest]) -> list[object]:
 
 
 def _state(agent: AgentAtRest) -> tuple[object, ...]:
-    """Return the state on which the agent's next steps depend. Times are relative to its clock."""
+    """Return the state that determines the agent's next steps. Times are relative to the agent's clock."""
     state = agent.state
     return (
         state.agent_id,

@@ -1,4 +1,4 @@
-"""Secured agents in virtual time.
+"""Create agents with keys, which sign and verify messages in virtual time.
 
 All keys are derived from the seed of the run, unless the scenario names a directory of keys. Agents seal and open every
 datagram as in a real mission. Results that several receivers need are cached (`_crypto_cache.py`).
@@ -26,7 +26,7 @@ from ucp.store import StoredState
 
 
 class SecuredOwnAgent(SecuredAgent, OwnAgent):
-    """An agent of the harness with keys."""
+    """An agent of the harness that signs and encrypts its messages."""
 
     def export(self, now: float, exported_at_us: int) -> dict[str, Any]:
         return export_chain(self.state, exported_at_us, self.signatures)
@@ -58,7 +58,7 @@ class SimulatedKeys:
         self.crypto = cached_crypto()
 
     def agent(self, agent_id: int, incarnation: int, now: float) -> Callable[..., SecuredOwnAgent]:
-        """Return a function that creates the agent of an incarnation that starts at mission second `now`.
+        """Return a function that creates an agent with keys, which starts at mission second `now`.
 
         Incarnations are numbered from 1.
         """
@@ -72,7 +72,7 @@ class SimulatedKeys:
         return partial(SecuredOwnAgent, session, seal=make_seal(bundle) if self.mission.seals else None)
 
     def key_fields(self, agent_id: int, incarnation: int, now: float) -> dict[str, Any]:
-        """Return the keys of a foreign agent for the first line of an incarnation."""
+        """Return the keys for an agent in another language, as fields of its first input line."""
         return {
             "bundle": self.mission.bundles[agent_id].to_json(),
             "boot": self._boot(agent_id, incarnation, now).hex(),
@@ -85,7 +85,7 @@ class SimulatedKeys:
 
 
 def _drops_nothing(scenario: Scenario) -> bool:
-    """Return whether secured agents certainly drop no datagram, with any seed.
+    """Return true if agents with keys cannot drop a datagram in this scenario, for any seed.
 
     They drop copies, datagrams from other senders or earlier incarnations, and answers that arrive after a newer query.
     None of these occurs if all agents are correct and the network only loses messages and has partitions.
@@ -108,5 +108,5 @@ def _drops_nothing(scenario: Scenario) -> bool:
 
 
 def _derived_bytes(seed: int, what: str) -> bytes:
-    """Return 32 bytes that follow from the seed. SimulatedKeys of a simulated mission are not secret."""
+    """Return 32 bytes that depend only on the seed. The keys of a simulated mission need not be secret."""
     return hashlib.sha256(f"{what} of seed {seed}".encode()).digest()

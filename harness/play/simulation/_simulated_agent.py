@@ -1,4 +1,4 @@
-"""The interface between the simulation and an agent, and its implementation by an agent of the harness.
+"""Define the interface between the simulation and an agent, and implement it for the agents of the harness.
 
 `foreign` implements it with a separate program.
 """
@@ -26,7 +26,7 @@ DiskContents = StoredState | tuple[Any]
 
 
 class VirtualAgent(Protocol):
-    """An agent in virtual time. `now` is the time of the agent's clock in mission seconds. It never decreases.
+    """An agent in virtual time. `now` is the time on the agent's clock in mission seconds, and never decreases.
 
     All methods and properties raise HarnessError if the agent fails.
     """
@@ -39,7 +39,9 @@ class VirtualAgent(Protocol):
 
     @property
     def chain_changed_at(self) -> float | None:
-        """Time of the last change of the chain, by the agent's clock. 0: no change yet. None: unknown."""
+        """The time of the last change of the chain on the agent's clock. 0 means no change yet, and None means
+        unknown.
+        """
 
     @property
     def initial_data(self) -> bytes: ...
@@ -73,10 +75,10 @@ class VirtualAgent(Protocol):
     def status(self) -> Status: ...
 
     def known_status(self) -> Status | None:
-        """Return the status, or None if the agent has failed."""
+        """Return the status of the agent, or None if the agent has failed."""
 
     def completed(self) -> list[bytes]:
-        """Return the hashes of the blocks that the agent completed, in order."""
+        """Return the hashes of the blocks that the agent has completed, in order."""
 
     def export(self, now: float, exported_at_us: int) -> dict[str, Any]:
         """Return the chain export as JSON."""
@@ -84,11 +86,11 @@ class VirtualAgent(Protocol):
     def stored(self, now: float) -> DiskContents: ...
 
     def end(self, now: float) -> None:
-        """End the incarnation. Later queries return the state at this time."""
+        """End the agent. Later calls return its state at this time."""
 
 
 class OwnAgent(Agent):
-    """An agent of the harness, which runs in this process."""
+    """An agent of the harness that runs in this process."""
 
     @property
     def initial_data(self) -> bytes:
@@ -137,4 +139,4 @@ class OwnAgent(Agent):
         return StoredState.of(self.state)
 
     def end(self, now: float) -> None:
-        """Do nothing, because the object keeps its state."""
+        """Do nothing. The object keeps the state of the agent."""

@@ -1,4 +1,4 @@
-"""The rogue node in virtual time.
+"""Run the rogue node, a sender of forged messages, in virtual time.
 
 The rogue node receives every datagram at the time of sending. Its own datagrams arrive after the mean latency at every
 living agent, except the agent that it imitates. That agent would drop them as an echo of its own messages.
@@ -21,7 +21,7 @@ MOMENT_S = LATENCY.mean_s
 
 
 class VirtualRogue:
-    """The rogue node on a virtual air. `number` is its number there, after the numbers of the agents."""
+    """The rogue node on a simulated network. Its `number` there follows the numbers of the agents."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class VirtualRogue:
 
     @property
     def sent(self) -> dict[int, int]:
-        """Number of an injection that has begun -> number of datagrams that it made."""
+        """The number of datagrams that each injection has created so far."""
         return dict(self._rogue.sent)
 
     def receive_message(self, sender: int, sequence: int, message: Message, now: float) -> None:
@@ -57,7 +57,7 @@ class VirtualRogue:
         self._send(now)
 
     def wake(self, now: float) -> None:
-        """Handle the time that the rogue node waited for."""
+        """Handle the timer for which the rogue node waited."""
         self._wakes_at = None
         self._rogue.handle_timer(now)
         self._send(now)

@@ -1,4 +1,6 @@
-"""Show the tracks of a run in virtual time on a ground station. The station sees vehicles, and cannot command them."""
+"""Show the flight paths of a simulated run on a ground station. The station can display vehicles, but not command
+them.
+"""
 
 from __future__ import annotations
 
@@ -36,17 +38,19 @@ class _Connection:
 
 
 class StationTracks:
-    """The connections of one run to its ground station, for use in one event loop. Close it after the run."""
+    """The connections of a simulated run to its ground station. Use them in one event loop, and close them after the
+    run.
+    """
 
     def __init__(self, station: GroundStation) -> None:
-        """Create the object without connections. Use `open` instead."""
+        """Create the object without connections. Callers use `open` instead."""
         self._station = station
         self._connections: dict[int, _Connection] = {}
         self._shown_at = 0.0
 
     @classmethod
     async def open(cls, scenario: Scenario, tracks: Mapping[int, Track], now: Callable[[], float]) -> Self:
-        """Connect all vehicles. Raises ScenarioError if the ground station cannot be reached."""
+        """Connect all vehicles to the ground station. Raises ScenarioError if it cannot be reached."""
         assert scenario.gcs is not None
         try:
             station = await GroundStation.open(Address.parse(scenario.gcs), now, lambda vehicles: None)
@@ -63,7 +67,7 @@ class StationTracks:
         return shown
 
     def show(self, mission_s: float, lost: set[int]) -> None:
-        """Send the places of the vehicles that are not `lost`, unless the last update was less than `SHOW_S` ago."""
+        """Send the positions of the vehicles that are not `lost`, if the last update was at least `SHOW_S` ago."""
         if (at := time.monotonic()) - self._shown_at < SHOW_S:
             return
         self._shown_at = at
@@ -84,7 +88,7 @@ class StationTracks:
                     connection.sock.send(data)
 
     def close(self) -> dict[str, Any]:
-        """End all connections, and return their record for run.json."""
+        """Close all connections, and return their record for run.json."""
         passed = self._station.to_json()
         self._station.close()
         for connection in self._connections.values():

@@ -1,4 +1,4 @@
-"""The queue of virtual time: messages in flight, events to log, and the ends of timers, in order of time.
+"""Simulate the network in virtual time: a queue of messages, events and timer expiries in order of time.
 
 Agents broadcast each message, so each message reaches nearly all agents. Most of these deliveries change no agent
 (`ucp.interest`). Unless the trace needs every handler run, the air omits deliveries without effect:
@@ -42,7 +42,7 @@ DISCARD_EVERY = 1000
 
 @dataclass(slots=True, eq=False)
 class MessageInFlight:
-    """A broadcast message that is on its way to the receivers."""
+    """A broadcast message that is on its way to its receivers."""
 
     sender: int
     sequence: int
@@ -66,7 +66,7 @@ QueryKind = Literal["vote", "reconcile"]
 
 @dataclass(slots=True, eq=False)
 class _AnswerLog:
-    """The answers to one query, and the agents that sent it."""
+    """The answers to one query, and the agents that sent this query."""
 
     answers: dict[int, list[MessageInFlight]] = field(default_factory=dict)
     """Sender -> its answers, in the order of sending."""
@@ -80,7 +80,7 @@ class _AnswerLog:
 
 @dataclass(slots=True, eq=False)
 class _OpenQuery:
-    """An open query of an agent, since the position `since` in the order of inputs."""
+    """A query of an agent that still accepts answers, since the position `since` in the order of inputs."""
 
     question: Question
     log: _AnswerLog
@@ -104,7 +104,7 @@ Incarnation 0 stands for the current one. Without a time, the event has that of 
 
 @dataclass(frozen=True, slots=True)
 class StrayDatagram:
-    """A datagram from the address of vehicle `source` that is not a message of the agent there."""
+    """A datagram from the address of vehicle `source` that the agent there did not send as a message."""
 
     source: int
     datagram: bytes
@@ -112,7 +112,7 @@ class StrayDatagram:
 
 
 class _Copies:
-    """The copies of a broadcast that arrive, as pairs of receiver and delay in seconds."""
+    """The copies of a broadcast that arrive. Each is a pair of receiver and delay in seconds."""
 
     def __init__(self, copies: list[tuple[int, float]]) -> None:
         self._copies = copies
@@ -137,7 +137,7 @@ the lower rank comes first.
 
 
 class VirtualAir:
-    """The air between the agents of `roster`. The number of an agent is its index in the roster.
+    """The simulated network between the agents in `roster`. The number of an agent is its index in the roster.
 
     `deliver_all`: also deliver messages that cannot change their receiver.
     """
@@ -180,12 +180,12 @@ class VirtualAir:
         """Number of a hold -> held messages, each with its receiver and its arrival without the hold."""
 
     def deliver_everything(self) -> None:
-        """Also deliver messages that cannot change their receiver, from now on."""
+        """Also deliver messages that cannot have an effect on their receiver. Earlier messages are not affected."""
         self._deliver_all = True
 
     @property
     def quiet_at(self) -> float:
-        """Time after which no message arrives that is now in flight.
+        """The time after which none of the messages on their way arrives any more.
 
         While a shared channel has messages, it is at least the time of the channel's next event.
         """
@@ -193,7 +193,9 @@ class VirtualAir:
         return self._quiet_at if channel is None or channel.next_s == NEVER else max(self._quiet_at, channel.next_s)
 
     def inputs_until(self, mission_s: float) -> Iterator[ScheduledInput]:
-        """Yield the inputs up to and including `mission_s`, in order. The consumer may add inputs meanwhile."""
+        """Yield the inputs of all agents up to and including `mission_s`, in order. Inputs may be added during the
+        loop.
+        """
         queue = self._queue
         while True:
             channel = self._channel
@@ -210,24 +212,24 @@ class VirtualAir:
         self.position = (mission_s, self._rank, 0, None)
 
     def schedule(self, at: float, number: int, what: DueEvent | None) -> None:
-        """Schedule an event to log, or without `what` the end of a timer."""
+        """Schedule an event to log, or a timer expiry if `what` is None."""
         self._rank += 1
         heappush(self._queue, (at, self._rank, number, what))
 
     def timer_order(self, ends: Mapping[int, float]) -> list[int]:
-        """Sort agents by the ends of their next timers. `ends` maps numbers of agents to these ends."""
+        """Return the agents sorted by the expiry of their next timers. `ends` contains the expiry of each."""
         queue = sorted(happening[:3] for happening in self._queue if happening[3] is None)
         return list(dict.fromkeys(number for at, _, number in queue if ends.get(number) == at))
 
     def inject(self, at: float, stray: StrayDatagram, numbers: Iterable[int]) -> None:
-        """Schedule the arrival of a stray datagram at these agents."""
+        """Schedule the arrival of a foreign datagram at these agents."""
         self._rank += 1
         self._quiet_at = max(self._quiet_at, at)
         for number in numbers:
             heappush(self._queue, (at, self._rank, number, stray))
 
     def broadcast_stray(self, now: float, number: int, datagram: bytes) -> None:
-        """Send a datagram that is not a message of the agent. Scripted fates do not apply to it."""
+        """Broadcast a datagram that is not a valid message. Scripted delivery rules do not apply to it."""
         stray = StrayDatagram(self._roster[number], datagram)
         if self._channel is not None:
             self._channel.send(now, number, stray, len(datagram))
@@ -245,7 +247,7 @@ class VirtualAir:
         datagram: RecordedBytes | None = None,
         sealed: bytes | None = None,
     ) -> None:
-        """Send a message of the agent, in a datagram with `data_bytes` bytes of data."""
+        """Broadcast a message of the agent, in a datagram with `data_bytes` bytes of data."""
         self._rank += 1
         channel, kind = self._channel, type(message)
         draws = self._medium.draw(number, now, data_bytes) if channel is None else _UNKNOWN
@@ -268,7 +270,7 @@ class VirtualAir:
             self._keep_answer(answered(message), flight, number)
 
     def _schedule_all(self, flight: MessageInFlight) -> None:
-        """Schedule the arrivals at all receivers, except at agents that will certainly ignore the message."""
+        """Schedule the arrivals of a message at all receivers, except at agents that will certainly ignore it."""
         queue, busy_until, deliver_all = self._queue, self.busy_until, self._deliver_all
         now, rank = flight.sent_at, flight.rank
         for receiver, delay in flight.draws.to_all():
@@ -284,7 +286,9 @@ class VirtualAir:
             self._channel.move([places[agent_id] for agent_id in self._roster], now)
 
     def apply(self, conditions: NetworkConditions, now: float, *, clears_all: bool) -> None:
-        """Apply these conditions to later broadcasts. `clears_all` also ends the channel, with all its messages."""
+        """Apply these network conditions to later broadcasts. `clears_all` also ends the shared channel, with all its
+        messages.
+        """
         if clears_all and self._channel is not None:
             self._channel, self._medium.latency = None, LATENCY
         self._medium.apply(conditions)
@@ -296,7 +300,9 @@ class VirtualAir:
             )
 
     def _deliver_frame(self, at: float, transmission: Transmission, message: MessageInFlight | StrayDatagram) -> None:
-        """Deliver a message whose frame ends. The conditions of the network apply to each copy that arrives."""
+        """Deliver a message whose transmission on the shared channel ends. The network conditions apply to each
+        copy.
+        """
         sender, received = transmission.sender, transmission.received
         draws = self._medium.draw(sender, at, transmission.data_bytes)
         if isinstance(message, StrayDatagram):
@@ -316,7 +322,7 @@ class VirtualAir:
                 self._schedule_arrival(message, receiver, at + delay)
 
     def _interested_receivers(self, received: int, flight: MessageInFlight, at: float) -> Iterable[int]:
-        """Return the receivers to which the message can matter.
+        """Return the receivers on which the message can have an effect.
 
         An agent that reconciles ignores questions. An answer that arrives at once matters only to the agents that ask
         now. A paused agent may ask before it reads the answer.
@@ -334,7 +340,7 @@ class VirtualAir:
     # Answers
 
     def take_answers(self, number: int) -> list[tuple[float, int, MessageInFlight]]:
-        """Return the new answers that the agent counts, as (mission seconds, rank, answer), in order.
+        """Return the new answers that the agent counts, in order, each as (mission seconds, rank, answer).
 
         They have arrived since the agent's query. Only the first answer of each sender counts.
         """
@@ -370,7 +376,7 @@ class VirtualAir:
                 query.log.askers.remove(number)
 
     def remove_agent(self, number: int) -> None:
-        """Remove an agent that was killed."""
+        """Remove an agent that was killed from the network."""
         for query in self.open_queries[number].values():
             query.log.askers.remove(number)
         self.open_queries[number].clear()
@@ -378,7 +384,7 @@ class VirtualAir:
         self.busy_until[number] = 0.0
 
     def _open_query(self, number: int, question: Question) -> None:
-        """Open a query of the agent. Answers to the same query of another agent also count if they arrive later."""
+        """Open a query of the agent. Later answers to the same query of another agent count for it too."""
         open_queries = self.open_queries[number]
         about: QueryKind = "vote" if question[0] is BlockAddResponse else "reconcile"
         before = open_queries.get(about)
@@ -392,7 +398,7 @@ class VirtualAir:
                 self._schedule_earliest(flights, number, query)
 
     def _keep_answer(self, question: Question, flight: MessageInFlight, sender: int) -> None:
-        """Keep an answer for the agents that have sent the query, or will send it before the answer arrives."""
+        """Keep an answer for the agents that have sent the same query, or will send it before the answer arrives."""
         log = self._answer_logs[question]
         log.answer_count += 1
         log.quiet_at = self._quiet_at
@@ -408,7 +414,7 @@ class VirtualAir:
             self._discard_answers(flight)
 
     def _schedule_earliest(self, flights: Iterable[MessageInFlight], receiver: int, query: _OpenQuery) -> None:
-        """Schedule the earliest of these answers, unless an earlier one is already scheduled."""
+        """Schedule the earliest of these answers, unless an earlier answer is already scheduled."""
         first = self._earliest(flights, receiver, query.since)
         if first is not None and first[:2] < query.first:
             at, rank, flight = first
@@ -418,7 +424,7 @@ class VirtualAir:
     def _earliest(
         self, flights: Iterable[MessageInFlight], receiver: int, since: ScheduledInput
     ) -> tuple[float, int, MessageInFlight] | None:
-        """Return (mission seconds, rank, message) of the message that arrives first after `since`."""
+        """Return the message that arrives first after `since`, as (mission seconds, rank, message), or None."""
         since_s, since_rank, _, _ = since
         started_at = self.started_at[receiver]
         soonest, latest = self._medium.soonest, self._medium.latest
@@ -436,7 +442,7 @@ class VirtualAir:
         return None if first is None else (first_at, first.rank, first)
 
     def _discard_answers(self, latest: MessageInFlight) -> None:
-        """Discard the answers that have arrived at all receivers, and whose query no agent has open."""
+        """Discard the answers that have arrived at all receivers and that no open query needs."""
         self._discarded_at = latest.rank
         heard_before = min([latest.sent_at, *self.paused_at.values()])
         self._answer_logs = defaultdict(
@@ -451,7 +457,7 @@ class VirtualAir:
     # Scripted fates
 
     def _apply_fates(self, now: float, number: int, flight: MessageInFlight) -> bool:
-        """Schedule the arrivals of a message as the scripted fates require. Return false if no fate matches."""
+        """Schedule the arrivals of a message by the scripted delivery rules. Return false if no rule matches."""
         decided = self._script.decide(
             now, flight.sender, flight.message, flight.draws, lambda receiver: self._medium.hears(number, receiver)
         )
@@ -473,7 +479,9 @@ class VirtualAir:
         return True
 
     def release(self, number: int, at: float) -> None:
-        """End a hold. Its messages arrive at `at`, or at their own time if that is later."""
+        """Stop holding back the messages of this rule. They arrive at the time `at`, or at their own time if that is
+        later.
+        """
         for flight, receiver, would_arrive in self._held.pop(number, ()):
             self._schedule_arrival(flight, receiver, max(at, would_arrive))
 
@@ -482,5 +490,5 @@ class VirtualAir:
         heappush(self._queue, (at, flight.rank, receiver, flight))
 
     def unmatched_fates(self) -> list[str]:
-        """Return a sentence for each scripted fate that did not take effect."""
+        """Return a sentence for each scripted delivery rule that had no effect."""
         return self._script.unmatched(self._waiting)

@@ -1,4 +1,4 @@
-"""Scripted fates of single messages, and timers that expire late."""
+"""Apply scripted rules that decide the delivery of single messages, and delay the expiry of single timers."""
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -19,7 +19,7 @@ NameOf = Callable[[bytes], str | None]
 
 @dataclass(slots=True, eq=False)
 class _ScriptedFate:
-    """A scripted fate, with the numbers of messages that matched it and of deliveries that it decided."""
+    """A scripted delivery rule, with the number of messages that it matched and of deliveries that it decided."""
 
     index: int
     fate: Fate
@@ -37,7 +37,7 @@ class _ScriptedFate:
 
 @dataclass(slots=True)
 class DecidedDelivery:
-    """The delivery of one message, as far as it is decided. Times are mission seconds, receivers are numbers."""
+    """The decided delivery of one message. Times are mission seconds, and receivers are numbers."""
 
     arrivals: list[tuple[int, float]] = field(default_factory=list)
     """(receiver, time): the copy arrives at this time."""
@@ -50,7 +50,7 @@ class DecidedDelivery:
 
 
 class FateScript:
-    """The scripted fates of a run. `name_of` returns a block's name from its hash.
+    """The scripted delivery rules of a run. `name_of` returns the name of the block with a hash.
 
     The number of a receiver is its index in `roster`.
     """
@@ -68,7 +68,7 @@ class FateScript:
             self._about[part.fate.message, part.fate.sender].append(part)
 
     def hold(self, fate: Fate) -> int:
-        """Append a fate that holds the matching messages from now on. Return its number."""
+        """Add a rule that holds back matching messages from now on. Return its number."""
         part = _ScriptedFate(len(self._parts), fate.model_copy(update={"until_s": None}), holds=True)
         self._parts.append(part)
         self._about[fate.message, fate.sender].append(part)
@@ -76,14 +76,14 @@ class FateScript:
         return part.index
 
     def release(self, number: int, fate: Fate) -> None:
-        """Set the end of the hold with this number to that of `fate`."""
+        """Set the times at which the rule with this number stops to hold back messages, as `fate` gives them."""
         part = self._parts[number]
         part.fate, part.holds = fate, False
 
     def decide(
         self, now: float, sender: int, message: Message, draws: RandomDraws, hears: Callable[[int], bool]
     ) -> DecidedDelivery | None:
-        """Return the delivery of a message of agent `sender`. None if no fate matches it."""
+        """Return the delivery of a message of agent `sender`, or None if no rule matches it."""
         parts = [part for part in self._matching(now, sender, message) if self._count_match(part)]
         if not parts:
             return None
@@ -123,9 +123,9 @@ class FateScript:
         return decided
 
     def settled_counts(self, now: float) -> tuple[int, ...] | None:
-        """Return the number of matches of each fate, up to the largest number that the fate names.
+        """Return the number of messages that each rule has matched, limited to the largest number that the rule names.
 
-        None if the result of a fate still depends on time.
+        Return None if the result of a rule still depends on time.
         """
         if any(part.arrivals or part.holds for part in self._parts):
             return None
@@ -135,7 +135,7 @@ class FateScript:
         return tuple(min(part.matches, max(part.fate.counts or (0,))) for part in self._parts)
 
     def unmatched(self, waiting: Collection[str]) -> list[str]:
-        """Return a sentence for each fate that did not take effect, because its author expects an effect.
+        """Return a sentence for each rule that had no effect, because its author expects an effect.
 
         `waiting`: names of fates for whose message another message still waits.
         """
@@ -166,14 +166,14 @@ class FateScript:
                 yield part
 
     def _count_match(self, part: _ScriptedFate) -> bool:
-        """Count a matching message. Return whether the fate applies to a message with this number."""
+        """Count a matching message. Return true if the rule applies to the message with this number."""
         part.matches += 1
         counts = part.fate.counts
         return counts is None or part.matches in counts
 
 
 class RunningTimer(NamedTuple):
-    """A running timer of an agent."""
+    """A running timer of an agent, with its number among all timers of this name."""
 
     name: str
     number: int
@@ -183,7 +183,7 @@ class RunningTimer(NamedTuple):
 
 
 class LateTimers:
-    """The timers of one agent, through all of its incarnations. `text` is the agent's `lateness` in the scenario."""
+    """The timers of one agent across all its restarts. `text` is the agent's `lateness` in the scenario."""
 
     def __init__(self, text: str = "") -> None:
         self.running: dict[str, RunningTimer] = {}
@@ -192,7 +192,7 @@ class LateTimers:
         self._started = 0
 
     def update(self, state: AgentState) -> None:
-        """Update the running timers after an input. Several new timers are numbered in the order of `state.timers`."""
+        """Update the list of running timers after an input. New timers are numbered in the order of `state.timers`."""
         for timer in state.timers:
             known, deadline = self.running.get(timer.name), timer.deadline
             if deadline is None:
@@ -203,12 +203,14 @@ class LateTimers:
 
     @property
     def late_ones_have_ended(self) -> bool:
-        """True if all late timers have ended. From now on, all timers end on time."""
+        """True if all timers that the scenario delays have expired. From then on, all timers expire on time."""
         late = self._late_by_s.keys()
         running = {timer.number for timer in self.running.values()}
         return self._started > max(late, default=-1) and running.isdisjoint(late)
 
     def next(self, at: Callable[[float], float]) -> tuple[float, RunningTimer] | None:
-        """Return the mission second and the timer of the next end. `at` converts a time of the agent's clock."""
+        """Return the next timer to expire, and its mission second. `at` converts a time on the agent's clock to mission
+        seconds.
+        """
         ends = ((at(timer.deadline) + self._late_by_s.get(timer.number, 0.0), timer) for timer in self.running.values())
         return min(ends, default=None, key=lambda end: (end[0], end[1].deadline))

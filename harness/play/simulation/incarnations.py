@@ -1,4 +1,4 @@
-"""The incarnations of agents in virtual time, and the names of the blocks that they complete."""
+"""Represent agents in virtual time between a start and an end, and name the blocks that they complete."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
 
 
 class KeyedAgent(Protocol):
-    """An agent with keys. It is an agent of the harness or a foreign agent."""
+    """An agent that signs and encrypts its messages. It runs in this process or as a separate program."""
 
     def sealed_to_send(self) -> "Iterable[OutgoingDatagram]":
         """Return the datagrams that the agent sent since the previous call, in order."""
 
     def revoke(self, body: bytes, now: float) -> object:
-        """Handle a revocation by the authority of the keys."""
+        """Handle a signed list of vehicles that are excluded from the mission."""
 
 
 @dataclass(slots=True)
 class Incarnation:
-    """An agent from its start, restart or reboot to its end."""
+    """An agent in virtual time, from a start or restart to its end."""
 
     agent: VirtualAgent
     source: RandomEvents
@@ -62,11 +62,13 @@ class Incarnation:
         return self.agent.status().top_chain_hash if self.state is None else self.state.chain.top_chain_hash.hex()
 
     def local_s(self, mission_s: float) -> float:
-        """Return the time that the agent's clock shows at a mission second."""
+        """Return the time on the agent's clock at this mission second."""
         return mission_s if self.clock is None else self.clock.shows(mission_s)
 
     def timestamp_us(self, mission_s: float) -> int:
-        """Return the agent's clock in microseconds, at least 0. After the agent's end, the clock stands still."""
+        """Return the time on the agent's clock in microseconds, at least 0. After the agent ended, its clock stands
+        still.
+        """
         return max(0, round(self._last_local_s(mission_s) * MICROSECONDS))
 
     def export(self, mission_s: float) -> dict[str, Any]:
@@ -79,12 +81,14 @@ class Incarnation:
 
     @property
     def chain_changed_at(self) -> float | None:
-        """Mission second of the last change of the chain. 0 if there was no change, and None if it is unknown."""
+        """The mission second of the last change of the chain. It is 0 if there was no change, and None if it is
+        unknown.
+        """
         local_s = self.agent.chain_changed_at
         return self.mission_s(local_s) if local_s else local_s
 
     def _last_local_s(self, mission_s: float) -> float:
-        """Return the time that the agent's clock shows, or showed at the agent's end."""
+        """Return the time on the agent's clock, or the time at which the agent ended if it has ended."""
         return self.local_s(mission_s if self.ended_at is None else self.ended_at)
 
 
@@ -97,7 +101,7 @@ class BlockNames:
         self._names: dict[bytes, str] = {}
 
     def of(self, block_hash: bytes) -> str | None:
-        """Return `<agent>.<ordinal>` of a block. None if no agent has completed it."""
+        """Return the name of a block, such as 3.2, or None if no agent has completed it."""
         if block_hash not in self._names:
             for agent_id, incarnations in zip(self._roster, self._incarnations, strict=True):
                 completed = dict.fromkeys(

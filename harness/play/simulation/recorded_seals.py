@@ -1,4 +1,4 @@
-"""Sealed event data from records of a mission. A replay reuses it, because it lacks the vehicles' keys."""
+"""Reuse encrypted event data from the records of a mission, because a replay lacks the keys of the vehicles."""
 
 import base64
 from collections.abc import Iterable, Mapping
@@ -11,7 +11,7 @@ from ucp.sealed import SEAL_BYTES
 
 @dataclass(frozen=True)
 class RecordedSeals:
-    """A seal that returns recorded data. Event data without a record stays unsealed."""
+    """A substitute for encryption that returns recorded data. Event data without a record stay unencrypted."""
 
     sealed: Mapping[bytes, bytes]
     """Encoded last event of a block -> sealed event data of the block."""
@@ -26,7 +26,7 @@ class RecordedSeals:
 
 
 def recorded_seals(script: Iterable[ScriptedEvent], agent_id: int) -> RecordedSeals | None:
-    """Return the sealed data of this agent in the script of events. None if the script has no sealed data of it."""
+    """Return the encrypted data of this agent in a script of events, or None if there are none."""
     sealed = {
         event.logged.encode(): base64.b64decode(event.sealed)
         for event in script

@@ -1,4 +1,4 @@
-"""A swarm in virtual time whose agents start with stored states, instead of empty chains."""
+"""Simulate a swarm whose agents start with stored states, in place of empty chains."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,7 +12,7 @@ from ucp.store import StoredState
 
 
 class RestoredSwarm(Simulation):
-    """A swarm whose agents boot with their stored states. An agent without a stored state does not start.
+    """A simulated swarm whose agents start with stored states. An agent without a stored state does not start.
 
     Agents boot without their deques, and `give_deque` adds them one by one. If all agents proposed blocks at once, they
     would all be in a reconcile and answer no query, possibly forever.
@@ -21,13 +21,13 @@ class RestoredSwarm(Simulation):
     def __init__(
         self, scenario: Scenario, stored: Mapping[int, StoredState], recorder: Recorder, **options: Any
     ) -> None:
-        """`options` are those of `Simulation`."""
+        """Create the swarm. `options` are those of `Simulation`."""
         super().__init__(scenario, 0, recorder, **options)
         self._stored = stored
         self._generating = False
 
     async def give_deque(self, agent_id: int) -> None:
-        """Reboot the agent with its current state and the stored deque, without blocks that it already holds."""
+        """Restart the agent with its current state and the stored deque, without blocks that it already holds."""
         incarnation = self._alive[self._number[agent_id]]
         assert incarnation is not None and incarnation.state is not None, "the agent has booted"
         state = incarnation.state

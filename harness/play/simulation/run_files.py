@@ -1,4 +1,4 @@
-"""The files of a simulated run, and the interface of a recorder of events during a run."""
+"""Write the files of a simulated run, and define the interface of an object that records its events."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
@@ -26,7 +26,7 @@ class DiskRecorder:
         self._traces[agent_id].write(header_line(**header(incarnation)))
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
-        """Do nothing, because the block with the event contains this information."""
+        """Do nothing, because the file with the agent's blocks contains this information."""
 
     def write(self, agent_id: int, entries: list[Entry]) -> None:
         self._traces[agent_id].write("".join([entry.to_line() for entry in entries]))
@@ -48,13 +48,13 @@ class DiskRecorder:
         self._rundir.keep_exports_before_final_reconcile()
 
     def export(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
-        """Write the exports. Raises OSError."""
+        """Write the chain exports of these agents. Raises OSError."""
         for incarnation in incarnations:
             path = self._rundir.agents / f"{incarnation.agent.agent_id}.chain.json"
             write_json_atomically(path, incarnation.export(at_s))
 
     def problems(self) -> dict[int, str]:
-        """Return agent ID -> reason for the early end of its trace."""
+        """Return, for each agent whose trace ended early, the reason."""
         return {agent_id: trace.problem for agent_id, trace in self._traces.items() if trace.problem}
 
     def close(self) -> None:
@@ -63,7 +63,7 @@ class DiskRecorder:
 
 
 def header(incarnation: Incarnation) -> dict[str, Any]:
-    """Return the first line of a trace as keyword arguments of `ucp.trace.header_line`."""
+    """Return the first line of a trace, as keyword arguments of `ucp.trace.header_line`."""
     agent = incarnation.agent
     clock = {"epoch_us": 0, "speedup": 1, **(incarnation.clock.model_dump() if incarnation.clock else {})}
     return {
@@ -83,7 +83,7 @@ class Recorder(Protocol):
     """True if handler runs are recorded. Otherwise `write` is not called."""
 
     def begin(self, incarnation: Incarnation) -> None:
-        """Record the start of an incarnation."""
+        """Record that an agent started."""
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
         """Record that an agent logs an event with `data_bytes` bytes of data."""
@@ -94,10 +94,10 @@ class Recorder(Protocol):
         """Record a change of the network, or a fault of agents."""
 
     def injected(self, record: dict[str, Any]) -> None:
-        """Record a datagram of the rogue node. See `harness.play.rogue._journal`."""
+        """Record a datagram of the rogue node in the format of `harness.play.rogue._journal`."""
 
     def transmitted(self, record: dict[str, Any]) -> None:
-        """Record a message that left the shared channel, or that a radio dropped. Called only while tracing."""
+        """Record a message that left the shared channel, or that a radio dropped. Only called if traces are written."""
 
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Record the positions of the vehicles."""

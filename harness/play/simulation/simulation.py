@@ -1,4 +1,4 @@
-"""A swarm in virtual time. The agents are those that `ucp.node` runs.
+"""Simulate a swarm in virtual time, with the same agent code that `ucp.node` runs.
 
 The simulation does not wait, and does not depend on the machine. The same scenario and seed give the same run to the
 last bit. The events of each agent, the network draws of each sender and the quirks of each agent have random streams of
@@ -47,7 +47,7 @@ PROGRESS_S = 20.0
 
 
 class _AnyRun(SoughtRun):
-    """A description that matches every handler run."""
+    """A description that matches any handler run."""
 
     def matches(self, agent_id: int, run: HandlerRun) -> bool:
         return True
@@ -57,7 +57,7 @@ ANY_RUN = _AnyRun("any")
 
 
 class Simulation(EventLoop):
-    """A swarm in virtual time, which implements `harness.play.mission.Swarm`."""
+    """A swarm in virtual time. It implements the interface `harness.play.mission.Swarm`."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class Simulation(EventLoop):
 
     @property
     def tracks(self) -> Mapping[int, Track]:
-        """The tracks of the vehicles. Empty if the scenario needs no positions."""
+        """The flight paths of the vehicles. The table is empty if the scenario needs no positions."""
         return self._tracks
 
     # The methods of harness.play.mission.Swarm
@@ -160,7 +160,7 @@ class Simulation(EventLoop):
                 await self._breathe(self)
 
     async def _run_at(self, pace: "Pace", furthest: float) -> None:
-        """Do the same as `run`, but stop at the time that the pace allows."""
+        """Play the simulation like `run`, but stop at the time that the requested speed allows."""
         allowed_s = await pace.allowed_until(self._now)
         if allowed_s is None:
             return
@@ -221,7 +221,7 @@ class Simulation(EventLoop):
         self._recorder.changed({**record, **more})
 
     def _move(self) -> None:
-        """Move the vehicles to their places at this time, and adapt the network."""
+        """Move the vehicles to their positions at this time, and adapt the radio losses."""
         if not self._tracks:
             return
         places = {vehicle: Place(*track.in_field(self._now)) for vehicle, track in self._tracks.items()}
@@ -249,7 +249,10 @@ class Simulation(EventLoop):
         return False
 
     def _is_settled(self) -> bool:
-        """Return whether all agents are idle. No message is in flight and no timer runs, so other agents hang."""
+        """Return true if all agents are idle. If some hang instead, record them.
+
+        Callers must make sure that no message is on its way and that no timer runs.
+        """
         hanging = [
             incarnation.agent for incarnation in self.living() if incarnation.waiting is None and not incarnation.idle
         ]
@@ -259,7 +262,9 @@ class Simulation(EventLoop):
         return not hanging and all(incarnation.waiting is None for incarnation in self.living())
 
     def _new_recurrence(self) -> Recurrence | None:
-        """Return a search for a cycle, or None if the future depends on draws or on other inputs than the agents."""
+        """Return a search for an endless cycle, or None if the future depends on random numbers or on further
+        inputs.
+        """
         moving = bool(self._tracks) and self.scenario.network.radio and self.played.final_reconcile is None
         delays = self._medium.certain_delays()
         unknown = self._has_unknown_agents or self._rogue is not None
@@ -269,7 +274,7 @@ class Simulation(EventLoop):
         return Recurrence(delays)
 
     async def _run_until_recurrence(self, mission_s: float, recurrence: Recurrence) -> bool:
-        """Run until `mission_s`, or until the swarm is in a cycle. Return whether it is in a cycle."""
+        """Run until `mission_s`, or until the swarm repeats a cycle forever. Return true if it does."""
         self._recurrence = recurrence
         while self._now < mission_s:
             if self._air.quiet_at > self._now:
@@ -354,7 +359,7 @@ class Simulation(EventLoop):
             self._foreign_swarm.close()
 
     def end(self) -> None:
-        """Record the outcome at the end of the mission."""
+        """Record the result at the end of the mission."""
         if self._rogue is not None:
             self._rogue.close()
         self.played = self._outcome_so_far()
@@ -388,13 +393,15 @@ class Simulation(EventLoop):
         return (incarnation for incarnation in self._alive if incarnation is not None)
 
     def exporting(self) -> Iterator[Incarnation]:
-        """Yield the agents that leave an export, in the order of the roster. They are alive or were switched off."""
+        """Yield the agents that leave a chain export, in the order of the roster. They are alive or were switched
+        off.
+        """
         for number, incarnation in enumerate(self._alive):
             if (leaves := self._switched_off.get(number, incarnation)) is not None:
                 yield leaves
 
     def records(self) -> list["IncarnationRecord"]:
-        """Return the inputs and answers of each incarnation of a foreign agent."""
+        """Return the recorded inputs and answers of the foreign agents, for each of their starts."""
         return [] if self._foreign_swarm is None else self._foreign_swarm.records
 
     def _agent_to_json(self, number: int) -> dict[str, Any]:
@@ -433,7 +440,7 @@ class Simulation(EventLoop):
         }
 
     def _program_to_json(self, number: int, known: Sequence[Status | None]) -> dict[str, Any]:
-        """Return command and version of a foreign agent. Empty for an agent of the harness."""
+        """Return the command and version of a foreign agent. The result is empty for an agent of the harness."""
         agent_id = self.roster[number]
         if self._foreign_swarm is None or agent_id not in self._foreign_swarm:
             return {}
@@ -441,7 +448,7 @@ class Simulation(EventLoop):
         return {"command": self._foreign_swarm.command_of(agent_id), "version": version}
 
     def _handler_runs(self, incarnation: Incarnation, status: Status | None) -> dict[str, int | float] | None:
-        """Return the number of handler runs. A foreign agent reports this number itself."""
+        """Return the number of handler runs of the agent. A foreign agent reports this number itself."""
         if status is None:
             return None
         at_s = self._now if incarnation.ended_at is None else incarnation.ended_at
@@ -471,7 +478,7 @@ class Simulation(EventLoop):
         self._start(number, self._disks.pop(number, None))
 
     async def fall(self, agent_id: int) -> None:
-        """Remove the vehicle from the ground station. Its track does not change."""
+        """Remove the vehicle from the ground station's display. Its flight path does not change."""
         self.lost_vehicles.add(agent_id)
 
     async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
@@ -513,7 +520,7 @@ class Simulation(EventLoop):
 
 
 def no_vehicles(keys: Sequence[str]) -> str:
-    """Return the error that these keys need flying vehicles."""
+    """Return an error message: these keys of the scenario need flying vehicles."""
     named = ", ".join(f"`{key}`" for key in keys)
     return (
         f"{named} need{'s' if len(keys) == 1 else ''} flying vehicles, but virtual time computes the tracks: use "

@@ -1,4 +1,4 @@
-"""The simulation backend. It plays a swarm in virtual time, and writes a run directory like the other backends."""
+"""The simulation backend: it plays a swarm in virtual time, and writes the same run directory as other backends."""
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -122,7 +122,7 @@ class SimulationBackend(Backend):
 
 
 def _of_real_vehicles(scenario: Scenario) -> list[str]:
-    """Return the keys of the scenario that only a vehicle program supports."""
+    """Return the keys of the scenario that need real vehicle programs."""
     asked = (scenario.vehicles, *scenario.vehicles.each.values())
     keys = ("frame", "parameters", "wind", "arguments", "debugger")
     return [key for key in keys if any(getattr(vehicles, key) for vehicles in asked)]
@@ -146,7 +146,7 @@ def _export(simulation: Simulation, files: DiskRecorder) -> None:
 
 
 async def _compare_again(simulation: Simulation, on_progress: Callable[[Simulation], Awaitable[None]]) -> None:
-    """Check that foreign agents are deterministic: give them their inputs again, and compare the answers."""
+    """Check that foreign agents are deterministic: give them their inputs a second time, and compare the answers."""
     from harness.play.simulation.foreign.determinism import DeterminismCheck, NondeterminismError
 
     simulation.enter("the same again")
@@ -163,7 +163,9 @@ async def _compare_again(simulation: Simulation, on_progress: Callable[[Simulati
 
 @contextmanager
 def _programs(scenario: Scenario, rundir: RunDirectory) -> Iterator["ProgramPool | None"]:
-    """Open a pool of programs for the foreign agents, with logs in the run directory. None without foreign agents."""
+    """Yield a pool of programs for the foreign agents, with logs in the run directory. Yield None without foreign
+    agents.
+    """
     if not scenario.foreign:
         yield None
         return

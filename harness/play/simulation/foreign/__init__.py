@@ -1,4 +1,4 @@
-"""Foreign agents in virtual time. They are programs that read inputs as lines and write answers as lines.
+"""Run agents in any language in virtual time. They are programs that read inputs and write answers as lines of text.
 
 `_virtual_program` starts a program and exchanges lines with it, within a limit of wall time. `_answer` parses an
 answer. `_foreign_agent` lets the simulation drive one incarnation as it drives its own agents, and `_foreign_secured`

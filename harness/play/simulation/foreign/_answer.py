@@ -1,4 +1,4 @@
-"""The parser of an answer of a foreign agent, and the errors of such an agent."""
+"""Parse an answer line of a foreign agent (a separate program), and define the errors of such an agent."""
 
 import base64
 import math
@@ -22,20 +22,20 @@ SHOWN = 60
 
 
 class AnswerError(Exception):
-    """A line that is not a valid answer. The message completes a sentence that starts with "agent 3 answered"."""
+    """An error: a line is not a valid answer. The message completes a sentence that starts with "agent 3 answered"."""
 
 
 class LacksError(Exception):
-    """The agent does not support the input. The message is the agent's sentence."""
+    """An error: the agent does not support the input. The message is the sentence that the agent wrote."""
 
 
 class RefusedError(Exception):
-    """The agent refuses the input. The message is the agent's sentence."""
+    """An error: the agent refuses the input. The message is the sentence that the agent wrote."""
 
 
 @dataclass(slots=True)
 class Answer:
-    """A valid answer of an agent."""
+    """A valid answer of a foreign agent."""
 
     sent: list[tuple[bytes, RecordedBytes]]
     """Datagrams, each with its record, which contains the message if the datagram is one."""
@@ -91,7 +91,7 @@ def _datagram(text: Any) -> tuple[bytes, RecordedBytes]:
 
 
 def _entries(trace: list[Any]) -> Iterable[Entry]:
-    """Yield the lines of a trace without its header, which the harness knows."""
+    """Yield the lines of a trace except its header, which the harness writes itself."""
     for number, line in enumerate(trace):
         if isinstance(line, dict) and "schema" in line:
             continue
@@ -109,7 +109,7 @@ def _entries(trace: list[Any]) -> Iterable[Entry]:
 
 
 def shown(value: Any) -> str:
-    """Return the start of a value from an agent, for an error message."""
+    """Return the beginning of a value that an agent wrote, for an error message."""
     text = value.decode(errors="replace").strip() if isinstance(value, bytes) else str(value)
     return repr(text[:SHOWN] + ("..." if len(text) > SHOWN else ""))
 
@@ -118,7 +118,7 @@ Outcome = Literal["crashed", "hung", "not supported"]
 
 
 class AgentLacksError(UnsupportedError):
-    """An agent does not support the mission or virtual time."""
+    """An error: an agent does not support the mission, or does not support virtual time."""
 
     outcome: Outcome = "not supported"
 

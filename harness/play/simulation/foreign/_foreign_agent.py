@@ -1,4 +1,5 @@
-"""One incarnation of a foreign agent in virtual time. It has the interface of `OwnAgent`, and a program behind it.
+"""Run one start of a foreign agent (a separate program) in virtual time. It has the same interface as an agent in this
+process.
 
 The harness writes each input to the program as a line. The answer contains the datagrams that the agent sends, the end
 of its next timer, and the lines of its trace. The harness asks for the agent's state with the commands of the control
@@ -42,13 +43,13 @@ NO_VIRTUAL_TIME = (2, 127)
 
 
 class _CounterPerSecond:
-    """A counter for the current mission second."""
+    """A counter of the events in the current mission second."""
 
     def __init__(self) -> None:
         self._second = self._count = 0
 
     def add(self, count: int, now: float) -> int:
-        """Add `count`, and return the count of the mission second `now`."""
+        """Add `count`, and return the total for the mission second of `now`."""
         self._count = count + (self._count if self._second == int(now) else 0)
         self._second = int(now)
         return self._count
@@ -56,7 +57,9 @@ class _CounterPerSecond:
 
 @dataclass
 class IncarnationRecord:
-    """The inputs and answers of one incarnation as lines. After `limit` bytes, no further lines are recorded."""
+    """The recorded inputs and answers of a program, as lines, from its start to its end. Recording stops after `limit`
+    bytes.
+    """
 
     agent_id: int
     command: tuple[str, ...]
@@ -73,7 +76,7 @@ class IncarnationRecord:
 
 
 class ForeignAgent:
-    """One incarnation of a foreign agent, which implements `VirtualAgent`.
+    """A foreign agent from one start to its end. It implements the interface `VirtualAgent`.
 
     The methods raise AgentFailedError or AgentLacksError. After a failure, each input raises the same error again.
     """
@@ -91,7 +94,7 @@ class ForeignAgent:
         key_fields: Mapping[str, Any] | None = None,
         record_bytes: int,
     ) -> None:
-        """Start the incarnation.
+        """Start the agent by writing its first input line.
 
         - `mission`: mission file (`ucp-mission/1`).
         - `store`: contents of the disk with which the agent boots.
@@ -164,7 +167,7 @@ class ForeignAgent:
         return self._timer
 
     def silent_until(self) -> float | None:
-        """Return None, because the state of a foreign agent is unknown."""
+        """Return None, because the internal state of the program is unknown."""
         return None
 
     def outgoing(self) -> Sequence[AgentOutput]:
@@ -210,7 +213,7 @@ class ForeignAgent:
         return self._export if self._export is not None else self._ask_for_export(now)
 
     def _ask_for_export(self, now: float) -> dict[str, Any]:
-        """Request the export, and check that it is one of this agent and mission."""
+        """Request the chain export, and check that it belongs to this agent and mission."""
         export = self._ask("export", now)
         try:
             read = Export.model_validate(export)
@@ -236,11 +239,11 @@ class ForeignAgent:
     # Lines
 
     def _time_text(self, now: float) -> str:
-        """Return the time of an input as text. Rounding must not make it earlier than that of the previous input."""
+        """Return the time of an input as text. Rounding never makes it earlier than the time of the previous input."""
         return repr(float(max(now, self._now)))
 
     def _ask(self, command: str, now: float) -> dict[str, Any]:
-        """Send a command that must not change the agent, and return its answer."""
+        """Send a command that must not change the agent's state, and return the answer."""
         timer = self._timer
         answer = self._exchange(f'{{"t":{self._time_text(now)},"command":"{command}"}}', f"the command {command}", now)
         if answer.sent or answer.timer != timer or any(isinstance(entry, HandlerRun) for entry in answer.trace):
@@ -258,7 +261,7 @@ class ForeignAgent:
         return command_answer
 
     def _give_input(self, line: str, what: str, now: float) -> Answer:
-        """Give an input to the agent, and take over all outputs. An input on which the agent fails has no outputs."""
+        """Give an input to the agent, and store its outputs. If the agent refuses the input, there are no outputs."""
         answer = self._exchange(line, what, now)
         if self._datagrams_sent.add(len(answer.sent), now) > MAX_SENT_PER_S:
             raise self._failure("crashed", f"sent more than {MAX_SENT_PER_S} datagrams within mission second {now:.0f}")
@@ -298,7 +301,7 @@ class ForeignAgent:
         return answer
 
     def _check(self, entries: list[Entry]) -> list[bytes]:
-        """Check the times of the trace, and return the hashes of the blocks that it reports as completed."""
+        """Check the times in the trace, and return the hashes of the blocks that it reports as completed."""
         for entry in entries:
             if not abs(entry.t - self._now) <= ROUNDED_S:
                 raise self._failure("crashed", f"wrote t={entry.t!r} into its trace of an input at {self._now:g} s")
@@ -329,10 +332,10 @@ class ForeignAgent:
 
 
 def _changes(entries: list[Entry]) -> Iterator[tuple[str, str]]:
-    """Yield operation and block hash of each change in these lines."""
+    """Yield the operation and block hash of each change in these trace lines."""
     return (change for entry in entries if isinstance(entry, HandlerRun) for change in entry.changes)
 
 
 def _where(error: ValidationError) -> str:
-    """Return the first invalid key."""
+    """Return the name of the first invalid key."""
     return f"`{'.'.join(str(part) for part in error.errors()[0]['loc'])}`"

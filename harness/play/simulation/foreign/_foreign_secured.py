@@ -1,4 +1,4 @@
-"""A foreign agent with keys. The harness opens its datagrams for the records, and delivers them unchanged."""
+"""Run a foreign agent with keys. The harness decrypts its datagrams for the records, and delivers them unchanged."""
 
 import re
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ _DIGITS = re.compile("[0-9a-fA-F]{8,}")
 
 
 class SecuredForeignAgent(ForeignAgent):
-    """A foreign agent with the keys of `bundle`. The other arguments are those of `ForeignAgent`.
+    """A foreign agent with the keys in `bundle`. The other arguments are those of `ForeignAgent`.
 
     Error messages do not contain its secrets.
     """
@@ -30,7 +30,7 @@ class SecuredForeignAgent(ForeignAgent):
         super().__init__(*arguments, **options)
 
     def sealed_to_send(self) -> Iterator[OutgoingDatagram]:
-        """Yield the datagrams since the previous call, in order. A datagram that cannot be opened has no message."""
+        """Yield the datagrams since the previous call, in order. A datagram that cannot be decrypted has no message."""
         sent, self._sent = self._sent, []
         for data, _ in sent:
             try:
@@ -46,7 +46,7 @@ class SecuredForeignAgent(ForeignAgent):
             yield OutgoingDatagram(data, content.sequence, content.message if is_own else None, opened.recorded)
 
     def revoke(self, body: bytes, now: float) -> None:
-        """Give the agent a revocation by the authority of the keys."""
+        """Give the agent a signed list of vehicles that are excluded from the mission."""
         given = f'{{"t":{self._time_text(now)},"command":"revoke","revocation":"{in_base64(body)}"}}'
         self._checked_answer("revoke", self._give_input(given, "the command revoke", now).command_answer)
 
@@ -57,7 +57,7 @@ class SecuredForeignAgent(ForeignAgent):
         return super()._lacks_error(self._hidden(words))
 
     def _hidden(self, words: str) -> str:
-        """Return the text without secrets and without parts of secrets."""
+        """Return the text with all secrets, and parts of secrets, removed."""
 
         def shown(digits: re.Match[str]) -> str:
             text = digits[0].lower()

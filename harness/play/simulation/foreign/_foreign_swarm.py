@@ -1,4 +1,4 @@
-"""The foreign agents of a swarm, and the programs that play them."""
+"""Manage the foreign agents of a swarm, and the programs that run them."""
 
 import errno
 from collections.abc import Callable, Mapping
@@ -27,7 +27,7 @@ def commands_of(scenario: Scenario) -> dict[int, list[str]]:
 
 
 class ForeignSwarm:
-    """The foreign agents of a scenario.
+    """The foreign agents of a scenario, that is, the agents that are separate programs.
 
     By default `programs` is the pool that all missions in this process share. `keys` are those of a secured mission.
     """
@@ -81,7 +81,7 @@ class ForeignSwarm:
     def begin(
         self, agent_id: int, incarnation: int, now: float, stored: DiskContents | None, *, started_at: float
     ) -> ForeignAgent:
-        """Start an incarnation of the agent, with the contents of its disk if `stored` is given. Raises HarnessError.
+        """Start the agent, with the contents of its disk if `stored` is given. Raises HarnessError.
 
         It starts at mission second `started_at`, when the agent's clock shows `now`.
         """
@@ -110,7 +110,7 @@ class ForeignSwarm:
         return agent
 
     def ended(self, agent: VirtualAgent) -> None:
-        """Return the program of an agent whose incarnation has ended to the pool."""
+        """Make the program of an agent that has ended available for another agent."""
         if (program := self._playing.pop(agent.agent_id, None)) is not None:
             self._programs.give_back(program)
 
@@ -121,7 +121,9 @@ class ForeignSwarm:
         self._playing.clear()
 
     def _mission(self, agent_id: int, incarnation: int) -> dict[str, Any]:
-        """Return the mission file. It differs from that of a process where virtual time does."""
+        """Return the mission file of an agent. It differs from that of a real process where virtual time requires
+        it.
+        """
         mission = mission_file(
             agent_id,
             self._scenario,

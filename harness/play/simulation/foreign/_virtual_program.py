@@ -1,4 +1,4 @@
-"""A program that plays agents in virtual time, and the pool that reuses such programs.
+"""Run a program that plays agents in virtual time, and keep a pool of such programs for reuse.
 
 The harness writes one line to the program's standard input and reads one line as its answer, as the contract describes
 for `--virtual`. The program has a few seconds of wall time for each answer. It does not receive Ctrl-C. It ends when
@@ -39,7 +39,9 @@ _LIBC = CDLL(None)
 
 
 class ProgramFailedError(Exception):
-    """A program ended, hung, or wrote an invalid line. The message completes a sentence that starts with "agent 3"."""
+    """An error: a program ended, hung, or wrote an invalid line. The message completes a sentence that starts with
+    "agent 3".
+    """
 
     def __init__(self, outcome: Outcome, what: str, status: int | None = None) -> None:
         super().__init__(what)
@@ -49,7 +51,7 @@ class ProgramFailedError(Exception):
 
 
 class LineProgram:
-    """A running program, which was started with `command` and the argument `--virtual`.
+    """A running program that was started with `command` and the argument `--virtual`.
 
     Its standard error goes to `log`. Without `log`, it goes to a temporary file that each mission clears. Raises
     OSError if the program cannot be started.
@@ -96,7 +98,7 @@ class LineProgram:
         return self._process.poll() is None
 
     def write(self, line: bytes) -> None:
-        """Write a line. Raises ProgramFailedError."""
+        """Write a line to the program. Raises ProgramFailedError."""
         if self._received:
             raise ProgramFailedError("crashed", f"wrote an unexpected line: {_shown(self._received)}")
         self.owes_an_answer = True
@@ -110,7 +112,7 @@ class LineProgram:
             self._write_rest(memoryview(line)[written:])
 
     def read(self) -> bytes:
-        """Read the next line, with its line end. Raises ProgramFailedError."""
+        """Read the next line from the program, including its line end. Raises ProgramFailedError."""
         limit_s = ANSWER_LIMIT_S if self._answered else START_LIMIT_S
         if not self._received:
             if not self._readable.poll(limit_s * 1000):
@@ -125,7 +127,7 @@ class LineProgram:
         return line
 
     def _read_rest(self, limit_s: float) -> bytes:
-        """Read the rest of a line that arrives in pieces, and return the line."""
+        """Read the rest of a line that arrives in several pieces, and return the whole line."""
         deadline = time.monotonic() + limit_s
         pieces = [self._received]
         length = len(self._received)
@@ -143,7 +145,9 @@ class LineProgram:
         return self._received[: self._received.find(b"\n") + 1]
 
     def _write_rest(self, left: memoryview) -> None:
-        """Write the rest of a line when the pipe is full. Read output meanwhile, so that the program can go on."""
+        """Write the rest of a line when the pipe is full. Output of the program is read meanwhile, so that it can
+        continue.
+        """
         deadline = time.monotonic() + ANSWER_LIMIT_S
         ready = select.poll()
         ready.register(self._in, select.POLLOUT)
@@ -175,14 +179,14 @@ class LineProgram:
         return ProgramFailedError("crashed", f"ended by itself with status {status}", status)
 
     def log_phrase(self) -> str:
-        """Return the end of an error message: the path of the log, or the last line of the output."""
+        """Return the end of an error message: the path of the program's log, or the last line of its output."""
         if self.log is not None:
             return f"; its log is {self.log}"
         words = self.last_line()
         return f"; its last output: {words}" if words else ""
 
     def last_line(self) -> str:
-        """Return the last line of standard error. Empty if there is none."""
+        """Return the last line of standard error, or an empty string."""
         if self.log is not None:
             return last_line_in(self.log)
         size = self._errors.seek(0, os.SEEK_END)
@@ -190,19 +194,19 @@ class LineProgram:
         return last_line(self._errors.read().decode("utf-8", "replace"))
 
     def clear_output(self) -> None:
-        """Discard the standard error of a finished mission, unless it goes to a log."""
+        """Discard the standard error of a finished mission, unless it is written to a log."""
         if self.log is None:
             self._errors.seek(0)
             self._errors.truncate()
 
     def close_input(self) -> None:
-        """Close the standard input of the program, on which it ends."""
+        """Close the standard input of the program. The program then ends."""
         with suppress(OSError):
             assert self._process.stdin is not None
             self._process.stdin.close()
 
     def end(self, within_s: float = 0.0) -> None:
-        """End the program and its children, after `within_s` seconds with SIGKILL."""
+        """End the program and its child processes. After `within_s` seconds, kill them with SIGKILL."""
         self.close_input()
         try:
             self._process.wait(within_s)
@@ -216,11 +220,11 @@ class LineProgram:
         self.release()
 
     def close(self) -> None:
-        """End the program at once."""
+        """Kill the program at once."""
         self.end()
 
     def release(self) -> None:
-        """Close the files of this process that belong to the program. Do not end the program."""
+        """Close this process's files for the program without ending the program."""
         self.close_input()
         assert self._process.stdout is not None
         self._process.stdout.close()
@@ -250,7 +254,7 @@ GRACE_S = 1.0
 
 
 class ProgramPool:
-    """A pool of programs.
+    """A pool of idle programs for reuse.
 
     Standard error of a program goes to a file for each agent in the directory `logs`. With None, only error messages
     use it.
@@ -264,7 +268,7 @@ class ProgramPool:
         self._lock = Lock()
 
     def take(self, command: Sequence[str], agent_id: int) -> LineProgram:
-        """Return an idle or new program. The caller gives it back later. Raises OSError if it cannot be started."""
+        """Return an idle or a new program. The caller must give it back. Raises OSError if it cannot be started."""
         log = self._logs / f"{agent_id}.log" if self._logs is not None else None
         with self._lock:
             program = self._idle_program(tuple(command), log) or LineProgram(command, log)
@@ -282,7 +286,7 @@ class ProgramPool:
         return None
 
     def give_back(self, program: LineProgram) -> None:
-        """Make the program available again. End it if it still has to write an answer."""
+        """Make the program available again. If it still has to write an answer, end it."""
         with self._lock:
             self._taken.discard(program)
             if program.owes_an_answer:
@@ -294,7 +298,7 @@ class ProgramPool:
                 self._idle.pop(0).close()
 
     def close(self) -> dict[int, list[str]]:
-        """End all of them. Return the names of processes that they left behind, by agent, if they have logs."""
+        """End all programs. If they have logs, return the names of processes that they left behind, by agent."""
         programs = [*self._taken, *self._idle]
         self._taken.clear()
         self._idle.clear()

@@ -1,4 +1,4 @@
-"""Check that foreign agents are deterministic.
+"""Check that foreign agents (separate programs) are deterministic.
 
 The check gives each incarnation its inputs again, in another process and at another time, and compares the answers. An
 agent that reads a clock, draws random numbers of its own, or keeps data of an earlier incarnation answers differently.
@@ -22,7 +22,7 @@ OF_BEFORE = "it may keep state of an earlier incarnation in the same process"
 
 
 class NondeterminismError(HarnessError):
-    """An agent gives different answers to the same inputs."""
+    """An error: an agent gives different answers to the same inputs."""
 
     exit_status = VIOLATED
 
@@ -32,7 +32,7 @@ class NondeterminismError(HarnessError):
 
 
 class DeterminismCheck:
-    """A check of any number of incarnations, with one process for each command. Close it after use.
+    """Checks recorded agents for determinism, with one process for each command. Close it after use.
 
     `patient`: wait for the next second of the clock first, because an agent may read a clock in whole seconds.
     """
@@ -43,7 +43,7 @@ class DeterminismCheck:
             time.sleep(1 - time.time() % 1)
 
     def compare(self, record: IncarnationRecord) -> None:
-        """Give an incarnation its inputs again. Raises NondeterminismError if an answer differs.
+        """Give an agent its recorded inputs again. Raises NondeterminismError if an answer differs.
 
         The first incarnation of each command gets its inputs twice, so that each process plays more than one
         incarnation.
@@ -62,7 +62,7 @@ class DeterminismCheck:
 
 
 def _error_message(record: IncarnationRecord, difference: str, *, used: bool) -> str:
-    """Return the error message, with the probable cause.
+    """Return an error message that includes the probable cause.
 
     Two new processes show whether an earlier incarnation in the same process causes the difference.
     """
@@ -78,7 +78,7 @@ def _error_message(record: IncarnationRecord, difference: str, *, used: bool) ->
 
 
 def _first_difference(program: LineProgram, record: IncarnationRecord) -> str | None:
-    """Give the recorded inputs to a program. Return a description of the first different answer, or None."""
+    """Give the recorded inputs to a program. Return a description of the first answer that differs, or None."""
     for line, answer in record.exchanges:
         try:
             program.write(line)
@@ -103,7 +103,7 @@ def _input(line: bytes) -> str:
 
 
 def _difference(before: bytes, now: bytes) -> str:
-    """Describe the first difference of two answers."""
+    """Return a description of the first difference between two answers."""
     try:
         different = next(_differences(json.loads(before), json.loads(now), ()), None)
     except (ValueError, RecursionError):
