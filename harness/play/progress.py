@@ -1,4 +1,4 @@
-"""Display an active run: mission time, chain lengths and reconciling agents, and afterwards the progress of the checker.
+"""Display an active run: mission time, chain lengths and reconciling agents, and later the progress of the checker.
 
 A terminal shows a live table. Other outputs, such as CI logs, get a line every few seconds.
 """
