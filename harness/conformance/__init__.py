@@ -1,4 +1,4 @@
-"""Conformance: test one agent alone, while the harness plays its peers. See docs/how-to/test-one-agent.md.
+"""Test one agent alone, while the harness plays all other agents. See docs/how-to/test-one-agent.md.
 
 The reference (`_reference_model`) is the independent transcription of Algorithms 1 to 20. `_alphabet` lists the inputs
 that are possible in a state, and `_state_space` explores all states breadth first. A vector (`vectors`) is one state

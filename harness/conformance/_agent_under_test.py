@@ -1,4 +1,4 @@
-"""An agent under test and its mission."""
+"""Define the interface of an agent under test, and its mission."""
 
 import base64
 from abc import ABC, abstractmethod
@@ -17,7 +17,9 @@ from ucp.mission import SCHEMA
 
 
 class AgentUnderTest(ABC):
-    """One incarnation of the agent under test, with the reference that gets the same inputs."""
+    """An agent under test from one start to its end, together with the reference implementation that gets the same
+    inputs.
+    """
 
     def __init__(self, variant: SettingsVariant) -> None:
         self.model = ReferenceModel(variant.settings)
@@ -25,7 +27,7 @@ class AgentUnderTest(ABC):
         """False if the machine was late, and the reference could not follow the agent to its state."""
 
     async def step(self, given: Input) -> Observation | None:
-        """Give the input to the agent and to the reference, and compare them.
+        """Give the input to the agent and to the reference, and return the comparison of their behaviour.
 
         Return None if the input is impossible in the current state.
         """
@@ -44,7 +46,7 @@ class AgentUnderTest(ABC):
     @property
     @abstractmethod
     def timer_is_near(self) -> bool:
-        """True if the next timer expires so soon that it must be the next input."""
+        """True if the next timer of the agent expires so soon that its expiry must be the next input."""
 
     @abstractmethod
     def exchanges(self) -> tuple[RecordedDatagram, ...]:
@@ -52,7 +54,7 @@ class AgentUnderTest(ABC):
 
     @abstractmethod
     async def close(self) -> None:
-        """End the agent, or make its process available for the next incarnation."""
+        """End the agent, or make its process available for the next test."""
 
 
 Start = Callable[[SettingsVariant, bool], Awaitable[AgentUnderTest]]
@@ -72,7 +74,7 @@ def mission(
     speedup: float,
     keys: Mapping[str, Any] = NO_KEYS,
 ) -> dict[str, Any]:
-    """Return a mission file. `keys` replace keys of it."""
+    """Return a mission file for the agent. `keys` replace or extend its keys."""
     return {
         "schema": SCHEMA,
         "contract": CONTRACT,

@@ -1,4 +1,4 @@
-"""The input alphabet: all relevant variants of the nine messages, events, timers and commands.
+"""List all inputs of the generated tests: the relevant variants of the nine messages, events, timers and commands.
 
 An input is a function of the reference's state. For example, "vote no of an agent that has voted" needs an agent that
 has voted. The function returns an action, or None if the input is impossible in this state. All peers behave alike, so
@@ -42,7 +42,7 @@ Tally = Literal["voting", "phase one", "phase two", "timer"]
 
 @dataclass(frozen=True)
 class Input:
-    """One input of the alphabet. Its name describes it."""
+    """One kind of input for the agent under test, described by its name."""
 
     name: str
     make: Callable[[ReferenceModel], Action | None]
@@ -98,7 +98,9 @@ def _last_responder(responders: Callable[[ReferenceModel], set[int]]) -> Callabl
 
 
 def _voters(model: ReferenceModel) -> set[int]:
-    """Return the agents that have voted in the current vote. During a reconcile, votes do not count."""
+    """Return the agents that have voted in the current vote. During a reconcile, the list is empty because votes do not
+    count.
+    """
     state = model.state
     return state.voters if state.voting_timer.active and not state.reconcile_in_progress else set()
 
@@ -126,7 +128,7 @@ def _chain_hashes(model: ReferenceModel) -> list[bytes]:
 
 
 def _chain_below_top(model: ReferenceModel) -> bytes | None:
-    """Return the hash of the chain without its top block."""
+    """Return the hash of the chain without its newest block."""
     hashes = _chain_hashes(model)
     return hashes[-2] if len(hashes) > 1 else None
 
@@ -137,7 +139,7 @@ def _top_block(model: ReferenceModel) -> Block | None:
 
 
 def _chain_with_popped_block(model: ReferenceModel) -> bytes | None:
-    """Return the hash of the chain with the block that was popped last."""
+    """Return the hash of the chain with the most recently removed block on top."""
     stack = model.state.reconcile_stack
     return next_chain_hash(_top(model), stack[-1].block_hash) if stack else None
 
@@ -391,13 +393,13 @@ def _next(candidate: Callable[[ReferenceModel], Block | None]) -> Callable[[Refe
 
 
 def _named_block(model: ReferenceModel) -> Block | None:
-    """Return the block that was named first in the current phase 2."""
+    """Return the block that was named first in the answers of reconcile phase 2."""
     named = [candidate for candidate in model.state.reconcile_response_dictionary if candidate != IS_TOP_OF_CHAIN]
     return model.blocks.get(named[0]) if _phase_two(model) and named else None
 
 
 def _block_of_stack(place: int) -> Callable[[ReferenceModel], Block | None]:
-    """Return a function that returns the block at this place from the top of the stack. 1 is the top."""
+    """Return a function that returns the block at this position of the reconcile stack. Position 1 is the top."""
     return lambda model: model.state.reconcile_stack[-place] if len(model.state.reconcile_stack) >= place else None
 
 

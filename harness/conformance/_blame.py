@@ -1,4 +1,4 @@
-"""Find the handler that most likely caused a failure, from outside the agent.
+"""Find the handler that most likely caused a failure, using only observations from outside the agent.
 
 One input can trigger several handlers, one after another, and the wrong handler may even have run before this input.
 The evidence is: missing and unexpected messages, wrong values in the status, and the branches that passed or failed in
@@ -44,7 +44,7 @@ STARTING_BRANCHES = {"proposed", "asked", "recommitted, more to come"}
 
 @dataclass(frozen=True)
 class BlamedBranch:
-    """The handler to blame, and the branch that the reference took in it."""
+    """The handler that most likely caused a failure, and the branch that the reference took in it."""
 
     handler: str
     branch: str
@@ -59,7 +59,9 @@ class BlamedBranch:
 
 
 class BlameEvidence:
-    """The number of passed and failed vectors with each branch, and the pairs of successive branches that passed."""
+    """The evidence for choosing a handler: how many tests of each branch passed or failed, and which pairs of
+    successive branches passed.
+    """
 
     def __init__(self, variant_results: Iterable[VariantResult]) -> None:
         self._passed: Counter[Branch] = Counter()
@@ -98,14 +100,14 @@ class BlameEvidence:
         return BlamedBranch(run.handler, run.branch)
 
     def _fails_without_preceding_input(self, failure: ConfirmedFailure) -> bool:
-        """Return whether the expiry of the timer also fails without the ignored answer before it."""
+        """Return true if the timer's expiry also fails without the preceding answer, which the agent must ignore."""
         key = failure.observation.key
         if INPUTS[key.input].preceding is None:
             return False
         return (failure.variant, VectorKey(*failure.observation.before, TIMER)) not in self._pairs
 
     def _counts_wrongly_from_start(self, failure: ConfirmedFailure) -> bool:
-        """Return whether the count was wrong from its start, because the agent decides rightly after other counts."""
+        """Return true if the agent counted wrongly from the start, because it decides correctly after other counts."""
         observation, first = failure.observation, failure.observation.outcome.runs[0]
         if first.handler not in BEGINNING_OF_COUNT:
             return False
@@ -115,7 +117,8 @@ class BlameEvidence:
         )
 
     def _holds_other_blocks(self, observation: Observation) -> ExpectedRun | None:
-        """Return the run that should have changed the blocks, if the status has wrong blocks.
+        """Return the handler run that should have changed the blocks, if the agent's status shows wrong blocks.
+        Otherwise return None.
 
         If this branch passes elsewhere, return an earlier run whose branch never passes.
         """
@@ -131,14 +134,16 @@ class BlameEvidence:
 
     @staticmethod
     def _starter_of_timer(failure: ConfirmedFailure) -> BlamedBranch:
-        """Return the handler that starts the wrong timer, with its branch if it ran in this step."""
+        """Return the handler that starts the timer with the wrong duration, with its branch if it ran in this step."""
         for run in failure.observation.outcome.runs:
             if HANDLERS[run.handler].starts and run.branch in STARTING_BRANCHES:
                 return BlamedBranch(run.handler, run.branch)
         return BlamedBranch(STARTED_BY[str(failure.observation.wrong_timer)], "")
 
     def _most_suspicious(self, runs: Sequence[ExpectedRun], failure: ConfirmedFailure) -> ExpectedRun:
-        """Return the run to blame by its messages, by its successor, and by the vectors that passed."""
+        """Return the handler run that most likely failed, judged by its messages, its successor, and the tests that
+        passed.
+        """
         observation = failure.observation
         if len(runs) == 1:
             return runs[0]
@@ -166,7 +171,7 @@ class BlameEvidence:
 
 
 def _took_another_decision(observation: Observation) -> ExpectedRun | None:
-    """Return the handler run of the expired timer, if another decision of it explains all unexpected messages."""
+    """Return the handler run of the expired timer, if a different decision in it explains all unexpected messages."""
     first, *then = observation.outcome.runs
     if first.handler not in BEGINNING_OF_COUNT or not observation.unexpected:
         return None
@@ -177,13 +182,15 @@ def _took_another_decision(observation: Observation) -> ExpectedRun | None:
 
 
 def _messages_after(event: LocalEvent) -> set[str]:
-    """Return the names of the messages that the agent may send after this event."""
+    """Return the names of the messages that the agent may send after this local event."""
     handler = ON_LOCAL_EVENT[event]
     return _names(handler.sends).union(*[_messages_after(then) for then in handler.triggers if then in _LEADING_EVENTS])
 
 
 def _sends_other_content(observation: Observation) -> ExpectedRun | None:
-    """Return the run that sent the right messages with a wrong content. None if a block or a type is wrong, too."""
+    """Return the handler run that sent the right messages with wrong content. Return None if a block or a type is wrong
+    too.
+    """
     if BLOCK_KEYS & set(observation.wrong_status_keys) or set(observation.missing) != set(observation.unexpected):
         return None
     return next(

@@ -1,4 +1,4 @@
-"""Run the handwritten cases, each with its own agents. A few cases run in parallel. Failed cases run again, alone."""
+"""Run the handwritten test cases, each with its own agents. Some run in parallel, and failed ones run again alone."""
 
 import asyncio
 from dataclasses import replace
@@ -19,7 +19,7 @@ _HANDLER = {handler.algorithm: handler.name for handler in HANDLERS.values()}
 
 
 async def handwritten(lab: UdpLab, only: str | None) -> list[CaseResult]:
-    """Run all handwritten cases, or those of one Algorithm. Return their results."""
+    """Run all handwritten test cases, or those of one Algorithm, and return their results."""
     cases = [case for case in ALL_CASES if only is None or only in (str(case.algorithm), _HANDLER.get(case.algorithm))]
     results: dict[str, CaseResult] = {}
     waiting = iter(cases)

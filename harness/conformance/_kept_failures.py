@@ -1,4 +1,4 @@
-"""Files kept of each failure, among them a scenario that gives the agent the same inputs.
+"""Write files about each failure, including a scenario that gives the agent the same inputs again.
 
 failure.txt       the expected and the received messages
 vector.jsonl      the inputs and the expected answers, as `COMMAND --virtual` reads and writes them
@@ -39,7 +39,7 @@ COMMENT = (
 
 
 def scenario_of(name: str, command: Sequence[str], variant: SettingsVariant, path: Sequence[str]) -> str:
-    """Return a scenario file that gives the inputs of the path to the agent. Raises NotPlayableError."""
+    """Return the text of a scenario that gives these inputs to the agent. Raises NotPlayableError."""
     script: list[Document] = []
     datagrams: list[Document] = []
     timeline: list[Document] = [{"at_s": 0, "kill": list(PEERS)}]
@@ -78,7 +78,7 @@ EPOCH_US = 1_700_000_000_000_000
 
 
 def keep(case: CaseResult, command: Sequence[str], directory: Path) -> None:
-    """Write the files of a failure into a new directory. Raises MachineError if this is impossible."""
+    """Write the files of a failure into a new directory. Raises MachineError if that fails."""
     try:
         directory.mkdir(parents=True)
         lines = list(lines_of(case))

@@ -1,4 +1,4 @@
-"""One step of the agent under test, compared with the reference, and its description in words."""
+"""Compare one step of the agent under test with the reference, and describe it in words."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from ucp.messages import MalformedDatagramError, Message, decode
 
 
 class KnownNames:
-    """Names for the blocks and chains that the reference knows, such as "2.1"."""
+    """Names such as "2.1" for the blocks and chains that the reference knows."""
 
     def __init__(self, model: ReferenceModel) -> None:
         state = model.state
@@ -48,7 +48,7 @@ class KnownNames:
 
 
 def message_text(message: Message, names: KnownNames) -> str:
-    """Return a message in words, such as "Commit Block (1.1 on inception)"."""
+    """Return a text about a message, such as "Commit Block (1.1 on inception)"."""
     return in_words(message, names)
 
 
@@ -68,7 +68,7 @@ MAX_EARLY_TIMERS = 3
 
 @dataclass(frozen=True)
 class RecordedDatagram:
-    """A datagram between the agent and its peers."""
+    """A datagram between the agent under test and the simulated other agents."""
 
     t: float
     """Mission second."""
@@ -117,7 +117,7 @@ def compare(
     status: Mapping[str, Any],
     wrong: Iterable[str],
 ) -> Observation:
-    """Compare the agent's datagrams and status after an input with the reference, which has had the same input.
+    """Compare the agent's datagrams and status after an input with those of the reference after the same input.
 
     `wrong` contains sentences about known deviations.
     """
@@ -162,7 +162,7 @@ def compare(
 def _timer_expired_early(
     model: ReferenceModel, expected: Sequence[Message], received: Sequence[Message], status: Mapping[str, Any]
 ) -> str | None:
-    """Return the timer whose early expiry explains the received messages and the status. None if no timer does.
+    """Return the timer whose early expiry explains the received messages and the status, or None.
 
     This call advances the model, so the model cannot follow the agent any more.
     """

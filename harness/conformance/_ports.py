@@ -1,4 +1,5 @@
-"""Open sockets inside the lab for the harness outside: `python -m harness.conformance._ports SOCKET PORT...`.
+"""Open sockets inside the virtual network, and pass them to the harness outside: `python -m harness.conformance._ports
+SOCKET PORT...`.
 
 The program runs in the network namespace of a vehicle. It binds a UDP socket to each port, passes all of them to the
 harness through the Unix socket SOCKET, and ends. A socket stays in the namespace in which it was opened.

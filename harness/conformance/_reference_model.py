@@ -1,4 +1,4 @@
-"""The reference next to the agent under test, and snapshots of it.
+"""Run the reference implementation next to the agent under test, and save and restore its state.
 
 The reference is that of the step judge (`harness.checker.reference`). It receives the same inputs as the agent under
 test. The inputs are made from the reference's state, which contains the agent's real blocks with the timestamps of the
@@ -30,7 +30,7 @@ EVENT_ID = 7
 
 @dataclass(frozen=True)
 class PeerDatagram:
-    """A datagram of a peer. `message` is None if `data` is no valid message."""
+    """A datagram from a simulated agent. `message` is None if `data` is not a valid message."""
 
     sender: int
     message: Message | None
@@ -39,19 +39,19 @@ class PeerDatagram:
 
 @dataclass(frozen=True)
 class LoggedEvent:
-    """The agent logs an event."""
+    """An input: the agent logs an event."""
 
     data: bytes
 
 
 @dataclass(frozen=True)
 class TimerExpiry:
-    """The next timer expires."""
+    """An input: the next timer of the agent expires."""
 
 
 @dataclass(frozen=True)
 class ControlCommand:
-    """A command on the control socket."""
+    """An input: a command on the control socket of the agent."""
 
     name: str
 
@@ -73,7 +73,9 @@ class ExpectedRun:
 
 @dataclass(frozen=True)
 class ExpectedOutcome:
-    """The handler runs of the reference after one input, in order. Empty if the input is dropped."""
+    """The handler runs of the reference after one input, in order. The list is empty if the agent must drop the
+    input.
+    """
 
     runs: tuple[ExpectedRun, ...]
 
@@ -83,12 +85,12 @@ class ExpectedOutcome:
 
     @property
     def algorithm(self) -> int:
-        """Number of the Algorithm that handles the input."""
+        """The number of the Algorithm that handles the input."""
         return self.runs[0].algorithm
 
 
 class ReferenceModel:
-    """The reference agent, all blocks of the test so far, and the number of handler runs."""
+    """The reference agent, with all blocks of the test so far and the number of handler runs."""
 
     def __init__(self, settings: Settings) -> None:
         self.agent = ReferenceAgent(AGENT, ROSTER, INITIAL_DATA, ReferenceSettings.of(settings))
@@ -106,7 +108,7 @@ class ReferenceModel:
         return self.agent.state
 
     def new_block(self, owner: int, *, young: bool) -> Block:
-        """Return a new block of a peer, unknown to the agent under test."""
+        """Return a new block of a simulated agent, which the agent under test does not know."""
         self._fresh += 1
         timestamp_us = (YOUNG_US if young else OLD_US) + self._fresh
         event = LoggableEvent(timestamp_us, EVENT_ID, b"of a peer, %d" % self._fresh)
@@ -119,12 +121,14 @@ class ReferenceModel:
         return PeerDatagram(sender, message, encode(sender, self._sequence, message))
 
     def event(self) -> LoggedEvent:
-        """Return a new event. With the settings of `VARIANTS` each event fills a block."""
+        """Return a new event. With the settings of `VARIANTS`, each event completes a block."""
         self.logged += 1
         return LoggedEvent(b"event %d" % self.logged)
 
     def feed(self, action: Action, now: float, timestamp_us: int = 0) -> ExpectedOutcome:
-        """Give the reference an input. `timestamp_us` is the timestamp that the agent under test gave to an event."""
+        """Give the reference an input, and return its handler runs. `timestamp_us` is the agent's timestamp of an
+        event.
+        """
         match action:
             case PeerDatagram():
                 self.agent.receive_datagram(action.data, now)
@@ -141,7 +145,7 @@ class ReferenceModel:
         return ExpectedOutcome(runs)
 
     def status(self) -> dict[str, Any]:
-        """Return the expected answer of the agent to the command `status`."""
+        """Return the answer that the agent should give to the command `status`."""
         state = self.state
         return {
             "idle": state.idle,
@@ -165,7 +169,7 @@ CONTAINERS = frozenset((bytearray, set, list, deque, dict))
 
 
 class ModelSnapshot:
-    """The state of a model at one moment, to restore it later.
+    """A saved state of the reference, to which it can return later.
 
     Counters for reports are left out. Paused timers are left out, too, because no timer is paused between inputs.
     """
@@ -176,7 +180,7 @@ class ModelSnapshot:
         self._deadlines = [(timer, timer.deadline) for timer in model.state.timers]
 
     def restore(self) -> ReferenceModel:
-        """Reset the model to the state of the snapshot, and return it."""
+        """Set the reference back to the saved state, and return it."""
         for part, plain, containers in self._parts:
             part.update(plain)
             for name, value in containers:
@@ -187,7 +191,7 @@ class ModelSnapshot:
 
 
 def _sorted(part: dict[str, Any]) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
-    """Return the immutable values of a part, and copies of its containers."""
+    """Return the immutable values of an object's attributes, and copies of its containers."""
     containers = [(name, _copied(value)) for name, value in part.items() if type(value) in CONTAINERS]
     return {name: value for name, value in part.items() if type(value) not in CONTAINERS}, containers
 

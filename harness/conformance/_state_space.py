@@ -1,4 +1,4 @@
-"""The state space of one agent, and its exploration, breadth first.
+"""Explore all states that one agent can reach, breadth first.
 
 Two states are the same if no handler can distinguish them. Beyond two blocks, a longer chain, stack or deque does not
 change the branch that a handler takes. Counted answers matter only to the handlers that count in the same activity.
@@ -26,7 +26,7 @@ MAX_STATES = 4000
 
 @dataclass(frozen=True)
 class SettingsVariant:
-    """Settings of the agent under test."""
+    """A combination of settings for the agent under test."""
 
     name: str
     settings: Settings
@@ -35,7 +35,7 @@ class SettingsVariant:
 
 
 def _settings(**other: object) -> Settings:
-    """Return settings with timers of different durations, in which each event fills a block.
+    """Return settings in which each timer has a different duration and each event completes a block.
 
     By default a vote ends before any phase that begins after it.
     """
@@ -59,7 +59,7 @@ VARIANTS: dict[str, SettingsVariant] = {
 
 
 class AgentState(NamedTuple):
-    """The values that handlers can distinguish."""
+    """The state of an agent, reduced to the values that handlers can distinguish."""
 
     activity: str
     """Name of the running timer of a reconcile, "voting", "idle", or "stuck" (a reconcile without a running timer)."""
@@ -108,7 +108,7 @@ def state_of(model: ReferenceModel) -> AgentState:
 
 
 def _candidates(model: ReferenceModel) -> tuple[object, ...]:
-    """Return each candidate of phase 2: its kind, its age, and the number of answers that name it."""
+    """Return, for each candidate of reconcile phase 2, its kind, its age, and the number of answers that name it."""
     state = model.state
     stack = [block.block_hash for block in reversed(state.reconcile_stack)]
     candidates = []
@@ -125,7 +125,9 @@ def _candidates(model: ReferenceModel) -> tuple[object, ...]:
 
 
 class VectorKey(NamedTuple):
-    """The identity of a vector: an input in a state. `counted` is empty if the input does not depend on it."""
+    """The identity of a generated test: an input in a state. `counted` is empty if the input does not depend on earlier
+    counts.
+    """
 
     activity: str
     holdings: tuple[str | int, ...]
@@ -140,7 +142,7 @@ def key_of(state: AgentState, given: Input) -> VectorKey:
 
 @dataclass(frozen=True)
 class Transition:
-    """An edge of the state space: the input in `key` leads from `before` to `after`."""
+    """A transition between two states: the input in `key` leads from `before` to `after`."""
 
     key: VectorKey
     path: tuple[str, ...]
@@ -153,13 +155,13 @@ class Transition:
 
 
 def next_timer_name(model: ReferenceModel) -> str | None:
-    """Return the name of the timer that expires next. None if no timer runs."""
+    """Return the name of the timer that expires next, or None if no timer runs."""
     running = [timer for timer in model.state.timers if timer.deadline is not None]
     return min(running, key=lambda timer: timer.deadline or 0.0).name if running else None
 
 
 def advance(model: ReferenceModel, given: Input, now: float) -> tuple[ExpectedOutcome, float] | None:
-    """Give the reference an input in virtual time. Return the outcome and its time.
+    """Give the reference an input in virtual time, and return its handler runs and the time.
 
     Return None if the input is impossible in the current state.
     """
@@ -175,7 +177,9 @@ def advance(model: ReferenceModel, given: Input, now: float) -> tuple[ExpectedOu
 
 
 def explore(variant: SettingsVariant) -> Iterator[Transition]:
-    """Yield each vector once, with the shortest path to it. Each call yields the same transitions."""
+    """Yield each generated test once, with a shortest sequence of inputs that leads to it. Each call gives the same
+    result.
+    """
     seen: set[VectorKey] = set()
     model = ReferenceModel(variant.settings)
     start = state_of(model)
@@ -210,7 +214,7 @@ def explore(variant: SettingsVariant) -> Iterator[Transition]:
 
 
 def walk(variant: SettingsVariant, path: tuple[str, ...]) -> tuple[ReferenceModel, float]:
-    """Return the reference after these inputs, and the time of the last one."""
+    """Return the reference after these inputs, and the time of the last input."""
     model, now = ReferenceModel(variant.settings), 0.0
     for name in path:
         advanced = advance(model, INPUTS[name], now)
@@ -234,7 +238,7 @@ _CHANGING_BRANCHES = {
 
 
 def changes_nothing(outcome: ExpectedOutcome) -> bool:
-    """Return whether the outcome leaves the agent unchanged."""
+    """Return true if these handler runs leave the agent unchanged."""
     if len(outcome.runs) != 1:
         return False
     (run,) = outcome.runs
@@ -255,7 +259,7 @@ one agent can reach them again and again."""
 
 
 def _reveals_counting(snapshot: ModelSnapshot, now: float, before: AgentState, given: Input) -> bool:
-    """Return whether the expiry of the timer reveals an agent that wrongly counts the input."""
+    """Return true if the later expiry of the timer would show that an agent wrongly counted the input."""
     if (
         (before.activity, before.holdings) not in COUNTING_STATES
         or given.preceding is None
@@ -271,7 +275,8 @@ def _reveals_counting(snapshot: ModelSnapshot, now: float, before: AgentState, g
 
 
 def _outcome_of_timer(snapshot: ModelSnapshot, now: float, name: str, *, counts: bool) -> ExpectedOutcome | None:
-    """Return the outcome of the timer's expiry after this input.
+    """Return the handler runs after this input and the expiry of the timer. If `counts` is true, the input counts
+    although it must not.
 
     Return None if the input is impossible, or unless the agent counts (`counts`) or ignores the input.
     """
@@ -288,12 +293,14 @@ def _outcome_of_timer(snapshot: ModelSnapshot, now: float, name: str, *, counts:
 
 
 def handlers_and_messages(outcome: ExpectedOutcome) -> tuple[object, ...]:
-    """Return handlers, branches and names of messages: the part of an outcome that does not depend on block hashes."""
+    """Return the handlers, branches and message names of these handler runs. They do not depend on block hashes."""
     return tuple((run.handler, run.branch, tuple(message.NAME for message in run.sent)) for run in outcome.runs)
 
 
 def _is_redundant(model: ReferenceModel, before: AgentState, given: Input) -> bool:
-    """Return whether the input leads only to states equivalent to known ones, or depends on more than the state."""
+    """Return true if the input leads only to states equivalent to known ones, or if its effect depends on more than the
+    state.
+    """
     if given.name == LOG:
         return len(model.state.blocks_to_be_committed) >= MAX_WAITING
     if before.activity != "voting" and "waits behind" in given.name:
@@ -304,7 +311,7 @@ def _is_redundant(model: ReferenceModel, before: AgentState, given: Input) -> bo
 
 
 def _answer_count(model: ReferenceModel, before: AgentState) -> int:
-    """Return the number of answers that the agent has counted in its current activity."""
+    """Return the number of answers that the agent has counted for its current vote or query."""
     state = model.state
     match before.activity:
         case "voting":

@@ -1,4 +1,4 @@
-"""Play all vectors with many agents in parallel, and then replay the suspected failures, with few agents at a time.
+"""Play all generated tests with many agents in parallel. Then repeat the suspected failures with few agents at a time.
 
 Parallel agents compete for the processor, so a wrong answer may be the fault of the machine. A suspicion becomes a
 failure only if it repeats in each of several replays.
@@ -59,7 +59,7 @@ MAX_FAILED_STARTS = 3
 
 @dataclass(frozen=True)
 class ConfirmedFailure:
-    """A vector that failed in each replay."""
+    """A generated test that failed each time it was repeated."""
 
     variant: str
     path: tuple[str, ...]
@@ -75,7 +75,7 @@ class ConfirmedFailure:
 
 @dataclass
 class VariantResult:
-    """The results of the vectors of one variant."""
+    """The results of all generated tests with one combination of settings."""
 
     vectors: VectorSet
     passed: set[VectorKey] = field(default_factory=set)
@@ -86,7 +86,7 @@ class VariantResult:
 
 
 class ReplayVerdict(Enum):
-    """The verdict of a replay without a failure."""
+    """The result of a repeated test that did not fail."""
 
     RIGHT = auto()
     TOO_LATE = auto()
@@ -98,7 +98,7 @@ ReplayOutcome = ConfirmedFailure | ReplayVerdict
 
 
 class VectorSuite:
-    """All vectors of a test. It calls `show_progress` with the number of passed vectors after each change."""
+    """All generated tests. `show_progress` is called after each change with the number of passed tests."""
 
     def __init__(
         self,
@@ -130,7 +130,7 @@ class VectorSuite:
         self._unexplained_ends: set[str] = set()
 
     async def run(self, until: float) -> None:
-        """Play all vectors, then those for which the machine was late, and then the suspicions.
+        """Play all tests, then those for which the machine was too late, and then the suspected failures.
 
         `until` is the second of the monotonic clock at which no further vectors begin. Raises NoAgentError if the
         agent never starts.
@@ -156,7 +156,7 @@ class VectorSuite:
 
     @property
     def _suspicious(self) -> bool:
-        """Return whether the suite has the maximum number of suspicions."""
+        """Return true if the maximum number of suspected failures is reached."""
         return sum(len(variant_result.suspicions) for variant_result in self.variant_results) >= self._max_suspicions
 
     def _report_progress(self) -> None:
@@ -174,7 +174,7 @@ class VectorSuite:
                 self._working[number] -= 1
 
     def _next_variant(self) -> int | None:
-        """Return the variant with the most vectors left for each worker. None if no variant has vectors left."""
+        """Return the settings with the most remaining tests for each agent, or None if no tests remain."""
         shares = [
             (vector_map.left / (self._working[number] + 1), number)
             for number, vector_map in enumerate(self._maps)
@@ -196,7 +196,7 @@ class VectorSuite:
             self._on_tour[number] -= 1
 
     async def _run_tour(self, variant_result: VariantResult, vector_map: VectorMap, until: float) -> None:
-        """Start an agent, and lead it on a tour until the tour ends."""
+        """Start an agent, and let it play tests one after another until it fails or no test remains."""
         try:
             async with self._starting:
                 agent = await self._start(variant_result.vectors.variant, False)
@@ -240,7 +240,9 @@ class VectorSuite:
 
     @staticmethod
     def _suspicions_to_retry(variant_result: VariantResult) -> Iterator[Suspicion]:
-        """Yield the suspicions with the shortest paths, at most MAX_RETRIES_OF_A_KIND with the same branches."""
+        """Yield the suspected failures with the shortest inputs, at most MAX_RETRIES_OF_A_KIND with the same
+        branches.
+        """
         kinds: Counter[object] = Counter()
         for suspicion in sorted(variant_result.suspicions, key=lambda suspicion: len(suspicion.path)):
             kind = handlers_and_messages(suspicion.observation.outcome)
@@ -251,7 +253,7 @@ class VectorSuite:
     # Replays with few agents at a time
 
     async def _retry_late(self, late_keys: Iterator[tuple[VariantResult, VectorKey]], until: float) -> None:
-        """Play the vectors for which the machine was late in each tour."""
+        """Play the tests for which the machine was too late each time."""
         for variant_result, key in late_keys:
             if time.monotonic() >= until:
                 return
@@ -289,7 +291,7 @@ class VectorSuite:
     async def _retry_variants(
         self, variant_result: VariantResult, suspicion: Suspicion
     ) -> AsyncIterator[ReplayOutcome]:
-        """Replay the suspicion by different paths until it fails, and yield the outcomes.
+        """Repeat a suspected failure with different sequences of inputs until it fails again. Yield each result.
 
         The first path is the shortest one. The next paths are the shortest one with an additional answer that the agent
         must ignore. The last paths are the ends of the original path.
@@ -320,7 +322,9 @@ class VectorSuite:
     async def _find_miscounted(
         self, variant: SettingsVariant, path: Sequence[str], failure: ConfirmedFailure, *, needs_earlier_round: bool
     ) -> ConfirmedFailure:
-        """Return the failure with its cause, if the path does not fail without the ignored answers of one handler."""
+        """Return the failure with its cause, if it disappears when the ignored answers of one handler are left out.
+        Otherwise return None.
+        """
         counted = _ignored_answers(variant, path)
         for handler in dict.fromkeys(run.handler for run in counted.values()):
             others = [
@@ -332,7 +336,8 @@ class VectorSuite:
         return replace(failure, needs_earlier_round=needs_earlier_round)
 
     async def _play_repeatedly(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Replay a path several times. Return RIGHT if one replay is right, or the failure if REPETITIONS replays fail.
+        """Repeat these inputs several times. Return RIGHT if the agent is right once, or the failure if all REPETITIONS
+        fail.
 
         Return TOO_LATE if the machine was late in too many replays.
         """
@@ -348,7 +353,9 @@ class VectorSuite:
         return TOO_LATE
 
     async def play(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Give a new agent these inputs. Return the first failure, RIGHT, or TOO_LATE if the machine was late."""
+        """Give a new agent these inputs. Return the first failure, or RIGHT, or TOO_LATE if the machine was too
+        late.
+        """
         try:
             agent = await self._start(variant, True)
         except (AgentEndedError, UnsupportedError):
@@ -365,7 +372,7 @@ class VectorSuite:
 
 
 def _kind_of_end(ended: str) -> str:
-    """Return "it hangs", or "it ended with status 1"."""
+    """Return a short phrase about the end of an agent, "it hangs" or "it ended with status 1"."""
     return ended.partition(":")[0]
 
 
@@ -376,14 +383,16 @@ def _unexplained_failure(variant: SettingsVariant, suspicion: Suspicion, ended: 
 
 
 def _single_run(variant: SettingsVariant, path: tuple[str, ...], name: str) -> ExpectedRun | None:
-    """Return the handler run that an input causes after this path. None unless it causes exactly one."""
+    """Return the handler run that the last input causes after these inputs. Return None unless there is exactly one."""
     model, now = walk(variant, path)
     advanced = advance(model, INPUTS[name], now)
     return advanced[0].runs[0] if advanced is not None and len(advanced[0].runs) == 1 else None
 
 
 def _ignored_answers(variant: SettingsVariant, path: Sequence[str]) -> dict[int, ExpectedRun]:
-    """Return place in the path -> handler run, for each answer on the path that the agent must ignore."""
+    """Return, for each answer in these inputs that the agent must ignore, its position and the handler run that ignores
+    it.
+    """
     model, now = ReferenceModel(variant.settings), 0.0
     uncounted = {}
     for place, name in enumerate(path[:-1]):
@@ -396,7 +405,7 @@ def _ignored_answers(variant: SettingsVariant, path: Sequence[str]) -> dict[int,
 
 
 def _path_tails(variant: SettingsVariant, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Yield ends of a path, from the shortest to the whole path. Each begins when the agent was idle.
+    """Yield final parts of these inputs, from the shortest to the whole. Each begins where the agent was idle.
 
     Ends with more than MAX_PATH inputs are left out.
     """
@@ -414,7 +423,7 @@ def _path_tails(variant: SettingsVariant, path: tuple[str, ...]) -> Iterator[tup
 
 
 async def _run_all(work: Sequence[Coroutine[Any, Any, None]]) -> None:
-    """Run all coroutines. The first error cancels the others, and is raised."""
+    """Run all coroutines in parallel. The first error cancels the others and is raised."""
     try:
         async with asyncio.TaskGroup() as group:
             for each in work:

@@ -1,4 +1,4 @@
-"""Tours: one agent plays many vectors, one after another, along the shortest paths between them.
+"""Let one agent play many generated tests, one after another, along the shortest paths between their states.
 
 In each state the tour first plays the vectors that leave the agent unchanged, and then one that changes it. If no
 vectors are left in a state, the tour goes to the nearest state with vectors that are left. Many tours run in parallel,
@@ -34,7 +34,7 @@ _RESTART = "another agent starts"
 
 @dataclass(frozen=True)
 class Suspicion:
-    """A deviation of an agent in a tour. It may be the machine's fault."""
+    """A deviation of an agent that may also be the fault of a slow machine."""
 
     path: tuple[str, ...]
     """All inputs since the start of the agent. The agent answered the last one wrongly."""
@@ -44,7 +44,9 @@ class Suspicion:
 
 
 class VectorMap:
-    """The vectors of a variant that are left to play, and the edges of the state space, which lead there."""
+    """The generated tests that remain for one combination of settings, and a map of the transitions that lead to
+    them.
+    """
 
     def __init__(self, variant: SettingsVariant, transitions: list[Transition], wanted: set[VectorKey]) -> None:
         self.variant = variant
@@ -75,7 +77,7 @@ class VectorMap:
                 self._edges[transition.key[:3]].append((transition.key.input, transition.after, costs))
 
     def unseen_in(self, state: AgentState, ruled_out: Container[VectorKey] = ()) -> VectorKey | None:
-        """Return the next vector to play in this state. None if none is left except those in `ruled_out`.
+        """Return the next test to play in this state, except those in `ruled_out`. Return None if none remains.
 
         Inputs that leave the agent unchanged come first, then other inputs, then timers, and last the inputs that make
         the chain longer.
@@ -100,7 +102,7 @@ class VectorMap:
         return key in self._growing, INPUTS[key.input].tally == "timer", key not in self._quiet, key.input
 
     def take(self, key: VectorKey) -> bool:
-        """Remove a vector from those that are left. Return whether it was one of them."""
+        """Remove a test from the remaining tests. Return true if it was one of them."""
         here = self._unseen.get((key.activity, key.holdings))
         if here is None or key not in here:
             return False
@@ -109,7 +111,7 @@ class VectorMap:
         return True
 
     def return_key(self, key: VectorKey) -> bool:
-        """Add a vector to those that are left again, because the machine was late. After MAX_TRIES give it up.
+        """Add a test to the remaining tests again, because the machine was too late. After MAX_TRIES times, abandon it.
 
         Return whether it is left.
         """
@@ -122,19 +124,20 @@ class VectorMap:
         return True
 
     def give_up(self) -> None:
-        """Remove all vectors that are left."""
+        """Remove all remaining tests."""
         self._unseen.clear()
         self.left = 0
 
     def avoid(self, key: VectorKey) -> None:
-        """Remove the edge of a vector at which the agent deviates from all paths."""
+        """Remove a transition from all paths, because the agent deviates there."""
         edges = self._edges[key[:3]]
         edges[:] = [edge for edge in edges if edge[0] != key.input]
 
     def path_from(
         self, state: AgentState, ruled_out: Container[VectorKey] = ()
     ) -> tuple[list[str], VectorKey | None] | None:
-        """Return the cheapest path to a vector that is left, and this vector. Its input is the last one of the path.
+        """Return the cheapest sequence of inputs to a remaining test, with this test. Return None if no test can be
+        reached.
 
         An empty path means that a new agent gets there more cheaply. Return None if no path leads to such a vector.
         `ruled_out` contains vectors that were impossible, or led to another state than the map has.
@@ -164,7 +167,7 @@ class VectorMap:
         return None
 
     def leads_to(self, state: AgentState, name: str) -> AgentState | None:
-        """Return the state to which the input leads by the map. None if the map has no such edge."""
+        """Return the state to which the input leads according to the map, or None if the map does not contain it."""
         return next((after for each, after, _ in self._edges_from(state) if each == name), None)
 
     def _edges_from(self, state: AgentState) -> Iterator[tuple[str, AgentState, float]]:
@@ -174,7 +177,7 @@ class VectorMap:
 
 
 class Tour:
-    """A tour of one agent. It calls `passed` for each vector that passes."""
+    """A sequence of tests played by one agent. `passed` is called for each test that passes."""
 
     def __init__(self, vector_map: VectorMap, agent: AgentUnderTest, passed: Callable[[VectorKey], None]) -> None:
         self._map = vector_map
@@ -186,9 +189,9 @@ class Tour:
         self._passed = passed
 
     async def run(self, until: float) -> Suspicion | None:
-        """Play until the end of the tour, at most until the second `until` of the monotonic clock.
+        """Play until the agent deviates or nothing remains, at most until the second `until` of the monotonic clock.
 
-        Return the suspicion that ended the tour. None if the agent did not deviate.
+        Return the deviation, or None if the agent did not deviate.
         """
         try:
             return await self._run_until(until)
@@ -228,7 +231,7 @@ class Tour:
             self._claim = None
 
     def _next_input(self) -> str | None:
-        """Return the name of the next input. None if the tour should end here."""
+        """Return the name of the next input, or None if this agent should stop here."""
         state = state_of(self._agent.model)
         if self._agent.timer_is_near:
             self._discard_plan()

@@ -1,4 +1,4 @@
-"""An agent over UDP. The agent and the reference get the same input, and are then compared.
+"""Test an agent over UDP: give the agent and the reference the same input, and compare their answers.
 
 The comparison covers the agent's broadcasts, and its answer to the command `status`. The count of handler runs in the
 status shows when the agent has handled the input. Therefore an input without an expected message costs no waiting time,
@@ -57,7 +57,7 @@ from ucp.messages import MalformedDatagramError, Message, decode
 
 @dataclass(frozen=True)
 class Timing:
-    """Speed of mission time, and time limits in wall seconds."""
+    """The speed of mission time, and the time limits in seconds of wall time."""
 
     speedup: float
     """Mission seconds per wall second."""
@@ -84,7 +84,7 @@ MIN_ANSWERS = 2
 
 
 class UdpAgent(AgentUnderTest):
-    """An agent as a process that is tested over UDP."""
+    """An agent that is a process and is tested over UDP."""
 
     def __init__(
         self,
@@ -103,7 +103,7 @@ class UdpAgent(AgentUnderTest):
 
     @classmethod
     async def start(cls, lab: UdpLab, variant: SettingsVariant, timing: Timing) -> "UdpAgent":
-        """Start an agent and its mission. Raises NoAgentError, UnsupportedError, AgentEndedError."""
+        """Start an agent and its mission, and return it. Raises NoAgentError, UnsupportedError, AgentEndedError."""
         port = lab.take_port()
         try:
             process = await ProcessUnderTest.start(
@@ -144,11 +144,11 @@ class UdpAgent(AgentUnderTest):
         return self._mission_s(time.time())
 
     def _mission_s(self, at_s: float) -> float:
-        """Return the mission second at a wall time, in seconds since the Unix epoch."""
+        """Return the mission second at a wall time, which is in seconds since the Unix epoch."""
         return (at_s - self._epoch) * self._timing.speedup
 
     def _wall_s(self, mission_s: float) -> float:
-        """Return the wall time at a mission second, in seconds since the Unix epoch."""
+        """Return the wall time of a mission second, in seconds since the Unix epoch."""
         return self._epoch + mission_s / self._timing.speedup
 
     @property
@@ -231,7 +231,7 @@ class UdpAgent(AgentUnderTest):
         received: Sequence[tuple[float, bytes]],
         status: Mapping[str, Any],
     ) -> bool:
-        """Return whether timers that expired before or after the input explain the messages and the status.
+        """Return true if timers that expired before or after the input explain the messages and the status.
 
         If so, the model then is in the state of the agent.
         """
@@ -257,18 +257,20 @@ class UdpAgent(AgentUnderTest):
         return False
 
     async def _status(self) -> dict[str, Any]:
-        """Return the status of the agent. Empty if it does not answer."""
+        """Return the status of the agent. It is empty if the agent does not answer."""
         try:
             return await self.process.ask("status")
         except (AgentEndedError, AgentRefusedError):
             return {}
 
     def _may_have_expired(self, deadline: float | None) -> bool:
-        """Return whether the timer may have expired by now."""
+        """Return true if the timer may have expired by now."""
         return deadline is not None and self._wall_s(deadline) - time.time() < self._timing.early_s
 
     async def _wait_for_timer(self, until: float, name: str) -> str | None:
-        """Wait until the timer expires, or until a message arrives. Return a sentence if the message is too early."""
+        """Wait until the timer expires or a message arrives. If the message is too early, return a sentence about
+        it.
+        """
         while time.time() < until and not self.peer_socket.received:
             await self.peer_socket.arrival(until)
         early_s = until - self.peer_socket.received[0][0] if self.peer_socket.received else 0.0
@@ -278,11 +280,11 @@ class UdpAgent(AgentUnderTest):
         return None
 
     def _first_arrival_s(self) -> float:
-        """Return the mission second of the first received message. 0 without a message."""
+        """Return the mission second of the first received message, or 0 if there is none."""
         return self._mission_s(self.peer_socket.received[0][0]) if self.peer_socket.received else 0.0
 
     async def _give(self, action: Action) -> list[Any]:
-        """Give the input to the agent. After an event, return the deque of the agent's export."""
+        """Give the input to the agent. After an event, return the deque in the agent's export."""
         match action:
             case PeerDatagram():
                 self.peer_socket.send(action.data)
@@ -297,7 +299,7 @@ class UdpAgent(AgentUnderTest):
         return []
 
     async def _settle(self, messages: int, since: float, deadline: float | None) -> tuple[dict[str, Any], int, bool]:
-        """Wait until the agent has handled the input and sent the expected number of messages, or until it is too late.
+        """Wait until the agent has handled the input and sent the expected number of messages, or until a time limit.
 
         `since` is the wall time of the input, and `deadline` is the mission second of the next timer. If the agent
         counts its handler runs in another way, its status must have the expected values for a while.
@@ -339,7 +341,7 @@ class UdpAgent(AgentUnderTest):
 
 
 def _end(error: Exception) -> str | None:
-    """Return the end of the agent in words. None if a late machine may be the cause of the error."""
+    """Return a description of how the agent ended, or None if a slow machine may be the cause of the error."""
     return str(error) if isinstance(error, AgentHangsError | AgentExitedError) else None
 
 
@@ -348,7 +350,7 @@ def _contents(received: Sequence[tuple[float, bytes]]) -> list[bytes]:
 
 
 def _messages(datagrams: Iterable[bytes]) -> list[Message] | None:
-    """Return the decoded messages. None if a datagram is malformed."""
+    """Return the decoded messages, or None if a datagram is malformed."""
     try:
         return [decode(data).message for data in datagrams]
     except MalformedDatagramError:
@@ -356,7 +358,7 @@ def _messages(datagrams: Iterable[bytes]) -> list[Message] | None:
 
 
 def _expire(model: ReferenceModel, now: float) -> list[bytes]:
-    """Let the next timer of the reference expire, at its deadline, or at `now` if the deadline has passed.
+    """Let the next timer of the reference expire at its deadline, or at the time `now` if the deadline has passed.
 
     Return the datagrams that the reference sends. Empty if no timer runs.
     """
@@ -370,7 +372,7 @@ def _expire(model: ReferenceModel, now: float) -> list[bytes]:
 def log_same_block(
     model: ReferenceModel, action: LoggedEvent, now: float, waiting: list[Any]
 ) -> tuple[ExpectedOutcome, list[str]]:
-    """Give the reference the event with the timestamp of the agent, so that both complete the same block.
+    """Give the reference an event with the agent's timestamp, so that both complete the same block.
 
     `waiting` is the deque of the agent's export. Return the outcome, and sentences about a wrong block.
     """
@@ -396,7 +398,7 @@ def log_same_block(
 
 
 def starter(lab: UdpLab) -> Start:
-    """Return a function that starts agents in this lab."""
+    """Return a function that starts agents in this virtual network."""
 
     async def start(variant: SettingsVariant, alone: bool) -> AgentUnderTest:
         return await UdpAgent.start(lab, variant, TIMING_ALONE if alone else TIMING_IN_PARALLEL)

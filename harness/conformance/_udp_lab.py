@@ -1,4 +1,5 @@
-"""The lab of a conformance test over UDP, with two vehicles: one for all agents under test, and one for their peers.
+"""The virtual network of a test over UDP. It has two vehicles: one for all agents under test, and one for all simulated
+agents.
 
 Each agent has its own port. Therefore agents that are tested in parallel do not receive each other's messages.
 """
@@ -47,23 +48,25 @@ ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
 
 
 class NoAgentError(HarnessError):
-    """The agent does not start, so it cannot be tested."""
+    """An error: the agent cannot be started, so it cannot be tested."""
 
 
 class AgentEndedError(Exception):
-    """The agent ended by itself, or does not answer. The message names the end."""
+    """An error: the agent ended by itself, or does not answer. The message describes the end."""
 
 
 class AgentExitedError(AgentEndedError):
-    """The process of the agent ended."""
+    """An error: the process of the agent ended by itself."""
 
 
 class AgentHangsError(AgentEndedError):
-    """The agent runs, but answered none of several requests."""
+    """An error: the agent still runs, but answered none of several requests."""
 
 
 class UdpLab:
-    """A lab with `count` ports. Open it with `async with`. `take_port` reserves a port for an agent."""
+    """A virtual network in which `count` agents can be tested at once. Open it with `async with`. `take_port` reserves
+    a port.
+    """
 
     def __init__(self, place: Path, command: Sequence[str], count: int) -> None:
         self.place = place
@@ -142,7 +145,7 @@ class UdpLab:
     def mission(
         self, variant: SettingsVariant, port: int, speedup: float, keys: Mapping[str, Any] = NO_KEYS
     ) -> dict[str, Any]:
-        """Return the mission file of an agent on this port. `keys` replace keys of it."""
+        """Return the mission file of an agent on this port. `keys` replace or extend its keys."""
         address = self.lab.addresses[AGENTS_VEHICLE]
         return mission(variant, address=address, broadcast=self.lab.broadcast, port=port, speedup=speedup, keys=keys)
 
@@ -163,7 +166,7 @@ class UdpLab:
 
 
 class PeerSocket:
-    """The socket of an agent's peers: it receives the agent's datagrams, and sends those of the peers.
+    """The UDP socket for all simulated agents of one test. It receives the tested agent's datagrams, and sends theirs.
 
     `received` has pairs of arrival and datagram. The arrival is the time at which the kernel received the datagram, in
     seconds since the Unix epoch. It does not depend on when the harness reads the socket.
@@ -198,7 +201,7 @@ class PeerSocket:
                     self._arrived.set()
 
     async def arrival(self, until: float) -> None:
-        """Wait until a datagram arrives, or until this wall time, in seconds since the Unix epoch."""
+        """Wait until a datagram arrives, or until this wall time in seconds since the Unix epoch."""
         self._arrived.clear()
         with suppress(TimeoutError):
             await asyncio.wait_for(self._arrived.wait(), max(0.0, until - time.time()))
@@ -215,7 +218,7 @@ class PeerSocket:
 
 
 class ProcessUnderTest:
-    """The process of an agent, with its control socket and its files."""
+    """The process of an agent under test, with its control socket and its files."""
 
     def __init__(
         self, air: UdpLab, directory: Path, agent_id: int, process: LabProcess, processes: ChildProcesses
@@ -234,7 +237,7 @@ class ProcessUnderTest:
     async def start(
         cls, air: UdpLab, directory: Path, mission: dict[str, Any] | bytes, agent_id: int
     ) -> "ProcessUnderTest":
-        """Start the process. It may not be ready yet. Raises NoAgentError if the program does not exist."""
+        """Start the process without waiting until it is ready. Raises NoAgentError if the program does not exist."""
         name = f"{agent_id}.mission.json"
         text = mission if isinstance(mission, bytes) else json.dumps(mission).encode()
         (directory / name).write_bytes(text)
@@ -273,7 +276,7 @@ class ProcessUnderTest:
                 await asyncio.sleep(POLL_S)
 
     def raise_end(self) -> None:
-        """Raise UnsupportedError if the process ended with status 127, otherwise AgentExitedError."""
+        """Raise an error for the ended process: UnsupportedError after exit status 127, otherwise AgentExitedError."""
         if self.process.returncode == UNSUPPORTED:
             raise UnsupportedError(last_line(self.output))
         raise self._exited()
@@ -282,7 +285,7 @@ class ProcessUnderTest:
         return AgentExitedError(f"it ended with {self.process.end}: {last_line(self.output)}")
 
     async def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
-        """Send a command, and return the answer.
+        """Send a command to the agent, and return its answer.
 
         Raises AgentEndedError if the agent does not answer, and AgentRefusedError if it refuses the command.
         """
@@ -297,7 +300,7 @@ class ProcessUnderTest:
             raise AgentEndedError(str(error)) from None
 
     async def check_answers(self) -> None:
-        """Raise AgentHangsError if the agent runs and answers none of several requests."""
+        """Raise AgentHangsError if the agent still runs but answers none of several requests."""
         for _ in range(MAX_REPEATED_REQUESTS):
             next_chance = time.monotonic() + REPEATED_REQUEST_LIMIT_S
             try:
@@ -311,7 +314,7 @@ class ProcessUnderTest:
             raise AgentHangsError(f"it hangs: it did not answer {MAX_REPEATED_REQUESTS} requests in a row")
 
     async def export(self) -> dict[str, Any]:
-        """Make the agent export its chain, and return the export. Raises AgentEndedError, AgentRefusedError."""
+        """Request a chain export from the agent, and return it. Raises AgentEndedError, AgentRefusedError."""
         answer = await self.ask("export")
         path = self.directory / f"{self.agent_id}.chain.json"
         try:

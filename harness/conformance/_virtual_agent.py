@@ -1,4 +1,4 @@
-"""An agent in virtual time: `COMMAND --virtual`, which reads inputs and writes answers as lines.
+"""Test an agent in virtual time: `COMMAND --virtual` reads inputs and writes answers as lines of text.
 
 A test in virtual time waits for no timer. It also compares the time at which the next timer expires. One process plays
 many incarnations of the agent, one after another.
@@ -65,7 +65,7 @@ class VirtualProgram:
 
     @classmethod
     async def start(cls, command: Sequence[str], errors: Path) -> "VirtualProgram":
-        """Start the process. Raises NoAgentError.
+        """Start the process and return it. Raises NoAgentError.
 
         `asyncio.create_subprocess_exec` is no alternative: after a cancellation it waits forever for the pipes.
         """
@@ -107,7 +107,7 @@ class VirtualProgram:
         return cls(process, processes, asyncio.StreamWriter(writing, protocol, None, loop), reading, answers, errors)
 
     async def ask(self, line: dict[str, Any], limit_s: float = ANSWER_LIMIT_S) -> dict[str, Any]:
-        """Send a line, and return the answer. Raises AgentEndedError, UnsupportedError."""
+        """Send a line to the agent, and return its answer. Raises AgentEndedError, UnsupportedError."""
         self._lines += 1
         try:
             async with asyncio.timeout(limit_s):
@@ -139,7 +139,7 @@ class VirtualProgram:
         return answer
 
     async def close(self) -> None:
-        """End the process and all its children, even if other processes hold its pipes."""
+        """End the process and all processes that it started, even if they hold its pipes open."""
         if not self._input.is_closing():
             self._input.transport.abort()
         self._reading.close()
@@ -161,7 +161,9 @@ async def _wait_for_end(process: subprocess.Popen[bytes]) -> None:
 
 
 class VirtualTimeAgent(AgentUnderTest):
-    """One incarnation of an agent in virtual time. At its end its process goes into the list `idle`, if one exists."""
+    """An agent in virtual time, from one start to its end. Afterwards its process is added to the list `idle`, if there
+    is one.
+    """
 
     def __init__(self, variant: SettingsVariant, program: VirtualProgram, idle: list[VirtualProgram] | None) -> None:
         super().__init__(variant)
@@ -255,7 +257,9 @@ def _same_instant(announced_s: Any, expected_s: float | None) -> bool:
 
 
 def starter(command: Sequence[str], errors: Path) -> tuple[Start, list[VirtualProgram]]:
-    """Return a function that starts agents in virtual time, and the list of idle processes to close at the end."""
+    """Return a function that starts agents in virtual time, and the list of idle processes that must be closed at the
+    end.
+    """
     idle: list[VirtualProgram] = []
 
     async def start(variant: SettingsVariant, alone: bool) -> AgentUnderTest:

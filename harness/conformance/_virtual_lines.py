@@ -1,4 +1,4 @@
-"""A path as lines of virtual time: the inputs for `COMMAND --virtual`, and the expected answers.
+"""Convert a sequence of inputs to the lines that `COMMAND --virtual` reads, and to the answers that it should write.
 
 ucp/contract/CONTRACT.md describes the lines. An input has its time. An answer has datagrams in base64, and the time at
 which the next timer expires. Each line also has a description in words.
@@ -28,7 +28,7 @@ from ucp.clock import MICROSECONDS
 
 @dataclass(frozen=True)
 class VirtualLine:
-    """An input and the expected answer."""
+    """An input for an agent in virtual time, and the expected answer."""
 
     name: str
     given: dict[str, Any]
@@ -41,11 +41,11 @@ class VirtualLine:
 
 
 class NotPlayableError(Exception):
-    """An input is impossible in virtual time, because over UDP a timer expired late."""
+    """An error: an input cannot occur in virtual time, because over UDP a timer expired late."""
 
 
 class LineWriter:
-    """The reference in virtual time. It records each input and answer as a line."""
+    """Runs the reference in virtual time, and converts each input and answer to a line."""
 
     def __init__(self, variant: SettingsVariant) -> None:
         self.model = ReferenceModel(variant.settings)
@@ -53,11 +53,11 @@ class LineWriter:
         self._variant = variant
 
     def first_line(self) -> dict[str, Any]:
-        """Return the line that starts an incarnation of the agent."""
+        """Return the line that starts the agent."""
         return {"t": 0.0, "mission": virtual_mission(self._variant), "trace": False}
 
     def lines(self, path: Sequence[str]) -> Iterator[VirtualLine]:
-        """Yield the lines of these inputs. Raises NotPlayableError."""
+        """Yield the lines for these inputs. Raises NotPlayableError."""
         for name in path:
             given = INPUTS[name]
             if given.preceding is not None:
@@ -95,7 +95,7 @@ def virtual_mission(variant: SettingsVariant) -> dict[str, Any]:
 
 
 def given_line(action: Action, now: float, timestamp_us: int) -> dict[str, Any]:
-    """Return an input in the form that `COMMAND --virtual` reads."""
+    """Return an input in the format that `COMMAND --virtual` reads."""
     match action:
         case PeerDatagram():
             return {"t": now, "datagram": base64.b64encode(action.data).decode("ascii")}

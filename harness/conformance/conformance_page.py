@@ -1,4 +1,4 @@
-"""A page with the results of many agents: a table of agents and Algorithms, in one HTML file without external parts."""
+"""Write a table of agents and Algorithms with test results, as one HTML file that needs no other files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ FAILURES_SHOWN = 20
 
 
 class AgentsFileError(HarnessError):
-    """The file of agents cannot be used."""
+    """An error: the file that lists the agents cannot be used."""
 
 
 @dataclass(frozen=True)
 class TableCell:
-    """The results of one agent in one Algorithm."""
+    """The results of one agent for one Algorithm."""
 
     text: str
     kind: str
@@ -36,7 +36,7 @@ class TableCell:
 
 
 def read_agents(path: Path) -> dict[str, list[str]]:
-    """Return name -> command from a YAML file. Raises AgentsFileError."""
+    """Return the command of each agent by name, from a YAML file. Raises AgentsFileError."""
     form = "`name: [program, argument, ...]` for each agent"
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -59,7 +59,7 @@ def read_agents(path: Path) -> dict[str, list[str]]:
 
 
 def to_html(results: Mapping[str, Results | str]) -> str:
-    """Return the page. An agent that could not be tested has a sentence instead of results."""
+    """Return the HTML page. An agent that could not be tested has a sentence in place of results."""
     tested = {name: result for name, result in results.items() if isinstance(result, Results)}
     rows = {name: {row.algorithm: row for row in result.rows()} for name, result in tested.items()}
     numbers = [number for number in (*sorted(TITLES), FURTHER_CHECKS) if any(number in each for each in rows.values())]

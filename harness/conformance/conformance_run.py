@@ -1,4 +1,4 @@
-"""A conformance test of one agent: play the vectors and the handwritten cases, and write the files of each failure."""
+"""Test one agent for conformance: play all generated and handwritten tests, and write files about each failure."""
 
 import asyncio
 import time
@@ -55,7 +55,7 @@ def conform(
     show_progress: Callable[[int, int], None],
     vector_sets: Sequence[VectorSet] | None = None,
 ) -> Results:
-    """Test an agent. Raises MachineError, NoAgentError.
+    """Test an agent, and return the results. Raises MachineError, NoAgentError.
 
     `show_progress` receives the number of passed vectors, and the number of all vectors. `vector_sets` replace the
     vectors that the request selects.
@@ -167,7 +167,7 @@ def _case(failure: ConfirmedFailure, evidence: BlameEvidence) -> CaseResult:
 
 
 def _keep_failures(results: Results, request: ConformanceRequest) -> None:
-    """Write the files of each failure. If the disk refuses one, a note reports this, and the results stay."""
+    """Write the files of each failure. If the disk refuses a file, add a note to the results."""
     if request.keep is None:
         return
     kept = []

@@ -1,4 +1,6 @@
-"""The results of a conformance test: counts for each Algorithm, and the expected and received messages of failures."""
+"""Store the results of a conformance test: counts for each Algorithm, and the expected and received messages of
+failures.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,7 +21,7 @@ FURTHER_CHECKS = 0
 
 @dataclass(frozen=True)
 class CaseResult:
-    """The result of one case: a handwritten case, or a vector that failed."""
+    """The result of one handwritten test case, or of a generated test that failed."""
 
     name: str
     algorithm: int
@@ -72,7 +74,7 @@ class CaseResult:
 
 @dataclass
 class AlgorithmCounts:
-    """The number of cases of one Algorithm, by verdict."""
+    """The number of test cases of one Algorithm with each verdict."""
 
     algorithm: int
     passed: int = 0
@@ -91,7 +93,7 @@ class AlgorithmCounts:
 
 @dataclass
 class Results:
-    """The results of a test of one agent."""
+    """The results of a conformance test of one agent."""
 
     command: Sequence[str]
     wall_s: float
@@ -123,7 +125,7 @@ class Results:
 
     @property
     def exit_status(self) -> int:
-        """The exit status of the command. A case that was not tried has not passed."""
+        """The exit status of the command. A test case that was not run does not count as passed."""
         if self.interrupted:
             return INTERRUPTED
         if self.failures:

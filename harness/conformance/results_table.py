@@ -1,4 +1,4 @@
-"""Results on the terminal and as JUnit XML, and the progress of a run."""
+"""Print results on the terminal, write them as JUnit XML, and show the progress of a test."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -63,7 +63,7 @@ def _counts(row: AlgorithmCounts) -> list[Text]:
 
 
 def headline(case: CaseResult) -> str:
-    """Return a line about a case: Algorithm, handler, branch, and name of the case."""
+    """Return one line about a test case: Algorithm, handler, branch, and name."""
     where = f"Algorithm {case.algorithm} {case.handler}" if case.algorithm else case.handler or "the program"
     branch = f", branch {case.branch!r}" if case.branch else ""
     settings = f" (settings: {case.settings})" if case.settings not in ("", "default") else ""
@@ -72,7 +72,7 @@ def headline(case: CaseResult) -> str:
 
 
 def lines_of(case: CaseResult) -> Iterator[str]:
-    """Yield the lines of a failure: inputs, expected and received messages, deviations, and the last datagrams."""
+    """Yield the lines about a failure: inputs, expected and received messages, deviations, and the last datagrams."""
     yield headline(case)
     if case.inputs:
         yield f"  after {'; '.join(case.inputs[:-1])}" if case.inputs[:-1] else "  from its start"
@@ -94,7 +94,9 @@ def _failure(case: CaseResult) -> list[Text]:
 
 
 def to_junit(results: Results) -> str:
-    """Return JUnit XML with a test case for each failure, each handwritten case, and the vectors of each Algorithm."""
+    """Return JUnit XML with a test case for each failure, for each handwritten test, and for all generated tests of
+    each Algorithm.
+    """
     return to_xml("conformance", "conformance", results.started_at, results.wall_s, _junit_cases(results))
 
 
@@ -118,7 +120,9 @@ REDRAW_EVERY_S, LINE_EVERY_S = 0.2, 10.0
 
 @contextmanager
 def progress() -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that shows progress. Its arguments are the number of passed vectors, and that of all vectors."""
+    """Yield a function that shows progress. Its arguments are the number of passed tests and the number of all
+    tests.
+    """
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     bar = Progress(*columns, console=console, auto_refresh=False, transient=True, disable=not console.is_terminal)

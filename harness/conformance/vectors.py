@@ -1,4 +1,4 @@
-"""The generated vectors, and their file for tests of agents outside the harness.
+"""Generate the tests for all states and inputs of an agent, and write them to a file for use without the harness.
 
 An agent with other settings is another agent. Its vectors are included if they differ from those of the default
 settings.
@@ -32,7 +32,7 @@ from harness.conformance._virtual_lines import LineWriter, VirtualLine
 
 @dataclass(frozen=True)
 class VectorSet:
-    """The vectors of one variant of the settings."""
+    """The generated tests for one combination of settings."""
 
     variant: SettingsVariant
     steps: Sequence[Transition]
@@ -46,7 +46,7 @@ class VectorSet:
 
 
 def generate(only: str | None = None) -> list[VectorSet]:
-    """Return all vectors, or those in which one handler runs. Each call returns the same.
+    """Return all generated tests, or those in which one handler runs. Each call returns the same tests.
 
     `only` is the number of an Algorithm, or the name of its handler.
     """
@@ -60,7 +60,7 @@ def generate(only: str | None = None) -> list[VectorSet]:
 
 @cache
 def _all_sets() -> tuple[VectorSet, ...]:
-    """Return all vectors. They are computed once for all agents, which takes seconds."""
+    """Return all generated tests. They are computed once for all agents, because that takes seconds."""
     default_results: dict[VectorKey, tuple[object, ...]] = {}
     generated = []
     for variant in VARIANTS.values():
@@ -80,7 +80,7 @@ SCHEMA = "ucp-conformance-vectors/1"
 
 
 def to_lines(generated: Sequence[VectorSet]) -> Iterator[str]:
-    """Yield the lines of the file, each with its line end. The same vectors give the same lines."""
+    """Yield the lines of the file with all tests, including line ends. Equal tests always give equal lines."""
     total = sum(len(vectors.wanted) for vectors in generated)
     yield _line(
         {
@@ -115,7 +115,9 @@ def to_lines(generated: Sequence[VectorSet]) -> Iterator[str]:
 
 
 def _step(number: int, after: int, line: VirtualLine, state: str | None) -> dict[str, Any]:
-    """Return the document of a line. `state` is the state in words, or None for a step that only leads to a vector."""
+    """Return the JSON object for one line. `state` describes the state, or is None for a step that only leads to a
+    test.
+    """
     runs = [{"algorithm": run.algorithm, "handler": run.handler, "branch": run.branch} for run in line.outcome.runs]
     step = {"step": number, "after": after, "input": line.name, "in": line.given, "out": line.answer}
     words = {"says": line.input_text, "sends": line.sent_texts, "runs": runs}

@@ -1,4 +1,4 @@
-"""The test bench of a handwritten case: it starts agents, plays their peers, and checks their messages."""
+"""Provide the tools for a handwritten test case: start agents, play the other agents, and check messages."""
 
 import asyncio
 import base64
@@ -29,7 +29,7 @@ ReceivedMessage = TypeVar("ReceivedMessage", bound=Message)
 
 
 class WrongBehaviourError(Exception):
-    """The agent did not do the expected. `expected` and `received` describe the difference."""
+    """An error: the agent did not behave as expected. `expected` and `received` describe the difference."""
 
     def __init__(self, expected: str, received: str) -> None:
         super().__init__(f"expected {expected}; {received}")
@@ -37,12 +37,12 @@ class WrongBehaviourError(Exception):
 
 
 class CannotJudgeError(Exception):
-    """The case cannot judge this agent on this machine. The message has the reason."""
+    """An error: the test case cannot judge this agent on this machine. The message is the reason."""
 
 
 @dataclass(frozen=True)
 class HandwrittenCase:
-    """A handwritten case."""
+    """A handwritten test case."""
 
     name: str
     algorithm: int
@@ -57,7 +57,9 @@ ALL_CASES: list[HandwrittenCase] = []
 
 
 def case(name: str, section: str, algorithm: int = 0) -> Callable[[Callable[["Bench"], Awaitable[None]]], None]:
-    """Add the decorated function to `ALL_CASES`. The Algorithm 0 stands for none."""
+    """Return a decorator that adds a test case to `ALL_CASES`. Algorithm 0 means that the case tests no single
+    Algorithm.
+    """
 
     def declare(play: Callable[["Bench"], Awaitable[None]]) -> None:
         ALL_CASES.append(HandwrittenCase(name, algorithm, section, play))
@@ -72,7 +74,7 @@ def require(true: bool, expected: str, received: object) -> None:
 
 
 class BenchAgent:
-    """An agent on the test bench, with its peers."""
+    """An agent in a handwritten test case, together with the other agents that the harness plays."""
 
     def __init__(self, process: ProcessUnderTest, peer_socket: PeerSocket) -> None:
         self.process = process
@@ -82,7 +84,7 @@ class BenchAgent:
         self._sequence = 0
 
     async def begin(self, ahead_s: float = 0.0) -> None:
-        """Start the mission in `ahead_s` wall seconds. A negative value means a start in the past."""
+        """Start the mission in `ahead_s` seconds of wall time. A negative value sets the start in the past."""
         self.epoch_s = time.time() + ahead_s
         await self.process.ask("start", epoch_us=round(self.epoch_s * MICROSECONDS))
 
@@ -97,7 +99,7 @@ class BenchAgent:
         await self.process.ask("log", event_id=EVENT_ID, data=base64.b64encode(data).decode("ascii"))
 
     async def receive(self, count: int, what: str, within_s: float = PATIENCE_S) -> list[Message]:
-        """Return the next messages. Raises WrongBehaviourError if fewer arrive within the time limit."""
+        """Return the next `count` messages. Raises WrongBehaviourError if fewer arrive within the time limit."""
         until = time.time() + within_s
         while len(self.peer_socket.received) < count and time.time() < until:
             self.peer_socket.drain()
@@ -108,7 +110,7 @@ class BenchAgent:
         return received
 
     async def receive_one(self, kind: type[ReceivedMessage], after: str) -> ReceivedMessage:
-        """Return the next message. Raises WrongBehaviourError if there is none, or one of another type."""
+        """Return the next message. Raises WrongBehaviourError if there is none, or if it has a different type."""
         what = f"a {kind.NAME} after {after}"
         (received,) = await self.receive(1, what)
         if not isinstance(received, kind):
@@ -121,9 +123,10 @@ class BenchAgent:
         require(not received, f"nothing {why}", _names(received))
 
     async def require_single_answer(self, top: bytes, after: str) -> None:
-        """Ask the agent whether it has this chain. Its next message must be the answer yes.
+        """Ask the agent whether it has this chain. Raises WrongBehaviourError unless its next message is the answer
+        yes.
 
-        Raises WrongBehaviourError otherwise, for example if the agent has answered an earlier message.
+        This also detects an answer to an earlier message.
         """
         self.send(2 if self.agent_id != 2 else 3, ChainContainQuery(top))
         (received,) = await self.receive(1, f"an answer to a Chain Contain Query after {after}")
@@ -134,7 +137,7 @@ class BenchAgent:
         return await self.process.ask("status")
 
     async def end(self) -> int:
-        """Wait for the end of the process, and return its status. Raises WrongBehaviourError if it does not end."""
+        """Wait until the process ends, and return its exit status. Raises WrongBehaviourError if it does not end."""
         try:
             return await asyncio.wait_for(self.process.process.wait(), PATIENCE_S * 2)
         except TimeoutError:
@@ -142,7 +145,7 @@ class BenchAgent:
 
 
 class Bench:
-    """The test bench. It starts agents in the lab."""
+    """Starts agents in the virtual network for a handwritten test case."""
 
     def __init__(self, lab: UdpLab) -> None:
         self.lab = lab
@@ -157,7 +160,7 @@ class Bench:
         directory: Path | None = None,
         port: int | None = None,
     ) -> AsyncIterator[BenchAgent]:
-        """Start an agent, wait until it is ready, and start its mission if `started` is true.
+        """Start an agent and wait until it is ready. If `started` is true, also start its mission.
 
         `keys` replace keys of the mission file. The other arguments are those of `program`.
         """
@@ -182,7 +185,7 @@ class Bench:
         directory: Path | None = None,
         port: int | None = None,
     ) -> AsyncIterator[BenchAgent]:
-        """Start an agent that may never be ready.
+        """Start an agent that may never become ready.
 
         `text` replaces the whole mission file. `prepare` receives the directory of the agent before its start.
         `directory` and `port` are those of an earlier incarnation.

@@ -1,4 +1,4 @@
-"""Cases about blocks and votes: the size of a block, and the independence of successive votes."""
+"""Test cases about blocks and votes: the size of a block, and the independence of successive votes."""
 
 from harness.conformance._reference_model import PEERS
 from harness.conformance._state_space import VARIANTS

@@ -1,4 +1,4 @@
-"""Cases about datagrams: malformed ones, those of strangers, and a flood of them."""
+"""Test cases about datagrams: malformed ones, datagrams of unknown senders, and a flood of datagrams."""
 
 import asyncio
 import time

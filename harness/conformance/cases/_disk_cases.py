@@ -1,4 +1,4 @@
-"""Cases about the disk: a full disk, and restarts with the store of a killed agent."""
+"""Test cases about the disk: a full disk, and restarts with the data of a killed agent."""
 
 import signal
 from collections.abc import Callable
@@ -55,7 +55,7 @@ async def _no_export(bench: Bench) -> None:
 
 
 async def _commit(agent: BenchAgent, count: int) -> list[Block]:
-    """Let the agent commit blocks of a peer, and return these blocks."""
+    """Let the agent commit blocks of another agent, and return these blocks."""
     blocks, top = [], INCEPTION
     for number in range(count):
         block = Block(PEERS[0], number + 1, b"block %d" % number)

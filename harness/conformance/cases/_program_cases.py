@@ -1,4 +1,4 @@
-"""Cases about the program: its start and end, refused missions, and its control socket."""
+"""Test cases about the agent program: start and end, refused missions, and the control socket."""
 
 import asyncio
 import base64
@@ -116,7 +116,7 @@ async def _sigint(bench: Bench) -> None:
 
 
 async def _processes(agent: BenchAgent) -> list[int]:
-    """Return the IDs of the agent's processes. Raises CannotJudgeError if they are not visible."""
+    """Return the process IDs of the agent. Raises CannotJudgeError if they are not visible."""
     pids = await asyncio.to_thread(agent.process.processes.pids)
     if not pids:
         raise CannotJudgeError("the processes of the agent are not visible here")
@@ -252,7 +252,7 @@ async def _port(bench: Bench) -> None:
 
 
 async def _lines(agent: BenchAgent, *requests: bytes) -> list[Any]:
-    """Return the answers to raw lines, which arrive together on one connection."""
+    """Send several lines at once on one connection, and return the answers."""
     directory = os.open(agent.process.directory, os.O_PATH)
     try:
         path = f"/proc/self/fd/{directory}/{agent.agent_id}.control"

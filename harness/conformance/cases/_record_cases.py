@@ -1,4 +1,6 @@
-"""The records of an agent: its trace, its chain export and its status agree with each other and with the test."""
+"""Test cases about records: the trace, chain export and status of an agent must agree with each other and with the
+test.
+"""
 
 import base64
 from collections import Counter
@@ -65,7 +67,7 @@ class _Records:
 
 
 async def _play_recorded_mission(bench: Bench) -> _Records:
-    """Return the records of an agent that commits, votes, reconciles, drops datagrams, and is then killed."""
+    """Play a mission with every kind of step, kill the agent, and return its records."""
     async with bench.agent({"settings": SETTINGS, "roster": [*ROSTER, *PEERS]}) as agent:
         first, second, *_ = PEERS
         block = Block(first, 1, b"block")

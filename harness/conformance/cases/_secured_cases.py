@@ -1,4 +1,4 @@
-"""Cases about missions with keys: authentic and forged datagrams, signed blocks, and revocations."""
+"""Test cases about secured missions: valid and forged datagrams, signed blocks, and the exclusion of vehicles."""
 
 import asyncio
 import os
@@ -40,7 +40,7 @@ SECTION = "contract, Secured missions"
 
 
 class SecuredPeers:
-    """The peers of a secured agent, with their keys."""
+    """The other agents of a secured mission, with their keys."""
 
     def __init__(self, agent: BenchAgent, keys: "KeySet") -> None:
         from ucp.secure.opening import Opener
@@ -54,12 +54,12 @@ class SecuredPeers:
         self._sequence = 0
 
     def sealed(self, sender: int, message: Message) -> bytes:
-        """Return the next datagram of a peer, sealed with its keys."""
+        """Return the next datagram of another agent, encrypted and signed with its keys."""
         self._sequence += 1
         return self.sessions[sender].seal(self._sequence, message, None, None, 0)
 
     async def receive(self, count: int, what: str) -> "list[OpenedDatagram]":
-        """Return the next datagrams of the agent, opened with the keys of a peer.
+        """Return the next datagrams of the tested agent, decrypted with the keys of another agent.
 
         Raises WrongBehaviourError if fewer arrive, or if one is not authentic.
         """
@@ -77,9 +77,9 @@ class SecuredPeers:
             raise
 
     async def require_single_answer(self, after: str) -> bytes:
-        """Ask the agent whether it has the inception block. Its next datagram must be the answer, naming the request.
+        """Ask the agent whether it has the inception block. Its next datagram must be the answer to this request.
 
-        Return the datagram of the question.
+        Return the datagram of the request.
         """
         asked = self.sealed(ASKING_PEER, ChainContainQuery(INCEPTION))
         self.agent.peer_socket.send(asked)
