@@ -139,8 +139,9 @@ class Node:
         """Write the chain export whole or not at all. Raises OSError."""
         path = self._directory / f"{self.mission.agent_id}.chain.json"
         now = self.clock.now()
-        signatures = None if self._secured is None else self._secured.signatures
-        write_json_atomically(path, export_chain(self.agent.state, self.clock.timestamp_us(now), signatures))
+        at_us, secured = self.clock.timestamp_us(now), self._secured
+        document = export_chain(self.agent.state, at_us) if secured is None else secured.signed_export(at_us)
+        write_json_atomically(path, document)
         return path
 
     def _apply_quirks(self) -> None:

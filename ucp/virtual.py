@@ -191,8 +191,9 @@ class VirtualAgent:
     def _export(self, given: dict[str, Any], now: float) -> dict[str, Any]:
         self._trace_command(given, now)
         exported_at_us = max(0, self._epoch_us + round(now * MICROSECONDS))
-        signatures = cast("SecuredAgent", self._agent).signatures if self._secured else None
-        return export_chain(self._agent.state, exported_at_us, signatures)
+        if self._secured:
+            return cast("SecuredAgent", self._agent).signed_export(exported_at_us)
+        return export_chain(self._agent.state, exported_at_us)
 
     def _store(self, given: dict[str, Any], now: float) -> dict[str, Any]:
         stored = StoredState.of(self._agent.state)

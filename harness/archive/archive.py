@@ -90,15 +90,21 @@ class RunArchive:
     Files are read at first use, and once. `directory` is the first directory with a record, else the first given
     directory, else None. `exports` and `traces` have the readable files by agent. `problems` has a sentence for each
     damaged file, and `gaps` one for each missing file. With `skim`, large traces are read without the handler runs that
-    only received a message. `report_progress` receives a text before each long step of reading and judging. Raises
-    RunDirectoryError if a path does not exist, or is a directory with other content.
+    only received a message. `keys` are public keys that the user trusts, in place of those in the directory.
+    `report_progress` receives a text before each long step of reading and judging. Raises RunDirectoryError if a path
+    does not exist, or is a directory with other content.
     """
 
     def __init__(
-        self, *given: Path | str, skim: bool = False, report_progress: ReportProgress = lambda step: None
+        self,
+        *given: Path | str,
+        skim: bool = False,
+        keys: "PublicKeys | None" = None,
+        report_progress: ReportProgress = lambda step: None,
     ) -> None:
         self.report_progress = report_progress
         paths = [Path(path) for path in given]
+        self._trusted_keys = keys
         self._export_files = export_files(paths)
         self._skim = skim
         directories = [path for path in paths if path.is_dir()]
@@ -274,6 +280,8 @@ class RunArchive:
     @cached_property
     def _public_keys(self) -> tuple["PublicKeys | None", list[str]]:
         """Return the public keys, and a sentence on each problem with them."""
+        if self._trusted_keys is not None:
+            return self._trusted_keys, []
         beside = [*([self.directory] if self.directory else []), *self._agents]
         path = next((place / PUBLIC_KEYS_FILE for place in beside if (place / PUBLIC_KEYS_FILE).exists()), None)
         if path is None:
@@ -291,6 +299,14 @@ class RunArchive:
             return load_public(path), []
         except KeyFileError as error:
             return None, [f"{error}; signatures of blocks are not checked"]
+
+    @property
+    def anchor(self) -> str | None:
+        """The source that vouches for the public keys: the user, or run.json with their fingerprint. Else None."""
+        if self._trusted_keys is not None:
+            return "--keys"
+        keys = self.public_keys
+        return RUN_FILE if keys is not None and keys.fingerprint == self.record.keys_fingerprint else None
 
     @property
     def stores(self) -> dict[int, Path]:

@@ -59,6 +59,8 @@ class RunDirectory:
         self.keys: Mapping[int, Path] = {}
         """The directory with the keys of each vehicle during the run. It lies outside the run directory, which holds
         no secrets."""
+        self.keys_fingerprint: str | None = None
+        """Fingerprint of the public keys in the run directory. None without keys."""
         claim(path, self.agents, self.vehicles)
 
     def vehicle(self, vehicle_id: int, incarnation: int = 1) -> Path:
@@ -120,6 +122,7 @@ class RunDirectory:
     def write_public_keys(self, keys: "PublicKeys") -> None:
         """Write the public keys of a secured mission. The checker verifies signatures with them."""
         write_json_atomically(self.path / PUBLIC_KEYS_FILE, keys.to_json())
+        self.keys_fingerprint = keys.fingerprint
 
     def append_network(self, record: Mapping[str, Any]) -> None:
         """Append a change of the network, or a fault of agents, as it was applied at mission second `at_s`."""

@@ -95,6 +95,26 @@ class CurrentBlock(BaseModel):
     event_data: EncodedEventData
 
 
+class ExportedHead(BaseModel):
+    """The signed head of an export in a secured mission. The agent contract defines the signed bytes."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    mission: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
+    boot: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
+    number: Annotated[int, Field(ge=1, lt=2**32, strict=True)]
+    """The number of the export in this incarnation."""
+    height: Annotated[int, Field(ge=0, lt=2**32, strict=True)]
+    top_chain_hash: Hash
+    completed: Hash
+    """Digest of the list `completed`."""
+    held: Hash
+    """Digest of deque, reconcile stack, current block and flags."""
+    revoked: Annotated[list[AgentId], Field(max_length=MAX_AGENT_ID)]
+    """The agents whose revocation the agent knew, ascending."""
+    signature: Annotated[Base64, Field(max_length=MAX_SIGNATURE)]
+
+
 class Export(BaseModel):
     """The chain export of one agent. Unknown fields are ignored."""
 
@@ -111,6 +131,8 @@ class Export(BaseModel):
     reconcile_in_progress: bool
     idle: bool
     completed: list[Hash]
+    head: Annotated[ExportedHead | None, Field(exclude_if=lambda head: head is None)] = None
+    """The signed head, in a secured mission only."""
 
     @property
     def top_chain_hash(self) -> str:
@@ -147,9 +169,15 @@ class ExportMaker:
         self._blocks: dict[tuple[bytes, bytes | None, bytes | None], ExportedBlock] = {}
         self._event_data: dict[bytes, str] = {}
 
-    def export(self, state: AgentState, exported_at_us: int, signatures: Mapping[bytes, bytes] | None = None) -> Export:
+    def export(
+        self,
+        state: AgentState,
+        exported_at_us: int,
+        signatures: Mapping[bytes, bytes] | None = None,
+        head: Mapping[str, Any] | None = None,
+    ) -> Export:
         """Return the export that `read_export` would read from a file that `ucp.export.export_chain` wrote of this
-        state.
+        state. `head` is the signed head of a secured agent.
         """
         inception, signed = state.chain.inception, signatures or {}
         return Export.model_construct(
@@ -168,6 +196,7 @@ class ExportMaker:
             reconcile_in_progress=state.reconcile_in_progress,
             idle=state.idle,
             completed=[block_hash.hex() for block_hash in state.completed],
+            head=None if head is None else ExportedHead.model_validate(head),
         )
 
     def _block(self, block: Block, chain_hash: bytes | None, signed: Mapping[bytes, bytes]) -> ExportedBlock:

@@ -484,6 +484,8 @@ class RunRecord(JudgedRecord):
     unmatched_fates: list[str] = []
     """A sentence for each scripted fate without a matching message, each injection that sent nothing, and each vehicle
     that did not simulate a fault."""
+    keys_fingerprint: str | None = None
+    """Fingerprint of the public keys of a secured mission. null if the mission was not secured."""
     capture: dict[AgentKey, CapturedFrames] | None = None
     """Frames of each vehicle, if captures were requested and completed."""
     ground_station: GroundStationRecord | None = None

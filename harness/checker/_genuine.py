@@ -2,20 +2,14 @@
 
 import base64
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 from harness.archive.exports import Export, ExportedBlock
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, agents, violated
 from harness.checker.missing_incarnations import may_be_of_missing_incarnation
+from harness.checker.signatures import SignatureChecks, is_older, unanchored
 from ucp.block import Block, InceptionBlock, next_chain_hash
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ucp.secure.bundle import PublicKeys
-    from ucp.secure.crypto_suite import SignatureClaim
 
 NAME = "genuine"
 
@@ -51,46 +45,15 @@ class _VerifiedHashes:
         return True
 
 
-class _SignatureChecks:
-    """A cache of verified block signatures. Each signature is verified once."""
-
-    def __init__(self, keys: "PublicKeys", verified: "Callable[[SignatureClaim], bool] | None") -> None:
-        from ucp.secure.crypto_suite import verify
-
-        self._keys = keys
-        self._verified = verified or verify
-        self._checked: dict[tuple[_Content, str | None], str | None] = {}
-
-    def find_error(self, block: ExportedBlock) -> str | None:
-        """Return the error in the signature of the block, or None if it is valid. The text ends a sentence about
-        the block.
-        """
-        claim = (block.agent_id, block.timestamp_us, block.event_data, block.block_hash), block.signature
-        if claim not in self._checked:
-            self._checked[claim] = self._verify(block)
-        return self._checked[claim]
-
-    def _verify(self, block: ExportedBlock) -> str | None:
-        from ucp.secure.block_signature import block_claim
-
-        public_key = self._keys.vehicles.get(block.agent_id)
-        if public_key is None:
-            return f"and agent {block.agent_id} has no key in this mission"
-        if block.signature is None:
-            return "without a signature: it was made or edited without keys"
-        data = Block(block.agent_id, block.timestamp_us, block.event_bytes).block_data()
-        if not self._verified(block_claim(public_key, self._keys.mission, data, base64.b64decode(block.signature))):
-            return f"whose signature does not match the key of agent {block.agent_id}: it was forged or edited"
-        return None
-
-
 def check(evidence: Evidence) -> Judgement:
     """Compute the hashes in all exports again, and compare the blocks with those that each agent completed.
 
     In a secured mission signatures decide, so that the records of the agent that made a block may be missing. A signed
-    block that this agent did not complete is not genuine either, because an attacker has its key.
+    block that this agent did not complete is not genuine either, because an attacker has its key. The signed head of
+    an export covers order and number of its blocks.
 
-    The result is `not applicable` without an export, or if the blocks that an agent completed are unknown.
+    The result is `not applicable` without an export, if the blocks that an agent completed are unknown, or if no anchor
+    vouches for the public keys of a secured mission.
     """
     findings: list[Finding] = []
     roster = evidence.roster
@@ -100,9 +63,11 @@ def check(evidence: Evidence) -> Judgement:
     unknown: set[int] = set()
     blocks = 0
     recomputed = _VerifiedHashes()
-    signatures = _SignatureChecks(evidence.public_keys, evidence.verified) if evidence.public_keys else None
+    signatures = SignatureChecks(evidence.keys.public, evidence.verified) if evidence.keys else None
     for agent_id, export in evidence.exports.items():
         findings += _check_hashes(agent_id, export, evidence, recomputed)
+        if signatures and (wrong_head := signatures.find_head_error(export)):
+            findings.append(Finding(agent_id, f"its export {wrong_head}"))
         for block in export.blocks():
             blocks += 1
             on_the_roster = roster is None or block.agent_id in roster
@@ -127,6 +92,10 @@ def check(evidence: Evidence) -> Judgement:
             findings.append(Finding(agent_id, detail, name, block.block_hash))
     for agent_id, export in evidence.before_final_reconcile.items():
         edited = _check_hashes(agent_id, export, evidence, recomputed)
+        if signatures and (wrong_head := signatures.find_head_error(export)):
+            edited.append(Finding(agent_id, f"its export {wrong_head}"))
+        if (later := evidence.exports.get(agent_id)) and is_older(later, export):
+            findings.append(Finding(agent_id, "its export is older than the one from before the final reconcile"))
         findings += [replace(finding, detail=f"{finding.detail}, before the final reconcile") for finding in edited]
     if findings:
         return violated(NAME, "a block was not made by an agent of this mission", findings)
@@ -136,9 +105,12 @@ def check(evidence: Evidence) -> Judgement:
         return Judgement(NAME, "not applicable", _explain_unknown_makers(evidence, unknown))
     made = "signed" if signatures else "completed"
     reason = f"all hashes recompute, and each of {blocks} blocks was {made} by the agent that it names"
-    if not signatures and any(block.signature for export in evidence.exports.values() for block in export.blocks()):
-        reason += "; the signatures were not checked, because public.json is missing next to the exports"
-    return Judgement(NAME, "holds", reason)
+    if not evidence.secured:
+        return Judgement(NAME, "holds", reason)
+    if doubt := unanchored(evidence.exports.values(), evidence.keys):
+        return Judgement(NAME, "not applicable", doubt)
+    assert evidence.keys is not None, "unanchored exports have a reason"
+    return Judgement(NAME, "holds", f"{reason}, with the public keys that {evidence.keys.anchor} names")
 
 
 def _explain_unknown_makers(evidence: Evidence, unknown: set[int]) -> str:

@@ -28,6 +28,7 @@ from harness.checker._sent_times import sent_at, spread_of
 from harness.checker._trace_replay import Incarnation, replay
 from harness.checker.judgement import Judgement
 from harness.checker.reference.state import State
+from harness.checker.signatures import TrustedKeys, are_signed
 from harness.errors import RunDirectoryError
 from harness.play.rogue.rogue_line import OF_NO_INJECTION
 from harness.play.variant import VariantError, variant_in_use
@@ -40,7 +41,6 @@ from ucp.trace import HandlerRun, SentMessage
 from ucp.trigger import MessageTrigger
 
 if TYPE_CHECKING:
-    from ucp.secure.bundle import PublicKeys
     from ucp.secure.crypto_suite import SignatureClaim
 
 Derived = TypeVar("Derived")
@@ -136,8 +136,8 @@ class Evidence:
     captures: Captures | None = None
     lag: MeasuredLag | None = None
     """The measured lag of machine and agents. None if it was not measured."""
-    public_keys: "PublicKeys | None" = None
-    """The keys of a secured mission, which verify the signatures of blocks."""
+    keys: TrustedKeys | None = None
+    """The public keys of a secured mission, which verify the signatures of blocks and exports."""
     verified: "Callable[[SignatureClaim], bool] | None" = None
     """A function that returns true for a valid signature without verifying it, for a swarm played in this process."""
     watch: Watch | None = None
@@ -159,6 +159,16 @@ class Evidence:
     _derived: dict[Callable[["Evidence"], Any], Any] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
+
+    @cached_property
+    def secured(self) -> bool:
+        """True if any record shows that the mission was secured."""
+        return (
+            self.keys is not None
+            or (self.scenario is not None and self.scenario.security is not None)
+            or any(trace.header.secured for trace in self.traces.values())
+            or are_signed(self.exports.values())
+        )
 
     @cached_property
     def names(self) -> dict[str, str]:
@@ -383,7 +393,7 @@ def gather(archive: RunArchive) -> Evidence:
         archive.conditions(Condition),
         _captures(archive),
         archive.lag(),
-        archive.public_keys,
+        TrustedKeys(archive.public_keys, archive.anchor) if archive.public_keys else None,
         scenario=archive.record.scenario,
         link_losses=_link_losses(archive),
         stores=archive.stores,

@@ -11,6 +11,7 @@ import typer
 from harness.errors import MachineError, RunDirectoryError, ScenarioError
 
 if TYPE_CHECKING:
+    from ucp.secure.bundle import PublicKeys
     from ucp.secure.opening import Opener
     from ucp.secure.sealing import Depot
 
@@ -57,6 +58,31 @@ def depot_of(path: Path | None) -> "Depot | None":
             "--depot-key needs the package cryptography: run `pip install 'ucp-harness[secure]'`"
         ) from None
     return load_depot_key(path)
+
+
+KeysOption = Annotated[
+    Path | None,
+    typer.Option("--keys", help="Your own copy of the public keys, or their directory."),
+]
+
+
+def trusted_keys(path: Path | None) -> "PublicKeys | None":
+    """Return the public keys in a file or a directory that the user trusts. None without a path.
+
+    Raises KeysError, MachineError.
+    """
+    if path is None:
+        return None
+    try:
+        from harness.play.keyring import KeysError
+        from ucp.secure.bundle import PUBLIC_NAME, load_public
+        from ucp.secure.keyfile import KeyFileError
+    except ModuleNotFoundError:
+        raise MachineError("--keys needs the package cryptography: run `pip install 'ucp-harness[secure]'`") from None
+    try:
+        return load_public(path / PUBLIC_NAME if path.is_dir() else path)
+    except KeyFileError as error:
+        raise KeysError(f"--keys: {error}") from None
 
 
 def roster_of(text: str) -> int | list[int]:

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from harness.archive.directory import claim
-from harness.commands._shared_options import DepotKey, depot_of, refuse_existing, write_new
+from harness.commands._shared_options import DepotKey, KeysOption, depot_of, refuse_existing, trusted_keys, write_new
 from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
 from harness.field.depot import record_outputs
@@ -50,6 +50,7 @@ def consolidate_command(
         ),
     ] = False,
     depot_key: DepotKey = None,
+    keys: KeysOption = None,
 ) -> None:
     """Merge the chains of all vehicles into one record.
 
@@ -66,10 +67,12 @@ def consolidate_command(
         )
     if final_reconcile and out is None:
         raise ExportError("--reconcile writes the exports next to the record: name the record with -o NAME.jsonl")
-    record = consolidate(collect_exports(paths), depot_of(depot_key))
+    record = consolidate(collect_exports(paths, trusted_keys(keys)), depot_of(depot_key))
     reconciliation = _reconcile(record, out.with_suffix(".reconciled")) if final_reconcile and out is not None else None
     reconciled = reconciliation.line if reconciliation else None
     print_lines(in_words(record, reconciled, opened=depot_key is not None))
+    if record.collected.unproven is not None:
+        print_lines([record.collected.unproven])
     print_lines(_write_outputs(record, reconciled, out, kml_file, geojson_file, csv_file))
     if html_file is not None:
         from harness.field.depot.page import draw

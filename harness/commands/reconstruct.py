@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from harness.commands._shared_options import BundleOption, DepotKey, depot_of, opener_of
+from harness.commands._shared_options import BundleOption, DepotKey, KeysOption, depot_of, opener_of, trusted_keys
 from harness.commands.terminal import complain, print_json
 from harness.errors import VIOLATED, RunDirectoryError
 from harness.field.ingest import ingest_files
@@ -20,12 +20,13 @@ def reconstruct_command(
     out: Annotated[Path, typer.Option("--out", "-o", help="Scenario file; must be new.")],
     bundle: BundleOption = None,
     depot_key: DepotKey = None,
+    keys: KeysOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Make a scenario that reproduces a recorded flight.
 
     The scenario plays in virtual time. Exit status 0: it reproduces all chains. 1: it does not, and the first place
-    where it fails is printed. 2: nothing is usable.
+    where it fails is printed, or a signature is wrong. 2: nothing is usable.
     """
     if out.exists():
         raise RunDirectoryError(f"{out} exists: choose another --out; existing files are not overwritten")
@@ -34,10 +35,10 @@ def reconstruct_command(
         result = ingest_files(paths, opener)
         flight = result.largest()
         name = f"{paths[0].resolve().name} flown again"[:200]
-        reconstruction = reconstruct(flight, name, status.update, opener=opener, depot=depot)
+        reconstruction = reconstruct(flight, name, status.update, opener=opener, depot=depot, keys=trusted_keys(keys))
     left_out = [*result.sentences()]
     write(reconstruction, out, paths, left_out)
-    for sentence in left_out:
+    for sentence in (*left_out, *reconstruction.wrong_signatures):
         complain(sentence)
     if as_json:
         print_json({"scenario": str(out), **reconstruction.to_json()})
@@ -45,5 +46,5 @@ def reconstruct_command(
         console = Console(highlight=False)
         for sentence in (reconstruction.sentence, *reconstruction.problems[1:], *reconstruction.remarks, str(out)):
             console.print(sentence, soft_wrap=True, markup=False)
-    if reconstruction.problems:
+    if reconstruction.problems or reconstruction.wrong_signatures:
         raise typer.Exit(VIOLATED)

@@ -17,6 +17,7 @@ from harness import checker, report
 from harness.archive.archive import RunArchive
 from harness.checker import stored_verdict
 from harness.checker.survival import survival
+from harness.commands._shared_options import KeysOption, trusted_keys
 from harness.commands.terminal import StatusLine, complain, print_json, show_programs, show_result, show_survival
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, MachineError, RunDirectoryError
 from harness.field.ingest import ingest_files
@@ -58,6 +59,7 @@ def _missing(source: report.ReportSource) -> Iterator[str]:
 def check_command(
     paths: Annotated[list[Path], typer.Argument(help="Run directory, or chain exports.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
+    keys: KeysOption = None,
 ) -> None:
     """Judge chain exports and traces by the six characteristics.
 
@@ -66,7 +68,7 @@ def check_command(
     finished`.
     """
     with StatusLine() as status:
-        archive = RunArchive(*paths, report_progress=status.show)
+        archive = RunArchive(*paths, keys=trusted_keys(keys), report_progress=status.show)
         evidence = checker.gather(archive)
         directories = [path for path in paths if path.is_dir()]
         if not archive.recorded and evidence.traces and directories:

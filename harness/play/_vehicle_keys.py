@@ -73,7 +73,13 @@ def mission_keys(scenario: Scenario, secret: bytes) -> MissionKeys | None:
     bundles = _bundles_in(directory, scenario.roster)
     if security.seal and any(bundle.public.depot is None for bundle in bundles.values()):
         raise ScenarioError(f"`security.seal`: {directory} has no depot key: make keys with `ucp-harness keys new`")
-    return MissionKeys(bundles, _authority_in(directory, bundles, scenario), security.seal)
+    keys = MissionKeys(bundles, _authority_in(directory, bundles, scenario), security.seal)
+    if security.fingerprint not in (None, keys.public.fingerprint):
+        raise ScenarioError(
+            f"`security.fingerprint`: {directory} has other public keys, with the fingerprint "
+            f"{keys.public.fingerprint}: use the directory of this mission, or correct the fingerprint"
+        )
+    return keys
 
 
 def refuse_revocations(scenario: Scenario) -> None:

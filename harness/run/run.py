@@ -189,6 +189,7 @@ class RunRecording:
             channel=played.channel,
             capture=played.capture,
             ground_station=played.ground_station,
+            keys_fingerprint=self.directory.keys_fingerprint,
         )
 
     def end(self, played: RunOutcome, report_progress: ReportProgress = lambda step: None) -> Run:

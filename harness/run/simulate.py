@@ -17,6 +17,7 @@ from harness.archive.traces import Header, Trace
 from harness.checker import Evidence, Result
 from harness.checker.evidence import InjectedDatagram, RogueTraffic
 from harness.checker.judgement import Finding, Judgement
+from harness.checker.signatures import TrustedKeys
 from harness.errors import AgentFailedError, MachineError, RunDirectoryError
 from harness.gc_pause import gc_paused
 from harness.play import mission
@@ -173,21 +174,21 @@ class MemoryRecorder:
             [],
             self._kept,
             self._injected,
-            public_keys=simulation.public_keys,
+            keys=TrustedKeys(simulation.public_keys, "the run") if simulation.public_keys else None,
             verified=simulation.verified,
         )
 
     def _exports(self, at_s: float, incarnations: Iterable[Incarnation]) -> dict[int, Export]:
-        return {
-            incarnation.agent.agent_id: Export.model_validate(incarnation.export(at_s))
-            if incarnation.state is None
-            else self._maker.export(
-                incarnation.state,
-                incarnation.timestamp_us(at_s),
-                cast("SecuredAgent", incarnation.secured).signatures if incarnation.secured else None,
-            )
-            for incarnation in incarnations
-        }
+        return {incarnation.agent.agent_id: self._export(at_s, incarnation) for incarnation in incarnations}
+
+    def _export(self, at_s: float, incarnation: Incarnation) -> Export:
+        if incarnation.state is None:
+            return Export.model_validate(incarnation.export(at_s))
+        at_us = incarnation.timestamp_us(at_s)
+        if incarnation.secured is None:
+            return self._maker.export(incarnation.state, at_us)
+        secured = cast("SecuredAgent", incarnation.secured)
+        return self._maker.export(incarnation.state, at_us, secured.signatures, secured.sign_head(at_us))
 
 
 EVIDENCE_SHOWN = 5

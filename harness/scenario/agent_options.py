@@ -131,11 +131,20 @@ class SecurityOptions(Model):
     keys: Annotated[str, Field(min_length=1, max_length=4000)] = "fresh"
     """`fresh`: each run generates its keys. Otherwise a directory from `ucp-harness keys new`, or a directory of
     bundles."""
+    fingerprint: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
+    """Fingerprint of the public keys, as `ucp-harness keys inspect` prints it. The run ends with an error if `keys` is
+    a directory of other keys. Default: not compared."""
     captured: VehicleId | None = None
     """ID of a captured vehicle. The rogue node seals its datagrams with the keys of this vehicle. Default: none."""
     seal: bool = False
     """True if event data is encrypted for the depot, so that no agent can read the data of others. A block then has
     room for 48 bytes less."""
+
+    @model_validator(mode="after")
+    def _fingerprint_is_of_a_directory(self) -> "SecurityOptions":
+        if self.fingerprint is not None and self.keys == "fresh":
+            raise ValueError("`fingerprint` needs `keys`, a directory of keys: fresh keys are different in each run")
+        return self
 
 
 Staggered = Literal["vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s", "finalize_gap_s"]

@@ -8,6 +8,8 @@ sealed to the public key of the depot (X25519). No vehicle has the private keys 
 holds the secrets of this vehicle. A bundle that other users can read is rejected.
 """
 
+import hashlib
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -45,6 +47,12 @@ class PublicKeys:
     depot: bytes | None
     vehicles: Mapping[int, bytes]
     epoch_s: float = DEFAULT_EPOCH_S
+
+    @property
+    def fingerprint(self) -> str:
+        """The SHA-256 of all public keys of the mission, in hexadecimal. Other keys have another fingerprint."""
+        text = json.dumps(self.to_json(), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(b"UCP public keys\0" + text.encode("ascii")).hexdigest()
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of `public.json`."""

@@ -15,9 +15,11 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from ucp.agent import Agent, drop_reason
+from ucp.export import export_chain
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
 from ucp.secure._signatures import BlockSignatures
 from ucp.secure.envelope import BOOT_BYTES, CLEAR, LAST_SEQUENCE, REQUESTS, REVOCATION, ClearHeader
+from ucp.secure.export_head import head_of
 from ucp.secure.revocation import Revocation, RevocationError
 from ucp.secure.sealed_datagrams import OpenedDatagram, Request
 from ucp.secure.session import Session
@@ -65,6 +67,7 @@ class SecuredAgent(Agent):
         self._signatures = BlockSignatures(session, self.state)
         self._answered_requests: dict[int, Request] = {}
         """Sequence of a response in the outbox -> the request that it answers."""
+        self._exports = 0
         self._revocation_due = False
         self._revocation_sent_at: float | None = None
 
@@ -72,6 +75,17 @@ class SecuredAgent(Agent):
     def signatures(self) -> Mapping[bytes, bytes]:
         """The makers' signatures of all blocks that the agent holds, by block hash."""
         return self._signatures.held()
+
+    def signed_export(self, exported_at_us: int) -> dict[str, Any]:
+        """Return the chain export with the makers' signatures and a signed head."""
+        return {**export_chain(self.state, exported_at_us, self.signatures), "head": self.sign_head(exported_at_us)}
+
+    def sign_head(self, exported_at_us: int) -> dict[str, Any]:
+        """Return the signed head of an export at this time. Each head has the next number."""
+        self._exports += 1
+        revoked = self.revocation.revoked if self.revocation else ()
+        head = head_of(self.state, self.session.boot, self._exports, exported_at_us, revoked)
+        return head.sign(self.session.private_key, self.session.mission)
 
     # From the air
 

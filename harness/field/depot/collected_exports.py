@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, ValidationError
 
@@ -31,6 +31,7 @@ from harness.archive.exports import (
 from harness.archive.record_file import validate_leniently
 from harness.archive.traces import read_trace
 from harness.archive.vocabulary import unknown_names
+from harness.checker.signatures import TrustedKeys, vouch
 from harness.errors import ExportError
 from harness.field.depot.mission_comparison import INCEPTION, ROSTER, ComparedFile, UnreadableFileError
 from harness.field.depot.mission_comparison import read as read_compared_file
@@ -41,6 +42,9 @@ from harness.gc_pause import gc_paused
 from harness.report.logbook.book import logged_telemetry
 from ucp.block import Block, InceptionBlock, next_chain_hash
 from ucp.export import SCHEMA
+
+if TYPE_CHECKING:
+    from ucp.secure.bundle import PublicKeys
 
 HASH_DIGITS = 12
 MAX_NAMED = 5
@@ -84,6 +88,10 @@ class CollectedExports:
     flight_logs: list[FlightLog] = field(default_factory=list)
     telemetry: bool = True
     """True if events come from vehicles, unless a file contradicts that."""
+    wrong_signatures: list[str] = field(default_factory=list)
+    """A sentence on each wrong signature, in a secured mission."""
+    unproven: str | None = None
+    """The reason why valid signatures prove nothing. None if they do, or if the mission was not secured."""
 
     @property
     def read_exports(self) -> list[ReadExport]:
@@ -100,7 +108,8 @@ class CollectedExports:
 
     @property
     def problems(self) -> list[str]:
-        return [problem for read_export in self.read_exports for problem in read_export.problems]
+        problems = [problem for read_export in self.read_exports for problem in read_export.problems]
+        return [*problems, *self.wrong_signatures]
 
     @property
     def claims(self) -> dict[str, str]:
@@ -116,9 +125,10 @@ class CollectedExports:
 
 
 @gc_paused()
-def collect_exports(paths: Iterable[Path]) -> CollectedExports:
+def collect_exports(paths: Iterable[Path], keys: "PublicKeys | None" = None) -> CollectedExports:
     """Return the exports of the largest mission in files and directories.
 
+    `keys` are public keys that the user trusts. Without them, signatures are verified with the keys in the directories.
     Raises FieldError if a path does not exist, and ExportError if no export is usable.
     """
     reader, read_exports, left_out = _Reader(), list[ReadExport](), list[str]()
@@ -149,7 +159,23 @@ def collect_exports(paths: Iterable[Path]) -> CollectedExports:
     collected.flight_logs = flight_logs
     collected.remarks += [f"{log.path}: {problem}" for log in flight_logs for problem in log.problems]
     _add_context(collected, [each for each in context_files if each.shared[INCEPTION].value == mission])
+    _add_signatures(collected, paths, keys)
     return collected
+
+
+def _add_signatures(collected: CollectedExports, paths: Iterable[Path], keys: "PublicKeys | None") -> None:
+    """Verify the signatures of a secured mission, and add the results to the problems and remarks."""
+    archive = RunArchive(*(path for path in paths if path.is_dir() and _is_archive(path)), keys=keys)
+    public = archive.public_keys
+    trusted = TrustedKeys(public, archive.anchor) if public is not None else None
+    exports = [each.export for each in collected.read_exports]
+    collected.wrong_signatures, collected.unproven = vouch(exports, trusted)
+    if collected.unproven is not None:
+        collected.remarks.append(collected.unproven)
+
+
+def _is_archive(directory: Path) -> bool:
+    return (directory / RUN_FILE).is_file() or any(directory.glob(f"*{SUFFIX}"))
 
 
 def _is_flight_log(path: Path) -> bool:

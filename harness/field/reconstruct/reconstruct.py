@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from harness.archive.archive import ReportProgress
 from harness.archive.exports import Export
 from harness.checker.judgement import agents
+from harness.checker.signatures import TrustedKeys, vouch
 from harness.errors import FieldError, MachineError
 from harness.field.ingest import Flight
 from harness.field.reconstruct._comparing import FirstDifference, SoloRehearsals, first_difference
@@ -23,6 +24,7 @@ from harness.scenario.scenario_file import Document, to_yaml
 from ucp.clock import MICROSECONDS
 
 if TYPE_CHECKING:
+    from ucp.secure.bundle import PublicKeys
     from ucp.secure.opening import Opener
     from ucp.secure.sealing import Depot
 
@@ -55,6 +57,8 @@ class Reconstruction:
     difference: FirstDifference | None
     simulated: Simulated
     table: Timetable = field(repr=False)
+    wrong_signatures: list[str] = field(default_factory=list)
+    """A sentence on each wrong signature in the exports of a secured flight."""
 
     @property
     def problems(self) -> list[str]:
@@ -107,6 +111,7 @@ class Reconstruction:
                 "played": self.difference.played,
             },
             "problems": self.problems,
+            "wrong_signatures": self.wrong_signatures,
             "remarks": self.remarks,
         }
 
@@ -118,10 +123,12 @@ def reconstruct(
     *,
     opener: "Opener | None" = None,
     depot: "Depot | None" = None,
+    keys: "PublicKeys | None" = None,
 ) -> Reconstruction:
     """Reconstruct a flight. `report_progress` receives a text at each step. Raises FieldError without usable records.
 
-    In a secured mission, `opener` decrypts captures, and `depot` decrypts blocks.
+    In a secured mission, `opener` decrypts captures, `depot` decrypts blocks, and `keys` are public keys that the user
+    trusts.
     """
     report_progress("reading the inputs of each agent")
     remarks: list[str] = []
@@ -145,6 +152,7 @@ def reconstruct(
     if not any(rehearsal.played for rehearsal in rehearsals.values()):
         first = next((f"agent {agent_id} {words}; " for agent_id, words in why.items()), "")
         raise FieldError(first + NO_INPUTS)
+    wrong_signatures = _check_signatures(flight, keys, remarks)
     report_progress("ordering the inputs")
     ahead_s = {
         match.agent_id: match.clock_ahead_s
@@ -172,7 +180,18 @@ def reconstruct(
     remarks += _clocks_in_words(table)
     outcomes = [AgentOutcome(agent_id, _blocks(simulated, agent_id), why.get(agent_id)) for agent_id in recorded_agents]
     document["expect"] = _expected(simulated, rehearsals)
-    return Reconstruction(document, outcomes, remarks, difference, simulated, table)
+    return Reconstruction(document, outcomes, remarks, difference, simulated, table, wrong_signatures)
+
+
+def _check_signatures(flight: Flight, keys: "PublicKeys | None", remarks: list[str]) -> list[str]:
+    """Return a sentence on each wrong signature, and add a remark if nothing vouches for the exports."""
+    trusted = TrustedKeys(keys, "--keys") if keys is not None else None
+    if trusted is None and flight.public_keys is not None:
+        trusted = TrustedKeys(flight.public_keys, None)
+    wrong, doubt = vouch(flight.exports.values(), trusted)
+    if doubt is not None:
+        remarks.append(doubt)
+    return wrong
 
 
 def _compare_chains(

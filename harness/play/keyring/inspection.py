@@ -44,15 +44,16 @@ def inspect(path: Path) -> list[Facts]:
 
 def in_words(facts: Facts) -> str:
     """Return the facts as one line of text. Public keys are shortened."""
-    more = [f"{name.replace('_', ' ')} {_shown(value)}" for name, value in facts.items() if name not in _HEAD]
+    more = [f"{name.replace('_', ' ')} {_shown(name, value)}" for name, value in facts.items() if name not in _HEAD]
     return f"{facts['file']}: {facts['kind']}, mission {facts['mission']}" + "".join(f", {words}" for words in more)
 
 
 _HEAD = ("file", "kind", "mission")
 _DIGITS = 16
+_FINGERPRINT = "fingerprint"
 
 
-def _shown(value: Any) -> str:
+def _shown(name: str, value: Any) -> str:
     match value:
         case None:
             return "none"
@@ -60,7 +61,7 @@ def _shown(value: Any) -> str:
             return f"{', '.join(value)}" if len(value) <= _DIGITS else f"{len(value)} of them"
         case list():
             return ", ".join(map(str, value))
-        case str() if len(value) == 2 * KEY_BYTES:
+        case str() if len(value) == 2 * KEY_BYTES and name != _FINGERPRINT:
             return value[:_DIGITS]
     return str(value)
 
@@ -113,7 +114,7 @@ def _inspect(path: Path) -> Facts:
 def _public(public: PublicKeys) -> Facts:
     facts = public.to_json()
     del facts["schema"]
-    return facts
+    return {**facts, _FINGERPRINT: public.fingerprint}
 
 
 def _bundle(bundle: Bundle) -> Facts:

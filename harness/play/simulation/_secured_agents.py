@@ -17,7 +17,6 @@ from harness.play.simulation._simulated_agent import OwnAgent
 from harness.scenario import Scenario
 from netem.medium import LATENCY
 from ucp.clock import MICROSECONDS
-from ucp.export import export_chain
 from ucp.secure.bundle import Bundle
 from ucp.secure.sealing import make_seal
 from ucp.secure.secured_agent import SecuredAgent, make_boot
@@ -29,7 +28,7 @@ class SecuredOwnAgent(SecuredAgent, OwnAgent):
     """An agent of the harness that signs and encrypts its messages."""
 
     def export(self, now: float, exported_at_us: int) -> dict[str, Any]:
-        return export_chain(self.state, exported_at_us, self.signatures)
+        return self.signed_export(exported_at_us)
 
     def stored(self, now: float) -> StoredState:
         stored = super().stored(now)

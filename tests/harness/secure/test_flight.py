@@ -102,9 +102,10 @@ def test_a_command_says_what_is_true_and_no_secret(
 def test_what_is_reconciled_at_home_keeps_the_makers_signatures(flown: Path, tmp_path: Path) -> None:
     done = harness("consolidate", flown, "--out", tmp_path / "record.jsonl", "--reconcile")
     assert done.returncode == 0, done.stderr
-    shutil.copy(flown / "public.json", tmp_path / "record.reconciled")
-    judged = json.loads(harness("check", tmp_path / "record.reconciled", "--json").stdout)
-    assert judged["characteristics"]["4"]["verdict"] == "holds", judged["characteristics"]["4"]
+    judged = json.loads(harness("check", tmp_path / "record.reconciled", "--json", "--keys", flown).stdout)
+    genuine = judged["characteristics"]["4"]
+    assert (genuine["verdict"], genuine["evidence"]) == ("not applicable", [])
+    assert genuine["reason"].startswith("unsigned: the exports of agents 1 and 2 have no signed head"), genuine
 
 
 def brought_home(flown: Path, directory: Path) -> Path:

@@ -103,3 +103,14 @@ def test_what_was_revoked_at_home_is_the_first_that_the_timeline_revokes(home: H
     later = [{"at_s": 60, "revoke": [2], "heard_by": [1]}, *REVOKED["timeline"][1:]]
     with pytest.raises(ScenarioError, match="revokes agent 3 before the mission"):
         simulate(asked(home.directory, timeline=later), 1)
+
+
+def test_run_refuses_keys_with_another_fingerprint(home: Home) -> None:
+    def with_fingerprint(fingerprint: str) -> Scenario:
+        security = {"keys": str(home.directory), "fingerprint": fingerprint}
+        return scenario(agents=ROSTER, duration_s=10, security=security)
+
+    assert not simulate(with_fingerprint(home.public().fingerprint), 1).result.bad
+    assert home.public().fingerprint in harness("keys", "inspect", home.directory).stdout
+    with pytest.raises(ScenarioError, match=f"other public keys, with the fingerprint {home.public().fingerprint}"):
+        simulate(with_fingerprint("00" * 32), 1)

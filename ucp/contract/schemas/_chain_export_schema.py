@@ -33,6 +33,23 @@ def block(chain_hash: Schema) -> Schema:
     )
 
 
+MISSION_OR_BOOT: Schema = {"type": "string", "pattern": "^[0-9a-f]{32}$"}
+HEAD: Schema = record(
+    {
+        "mission": MISSION_OR_BOOT,
+        "boot": MISSION_OR_BOOT,
+        "number": {"type": "integer", "minimum": 1, "maximum": 2**32 - 1},
+        "height": COUNT,
+        "top_chain_hash": HASH,
+        "completed": HASH,
+        "held": HASH,
+        "revoked": listed(AGENT_ID),
+        "signature": SIGNATURE,
+    }
+)
+"""The signed head of an export in a secured mission."""
+
+
 def schema() -> Schema:
     """Return the schema of a chain export."""
     uncommitted = listed(block({"type": "null"}))
@@ -49,5 +66,7 @@ def schema() -> Schema:
             "reconcile_in_progress": FLAG,
             "idle": FLAG,
             "completed": listed(HASH),
-        }
+            "head": HEAD,
+        },
+        optional=("head",),
     )

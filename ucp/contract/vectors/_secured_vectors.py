@@ -22,6 +22,7 @@ OTHER_KEYS = KeySet.derived(bytes(32), ROSTER)
 BOOT = make_boot(1_795_258_278_064_591, b"a chance")
 EPOCH = 3
 NOW = EPOCH * KEYS.public.epoch_s
+NOW_US = 1_795_260_078_064_591
 
 
 def session(agent_id: int, keys: KeySet = KEYS) -> Session:
@@ -76,6 +77,7 @@ def vectors() -> dict[str, Any]:
         "group_secrets": {str(epoch): _secret(epoch).hex() for epoch in range(EPOCH + 1)},
         "bundles": {str(agent_id): KEYS.bundle(agent_id).to_json() for agent_id in ROSTER},
         "messages": [_sealed(*said) for said in MESSAGES],
+        "export": receiver.signed_export(NOW_US),
         "drops": {"agent_id": AGENT_ID, "roster": ROSTER, "now": NOW, "datagrams": dropped},
     }
 
