@@ -123,10 +123,14 @@ class Pilot:
         The vehicle may now act on its own. If it then leaves its mode, disarms, or misses a time limit, the current
         procedure ends without an error. Raises NotSimulatedError if the vehicle cannot simulate the circumstance.
         """
-        values = await bring_about(self.link, circumstance)
+        had_befallen, self._befallen = self._befallen, True  # the vehicle may act before it confirms a parameter
+        try:
+            values = await bring_about(self.link, circumstance)
+        except BaseException:
+            self._befallen = had_befallen
+            raise
         if circumstance.station_is_heard is not None:
             self.link.station_is_heard = circumstance.station_is_heard
-        self._befallen = True
         return values
 
     def shortfall(self, flight: Procedure) -> str | None:

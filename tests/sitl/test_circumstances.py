@@ -294,7 +294,7 @@ def test_lost_remote_control_is_set_and_ends_the_flight_without_failure(tmp_path
     async def fly() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):
             flying = asyncio.create_task(pilot.fly(pilot.flight(FAR, "mission")))
-            while pilot.state.mode != MODES["copter"]["AUTO"]:
+            while not pilot.state.has_moved:  # later than the last request to start the mission
                 await asyncio.sleep(0.01)
             assert await pilot.befall(RC_LOST) == {"SIM_RC_FAIL": 1.0}
             await asyncio.wait_for(flying, 20)

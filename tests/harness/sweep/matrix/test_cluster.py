@@ -28,10 +28,10 @@ class Cluster:
         self._file = directory / "scheduler.json"
 
     def start_scheduler(self, **env: str) -> str:
-        """Returns its address. It waits for the answer of a lost worker not for half a minute, but for two seconds."""
+        """Return its address. The scheduler waits two seconds for the answer of a lost worker, by default 30."""
         env["DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT"] = "2s"
         self.scheduler = self._start("scheduler", "scheduler", "--port", "0", "--scheduler-file", self._file, **env)
-        until(self._file.exists)
+        until(lambda: self._file.exists() and self._file.stat().st_size > 0)
         address: str = json.loads(self._file.read_text())["address"]
         return address
 
