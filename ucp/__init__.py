@@ -1,4 +1,5 @@
-"""The Uniform Chain Protocol: blocks, chain, messages, and the 20 event handlers of Algorithms 1-20.
+"""An implementation of the Uniform Chain Protocol: blocks, chain, messages, and the 20 event handlers of Algorithms
+1-20.
 
 `__all__` lists the public names. A name is imported at its first use, because every agent process imports this package.
 A lazy import keeps its start fast.

@@ -1,4 +1,4 @@
-"""The wait of answers before they are sent, by the setting `answer_spread_s`.
+"""Delay the answers of an agent by a random time, if the setting `answer_spread_s` asks for it.
 
 One agent asks, and all others answer at the same moment. On a radio channel that they share, many of these answers
 collide. With `answer_spread_s`, each answer waits for its own share of this time.
@@ -29,7 +29,7 @@ Outgoing = tuple[int, Message, RecordedBytes | None]
 
 
 def answer_wait_s(datagram: bytes, spread_s: float) -> float:
-    """Return the mission seconds, from 0 to `spread_s`, that an answer waits.
+    """Return the number of mission seconds, from 0 to `spread_s`, by which an answer is delayed.
 
     `datagram` is the encoded message. In a secured mission, it is the message before encryption.
     """
@@ -37,7 +37,7 @@ def answer_wait_s(datagram: bytes, spread_s: float) -> float:
 
 
 class WaitingAnswers:
-    """The answers of one agent that are not sent yet."""
+    """The answers of one agent that wait to be sent."""
 
     def __init__(self, agent_id: int, spread_s: float) -> None:
         self._agent_id = agent_id
@@ -46,11 +46,11 @@ class WaitingAnswers:
         self._count = 0
 
     def next_s(self) -> float | None:
-        """Return the mission second at which the next answer is due. None if none waits."""
+        """Return the mission second at which the next answer is due, or None if no answer waits."""
         return self._waiting[0][0] if self._waiting else None
 
     def exchange(self, outbox: list[Outgoing], now: float) -> list[Outgoing]:
-        """Keep the answers of `outbox` until they are due. Return all messages to send now, in order.
+        """Hold back the answers in `outbox` until they are due. Return all messages to send now, in order.
 
         An answer that has waited comes before the messages of the last input.
         """

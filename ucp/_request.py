@@ -1,4 +1,4 @@
-"""Check that a command is JSON that a trace can contain."""
+"""Check that a command to an agent is JSON that can be written to a trace."""
 
 import json
 from typing import Any
@@ -8,7 +8,9 @@ MAX_PARTS = 100
 
 
 def check_request(request: dict[str, Any]) -> None:
-    """Raise ValueError for NaN, a lone surrogate, or too many parts. Python's json accepts them."""
+    """Raise ValueError if a request contains NaN, a lone surrogate, or too many parts. Python's JSON parser accepts
+    them.
+    """
     try:
         text = json.dumps(request, allow_nan=False, ensure_ascii=False)
     except RecursionError:

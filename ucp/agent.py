@@ -1,4 +1,4 @@
-"""One agent of the Uniform Chain Protocol.
+"""One agent of the Uniform Chain Protocol, without I/O.
 
 Theory of operation
 -------------------
@@ -112,7 +112,7 @@ HANDLERS: dict[str, EventHandler[Any]] = {
 
 
 class Agent:
-    """A UCP agent without I/O: the caller passes input and time, and sends what the agent returns.
+    """A UCP agent without I/O: the caller passes inputs and the time, and sends the messages that the agent returns.
 
     `agent_id` is 1 to 65535. `roster` holds the IDs of all agents. `initial_data` is the data of the inception block,
     the same for all agents of a mission. `handlers` replace handlers by wrong ones (see `ucp.quirks`). `seal` encrypts
@@ -155,7 +155,7 @@ class Agent:
             self.replace_handlers(handlers)
 
     def replace_handlers(self, wrong: Iterable[EventHandler[Any]]) -> None:
-        """Replace the handlers of these names by wrong ones; all others become the correct ones."""
+        """Replace the correct handlers of these names by wrong ones. All other handlers become correct again."""
         handlers = HANDLERS | {handler.name: handler for handler in wrong}
         self._on_message = {message: handlers[handler.name] for message, handler in ON_MESSAGE.items()}
         self._on_timer = {timer: handlers[handler.name] for timer, handler in ON_TIMER.items()}
@@ -164,7 +164,9 @@ class Agent:
     # Inputs
 
     def receive_datagram(self, data: bytes, now: float) -> None:
-        """Handle a datagram from the broadcast port. Never raises; `dropped` counts hostile datagrams."""
+        """Handle a datagram from the broadcast port. It never raises an exception; `dropped` counts invalid
+        datagrams.
+        """
         try:
             sender, sequence, message = decode(data)
         except MalformedDatagramError as malformed:
@@ -175,9 +177,9 @@ class Agent:
     def receive_message(
         self, sender: int, sequence: int, message: Message, now: float, datagram: RecordedBytes | None = None
     ) -> None:
-        """Handle a decoded message from another agent on the roster, with blocks of agents on the roster only.
+        """Handle a decoded message, or drop it if its sender or block belongs to no other agent of the mission.
 
-        `datagram` is the encoded message, for the trace. Other messages are counted in `dropped`.
+        `datagram` is the encoded message, for the trace. Dropped messages are counted in `dropped`.
         """
         if reason := drop_reason(self.agent_id, self.roster, sender, message):
             self._drop(now, reason, datagram)
@@ -204,7 +206,7 @@ class Agent:
             raise ValueError(f"an event of {event.encoded_bytes} bytes is more than max_event_bytes {largest}")
 
     def next_timer(self) -> float | None:
-        """Return the mission second at which `handle_timer` is due. None if no timer runs and no answer waits."""
+        """Return the mission second at which `handle_timer` is due, or None if no timer runs and no answer waits."""
         timer = self._next_running_timer()
         deadline = None if timer is None else timer.deadline
         answer_s = self.next_answer()
@@ -213,11 +215,11 @@ class Agent:
         return min(answer_s, deadline)
 
     def next_answer(self) -> float | None:
-        """Return the mission second at which the next waiting answer is due. None if none waits."""
+        """Return the mission second at which the next delayed answer is due, or None if no answer waits."""
         return None if self._waiting_answers is None else self._waiting_answers.next_s()
 
     def _next_running_timer(self) -> Timer | None:
-        """Return the timer that expires next. None if no timer runs."""
+        """Return the timer that expires next, or None if no timer runs."""
         soonest, ends = None, math.inf
         for timer in self.state.timers:
             deadline = timer.deadline
@@ -226,7 +228,7 @@ class Agent:
         return soonest
 
     def silent_until(self) -> float | None:
-        """Return the mission second until which the agent answers no message, because it reconciles.
+        """Return the mission second until which the agent answers no message because it reconciles, or None.
 
         That is when the running timer of its reconcile expires. None if it does not reconcile, or no such timer runs.
         """
@@ -237,7 +239,9 @@ class Agent:
         return None
 
     def handle_timer(self, now: float) -> None:
-        """Run the handlers of all timers that have expired by `now`, earliest first, and release due answers."""
+        """Run the handlers of all timers that have expired by `now`, earliest first, and release the delayed answers
+        that are due.
+        """
         while (
             (timer := self._next_running_timer()) is not None and timer.deadline is not None and timer.deadline <= now
         ):
@@ -245,17 +249,17 @@ class Agent:
         self.release_answers(now)
 
     def release_answers(self, now: float) -> None:
-        """Let `datagrams_to_send` return the answers that have waited until `now`."""
+        """Let `datagrams_to_send` return the answers that were delayed until `now`."""
         if self._waiting_answers is not None:
             self._core.now = now
 
     def end_timer(self, timer: Timer, now: float) -> None:
-        """End a running timer at `now`, and run its handler."""
+        """End a running timer at the time `now`, and run its handler."""
         timer.stop()
         self._handle(now, TimerTrigger(timer.name), None, self._on_timer[timer.name])
 
     def boot(self, recovered: StoredState, now: float) -> None:
-        """Restore the state that an earlier incarnation stored on disk. Call it before any other input.
+        """Restore the state that the agent stored on disk before it ended. Call this before any other input.
 
         Timers, votes and the current block are lost. A reconcile in progress ends as if no agent had answered
         (Algorithm 20): the rest of the stack goes back onto the chain, then the deque's front is proposed again.
@@ -267,11 +271,11 @@ class Agent:
         self._handle(now, BootTrigger(len(core.chain)), trace_input, self._on_local_event["Reconcile Finalize"])
 
     def begin_reconcile(self, now: float) -> None:
-        """Start a reconcile by the operator's command (a final reconcile at the depot, Section 5.1)."""
+        """Start a reconcile because the operator requested it (the final reconcile of a mission, Section 5.1)."""
         self._handle(now, OperatorTrigger("reconcile"), None, self._on_local_event["Reconcile Begin"])
 
     def messages_to_send(self) -> list[tuple[int, Message]]:
-        """Return the messages of the handlers that ran, in order, as (sequence, message), and empty the outbox.
+        """Return the messages that handlers have sent, in order, as (sequence, message), and forget them.
 
         `answer_spread_s` has no effect on them. A driver of the network calls `datagrams_to_send`.
         """
@@ -284,23 +288,23 @@ class Agent:
         return outbox
 
     def _due_to_send(self) -> list[Outgoing]:
-        """Return the messages to broadcast now, in order. Answers wait by `answer_spread_s`."""
+        """Return the messages to broadcast now, in order. The setting `answer_spread_s` delays answers."""
         outbox = self._take_outbox()
         return outbox if self._waiting_answers is None else self._waiting_answers.exchange(outbox, self._core.now)
 
     def datagrams_to_send(self) -> list[bytes]:
-        """Return the datagrams to broadcast now, in order. Answers wait by `answer_spread_s`."""
+        """Return the datagrams to broadcast now, in order. The setting `answer_spread_s` delays answers."""
         return [encode(self.agent_id, sequence, message) for sequence, message, _ in self._due_to_send()]
 
     def trace(self) -> list[Entry]:
-        """Return the handler runs and dropped datagrams since the last call, in order."""
+        """Return the handler runs and dropped datagrams since the previous call, in order."""
         trace, self._trace = self._trace, []
         return trace
 
     # How a handler runs
 
     def _drop(self, now: float, reason: str, datagram: RecordedBytes | None) -> None:
-        """Count a datagram that no handler gets."""
+        """Count and trace a datagram that is dropped."""
         self.dropped[reason] += 1
         if self._tracing:
             self._trace.append(DroppedDatagram(now, reason, datagram or RecordedBytes("")))
@@ -313,7 +317,7 @@ class Agent:
         handler: EventHandler[Any],
         *inputs: object,
     ) -> None:
-        """Run a handler, and then those that it triggered, in order. `trace_input` is the trace's `input`."""
+        """Run a handler, and then the handlers that it triggered, in order. `trace_input` is written to the trace."""
         core = self._core
         core.now, core.running = now, handler
         branch = handler.run(core, *inputs)
@@ -323,7 +327,7 @@ class Agent:
             self._run_triggered()
 
     def _run_triggered(self) -> None:
-        """Run the handlers of local events, and of those that these trigger, in order."""
+        """Run the handlers of all triggered local events, including those that they trigger in turn."""
         core = self._core
         while core.triggered:
             event, by = core.triggered.popleft()
@@ -363,7 +367,7 @@ class Agent:
 
 
 def drop_reason(agent_id: int, roster: Container[int], sender: int, message: Message) -> str | None:
-    """Return the reason why the agent drops a well-formed message. None if it handles the message."""
+    """Return the reason why the agent drops a valid message, or None if it handles the message."""
     if sender == agent_id:
         return "own sender"
     if sender not in roster:
@@ -374,7 +378,7 @@ def drop_reason(agent_id: int, roster: Container[int], sender: int, message: Mes
 
 
 def tally_of(core: Core, handler: EventHandler[Any]) -> Tally | None:
-    """Return the counters or the choice of the handler for the trace. None if it has neither."""
+    """Return the vote counts or the choice of the handler for the trace, or None if it has neither."""
     if handler.tally is None:
         return None
     if handler.tally == "majority_response_block_hash":

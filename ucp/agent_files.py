@@ -1,4 +1,4 @@
-"""The files of an agent: the chain export, written completely or not at all, and trace and log, line by line."""
+"""Write the files of an agent: its chain export as a whole, and its trace and log line by line."""
 
 import contextlib
 import json
@@ -11,7 +11,7 @@ CHUNK_BYTES = 64 * 1024
 
 
 def write_json_atomically(path: Path, document: dict[str, Any]) -> None:
-    """Write JSON as `write_atomically` does."""
+    """Replace the content of a file by a JSON document, completely or not at all. Raises OSError."""
     write_atomically(path, json.dumps(document, indent=1) + "\n")
 
 
@@ -34,7 +34,7 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 class LogFile:
-    """A log for people. A line that cannot be written is lost."""
+    """A log file for human readers. A line that cannot be written is lost."""
 
     def __init__(self, path: Path) -> None:
         self._file: BinaryIO = path.open("ab", buffering=0)
@@ -50,7 +50,7 @@ class LogFile:
 
 
 class TraceFile:
-    """A trace, to which whole lines are appended. It ends at the first line that the disk refuses.
+    """A trace file. Only whole lines are appended, and it ends at the first line that cannot be written.
 
     An incomplete last line of an earlier incarnation is removed. `problem` is the reason of the end, so that a trace
     that ends early is distinguished from an agent that became silent.
@@ -83,7 +83,7 @@ class TraceFile:
 
 
 def _end_of_last_line(file: BinaryIO) -> int:
-    """Return the end of the last complete line of the file, or 0."""
+    """Return the position after the last complete line of the file, or 0."""
     end = file.seek(0, os.SEEK_END)
     while end:
         begin = max(0, end - CHUNK_BYTES)

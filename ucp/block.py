@@ -1,4 +1,4 @@
-"""Blocks and their hashes (Section 3.4, eq. 3.1-3.5).
+"""Define blocks and their hashes (Section 3.4, eq. 3.1-3.5).
 
 A block does not contain its chain hash (eq. 3.2), which belongs to a position in a chain (`ucp.chain`). A block
 therefore does not change if it is popped and committed again.
@@ -32,14 +32,14 @@ BLOCK_HEADER = struct_of(BLOCK_FIELDS)
 
 
 def hash_digest(data: bytes) -> bytes:
-    """The protocol's cryptographic hash function H: SHA-256, 32 bytes."""
+    """Return the hash H of the protocol: SHA-256, 32 bytes."""
     digest: bytes = sha256(data).digest()
     return digest
 
 
 @lru_cache(CHAIN_HASHES_KEPT)
 def next_chain_hash(chain_hash: bytes, block_hash: bytes) -> bytes:
-    """CH_n = H(CH_{n-1} || BH_n) over the raw digests (eq. 3.2)."""
+    """Return the chain hash after one more block: CH_n = H(CH_{n-1} || BH_n) over the raw digests (eq. 3.2)."""
     return hash_digest(chain_hash + block_hash)
 
 
@@ -66,7 +66,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class InceptionBlock:
-    """Block 0, the same on every agent before the mission begins (Section 3.4.1)."""
+    """The inception block, block 0. It is the same on every agent before the mission begins (Section 3.4.1)."""
 
     block_data: bytes
     block_hash: bytes = field(init=False, compare=False)

@@ -1,4 +1,4 @@
-"""The local chain: a stack of blocks over the inception block, indexed by block hash and by chain hash.
+"""The chain of an agent: a stack of blocks on the inception block, with indexes by block hash and by chain hash.
 
 Every question that a handler asks is one dictionary look-up, however long the mission has run.
 """
@@ -9,7 +9,7 @@ from ucp.block import Block, InceptionBlock, next_chain_hash
 
 
 class Chain:
-    """An agent's chain: an inception block and the blocks committed after it.
+    """The chain of an agent: an inception block and the blocks that were committed after it.
 
     `len(chain)` and iteration leave the inception block out. Iteration starts at the oldest block.
     """
@@ -32,7 +32,7 @@ class Chain:
         return block_hash in self._block_of_hash
 
     def with_chain_hashes(self) -> Iterator[tuple[Block, bytes]]:
-        """Yield each block above the inception block with its chain hash, oldest first."""
+        """Yield each block except the inception block, with its chain hash. The oldest is first."""
         return zip(self._blocks, self._chain_hashes[1:], strict=True)
 
     @property
@@ -47,12 +47,14 @@ class Chain:
         return chain_hash in self._height_of_chain_hash
 
     def successor(self, chain_hash: bytes) -> Block | None:
-        """Return the block above the one with `chain_hash`, None at the top. Raises KeyError if it is not there."""
+        """Return the block after the position with this chain hash, or None at the top. Raises KeyError if the hash is
+        unknown.
+        """
         height = self._height_of_chain_hash[chain_hash]
         return self._blocks[height] if height < len(self._blocks) else None
 
     def append(self, block: Block) -> None:
-        """Commit `block` on top (eq. 3.2). Raises ValueError if the chain holds it already."""
+        """Append a block to the chain (eq. 3.2). Raises ValueError if the chain already contains it."""
         if block.block_hash in self._block_of_hash:
             raise ValueError(f"block {block.block_hash.hex()} is in the chain already")
         chain_hash = next_chain_hash(self.top_chain_hash, block.block_hash)
@@ -63,7 +65,7 @@ class Chain:
         self.top_chain_hash = chain_hash
 
     def pop(self) -> Block:
-        """Remove and return the top block. Raises IndexError at the inception block."""
+        """Remove the newest block and return it. Raises IndexError if the chain is empty."""
         if not self._blocks:
             raise IndexError("the inception block is never popped")
         block = self._blocks.pop()

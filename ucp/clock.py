@@ -1,4 +1,4 @@
-"""Mission time: seconds since the start of the mission, `speedup` times as fast as wall time."""
+"""Measure mission time in seconds since the start of a mission. It runs `speedup` times as fast as wall time."""
 
 import time
 
@@ -6,7 +6,7 @@ MICROSECONDS = 1_000_000
 
 
 class MissionClock:
-    """A clock for mission time. It runs from `start` on, and never goes back, even if the wall clock is changed."""
+    """A clock for mission time. It never goes back, even if the wall clock of the machine is changed."""
 
     def __init__(self, speedup: float) -> None:
         self.speedup = speedup
@@ -29,9 +29,11 @@ class MissionClock:
         return max(0.0, (time.monotonic() - self._started) * self.speedup)
 
     def timestamp_us(self, now: float) -> int:
-        """Return mission time `now` in microseconds since the Unix epoch. With a speedup it runs ahead of wall time."""
+        """Return the mission time `now` as microseconds since the Unix epoch. With a speedup, it runs ahead of wall
+        time.
+        """
         return (self.epoch_us or 0) + round(now * MICROSECONDS)
 
     def wall_s(self, mission_s: float) -> float:
-        """Return the seconds of wall time that `mission_s` mission seconds take."""
+        """Return the number of seconds of wall time in `mission_s` mission seconds."""
         return mission_s / self.speedup

@@ -1,4 +1,4 @@
-"""Building and committing blocks: Algorithms 1-6 (Sections 3.6.1 and 3.6.2).
+"""Build and commit blocks: Algorithms 1-6 (Sections 3.6.1 and 3.6.2).
 
 A full block waits in the deque. The agent proposes it to the local UVS, and commits it if more agents approve than
 disapprove. Otherwise the chains have diverged, and the agent starts a reconcile.
@@ -13,7 +13,7 @@ from ucp.messages import BlockAddRequest, BlockAddResponse, CommitBlock
 
 @event_handler(1, "building", "full", triggers=("Process Next Deque Block",))
 def build_data_block(core: Core, event: LoggableEvent) -> str:
-    """Algorithm 1, Build Data Block: the vehicle logged an event."""
+    """Algorithm 1, Build Data Block: add an event of the vehicle to the block under construction."""
     core.current_block += event.encode()
     if len(core.current_block) + core.settings.max_event_bytes < core.settings.max_block_bytes:
         return "building"
@@ -37,7 +37,7 @@ def build_data_block(core: Core, event: LoggableEvent) -> str:
     tally="vote_count",
 )
 def process_next_deque_block(core: Core) -> str:
-    """Algorithm 2, Process Next Deque Block: propose the front of the deque to the local UVS."""
+    """Algorithm 2, Process Next Deque Block: propose the front block of the deque to the neighbours."""
     if core.reconcile_in_progress:
         return "reconcile in progress"
     if core.voting_timer.active:
@@ -55,7 +55,7 @@ def process_next_deque_block(core: Core) -> str:
 
 @event_handler(3, "reconcile in progress", "approve", "disapprove", sends=(BlockAddResponse,))
 def receive_request_add_block(core: Core, sender: int, message: BlockAddRequest) -> str:
-    """Algorithm 3, Receive Request Add Block: approve a block that goes on top of the same chain as ours."""
+    """Algorithm 3, Receive Request Add Block: approve a block if its sender has the same chain as this agent."""
     if core.reconcile_in_progress:
         return "reconcile in progress"
     approve = message.chain_hash == core.chain.top_chain_hash
@@ -68,7 +68,7 @@ def receive_request_add_block(core: Core, sender: int, message: BlockAddRequest)
     4, "no vote running", "another block", "another round", "counted already", "yes", "no", tally="vote_count"
 )
 def receive_vote_add_block(core: Core, sender: int, message: BlockAddResponse) -> str:
-    """Algorithm 4, Receive Vote Add Block: tally a vote, once per responder and round (Section 4.1)."""
+    """Algorithm 4, Receive Vote Add Block: count a vote, once per voter and round (Section 4.1)."""
     if not core.voting_timer.active or core.candidate_block is None:
         return "no vote running"
     if message.block_hash != core.candidate_block.block_hash:
@@ -94,7 +94,7 @@ def receive_vote_add_block(core: Core, sender: int, message: BlockAddResponse) -
     triggers=("Process Next Deque Block", "Reconcile Begin"),
 )
 def vote_timer_expiration(core: Core) -> str:
-    """Algorithm 5, Vote Timer Expiration: commit the candidate, vote again, or reconcile.
+    """Algorithm 5, Vote Timer Expiration: commit the proposed block, vote again, or reconcile.
 
     The pseudo-code does nothing if the chain changed during an approved vote. The text and Section 4.3 vote again.
     Otherwise an agent would become idle with a block in its deque. A tie is no majority and starts a reconcile. With
@@ -121,7 +121,7 @@ def vote_timer_expiration(core: Core) -> str:
 
 @event_handler(6, "reconcile in progress", "does not succeed", "held already", "committed")
 def receive_commit_block(core: Core, sender: int, message: CommitBlock) -> str:
-    """Algorithm 6, Receive Commit Block: another agent committed a block; follow if it succeeds our top.
+    """Algorithm 6, Receive Commit Block: append another agent's block if it follows this agent's top block.
 
     In Figure 3.9 this handler also has a local trigger. Here it has none: an agent commits its own blocks directly,
     because the first test of this handler would refuse them during Reconcile Finalize.

@@ -1,4 +1,4 @@
-"""The control socket: a program asks for the status of the agent, and sends commands.
+"""The control socket of an agent, through which other programs request its status and send commands.
 
 A Unix stream socket; one JSON object per line in, one per line out (see contract/CONTRACT.md).
 """
@@ -22,15 +22,15 @@ Command = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 class CommandError(Exception):
-    """A command that cannot be executed. The message is one sentence."""
+    """An error: a command cannot be executed. The message is one sentence."""
 
 
 class UnsupportedCommandError(CommandError):
-    """A command that needs a feature that this agent lacks."""
+    """An error: a command needs a feature that this agent does not have."""
 
 
 class ControlServer:
-    """A server that executes `commands` by name. It removes its socket at the end."""
+    """A server that executes `commands` by name. At its end, it removes its socket file."""
 
     def __init__(self, path: Path, commands: dict[str, Command], loop: Loop) -> None:
         self._path = path
@@ -39,7 +39,7 @@ class ControlServer:
         self._listener: socket.socket | None = None
 
     def start(self) -> None:
-        """Begin to serve. Replace the socket of an agent that has ended. Raises OSError."""
+        """Start to accept connections. A socket file of an agent that has ended is replaced. Raises OSError."""
         self._listener = listener = socket.socket(socket.AF_UNIX)
         listener.setblocking(False)
         # The socket gets its name only after it listens, so a client that sees the name can connect.
@@ -67,7 +67,7 @@ class ControlServer:
             _Client(self._listener.accept()[0], self.answer, self._loop)
 
     def answer(self, line: bytes) -> dict[str, Any]:
-        """Return the answer to a line."""
+        """Return the answer to one line with a request."""
         try:
             request = json.loads(line.decode())  # given bytes, json would also accept UTF-16
             if not isinstance(request, dict):
@@ -89,7 +89,7 @@ class ControlServer:
 
 
 class _Client:
-    """A connection that answers line by line, as fast as the client reads the answers.
+    """A connection to the control socket. It answers requests line by line, no faster than the client reads.
 
     It ends if the client disconnects or sends a line above the limit. Other connections continue.
     """
@@ -127,7 +127,7 @@ class _Client:
             self._answer_next_line()
 
     def _answer_next_line(self) -> None:
-        """Answer the next complete line, if there is one."""
+        """Answer the next complete line, if one has arrived."""
         line, newline, rest = self._received.partition(b"\n")
         if newline:
             self._received = rest

@@ -1,4 +1,4 @@
-"""The operations of event handlers on the protocol state of their agent.
+"""The operations with which event handlers change the state of their agent.
 
 Handlers use this interface of an agent, and callers use `ucp.agent`. A handler may send, start and trigger only what it
 declares. Anything else raises an error.
@@ -21,7 +21,7 @@ Seal = Callable[[bytes, int], bytes]
 
 
 class Core(AgentState):
-    """The state, its operations, and their results since the agent last took them.
+    """The state of an agent, the operations on it, and their results since the agent last took them.
 
     `outbox` has the (sequence, message, recorded datagram) to broadcast. `changes`, `announced` and `started` are the
     changes, messages and timers of the running handler, as in a trace. They and the recorded datagrams exist only with
@@ -53,12 +53,12 @@ class Core(AgentState):
         self._sequence = 0
 
     def trigger(self, event: LocalEvent) -> None:
-        """Trigger a local event: its handler runs after the current one has ended."""
+        """Trigger a local event. Its handler runs after the current handler has ended."""
         assert event in self.running.triggers, f"{self.running.name} does not declare that it triggers {event}"
         self.triggered.append((event, self.running.name))
 
     def send(self, message: Message) -> None:
-        """Broadcast `message` to the local UVS."""
+        """Broadcast `message` to all vehicles in range (the local UVS of the thesis)."""
         assert type(message) in self.running.sends, f"{self.running.name} does not declare that it sends {message.NAME}"
         self.sent[message.NAME] += 1
         datagram = None
@@ -70,7 +70,7 @@ class Core(AgentState):
         self._sequence += 1
 
     def start(self, timer: Timer, duration_s: float) -> None:
-        """Let `timer` count down from now, in mission seconds."""
+        """Start `timer`, so that it expires after `duration_s` mission seconds."""
         assert timer.name in self.running.starts, f"{self.running.name} does not declare that it starts {timer.name}"
         timer.start(self.now, duration_s)
         if self._tracing:
@@ -79,7 +79,7 @@ class Core(AgentState):
     def restore(
         self, completed: Iterable[bytes], chain: Iterable[Block], deque: Iterable[Block], stack: Iterable[Block]
     ) -> None:
-        """Restore the data of an earlier incarnation, and end the reconcile that it may have been in."""
+        """Restore the blocks that the agent held before it ended. A reconcile that was in progress is ended."""
         self.reconcile_in_progress = True
         for block_hash in completed:
             self.completed.append(block_hash)
@@ -97,7 +97,9 @@ class Core(AgentState):
                 self.newest_block_timestamp_us = max(self.newest_block_timestamp_us, block.timestamp_us)
 
     def event_data(self, timestamp_us: int) -> bytes:
-        """Return the event data of the block under construction, sealed if the mission seals it (`ucp.secure`)."""
+        """Return the event data of the block under construction. If the mission requires it, they are encrypted
+        (`ucp.secure`).
+        """
         events = bytes(self.current_block)
         if self._seal is None:
             return events
@@ -105,7 +107,7 @@ class Core(AgentState):
         return self.sealed
 
     def complete(self, block: Block) -> None:
-        """A block of our own is full: push it onto the back of the deque."""
+        """Push a newly completed block of this agent onto the back of the deque."""
         self.completed.append(block.block_hash)
         self.newest_block_timestamp_us = block.timestamp_us
         self._changed("complete", block)
@@ -123,13 +125,13 @@ class Core(AgentState):
         return block
 
     def commit(self, block: Block) -> None:
-        """Append `block` to the chain, computing its chain hash (eq. 3.2)."""
+        """Append `block` to the chain, and compute its chain hash (eq. 3.2)."""
         self.chain.append(block)
         self.chain_changed_at = self.now
         self._changed("chain+", block)
 
     def pop_to_stack(self) -> None:
-        """Move the chain's top block onto the reconcile stack."""
+        """Move the newest block of the chain to the top of the reconcile stack."""
         block = self.chain.pop()
         self.chain_changed_at = self.now
         self._changed("chain-", block)
@@ -147,7 +149,7 @@ class Core(AgentState):
         return block
 
     def remove_from_stack(self, block_hash: bytes) -> Block | None:
-        """Remove the block from any place of the reconcile stack, and return it. None if it is not there."""
+        """Remove the block from the reconcile stack, and return it. Return None if the stack does not contain it."""
         for position in range(len(self.reconcile_stack) - 1, -1, -1):  # the mutual successor is mostly on top
             if self.reconcile_stack[position].block_hash == block_hash:
                 block = self.reconcile_stack.pop(position)

@@ -1,4 +1,4 @@
-"""Loggable events: their encoding inside a block, and the generator of Algorithm 21.
+"""Define loggable events, their encoding in a block, and the random generator of Algorithm 21.
 
 `event_data` of a block is a run of events, each `timestamp_us (u64) || event_id (u8, 1..254) || length (u16) || data`,
 big-endian (Section 4.1).
@@ -31,7 +31,7 @@ DEFAULT_LOG: tuple[EventKind, ...] = ("mode", "arming", "text", "position")
 
 
 class MalformedEventsError(ValueError):
-    """Event data that is not a run of whole events."""
+    """An error: event data do not consist of whole events."""
 
 
 @dataclass(unsafe_hash=True, slots=True)
@@ -58,7 +58,7 @@ class LoggableEvent:
 
 
 def decode_events(event_data: bytes) -> list[LoggableEvent]:
-    """Return the events in a block's event data, oldest first.
+    """Return the events in a block's event data. The oldest is first.
 
     Raises MalformedEventsError with the offset of the error.
     """
@@ -71,7 +71,7 @@ def decode_events(event_data: bytes) -> list[LoggableEvent]:
 
 
 def decode_event(event_data: bytes, offset: int) -> tuple[LoggableEvent, int]:
-    """Return the event that begins at `offset`, and the offset of its end. Raises MalformedEventsError."""
+    """Return the event that begins at `offset`, and the position after it. Raises MalformedEventsError."""
     body = offset + EVENT_HEADER_BYTES
     if body > len(event_data):
         raise MalformedEventsError(f"event header at byte {offset} is cut off")
@@ -84,7 +84,7 @@ def decode_event(event_data: bytes, offset: int) -> tuple[LoggableEvent, int]:
 
 
 class RandomEvents:
-    """Algorithm 21: each second, with probability 1/mean, an event with a random ID and random data.
+    """The random event source of Algorithm 21: each second, with probability 1/mean, an event with random ID and data.
 
     The thesis gives no loop period: one trial per second, each agent with a random phase.
     """
@@ -95,7 +95,7 @@ class RandomEvents:
         self._next_trial_s = rng.random() * TRIAL_PERIOD_S
 
     def next(self) -> tuple[float, int, bytes]:
-        """Run trials until the next event. Return (mission second, event_id, data)."""
+        """Draw random numbers until an event occurs, and return it as (mission second, event_id, data)."""
         lot, probability, at_s = self._rng.random, self._probability, self._next_trial_s
         while lot() > probability:
             at_s += TRIAL_PERIOD_S

@@ -1,4 +1,4 @@
-"""The chain export, schema `ucp-chain-export/1`: everything that an agent holds, as a JSON document."""
+"""Write the chain export of an agent, a JSON document with all blocks that it holds (`ucp-chain-export/1`)."""
 
 import base64
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ SCHEMA = "ucp-chain-export/1"
 def export_chain(
     state: AgentState, exported_at_us: int, signatures: Mapping[bytes, bytes] | None = None
 ) -> dict[str, Any]:
-    """Return an agent's chain export, a JSON document of schema `ucp-chain-export/1`.
+    """Return the chain export of an agent as a JSON object.
 
     The chain is listed from its oldest block, the deque from its front, and the reconcile stack to its top.
     `signatures` are the makers' signatures by block hash, in a secured mission.

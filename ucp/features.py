@@ -1,4 +1,4 @@
-"""Features: optional parts of contract/CONTRACT.md that some missions need.
+"""List the optional parts of the agent contract (features) that some missions need.
 
 A mission file lists the features that it needs. An agent that lacks one of them ends with status 127 instead of running
 a different mission.
@@ -42,5 +42,5 @@ Only the settings of `ucp.settings.ADDED` may be missing in the file.
 
 
 def needed_features(mission: Mapping[str, Any]) -> list[str]:
-    """Return the features that a complete mission file needs."""
+    """Return the features that an agent needs for a mission. The mission file must be complete."""
     return [name for name, is_needed in FEATURES.items() if is_needed(mission)]

@@ -1,4 +1,4 @@
-"""Event handlers: the function of one of Algorithms 1-20, and its declarations.
+"""Define an event handler: the function for one of Algorithms 1-20, and its declarations.
 
 A handler declares its branches, and the messages, timers and local events that it may send, start and trigger.
 `ucp.core` enforces the declarations, and `docs.generate.handlers` draws the protocol from them.
@@ -27,7 +27,9 @@ LocalEvent = Literal[
 
 @dataclass(frozen=True, eq=False)
 class EventHandler(Generic[P]):
-    """An event handler. `run` gets the core of the agent and the input, and returns the name of the branch."""
+    """An event handler. `run` takes the state of the agent and the input, and returns the name of the branch it
+    took.
+    """
 
     name: str
     run: Callable[P, str]
@@ -41,7 +43,7 @@ class EventHandler(Generic[P]):
 
     @property
     def title(self) -> str:
-        """Return number and name of the algorithm. The docstring of each handler begins with them."""
+        """Return the number and name of the Algorithm, as the first words of the handler's docstring."""
         algorithm = re.match(rf"Algorithm ({self.algorithm}), (\w[\w ]+\w)", self.run.__doc__ or "")
         assert algorithm, f"the docstring of {self.name} begins with its algorithm"
         return " ".join(algorithm.groups())
@@ -55,7 +57,7 @@ def event_handler(
     triggers: tuple[LocalEvent, ...] = (),
     tally: str | None = None,
 ) -> Callable[[Callable[P, str]], EventHandler[P]]:
-    """Declare a function as the handler of Algorithm `algorithm`.
+    """Return a decorator that declares a function as the handler of Algorithm `algorithm`.
 
     `branches` has all return values. `sends`, `starts` and `triggers` have the allowed messages, timers and local
     events. `tally` is the attribute of the state with its counters or its choice.

@@ -1,4 +1,4 @@
-"""Decide which messages can have an effect on which agents.
+"""Decide which messages can have an effect on an agent, so that a simulation need not deliver the others.
 
 All messages are broadcast, so each of N agents receives the messages of all others. Most of them have no effect: an
 answer matters only to agents that asked, and an agent that reconciles answers no message. This module decides it from

@@ -1,4 +1,4 @@
-"""An event loop for sockets, timers and signals.
+"""An event loop for sockets, timers and signals, smaller than asyncio.
 
 `asyncio` can do the same. But its import takes longer than all other steps of an agent's start, and as much memory.
 With more agents than processors, the start of a swarm would mostly consist of this import.
@@ -16,7 +16,7 @@ Callback = Callable[[], object]
 
 
 class Timer:
-    """A scheduled callback. `cancel` it before it is due."""
+    """A scheduled call of a function. `cancel` prevents it."""
 
     __slots__ = ("callback",)
 
@@ -28,7 +28,7 @@ class Timer:
 
 
 class Loop:
-    """An event loop. `run` calls due callbacks one after another until `stop`.
+    """An event loop. `run` calls functions one after another when they are due, until `stop` is called.
 
     `on_error` gets the exception of a callback, and the loop continues. Without `on_error`, the exception ends the
     loop. `selector` waits for sockets. The default one rounds times up to milliseconds.
@@ -46,7 +46,7 @@ class Loop:
         self._wakeup_sender: socket.socket | None = None
 
     def watch(self, sock: socket.socket, *, readable: Callback | None = None, writable: Callback | None = None) -> None:
-        """Call back whenever `sock` can be read or written. Without a callback, stop watching the socket."""
+        """Call a function whenever the socket can be read or written. Without functions, stop watching the socket."""
         events = (selectors.EVENT_READ if readable else 0) | (selectors.EVENT_WRITE if writable else 0)
         if sock in self._callbacks and events:
             self._selector.modify(sock, events)
@@ -58,13 +58,13 @@ class Loop:
             self._callbacks[sock] = readable, writable
 
     def call_later(self, delay_s: float, callback: Callback) -> Timer:
-        """Call back after `delay_s` seconds of wall time. A negative delay counts as 0."""
+        """Call a function after `delay_s` seconds of wall time. A negative delay counts as 0."""
         timer = Timer(callback)
         heapq.heappush(self._timers, (time.monotonic() + max(0.0, delay_s), next(self._order), timer))
         return timer
 
     def stop_on(self, *signals: int) -> None:
-        """Stop on these signals, until `close`."""
+        """Stop the loop when the process receives one of these signals, until `close` is called."""
         wakeup_receiver, self._wakeup_sender = socket.socketpair()
         for end in (wakeup_receiver, self._wakeup_sender):
             end.setblocking(False)
@@ -77,7 +77,7 @@ class Loop:
         self._running = False
 
     def run(self) -> None:
-        """Run until `stop`. The loop may run again afterwards."""
+        """Run the loop until `stop` is called. It may run again afterwards."""
         while self._running:
             self._call_back(self._selector.select(self._seconds_to_next_timer()))
             self._call_due_timers()
@@ -92,13 +92,13 @@ class Loop:
         self._selector.close()
 
     def _call_back(self, ready: list[tuple[selectors.SelectorKey, int]]) -> None:
-        """Call the function of a socket that can be read or written."""
+        """Call the functions of the sockets that can be read or written."""
         for key, events in ready:
             readable, writable = self._callbacks.get(key.fileobj, (None, None))  # type: ignore[call-overload]
             self._call(readable if events & selectors.EVENT_READ and readable else writable)
 
     def _seconds_to_next_timer(self) -> float | None:
-        """Return the seconds until the next callback is due. None without one."""
+        """Return the number of seconds until the next scheduled call, or None if there is none."""
         return max(0.0, self._timers[0][0] - time.monotonic()) if self._timers else None
 
     def _call_due_timers(self) -> None:

@@ -1,4 +1,4 @@
-"""The nine network messages and their wire format.
+"""Define the nine network messages of the protocol and their encoding.
 
 Every datagram is broadcast and begins with one header, big-endian:
 
@@ -38,7 +38,7 @@ MAX_DATAGRAM_BYTES = 1472
 
 
 class MalformedDatagramError(ValueError):
-    """A datagram is not one well-formed message. `reason` is one of a few fixed texts, for counting."""
+    """An error: a datagram does not contain exactly one valid message. `reason` is one of a few fixed texts."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -47,7 +47,7 @@ class MalformedDatagramError(ValueError):
 
 @dataclass(unsafe_hash=True, slots=True)
 class BlockAddRequest:
-    """A request for votes on a block that goes on top of the chain with this chain hash (Algorithms 2 and 3)."""
+    """A request for votes on a block that will follow the position with this chain hash (Algorithms 2 and 3)."""
 
     NAME: ClassVar[str] = "Block Add Request"
     WIRE: ClassVar[Fields] = {"block_hash": Kind.HASH, "chain_hash": Kind.HASH}
@@ -89,7 +89,7 @@ class BlockAddResponse:
 
 @dataclass(unsafe_hash=True, slots=True)
 class CommitBlock:
-    """A block to commit (Algorithms 5, 6 and 20). `chain_hash` is the chain hash of the block in the sender's chain."""
+    """The announcement of a committed block (Algorithms 5, 6 and 20), with the hash of the chain up to this block."""
 
     NAME: ClassVar[str] = "Commit Block"
     WIRE: ClassVar[Fields] = {"chain_hash": Kind.HASH, "block": Kind.BLOCK}
@@ -123,7 +123,7 @@ class ChainContainQuery:
 
 @dataclass(unsafe_hash=True, slots=True)
 class ChainContainResponse:
-    """The answer, yes or no, to a Chain Contain Query (Algorithms 9 and 10)."""
+    """The answer yes or no to a Chain Contain Query (Algorithms 9 and 10)."""
 
     NAME: ClassVar[str] = "Chain Contain Response"
     WIRE: ClassVar[Fields] = {"contained": Kind.FLAG, "chain_hash": Kind.HASH}
@@ -244,7 +244,7 @@ CARRY_A_BLOCK = frozenset((CommitBlock, BlockResponse))
 
 
 def block_named(message: Message) -> bytes | None:
-    """Return the hash of the block that a message concerns. None if it concerns none."""
+    """Return the hash of the block that a message concerns, or None if it concerns no block."""
     if type(message) in CARRY_A_BLOCK:
         return message.block.block_hash  # type: ignore[union-attr]
     return getattr(message, "block_hash", None)
@@ -283,7 +283,7 @@ class Datagram(NamedTuple):
 
 
 def encode(sender: int, sequence: int, message: Message) -> bytes:
-    """Return the datagram of a message, at most MAX_DATAGRAM_BYTES long.
+    """Return a message as a datagram of at most MAX_DATAGRAM_BYTES bytes.
 
     `sender` is an agent ID. `sequence` counts the sender's datagrams and wraps at 2**32.
     """
@@ -293,7 +293,9 @@ def encode(sender: int, sequence: int, message: Message) -> bytes:
 
 
 def decode(datagram: bytes) -> Datagram:
-    """Return the content of a datagram. Raises MalformedDatagramError if it is not one well-formed message."""
+    """Return the content of a datagram. Raises MalformedDatagramError if it does not contain exactly one valid
+    message.
+    """
     if len(datagram) < HEADER.size:
         raise MalformedDatagramError("truncated")
     if len(datagram) > MAX_DATAGRAM_BYTES:
@@ -331,7 +333,7 @@ def _flag(body: bytes) -> bool:
 
 
 def decode_block(body: bytes) -> Block:
-    """Parse the block data of a block. Raises MalformedDatagramError if no message can carry the block."""
+    """Parse an encoded block. Raises MalformedDatagramError if no message can carry it."""
     if not BLOCK_HEADER.size < len(body) <= BLOCK_HEADER.size + MAX_EVENT_DATA_BYTES:
         raise MalformedDatagramError("wrong length")
     agent_id, timestamp_us = BLOCK_HEADER.unpack_from(body)

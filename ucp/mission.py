@@ -1,4 +1,4 @@
-"""The mission file, which an agent reads at its start (schema `ucp-mission/1`, see contract/CONTRACT.md)."""
+"""Read the mission file of an agent (schema `ucp-mission/1`, see contract/CONTRACT.md)."""
 
 import base64
 import json
@@ -28,16 +28,16 @@ MAX_NAME = 40
 
 
 class MissionError(Exception):
-    """A mission file that cannot be used. The message is one sentence with the file, the key and the allowed values."""
+    """An error: a mission file cannot be used. The message names the file, the key and the allowed values."""
 
 
 class UnsupportedMissionError(MissionError):
-    """A mission that needs a feature that this agent does not have."""
+    """An error: a mission needs a feature that this agent does not have."""
 
 
 @dataclass(frozen=True)
 class Network:
-    """The network. `address` is the IPv4 address of the agent, which ignores its own echoes."""
+    """The network settings of an agent. `address` is its own IPv4 address, whose datagrams it ignores."""
 
     address: str
     broadcast: str
@@ -58,7 +58,9 @@ class EventSource:
 
 @dataclass(frozen=True)
 class Security:
-    """The keys of a secured mission. `bundle` is their file, relative to the directory of the mission file."""
+    """The key settings of a secured mission. `bundle` is the key file, relative to the directory of the mission
+    file.
+    """
 
     bundle: str
 

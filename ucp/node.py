@@ -1,4 +1,4 @@
-"""One agent as a process: `python -m ucp.node MISSION_FILE`. With `--virtual` it is `ucp.virtual`.
+"""Run one agent as a process: `python -m ucp.node MISSION_FILE`. With `--virtual`, run `ucp.virtual` instead.
 
 The process drives `ucp.agent.Agent` with a UDP broadcast socket, the clock, and an event source. Next to the mission
 file it writes `<id>.chain.json`, `<id>.trace.jsonl`, `<id>.log`, a store if the mission names one, and the control
@@ -105,7 +105,9 @@ class Node:
         return agent_factory(mission, directory, report_write_error)
 
     def run(self) -> int:
-        """Serve until SIGTERM or SIGINT. Return the exit status, 1 if the chain could not be exported."""
+        """Run until the process receives SIGTERM or SIGINT. Return the exit status, which is 1 if the chain could not
+        be exported.
+        """
         self._loop.stop_on(signal.SIGTERM, signal.SIGINT)
         self._loop.watch(self._socket, readable=self._receive)
         self._control.start()
@@ -130,13 +132,13 @@ class Node:
         return status
 
     def _log_exception(self, error: Exception) -> None:
-        """Record an exception of a handler, and continue, because other agents still need this one."""
+        """Log an exception of a handler, and continue, because other agents depend on this one."""
         import traceback
 
         self._log_line("".join(traceback.format_exception(error)).rstrip())
 
     def export(self) -> Path:
-        """Write the chain export whole or not at all. Raises OSError."""
+        """Write the chain export, completely or not at all, and return its path. Raises OSError."""
         path = self._directory / f"{self.mission.agent_id}.chain.json"
         now = self.clock.now()
         at_us, secured = self.clock.timestamp_us(now), self._secured
@@ -165,7 +167,7 @@ class Node:
             self._feed(partial(self.agent.receive_datagram, data))
 
     def log_event(self, event_id: int, data: bytes) -> None:
-        """Log an event. It has no effect before the mission and after its end."""
+        """Log an event. Before the start and after the end of the mission, it is ignored."""
         if not self.generating:
             return
         event = LoggableEvent(self.clock.timestamp_us(self.clock.now()), event_id, data)
@@ -179,7 +181,7 @@ class Node:
         self._feed(self.agent.handle_timer)
 
     def _feed(self, feed: Callable[[float], None]) -> None:
-        """Give the agent one input. Then write store and trace, broadcast its messages, and set its next timer.
+        """Give the agent one input. Then write its records, broadcast its messages, and set its next timer.
 
         Store and trace come before the broadcast, because the process can be killed in between.
         """
@@ -334,7 +336,7 @@ class Node:
         return self.mission.quirks
 
     def _trace_command(self, request: dict[str, Any]) -> None:
-        """Write commands that trigger no handler to the trace, except before the mission."""
+        """Write a command that triggers no handler to the trace. Before the mission, do nothing."""
         if self.clock.running:
             self._record_entries([CommandEntry(self.clock.now(), str(request.get("command")), request)])
 
@@ -364,7 +366,9 @@ class Node:
 
 
 def _broadcast_socket(mission: Mission) -> socket.socket:
-    """Return a socket that receives broadcasts on the port of the mission. Raises OSError, which names the port."""
+    """Return a socket that receives broadcasts on the port of the mission. Raises OSError with the port in its
+    message.
+    """
     port = mission.network.port
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -379,7 +383,9 @@ def _broadcast_socket(mission: Mission) -> socket.socket:
 
 
 def main(arguments: list[str], node: Callable[[Mission, Path], Node] = Node) -> int:
-    """Return the exit status: 0, 1 without an export, 2 for a wrong mission or a used port, 127 without a feature."""
+    """Run an agent. Return exit status 0, 1 without an export, 2 for a wrong mission or a used port, or 127 for a
+    missing feature.
+    """
     if arguments == ["--virtual"]:
         from ucp.virtual import main as serve
 

@@ -1,4 +1,4 @@
-"""Bringing a chain back into agreement with the local UVS: Algorithms 7-20 (Section 3.6.3).
+"""Reconcile a chain with those of the neighbours: Algorithms 7-20 (Section 3.6.3).
 
 Phase 1 pops blocks onto the reconcile stack until the majority of agents contains the rest of the chain. Phases 2 and 3
 ask for the successors in the majority's chain, block by block, and commit them. Finalize commits the rest of the stack
@@ -25,7 +25,7 @@ IS_TOP_OF_CHAIN = b""
 
 @event_handler(7, "already in progress", "begun", triggers=("Reconcile Phase 1",))
 def reconcile_begin(core: Core) -> str:
-    """Algorithm 7, Reconcile Begin."""
+    """Algorithm 7, Reconcile Begin: start a reconcile, unless one is already in progress."""
     if core.reconcile_in_progress:
         return "already in progress"
     core.reconcile_in_progress = True
@@ -38,7 +38,7 @@ def reconcile_begin(core: Core) -> str:
 
 @event_handler(8, "asked", sends=(ChainContainQuery,), starts=("phase one",), tally="reconcile_vote_count")
 def reconcile_phase_1(core: Core) -> str:
-    """Algorithm 8, Reconcile Phase 1: ask which agents contain our top chain hash."""
+    """Algorithm 8, Reconcile Phase 1: ask which neighbours' chains contain this agent's top chain hash."""
     core.reconcile_vote_count = {"yes": 0, "no": 0}
     core.reconcile_responders.clear()
     core.send(ChainContainQuery(core.chain.top_chain_hash))
@@ -48,7 +48,7 @@ def reconcile_phase_1(core: Core) -> str:
 
 @event_handler(9, "reconcile in progress", "yes", "no", sends=(ChainContainResponse,))
 def receive_request_chain_contain(core: Core, sender: int, message: ChainContainQuery) -> str:
-    """Algorithm 9, Receive Request Chain Contain (the text before it calls it Algorithm 10, Figure 3.13)."""
+    """Algorithm 9, Receive Request Chain Contain: answer a query (the text before it calls it 10, Figure 3.13)."""
     if core.reconcile_in_progress:
         return "reconcile in progress"
     contained = core.chain.contains_chain_hash(message.chain_hash)
@@ -58,7 +58,7 @@ def receive_request_chain_contain(core: Core, sender: int, message: ChainContain
 
 @event_handler(10, "not in phase 1", "another chain", "counted already", "yes", "no", tally="reconcile_vote_count")
 def receive_phase_1_response(core: Core, sender: int, message: ChainContainResponse) -> str:
-    """Algorithm 10, Receive Phase 1 Response: tally, once per responder and query (Section 4.1)."""
+    """Algorithm 10, Receive Phase 1 Response: count an answer, once per agent and query (Section 4.1)."""
     if not core.phase_one_timer.active:
         return "not in phase 1"
     if message.chain_hash != core.chain.top_chain_hash:
@@ -103,7 +103,7 @@ def reconcile_phase_1_timer_expiration(core: Core) -> str:
     12, "asked", sends=(ChainHashSuccessorQuery,), starts=("phase two",), tally="reconcile_response_dictionary"
 )
 def reconcile_phase_2(core: Core) -> str:
-    """Algorithm 12, Reconcile Phase 2: ask which block follows the mutual block."""
+    """Algorithm 12, Reconcile Phase 2: ask which block follows the newest block in common."""
     core.reconcile_response_dictionary.clear()
     core.reconcile_responders.clear()
     core.start(core.phase_two_timer, core.settings.phase2_timeout_s)
@@ -121,7 +121,7 @@ def reconcile_phase_2(core: Core) -> str:
     triggers=("Reconcile Begin",),
 )
 def receive_request_next_in_sequence(core: Core, sender: int, message: ChainHashSuccessorQuery) -> str:
-    """Algorithm 13, Receive Request Next in Sequence: name our successor, or find that our chain has diverged.
+    """Algorithm 13, Receive Request Next in Sequence: name the next block, or detect that the chain has diverged.
 
     The reconcile may begin while our own vote runs: the voting timer runs on, and Algorithm 5 then does nothing.
     """
@@ -148,7 +148,7 @@ def receive_request_next_in_sequence(core: Core, sender: int, message: ChainHash
     tally="reconcile_response_dictionary",
 )
 def receive_response_next_in_sequence(core: Core, sender: int, message: NextInSequenceResponse) -> str:
-    """Algorithm 14, Receive Response Next in Sequence: one dictionary of candidate -> [count, timestamp]."""
+    """Algorithm 14, Receive Response Next in Sequence: count an answer that names the next block."""
     if not core.phase_two_timer.active:
         return "not in phase 2"
     if message.chain_hash != core.chain.top_chain_hash:
@@ -166,13 +166,13 @@ def receive_response_next_in_sequence(core: Core, sender: int, message: NextInSe
 
 
 def most_named(candidates: Mapping[bytes, Sequence[int]]) -> list[bytes]:
-    """Return the candidates of phase 2 with the most votes: none without an answer, several in a tie."""
+    """Return the candidates of phase 2 with the most votes. There are several in a tie, and none without an answer."""
     most = max((count for count, _ in candidates.values()), default=0)
     return [candidate for candidate, (count, _) in candidates.items() if count == most]
 
 
 def without_minority_top(candidates: Mapping[bytes, Sequence[int]]) -> Mapping[bytes, Sequence[int]]:
-    """Return the candidates of phase 2, without "Is Top Of Chain" if a vote on this chain would not be approved.
+    """Return the candidates of phase 2, without "Is Top Of Chain" if too few agents named it for a majority.
 
     The responders that name a block would refuse the next proposed block (Algorithms 3 and 5). The asking agent counts
     for "Is Top Of Chain".
@@ -193,7 +193,7 @@ def without_minority_top(candidates: Mapping[bytes, Sequence[int]]) -> Mapping[b
     tally="majority_response_block_hash",
 )
 def reconcile_phase_2_timer_expiration(core: Core) -> str:
-    """Algorithm 15, Reconcile Phase 2 Timer Expiration: choose the plurality's answer.
+    """Algorithm 15, Reconcile Phase 2 Timer Expiration: choose the block that most answers named.
 
     In a tie the oldest timestamp decides, and with equal timestamps the lowest hash. With the setting `phase2_tie`
     "block", a tie never ends the search while a block is on offer. With `top_needs_majority`, only the majority of a
@@ -229,7 +229,7 @@ def reconcile_phase_2_timer_expiration(core: Core) -> str:
     triggers=("Reconcile Phase 2", "Reconcile Finalize"),
 )
 def reconcile_phase_3(core: Core) -> str:
-    """Algorithm 16, Reconcile Phase 3: take the block from the reconcile stack, or ask for it.
+    """Algorithm 16, Reconcile Phase 3: take the chosen block from the reconcile stack, or request it.
 
     The pseudo-code stops after a block from the stack. Section 3.5.3 step 4 continues with phase 2. Otherwise the
     reconcile would never end.
@@ -253,7 +253,7 @@ def reconcile_phase_3(core: Core) -> str:
 
 @event_handler(17, "reconcile in progress", "sent", "not held", sends=(BlockResponse,))
 def receive_request_block_for_hash(core: Core, sender: int, message: RequestForBlock) -> str:
-    """Algorithm 17, Receive Request Block for Hash: send the block if our chain has it."""
+    """Algorithm 17, Receive Request Block for Hash: send the block if the chain contains it."""
     if core.reconcile_in_progress:
         return "reconcile in progress"
     block = core.chain.get(message.block_hash)
@@ -285,7 +285,7 @@ def receive_response_block_for_hash(core: Core, sender: int, message: BlockRespo
 
 @event_handler(19, "gave up", triggers=("Reconcile Finalize",))
 def reconcile_phase_3_timer_expiration(core: Core) -> str:
-    """Algorithm 19, Reconcile Phase 3 Timer Expiration: no block came; keep what was rebuilt."""
+    """Algorithm 19, Reconcile Phase 3 Timer Expiration: end the reconcile, because the block did not arrive."""
     core.majority_response_block_hash = None
     core.trigger("Reconcile Finalize")
     return "gave up"

@@ -1,4 +1,4 @@
-"""UCP in scapy: a layer for the header, each message, blocks and events, to read captures and to craft packets.
+"""Layers of the packet library scapy for UCP headers, messages, blocks and events, to read captures and create packets.
 
     from scapy.all import IP, UDP, Ether, rdpcap
     from ucp.scapy import UCP, Block, BlockAddRequest, LoggableEvent
@@ -87,7 +87,7 @@ class HashField(XStrFixedLenField):
 
 
 class OptionalHashField(HashField):
-    """A hash at the end of a message. It is None if no bytes are left."""
+    """An optional hash at the end of a message. It is None if no bytes are left."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, None)
@@ -100,7 +100,7 @@ class OptionalHashField(HashField):
 
 
 class BlockTimestampField(LongField):
-    """The timestamp of a block. None stands for the timestamp of the block's newest event."""
+    """The timestamp of a block. None means the timestamp of the newest event in the block."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, None)  # type: ignore[arg-type]
@@ -112,7 +112,7 @@ class BlockTimestampField(LongField):
 
 
 class CiphertextField(XStrField):
-    """The bytes before the tag and the signature."""
+    """The encrypted bytes before the authentication tag and the signature."""
 
     def getfield(self, pkt: Packet, s: bytes) -> tuple[bytes, bytes]:
         return s[-SEAL_BYTES:], s[:-SEAL_BYTES]
@@ -133,12 +133,12 @@ _FIELDS: dict[Kind, Callable[[str], Any]] = {
 
 
 def _fields(declared: Fields, *last: Any, **special: Any) -> list[Any]:
-    """Return the scapy fields for declared fields, then `last`. `special` replaces declared fields by name."""
+    """Return the scapy fields for the declared fields, followed by `last`. `special` replaces some of them by name."""
     return [*(special[name] if name in special else _FIELDS[kind](name) for name, kind in declared.items()), *last]
 
 
 class LoggableEvent(Packet):
-    """One event of a block."""
+    """One event in a block."""
 
     name = "Loggable Event"
     fields_desc = _fields(
@@ -160,7 +160,7 @@ def _event_or_raw(block: Packet, before: list[Any], last: Packet | None, rest: b
 
 
 class Block(Packet):
-    """A block in a message. Event data that is not a run of whole events is Raw at the end of `events`."""
+    """A block in a message. Event data that are not whole events appear as Raw at the end of `events`."""
 
     name = "Block"
     fields_desc = _fields(
@@ -176,7 +176,7 @@ class Block(Packet):
 
 
 class UCP(Packet):
-    """The header. If they are omitted, `type` and `length` are computed from the message that follows."""
+    """The header of a message. If `type` and `length` are omitted, they are computed from the message that follows."""
 
     name = "UCP"
     fields_desc = _fields(
@@ -207,7 +207,7 @@ class UCP(Packet):
 
 
 class SecuredUCP(Packet):
-    """The clear header of a datagram of a secured mission. `length` is computed if it is omitted."""
+    """The unencrypted header of a datagram in a secured mission. `length` is computed if it is omitted."""
 
     name = "Secured UCP"
     fields_desc = _fields(
@@ -245,7 +245,7 @@ class Sealed(Packet):
 
 
 class Revocation(Packet):
-    """The agents whose keys are revoked, signed by the authority. `count` is computed if it is omitted."""
+    """A signed list of vehicles that are excluded from the mission. `count` is computed if it is omitted."""
 
     name = "Revocation"
     fields_desc = _fields(
@@ -288,7 +288,7 @@ class ChainHashSuccessorQuery(Packet):
 
 
 class NextInSequenceResponse(Packet):
-    """A response of phase 2. `block_hash` None stands for "Is Top Of Chain"."""
+    """An answer of reconcile phase 2. The `block_hash` None means "Is Top Of Chain"."""
 
     name = messages.NextInSequenceResponse.NAME
     fields_desc = _fields(messages.NextInSequenceResponse.WIRE)
@@ -324,12 +324,12 @@ bind_bottom_up(UDP, UCP, dport=PORT)
 
 
 def to_layer(message: Message) -> Packet:
-    """Return the layer of a message of the codec, to put after a UCP header."""
+    """Return a message as a scapy layer, which can follow a UCP header."""
     return LAYERS[type(message)](message.body())
 
 
 def opened(packet: Packet, opener: "Opener") -> Packet:
-    """Return the plain packet (UCP and a message) with the content of a secured packet.
+    """Return the decrypted packet (UCP header and message) for an encrypted one.
 
     Raises MalformedDatagramError with the reason if the keys do not open the packet.
     """
@@ -340,7 +340,9 @@ def opened(packet: Packet, opener: "Opener") -> Packet:
 
 
 def message_of(packet: Packet) -> tuple[int, int, Message]:
-    """Return (sender, sequence, message) of a packet, as the codec reads them. Raises MalformedDatagramError."""
+    """Return the (sender, sequence, message) of a packet. Raises MalformedDatagramError if it is not a valid
+    message.
+    """
     header = packet.getlayer(UCP)
     if header is None:
         raise MalformedDatagramError("no UCP")

@@ -1,4 +1,4 @@
-"""Missions that seal event data: their inception block ends with the public key of the depot.
+"""Find out whether a mission encrypts its event data. If so, the inception block ends with the public key of the depot.
 
 This module only reads and writes this key. `ucp.secure.sealing` seals.
 """
@@ -10,11 +10,13 @@ SEAL_BYTES = 48
 
 
 def sealed_to(initial_data: bytes) -> bytes | None:
-    """Return the depot's public key (X25519) in the data of an inception block. None if event data is not sealed."""
+    """Return the depot's public key (X25519) in the data of an inception block, or None if event data are not
+    encrypted.
+    """
     key = initial_data[-DEPOT_KEY_BYTES:]
     return key if initial_data[:-DEPOT_KEY_BYTES].endswith(DEPOT_TAG) else None
 
 
 def seal_to(initial_data: bytes, depot: bytes) -> bytes:
-    """Return the data of the inception block of a mission that seals event data with this public key."""
+    """Return inception block data with this public key, so that the mission encrypts its event data."""
     return initial_data + DEPOT_TAG + depot

@@ -1,4 +1,4 @@
-"""Settings of an agent: timers, sizes, readings of an ambiguous thesis, and changes of the protocol.
+"""The settings of an agent: timers, sizes, interpretations of ambiguous passages in the thesis, and protocol changes.
 
 Each setting is declared once, as a field of `Settings`. The declaration has its allowed values and its effect.
 Other modules read the declarations and do not name the settings: features, schemas, the table in contract/CONTRACT.md,
@@ -21,7 +21,7 @@ MAX_TIMER_S = 1e9
 
 @dataclass(eq=False, frozen=True, slots=True)
 class Number:
-    """The declaration of a setting that is a number."""
+    """The declaration of a setting whose value is a number."""
 
     sentence: str
     """What the setting does, for the table in contract/CONTRACT.md."""
@@ -37,7 +37,9 @@ class Number:
 
 @dataclass(eq=False, frozen=True, slots=True)
 class Choice:
-    """The declaration of a setting with few values. An agent needs a feature for each value except the default."""
+    """The declaration of a setting with a few possible values. An agent needs a feature for each value except the
+    default.
+    """
 
     sentence: str
     """What the setting does, for the table in contract/CONTRACT.md; for a boolean, what it does when it is true."""
@@ -52,7 +54,7 @@ class Choice:
 
     @property
     def allowed(self) -> str:
-        """The allowed values as text."""
+        """The allowed values of the setting, as text."""
         return "true or false" if self.values == (False, True) else f"one of {', '.join(map(str, self.values))}"
 
 
@@ -74,7 +76,9 @@ def _reading(sentence: str, constant: str, values: tuple[bool, ...] | tuple[str,
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Durations in mission seconds, sizes in bytes. Raises ValueError for impossible values."""
+    """The settings of an agent, with durations in mission seconds and sizes in bytes. Raises ValueError for impossible
+    values.
+    """
 
     vote_timeout_s: Annotated[float, _timer("Duration of the voting timer (Algorithm 2).")] = 10.0
     phase1_timeout_s: Annotated[float, _timer("Duration of the phase 1 timer (Algorithm 8).")] = 5.0
@@ -167,7 +171,8 @@ class Settings:
                 raise ValueError(f"{name} must be {choice.allowed}, not {shown(value)}")
 
     def to_json(self) -> dict[str, Any]:
-        """Return the settings for missions and traces, without those of `ADDED` that have their default.
+        """Return the settings as JSON for missions and traces. Newer settings (`ADDED`) with their default value are
+        omitted.
 
         An agent that does not know such a setting can then play a mission that does not need it.
         """

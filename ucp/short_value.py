@@ -1,4 +1,4 @@
-"""Show a value of external input in an error message, short and on one line."""
+"""Show a value of untrusted input in an error message, shortened to one line."""
 
 import reprlib
 
@@ -23,6 +23,6 @@ def shown_key(key: object) -> str:
 
 
 def shown(value: object) -> str:
-    """Return the `repr` of a value for an error message. A long one is shortened."""
+    """Return the `repr` of a value for an error message. A long text is shortened."""
     text = _Short().repr(value)
     return text if len(text) <= MAX_CHARACTERS else f"{text[: MAX_CHARACTERS - 3]}..."

@@ -13,7 +13,7 @@ from ucp.timers import Timer
 
 
 class AgentState:
-    """The blocks, questions and counters of an agent. `now` is the mission second of its last input."""
+    """The blocks, queries and counters of an agent. `now` is the mission second of its last input."""
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Settings) -> None:
         self.agent_id = agent_id
@@ -64,7 +64,7 @@ class AgentState:
 
     @property
     def idle(self) -> bool:
-        """True if no timer runs, no reconcile is in progress, and no triggered handler waits."""
+        """True if no timer runs, no reconcile is in progress, and no triggered handler waits to run."""
         if self.reconcile_in_progress:
             return False
         for timer in self.timers:

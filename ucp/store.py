@@ -1,4 +1,4 @@
-"""The store of an agent: its data on the disk of its vehicle, from which it continues after a power failure.
+"""Store the data of an agent on the disk of its vehicle, so that it can continue after a power failure.
 
 The store is a journal. An entry is a line: the CRC-32 of the rest in eight hexadecimal digits, a space, and JSON. The
 first entry identifies the agent. Each other entry has the changes by one input, as in a trace, and the new blocks. The
@@ -33,13 +33,13 @@ Change = tuple[str, str]
 
 
 class StoreError(Exception):
-    """A store that this agent must not change. The message is one sentence."""
+    """An error: this agent must not change the store. The message is one sentence."""
 
 
 @dataclass(slots=True)
 class SecuredState:
-    """Further data of a secured agent: the start of its incarnation in microseconds UTC, the signatures of blocks by
-    block hash, and the newest received revocation.
+    """Additional stored data of a secured agent: its start time, the signatures of blocks, and the newest list of
+    excluded vehicles.
     """
 
     started_us: int
@@ -47,7 +47,7 @@ class SecuredState:
     revocation: bytes | None = None
 
     def replay(self, entry: dict[str, Any]) -> None:
-        """Add the new data of an entry."""
+        """Add the new data of an entry in the file."""
         self.started_us = max(self.started_us, int(entry.get("started_us", 0)))
         new = {bytes.fromhex(name): base64.b64decode(text) for name, text in entry.get("signatures", {}).items()}
         self.signatures = {**self.signatures, **new}
@@ -55,7 +55,7 @@ class SecuredState:
             self.revocation = base64.b64decode(revocation)
 
     def entry(self, before: "SecuredState | None" = None) -> dict[str, Any]:
-        """Return the data that is new since `before`, for an entry."""
+        """Return the data that are new since `before`, as an entry for the file."""
         new: dict[str, Any] = {}
         if before is None:
             new["started_us"] = self.started_us
@@ -69,7 +69,7 @@ class SecuredState:
 
 @dataclass(slots=True)
 class StoredState:
-    """The blocks of an agent by place, and the hashes of the blocks that it completed.
+    """The stored blocks of an agent by place, and the hashes of the blocks that it completed.
 
     The chain has its oldest block first, the deque its front first, the stack its top last. `secured` is None without
     keys.
@@ -93,17 +93,17 @@ class StoredState:
         yield from self.stack
 
     def encode(self) -> bytes:
-        """Return the data of all blocks, of chain, deque and stack in this order, each after its length (u16)."""
+        """Return the blocks of chain, deque and reconcile stack, in this order. Each follows its length (u16)."""
         return b"".join(len(data).to_bytes(2, "big") + data for data in (block.block_data() for block in self.blocks()))
 
     def check(self) -> None:
-        """Raise ValueError for an impossible state."""
+        """Raise ValueError if no agent can be in this state."""
         held = [block.block_hash for block in self.blocks()]
         if len({*held}) < len(held) or not {*self.completed} <= {*held}:
             raise ValueError("a block is in two places, or one that it completed in none")
 
     def _change(self, operation: str, block: Block) -> None:
-        """Apply a change, as in a trace."""
+        """Apply one change, which has the same form as in a trace."""
         match operation:
             case "complete":
                 self.completed.append(block.block_hash)
@@ -121,7 +121,9 @@ class StoredState:
                 self.stack.remove(block)
 
     def replay(self, entry: dict[str, Any], known: dict[str, Block]) -> None:
-        """Apply all changes of an entry, and add its blocks to `known`, the blocks of earlier entries by hash."""
+        """Apply all changes of an entry in the file, and add its blocks to `known`, an index of all blocks so far by
+        hash.
+        """
         for agent_id, timestamp_us, event_data in entry["blocks"]:
             block = block_on_disk(agent_id, timestamp_us, base64.b64decode(event_data))
             known[block.block_hash.hex()] = block
@@ -134,7 +136,8 @@ class StoredState:
 
 
 class Store:
-    """The store of an agent in the file `path`. Raises OSError, or StoreError for another file.
+    """The stored data of an agent in the file `path`. Raises OSError, or StoreError if the file belongs to another
+    agent.
 
     `state` is the state of the agent. `recovered` is the data of an earlier incarnation, or None.
     """
@@ -175,7 +178,7 @@ class Store:
         return stored
 
     def write(self, changes: list[Change], secured: SecuredState | None = None) -> None:
-        """Write the changes by one input to the disk. The first changes of an incarnation contain the recovered data.
+        """Write the changes of one input to the disk. The first write after a start also contains the restored data.
 
         The entry also has the new data of a `secured` agent.
         """
@@ -202,7 +205,7 @@ class Store:
         self._written.update(new)
 
     def _replace_journal(self, lines: bytes) -> BinaryIO:
-        """Replace the journal by a new one that begins with these lines."""
+        """Replace the file by a new one that begins with these lines."""
         temporary = self._path.with_name(f".{self._path.name}.new")
         file = temporary.open("wb", buffering=0)
         try:
@@ -230,7 +233,7 @@ class Store:
 
 
 def read_store(path: Path) -> tuple[Any, StoredState]:
-    """Return the header of a store, and the state that its whole entries lead to. The header is None without any entry.
+    """Return the header of a store, or None if it is empty, and the state after all complete entries.
 
     Raises OSError, or StoreError for an entry with the right checksum that no agent wrote.
     """
@@ -250,7 +253,7 @@ def read_store(path: Path) -> tuple[Any, StoredState]:
 
 
 def block_on_disk(agent_id: int, timestamp_us: int, event_data: bytes) -> Block:
-    """Return a block from the disk. Raises ValueError if it is invalid, or too large for a message."""
+    """Return a block that was read from the disk. Raises ValueError if it is invalid, or too large for a message."""
     try:
         return decode_block(BLOCK_HEADER.pack(agent_id, timestamp_us) + event_data)
     except struct.error as error:
@@ -263,14 +266,14 @@ def _line(document: dict[str, Any]) -> bytes:
 
 
 def _append(file: BinaryIO, lines: bytes) -> None:
-    """Write the lines to the disk. Raises OSError."""
+    """Append the lines to the file, and make sure that they are on the disk. Raises OSError."""
     if file.write(lines) != len(lines):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     os.fdatasync(file.fileno())
 
 
 def _sync_directory(path: Path) -> None:
-    """Write the names of the files in a directory to the disk."""
+    """Make sure that the names of new files in a directory are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -279,7 +282,7 @@ def _sync_directory(path: Path) -> None:
 
 
 def _entries(path: Path) -> Iterator[Any]:
-    """Yield the entries of a store up to the first damaged one; none without a store.
+    """Yield the entries of a store up to the first damaged one. A missing file has no entries.
 
     Raises OSError, or ValueError or RecursionError for an undamaged entry that is not JSON.
     """

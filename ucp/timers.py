@@ -1,8 +1,10 @@
-"""The timer of the thesis (Section 3.2). It expires once, and can be paused and resumed. Time is an argument."""
+"""A timer as in the thesis (Section 3.2). It expires once, and can be paused and resumed. The caller passes the
+time.
+"""
 
 
 class Timer:
-    """A timer. `deadline` is in mission seconds, and None while the timer is stopped or paused."""
+    """A timer. `deadline` is a mission second, or None while the timer is stopped or paused."""
 
     __slots__ = ("_paused", "deadline", "name")
 
@@ -28,7 +30,7 @@ class Timer:
             self.deadline = None
 
     def resume(self, now: float) -> None:
-        """Continue from the pause. Resumed at the same instant, it has exactly the same deadline."""
+        """Continue after a pause. If no time has passed since then, the deadline is exactly the same as before."""
         if self._paused is not None:
             paused_at, deadline = self._paused
             self.deadline = deadline + (now - paused_at)

@@ -1,4 +1,4 @@
-"""The trace of an agent: a line of JSON for each handler run, and for each other input.
+"""The trace of an agent. It has a line of JSON for each handler run, and for each input that runs no handler.
 
 A trace has all inputs in full, including dropped datagrams, so the agent can run again from it. `changes` is complete:
 a replay of the changes gives the contents of chain, deque and reconcile stack after each step.
@@ -22,13 +22,14 @@ Tally = dict[str, int | list[int]]
 
 
 class Encodable(Protocol):
-    """A datagram, an event, or a store."""
+    """An object that can be converted to bytes: a datagram, an event, or a store."""
 
     def encode(self) -> bytes: ...
 
 
 class RecordedBytes:
-    """Recorded bytes: `text` is base64, and `content` the decoded object, None if it was read from a trace.
+    """Recorded bytes. `text` is their base64 form. `content` is the decoded object, or None if the bytes come from a
+    file.
 
     Sender and receivers of a datagram share one object.
     """
@@ -36,7 +37,7 @@ class RecordedBytes:
     __slots__ = ("_text", "content")
 
     def __init__(self, text: str | None = None, content: Encodable | None = None) -> None:
-        """Create a record from its base64 text or its decoded object. One of them is enough."""
+        """Create the object from base64 text or from a decoded object. One of them is enough."""
         self._text = text
         self.content = content
 
@@ -64,14 +65,14 @@ class RecordedBytes:
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> dict[str, Any]:
-        """Read the record from a string of a trace line."""
+        """Let pydantic read the object from a string in a trace line."""
         made = {"type": "no-info", "function": cls}
         return {"type": "function-after", "function": made, "schema": handler(str)}
 
 
 @dataclass(slots=True)
 class SentMessage:
-    """A sent message. `block` is the hash of the block that it concerns, or None.
+    """A sent message in a trace line. `block` is the hash of the block that it concerns, or None.
 
     `datagram` is None in a trace of version 1, which lacks it.
     """
@@ -90,7 +91,7 @@ class SentMessage:
 
 @dataclass(slots=True)
 class StateSummary:
-    """A summary of the state: lengths of chain, deque and reconcile stack, flags, and the top chain hash."""
+    """The summary of an agent's state in a trace line: numbers of blocks, flags, and the top chain hash."""
 
     chain: int
     deque: int
@@ -169,7 +170,7 @@ class HandlerRun:
 
 @dataclass(slots=True)
 class DroppedDatagram:
-    """A datagram that the agent dropped, and the reason."""
+    """A trace line about a datagram that the agent dropped, with the reason."""
 
     t: float
     dropped: str
@@ -181,7 +182,7 @@ class DroppedDatagram:
 
 @dataclass(slots=True)
 class CommandEntry:
-    """A command that triggers no handler, with its arguments."""
+    """A trace line about a command that triggers no handler, with its arguments."""
 
     t: float
     command: str

@@ -1,4 +1,4 @@
-"""Triggers: the reasons why a handler runs, one class for each kind.
+"""Define triggers, the reasons why a handler runs. Each kind has its own class.
 
 A trace writes a trigger as a JSON object (`to_json`). `parse` reads one, and pydantic does so wherever a field has the
 type `Trigger`. An object that names no kind, several kinds, or a kind with missing or wrong values is an
@@ -19,11 +19,11 @@ class Trigger:
 
     @property
     def subject(self) -> int | str:
-        """The value of the key `kind`: a message's or timer's name, an event ID, and so on."""
+        """The value of the key `kind`, for example the name of a message or timer, or an event ID."""
         raise NotImplementedError
 
     def to_json(self) -> dict[str, int | str]:
-        """Return the trigger as a trace has it."""
+        """Return the trigger as a JSON object for a trace."""
         return {self.kind: self.subject}
 
     @classmethod
@@ -34,7 +34,7 @@ class Trigger:
 
 @dataclass(unsafe_hash=True, slots=True)
 class MessageTrigger(Trigger):
-    """A message arrived: its name, its sender's agent ID, and the sender's sequence number."""
+    """A trigger: a message arrived. It has the message's name, its sender's ID, and the sequence number."""
 
     message: str
     sender: int
@@ -52,7 +52,7 @@ class MessageTrigger(Trigger):
 
 @dataclass(unsafe_hash=True, slots=True)
 class EventTrigger(Trigger):
-    """The vehicle logged an event."""
+    """A trigger: the vehicle logged an event."""
 
     event_id: int
 
@@ -65,7 +65,7 @@ class EventTrigger(Trigger):
 
 @dataclass(unsafe_hash=True, slots=True)
 class TimerTrigger(Trigger):
-    """A timer expired."""
+    """A trigger: a timer expired."""
 
     timer: str
 
@@ -78,7 +78,7 @@ class TimerTrigger(Trigger):
 
 @dataclass(unsafe_hash=True, slots=True)
 class LocalTrigger(Trigger):
-    """Another handler, named here, triggered a local event."""
+    """A trigger: another handler, whose name is stored here, triggered a local event."""
 
     handler: str
 
@@ -91,7 +91,7 @@ class LocalTrigger(Trigger):
 
 @dataclass(unsafe_hash=True, slots=True)
 class OperatorTrigger(Trigger):
-    """The operator gave a command: `reconcile`."""
+    """A trigger: the operator gave the command `reconcile`."""
 
     command: str
 
@@ -104,7 +104,7 @@ class OperatorTrigger(Trigger):
 
 @dataclass(unsafe_hash=True, slots=True)
 class BootTrigger(Trigger):
-    """The agent booted, and found a chain of `blocks` blocks on its disk."""
+    """A trigger: the agent started, and found a chain of `blocks` blocks on its disk."""
 
     blocks: int
 
@@ -117,7 +117,7 @@ class BootTrigger(Trigger):
 
 @dataclass(slots=True)
 class UnknownTrigger(Trigger):
-    """An object that is no trigger of the contract; `fields` is the object."""
+    """A trigger that the agent contract does not define. `fields` is the whole JSON object."""
 
     fields: Mapping[str, int | str]
 
@@ -144,7 +144,7 @@ KINDS = frozenset(("message", *_OF_ONE_VALUE))
 
 
 def parse(fields: Mapping[str, int | str]) -> Trigger:
-    """Return the trigger of an object in a trace. It is an `UnknownTrigger` if it has no valid key."""
+    """Return the trigger that a JSON object of a trace describes. Without a valid key, it is an `UnknownTrigger`."""
     kinds = KINDS.intersection(fields)
     if len(kinds) != 1:
         return UnknownTrigger(fields)

@@ -1,4 +1,4 @@
-"""One agent in virtual time: `python -m ucp.node --virtual`.
+"""Run one agent in virtual time: `python -m ucp.node --virtual`.
 
 The program reads lines of JSON from standard input. Each line has an input and its time. The program answers with a
 line on standard output: its broadcasts, the time of its next timer, and its trace lines. It has no socket, no file and
@@ -36,7 +36,7 @@ MAX_LINE_BYTES = 16 * MAX_MISSION_BYTES
 
 
 class InputError(Exception):
-    """A line that is no valid input. The message is one sentence."""
+    """An error: a line is not a valid input. The message is one sentence."""
 
     def __init__(self, sentence: str, *, unsupported: bool = False) -> None:
         super().__init__(sentence)
@@ -44,7 +44,7 @@ class InputError(Exception):
 
 
 def serve(lines: BinaryIO, answers: BinaryIO) -> None:
-    """Answer each line until the end of the input."""
+    """Read lines with inputs, and write the answer to each, until the input ends."""
     agent: VirtualAgent | None = None
     while line := lines.readline(MAX_LINE_BYTES):
         try:
@@ -64,7 +64,7 @@ def serve(lines: BinaryIO, answers: BinaryIO) -> None:
 
 
 class VirtualAgent:
-    """One incarnation of an agent. It begins with the line `{"t", "mission", "trace", "store"}`. Raises InputError."""
+    """An agent from its start to its end. Its first line is `{"t", "mission", "trace", "store"}`. Raises InputError."""
 
     def __init__(self, given: dict[str, Any]) -> None:
         try:
@@ -105,7 +105,9 @@ class VirtualAgent:
             self._agent.boot(_parse_store(given["store"], secured=self._secured), now)
 
     def give(self, given: dict[str, Any]) -> None:
-        """Handle one input. Raises InputError for a refused input, which changes nothing, not even the agent's time."""
+        """Handle one input. Raises InputError if it is refused. A refused input changes nothing, not even the agent's
+        time.
+        """
         earlier = self._now
         try:
             self._give(given, self._advance(given))
@@ -127,7 +129,7 @@ class VirtualAgent:
             raise InputError("neither a mission, a datagram, an event, a timer nor a command")
 
     def answer(self) -> str:
-        """Return the results of the last input as a line."""
+        """Return the results of the last input as one line of text."""
         entries = [*self._agent.trace(), *self._traced_commands]
         self._traced_commands = []
         self._handled += sum(isinstance(entry, HandlerRun) for entry in entries)
@@ -255,7 +257,7 @@ _COMMANDS: dict[str, Callable[[VirtualAgent, dict[str, Any], float], dict[str, A
 
 
 def _agent_factory(mission: Mission, given: dict[str, Any]) -> Callable[..., Agent]:
-    """Return a function that makes the agent of the mission, with the arguments of Agent. Raises InputError."""
+    """Return a function that creates the agent of the mission. Its arguments are those of Agent. Raises InputError."""
     if mission.security is None:
         return Agent
     try:
@@ -303,7 +305,7 @@ def _store_document(stored: StoredState) -> dict[str, Any]:
 
 
 def _parse_store(value: Any, *, secured: bool) -> StoredState:
-    """Parse the answer to the command `store`. Raises InputError."""
+    """Parse stored data in the form of the command `store`'s answer. Raises InputError."""
 
     def blocks(place: str) -> list[Block]:
         return [
@@ -324,6 +326,6 @@ def _parse_store(value: Any, *, secured: bool) -> StoredState:
 
 
 def main() -> int:
-    """Serve until the end of standard input. The exit status is 0."""
+    """Answer input lines until the end of standard input. The exit status is 0."""
     serve(sys.stdin.buffer, sys.stdout.buffer)
     return 0

@@ -1,4 +1,4 @@
-"""Kinds of fields on the wire.
+"""Kinds of fields in encoded messages.
 
 Messages, blocks and events declare their fields with names and kinds, in the order on the wire. `ucp.scapy` makes its
 layers from these declarations. Tests compare the codec and the Wireshark dissector with them.
@@ -10,7 +10,9 @@ from struct import Struct
 
 
 class Kind(Enum):
-    """The kind of a field. The value of a fixed size is its format in Python's `struct`, big-endian."""
+    """The kind of a field in a message. For a field of fixed size, the value is its format in Python's `struct`,
+    big-endian.
+    """
 
     U8 = "B"
     U16 = "H"
@@ -35,5 +37,5 @@ VARIABLE = frozenset((Kind.OPTIONAL_HASH, Kind.BLOCK))
 
 
 def struct_of(fields: Fields) -> Struct:
-    """Return a struct that packs and unpacks fields of fixed size in their order."""
+    """Return a `struct.Struct` that packs and unpacks these fields of fixed size in their order."""
     return Struct("!" + "".join(kind.value for kind in fields.values()))

@@ -1,1 +1,1 @@
-"""The agent contract: its text, schemas, test vectors, specification, dissector and example agents."""
+"""The agent contract: its text, JSON schemas, test vectors, specification, Wireshark dissector and example agents."""

@@ -1,4 +1,4 @@
-"""Wrong agents: mistakes that an agent makes on request. They show which checks find which mistakes.
+"""Deliberate errors (quirks) that an agent makes on request. They show which checks detect which errors.
 
 A quirk replaces a handler, or a helper that handlers use. An agent has quirks only if its mission, its scenario or the
 command `quirk` names them. The thesis's own mistakes are among them: `ignore_commit` (Section 4.2), and `crash_on_tie`,
@@ -42,11 +42,11 @@ MAX_NAME = 40
 
 
 class UnknownQuirkError(ValueError):
-    """The name of a quirk is unknown."""
+    """An error: no deliberate error has this name."""
 
 
 def check_quirk(name: str, value: object) -> None:
-    """Raise UnknownQuirkError if the name is unknown, and ValueError if the quirk cannot have this value."""
+    """Raise UnknownQuirkError if no deliberate error has this name, and ValueError if it cannot have this value."""
     if name not in QUIRKS:
         name = name[:MAX_NAME]
         near = ", ".join(get_close_matches(name, QUIRKS, cutoff=0.0))
@@ -55,12 +55,12 @@ def check_quirk(name: str, value: object) -> None:
 
 
 def active_quirks(quirks: Mapping[str, bool | float]) -> dict[str, float]:
-    """Return the quirks that are neither false nor 0. An agent with no active quirk is correct."""
+    """Return the deliberate errors that are switched on, that is, neither false nor 0."""
     return {name: float(quirks[name]) for name in QUIRKS if quirks.get(name)} if quirks else {}
 
 
 def wrong_handlers(quirks: Mapping[str, bool | float], rng: Random) -> list[EventHandler[Any]]:
-    """Return all handlers of an agent with these quirks. The list is empty if no quirk is active.
+    """Return all handlers of an agent with these deliberate errors. The list is empty if none is switched on.
 
     The handlers draw random numbers from `rng`.
     """

@@ -1,4 +1,4 @@
-"""Mistakes in building and committing blocks (Algorithms 1 to 6)."""
+"""Deliberate errors in building and committing blocks (Algorithms 1 to 6)."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -249,7 +249,7 @@ def commit_twice(commit: Helper, core: Core, block: Block) -> None:
 
 
 class UnguardedChain(Chain):
-    """A chain that accepts a block twice."""
+    """A chain that accepts the same block twice."""
 
     def append(self, block: Block) -> None:
         self._block_of_hash.pop(block.block_hash, None)

@@ -1,4 +1,4 @@
-"""A quirk: one mistake of an implementation. A few lines replace a good handler, or a method of the core.
+"""Define a quirk: a deliberate error that replaces a correct handler, or an operation of the agent, by a wrong one.
 
     @quirk(4)
     def count_votes_twice(good: Handler, core: Core, sender: int, message: BlockAddResponse) -> str:
@@ -36,7 +36,7 @@ CRASHED = "crashed by quirk"
 
 @dataclass(frozen=True, eq=False)
 class Quirk:
-    """One mistake. `wrong` replaces the handlers of `algorithms`, or the core's method `helper` for these handlers.
+    """A deliberate error. `wrong` replaces the handlers of `algorithms`, or the operation `helper` in these handlers.
 
     `branches`, `sends`, `starts` and `triggers` list the branches, messages, timers and events of the wrong handlers
     that the good handlers lack. If `chance` is true, the value of the quirk is a probability 0..1, and `wrong` receives
@@ -56,7 +56,7 @@ class Quirk:
     chance: bool
 
     def check(self, value: object) -> None:
-        """Raise ValueError if the quirk cannot have this value. The message is one sentence."""
+        """Raise ValueError if this deliberate error cannot have this value. The message is one sentence."""
         if not self.chance:
             if not isinstance(value, bool):
                 raise ValueError(f"{self.name} must be true or false, not {shown(value)}")
@@ -116,7 +116,7 @@ def quirk(
     triggers: tuple[LocalEvent, ...] = (),
     chance: bool = False,
 ) -> Callable[[Callable[..., Any]], Quirk]:
-    """Turn a function into a quirk of these Algorithms. Its name and docstring become those of the quirk."""
+    """Return a decorator that declares a function as a deliberate error. Its docstring becomes the description."""
 
     def declare(wrong: Callable[..., Any]) -> Quirk:
         sentence = " ".join((wrong.__doc__ or "").split())
@@ -128,7 +128,7 @@ def quirk(
 
 
 def catch_exceptions(handler: EventHandler[Any]) -> EventHandler[Any]:
-    """Return the handler with a branch for exceptions.
+    """Return a handler that also has a branch for exceptions.
 
     An exception ends the handler run, and the agent continues, as in the field tests of the thesis.
     """

@@ -1,4 +1,4 @@
-"""Mistakes in reconciling (Algorithms 7 to 20)."""
+"""Deliberate errors in reconciling (Algorithms 7 to 20)."""
 
 from dataclasses import replace
 

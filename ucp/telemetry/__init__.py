@@ -1,4 +1,4 @@
-"""The `mavlink` event source: it turns the telemetry of a vehicle into loggable events.
+"""The event source `mavlink`: it converts the MAVLink telemetry of a vehicle to loggable events.
 
 `TelemetryEvents` translates the bytes of a vehicle into pairs of event ID and data. Time is an argument, and it does no
 I/O. `VehicleConnection` connects to the vehicle and passes its bytes to the translator. `describe` returns the data of

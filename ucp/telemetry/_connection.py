@@ -1,4 +1,4 @@
-"""The connection to a vehicle. It requests MAVLink messages and passes the received bytes on."""
+"""Connect to a vehicle, request MAVLink messages, and forward the received bytes."""
 
 import contextlib
 import socket
@@ -24,7 +24,7 @@ _FIRST_REQUEST_S, _LAST_REQUEST_S = 1.0, 30.0
 
 
 class VehicleConnection:
-    """Passes all bytes of the vehicle at `host`:`port` to `sink`, until `close`.
+    """A connection to the vehicle at `host`:`port`. It passes all received bytes to `sink` until `close` is called.
 
     It tries to connect until the vehicle accepts, requests the messages that `TelemetryEvents` needs, and connects
     again after a restart of the vehicle.
@@ -41,7 +41,7 @@ class VehicleConnection:
         self._connect()
 
     def close(self) -> None:
-        """Close the connection and stop trying to connect. `sink` is not called any more."""
+        """Close the connection and stop trying to connect. Afterwards `sink` is no longer called."""
         if self._retry_timer is not None:
             self._retry_timer.cancel()
         if self._socket is not None:
@@ -92,7 +92,7 @@ class VehicleConnection:
             self._retry()  # after a pause, because a port may accept each connection and close it at once
 
     def _request_messages(self, pause_s: float) -> None:
-        """Request the messages, and repeat the requests with growing pauses.
+        """Request the MAVLink messages, and repeat the requests with growing pauses.
 
         A vehicle that is booting acknowledges a request and may forget it.
         """

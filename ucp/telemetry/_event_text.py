@@ -1,4 +1,4 @@
-"""The data of `mavlink` events as text."""
+"""Describe the data of `mavlink` events as text."""
 
 import math
 import struct
@@ -15,7 +15,7 @@ _STATES = (  # MAV_STATE
 
 
 def vehicle_type(event_id: int, data: bytes) -> int | None:
-    """Return the MAV_TYPE that an event holds. None if it holds none."""
+    """Return the vehicle type (MAV_TYPE) that an event contains, or None if it contains none."""
     if event_id != _records.MODE_CHANGE or len(data) != _records.MODE_CHANGE_DATA.size:
         return None
     kind: int = _records.MODE_CHANGE_DATA.unpack(data)[1]
@@ -23,7 +23,7 @@ def vehicle_type(event_id: int, data: bytes) -> int | None:
 
 
 def describe(event_id: int, data: bytes, of_type: int | None = None) -> str:
-    """Describe an event of this source in words. Return 'unreadable' for any other data.
+    """Return a description of a `mavlink` event. For any other data, return 'unreadable'.
 
     `of_type` is the MAV_TYPE of the vehicle. Without it, some events have the number of a mode and not its name.
     """

@@ -1,4 +1,4 @@
-"""Names of ArduPilot's flight modes (custom_mode) by MAV_TYPE.
+"""Names of ArduPilot's flight modes (custom_mode) by vehicle type (MAV_TYPE).
 
 Source: ArduPilot's documentation of the parameters FLTMODE1 (Copter, Plane) and MODE1 (Rover).
 """
@@ -83,5 +83,5 @@ _BY_TYPE = {
 
 
 def mode_name(mode: int, vehicle_type: int) -> str:
-    """Return the name of a mode, or its number if it has no name."""
+    """Return the name of a flight mode, or its number if it has no name."""
     return _BY_TYPE.get(vehicle_type, {}).get(mode, str(mode))

@@ -1,4 +1,4 @@
-"""Event IDs of the `mavlink` source and the layout of their data. The package's docstring has a table of them."""
+"""Event IDs of the `mavlink` source, and the layout of their data. A table is in the docstring of the package."""
 
 import struct
 from typing import NamedTuple
@@ -44,7 +44,7 @@ _POSITION_DATA = struct.Struct(">IQiiiihhhHfffhhhHhbIB")
 
 
 class Position(NamedTuple):
-    """A position record, with the order and the units of its data: `>IQiiiihhhHfffhhhHhbIB`, 64 bytes."""
+    """A position event. The fields have the order and units of the encoded data: `>IQiiiihhhHfffhhhHhbIB`, 64 bytes."""
 
     vehicle_ms: int
     clock_us: int  # the vehicle's clock, microseconds since the Unix epoch; 0: unknown
@@ -73,12 +73,12 @@ class Position(NamedTuple):
 
     @classmethod
     def unpack(cls, data: bytes) -> "Position":
-        """Parse a position record. Raises struct.error unless `data` has 64 bytes."""
+        """Parse the data of a position event. Raises struct.error unless `data` has 64 bytes."""
         return cls._make(_POSITION_DATA.unpack(data))
 
 
 def position_of(event_id: int, data: bytes) -> Position | None:
-    """Return the position in an event. None if it is another event, is unreadable, or is out of range."""
+    """Return the position in an event, or None if it is another event, cannot be read, or is out of range."""
     if event_id != POSITION:
         return None
     try:

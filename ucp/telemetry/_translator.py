@@ -1,4 +1,4 @@
-"""Translate a MAVLink stream into loggable events, without I/O and without a clock."""
+"""Convert a MAVLink byte stream to loggable events, without I/O and without a clock."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _CANNOT_FLY = frozenset({10, 11})  # MAV_TYPE_GROUND_ROVER, MAV_TYPE_SURFACE_BOA
 
 
 class TelemetryEvents:
-    """Translates the MAVLink stream of one vehicle into events.
+    """Converts the MAVLink byte stream of one vehicle to events.
 
     `garbage` counts the unreadable parts of the stream.
     """
 
     def __init__(self, position_interval_s: float, rng: random.Random, log: Iterable[EventKind] = DEFAULT_LOG) -> None:
-        """Start without a known mode or position.
+        """Create the converter. It begins without a known flight mode or position.
 
         `position_interval_s` is the mean time between two position events in mission seconds. Each interval is drawn
         from `rng` between 0.5 and 1.5 times the mean. With equal intervals, all vehicles would complete their blocks at
@@ -64,7 +64,7 @@ class TelemetryEvents:
         self._clock_us = 0
 
     def receive(self, data: bytes, now: float) -> list[tuple[int, bytes]]:
-        """Return the events in the next bytes of the vehicle. Messages may be split at any byte.
+        """Return the events in the next bytes from the vehicle. A message may be split over several calls.
 
         `now` is the mission second, and never decreases. Malformed bytes are counted and raise nothing.
         """
@@ -107,7 +107,7 @@ class TelemetryEvents:
                 self._waypoint(message.seq, events)
 
     def _reset_after_reboot(self) -> None:
-        """Forget the position, estimate and mission item of the vehicle, because it has rebooted."""
+        """Forget the position, estimate and mission item of the vehicle after it has rebooted."""
         self._status = self._attitude = self._next_item = self._home_error = None
         self._logged_prearm.clear()
 
@@ -148,7 +148,7 @@ class TelemetryEvents:
             events.append((_records.BATTERY, _records.BATTERY_DATA.pack(self._vehicle_ms, *battery)))
 
     def _status_text(self, message: Any, events: list[tuple[int, bytes]]) -> None:
-        """Collect the chunks of a text. MAVLink 2 sends long texts in chunks of 50 characters with the same ID.
+        """Collect the parts of a text message. MAVLink 2 sends long texts in parts of 50 characters with the same ID.
 
         The last chunk is shorter.
         """
@@ -170,7 +170,7 @@ class TelemetryEvents:
         events.append((_records.STATUS_TEXT, head + text.encode()))
 
     def _waypoint(self, reached: int, events: list[tuple[int, bytes]]) -> None:
-        """Add the event that the vehicle reached an item of its mission.
+        """Add an event: the vehicle reached an item of its mission.
 
         ArduPilot 4.7 reports the last command after the reached waypoint, for example a change of speed. The event
         therefore has the number of the current item of MISSION_CURRENT if it is lower. Item 0 is home. It is the
@@ -182,7 +182,7 @@ class TelemetryEvents:
             events.append((_records.WAYPOINT, _records.WAYPOINT_DATA.pack(self._vehicle_ms, item)))
 
     def _estimate_is_good(self) -> bool:
-        """Return whether the vehicle reports a good estimate. Firmware that does not report it counts as good."""
+        """Return true if the vehicle reports a good position estimate. Firmware without such reports counts as good."""
         if self._status is None:
             return False
         reported = self._status.onboard_control_sensors_present & self._estimate_bit
@@ -229,24 +229,28 @@ class TelemetryEvents:
 
 
 class _HomeError:
-    """The error of a vehicle's height above home, computed from its first good position.
+    """The error of a vehicle's height above its home position, computed from its first good position.
 
     A rover of ArduPilot 4.7 sets its home before it knows its altitude, and afterwards reports a height of 584 m above
     home.
     """
 
     def __init__(self, message: Any, on_ground: bool) -> None:
-        """`on_ground` is true if the vehicle is on the ground, because it is not armed or cannot fly."""
+        """Compute the error. `on_ground` is true if the vehicle is not armed or cannot fly."""
         self._home_mm = message.alt - message.relative_alt
         self._error_mm = message.relative_alt if on_ground and abs(message.relative_alt) > _HOME_ERROR_MM else 0
 
     def height_mm(self, message: Any) -> int:
-        """Return the height above home, corrected until the vehicle sets its home to another altitude."""
+        """Return the corrected height above home in millimetres. The correction ends when the vehicle changes its home
+        altitude.
+        """
         moved_mm = abs(message.alt - message.relative_alt - self._home_mm)
         height_mm = message.relative_alt - (self._error_mm if moved_mm <= _HOME_MOVED_MM else 0)
         return int(max(-(2**31), min(2**31 - 1, height_mm)))
 
 
 def _thousandths(value: float) -> int:
-    """Return thousandths as a signed 16-bit number. Larger values are set to the limit, and NaN to 0."""
+    """Return the value in thousandths as a signed 16-bit number. Too large values become the limit, and NaN becomes
+    0.
+    """
     return 0 if math.isnan(value) else round(max(-32.768, min(32.767, value)) * 1000)

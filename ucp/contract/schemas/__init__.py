@@ -1,4 +1,4 @@
-"""JSON Schemas (draft 2020-12) of the JSON documents of the agent contract. `harness.json_schemas` writes the files.
+"""Generate the JSON Schemas (draft 2020-12) of all JSON documents in the agent contract.
 
 The schemas describe the input and output of a correct agent. They allow additional keys wherever CONTRACT.md requires
 readers to ignore them.
@@ -28,5 +28,5 @@ DOCUMENTS: dict[str, Callable[[], dict[str, Any]]] = {
 
 
 def generate(name: str) -> dict[str, Any]:
-    """Return the schema of a document."""
+    """Return the JSON schema of the document with this name."""
     return {"$schema": DIALECT, "title": name, **DOCUMENTS[name]()}

@@ -1,4 +1,4 @@
-"""The schema of the chain export (`ucp-chain-export/1`)."""
+"""The JSON schema of the chain export (`ucp-chain-export/1`)."""
 
 from ucp.contract.schemas._schema_parts import (
     AGENT_ID,
@@ -19,7 +19,7 @@ SIGNATURE: Schema = {**BASE64, "minLength": 88, "maxLength": 88}
 
 
 def block(chain_hash: Schema) -> Schema:
-    """Return the schema of a block. Blocks in deque and stack have no chain hash."""
+    """Return the JSON schema of a block. Blocks in the deque and the reconcile stack have no chain hash."""
     return record(
         {
             "agent_id": AGENT_ID,
@@ -51,7 +51,7 @@ HEAD: Schema = record(
 
 
 def schema() -> Schema:
-    """Return the schema of a chain export."""
+    """Return the JSON schema of a chain export."""
     uncommitted = listed(block({"type": "null"}))
     return record(
         {

@@ -1,4 +1,4 @@
-"""The schemas of requests and answers of the control socket."""
+"""The JSON schemas of requests to an agent's control socket, and of their answers."""
 
 from ucp.contract.schemas._schema_parts import BASE64, COUNT, EVENT_ID, FLAG, HASH, SECONDS, Schema, record
 from ucp.mission import LATEST_EPOCH_US
@@ -44,12 +44,12 @@ REFUSED: Schema = record(
 
 
 def request(*commands: str) -> Schema:
-    """Return the schema of a request with one of these commands."""
+    """Return the JSON schema of a request with one of these commands."""
     return {"oneOf": [record({"command": {"const": command}, **REQUESTS[command]}) for command in commands]}
 
 
 def answer(command: str) -> Schema:
-    """Return the schema of the answer to a command."""
+    """Return the JSON schema of the answer to a command."""
     success = {
         "status": record(DONE | STATUS | MAY_BE_MISSING, optional=tuple(MAY_BE_MISSING)),
         "export": record({**DONE, "path": {"type": "string"}}),
@@ -58,7 +58,9 @@ def answer(command: str) -> Schema:
 
 
 def schema() -> Schema:
-    """Return the schema of an exchange. Each request and each answer also has its own definition."""
+    """Return the JSON schema of a request with its answer. Each request and each answer also has a schema of its
+    own.
+    """
     definitions: Schema = {"request": request(*REQUESTS)}
     definitions |= {f"{command}-answer": answer(command) for command in REQUESTS}
     exchanges = [

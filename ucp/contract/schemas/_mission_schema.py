@@ -1,4 +1,4 @@
-"""The schema of the mission file (`ucp-mission/1`)."""
+"""The JSON schema of the mission file (`ucp-mission/1`)."""
 
 import dataclasses
 
@@ -24,14 +24,14 @@ def _setting(declared: Number | Choice) -> Schema:
 
 
 def settings(*, optional: bool) -> Schema:
-    """Return the schema of the settings with their defaults. If `optional`, each setting may be missing."""
+    """Return the JSON schema of the settings with their defaults. If `optional` is true, any setting may be missing."""
     defaults = dataclasses.asdict(Settings())
     named = {name: {**_setting(declared), "default": defaults[name]} for name, declared in DECLARED.items()}
     return record(named, optional=tuple(named) if optional else ADDED)
 
 
 def events() -> Schema:
-    """Return the schema of the event source."""
+    """Return the JSON schema of the event source."""
     optional: Schema = {
         "mean_s": ABOVE_0 | {"maximum": MAX_MEAN_S},
         "position_interval_s": ABOVE_0,
@@ -43,7 +43,7 @@ def events() -> Schema:
 
 
 def schema() -> Schema:
-    """Return the schema of a mission file."""
+    """Return the JSON schema of a mission file."""
     return record(
         {
             "schema": {"const": SCHEMA},

@@ -1,4 +1,4 @@
-"""Parts that several schemas share."""
+"""Parts that several JSON schemas share."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ ROSTER: Schema = {"type": "array", "items": AGENT_ID, "minItems": 1}
 
 
 def record(properties: Schema, *, optional: tuple[str, ...] = (), closed: bool = False) -> Schema:
-    """Return the schema of a JSON object with these keys. All except the `optional` ones are required.
+    """Return the JSON schema of an object with these keys. All keys except the `optional` ones are required.
 
     If `closed`, no other keys are allowed.
     """
@@ -33,5 +33,5 @@ def record(properties: Schema, *, optional: tuple[str, ...] = (), closed: bool =
 
 
 def listed(items: Schema) -> Schema:
-    """Return the schema of a list of any length."""
+    """Return the JSON schema of a list of any length."""
     return {"type": "array", "items": items}

@@ -1,4 +1,4 @@
-"""The schema of a line of a trace (`ucp-trace/2`)."""
+"""The JSON schema of a line of a trace (`ucp-trace/2`)."""
 
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
 from ucp.contract.schemas._mission_schema import settings
@@ -52,7 +52,7 @@ SECURED_DROPS = (
 
 
 def header() -> Schema:
-    """Return the schema of a header, the first line of each incarnation."""
+    """Return the JSON schema of a trace header, the first line after each start of an agent."""
     clock = record({"epoch_us": COUNT, "speedup": {"type": "number", "exclusiveMinimum": 0}})
     return record(
         {
@@ -69,7 +69,7 @@ def header() -> Schema:
 
 
 def trigger() -> Schema:
-    """Return the schema of a trigger."""
+    """Return the JSON schema of a trigger, the reason why a handler runs."""
     names = {"enum": [message.NAME for message in ON_MESSAGE]}
     kinds = (
         {"message": names, "from": AGENT_ID, "seq": COUNT},
@@ -83,7 +83,7 @@ def trigger() -> Schema:
 
 
 def handler_run() -> Schema:
-    """Return the schema of a handler run. Its algorithm and branch must belong to the handler."""
+    """Return the JSON schema of a handler run. Its algorithm and branch must belong to its handler."""
     sent = record(
         {
             "message": {"enum": [message.NAME for message in ON_MESSAGE]},
@@ -182,7 +182,7 @@ def handler_run() -> Schema:
 
 
 def aside() -> Schema:
-    """Return the schema of the lines without a handler run: dropped datagrams and commands."""
+    """Return the JSON schema of trace lines about dropped datagrams and commands."""
     return {
         "oneOf": [
             record({"t": SECONDS, "dropped": {"enum": [*DROPS, *SECURED_DROPS]}, "datagram": BASE64}),
@@ -192,10 +192,10 @@ def aside() -> Schema:
 
 
 def line() -> Schema:
-    """Return the schema of any line."""
+    """Return the JSON schema of any line of a trace."""
     return {"oneOf": [header(), handler_run(), *aside()["oneOf"]]}
 
 
 def schema() -> Schema:
-    """Return the schema of a line."""
+    """Return the JSON schema of a trace line, with title and description."""
     return line()

@@ -1,4 +1,4 @@
-"""The schemas of the lines of an agent in virtual time: inputs and outputs."""
+"""The JSON schemas of the input and output lines of an agent in virtual time."""
 
 from ucp.contract.schemas import _chain_export_schema, _control_schema, _mission_schema, _trace_schema
 from ucp.contract.schemas._schema_parts import BASE64, EVENT_ID, FLAG, SECONDS, TIMESTAMP, Schema, listed, record
@@ -11,7 +11,7 @@ COMMANDS = ("status", "stop_events", "reconcile", "export", "quirk", "revoke")
 
 
 def inputs() -> Schema:
-    """Return the schema of an input line."""
+    """Return the JSON schema of an input line."""
     in_virtual_time = {
         "properties": {
             "epoch_us": {"type": "integer"},
@@ -46,7 +46,7 @@ def inputs() -> Schema:
 
 
 def outputs() -> Schema:
-    """Return the schema of an output line."""
+    """Return the JSON schema of an output line."""
     stored = record({**_control_schema.DONE, "store": True})
     answers = [
         *(_control_schema.answer(command) for command in ("status", "stop_events")),
@@ -69,7 +69,9 @@ def outputs() -> Schema:
 
 
 def schema() -> Schema:
-    """Return the schema of an input with its output, as in the transcripts of `ucp/contract/vectors/missions`."""
+    """Return the JSON schema of an input together with its output, as in the files of
+    `ucp/contract/vectors/missions`.
+    """
     return record({"input": {"$ref": "#/$defs/input"}, "output": {"$ref": "#/$defs/output"}}) | {
         "$defs": {"input": inputs(), "output": outputs()}
     }

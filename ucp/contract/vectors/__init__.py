@@ -1,4 +1,5 @@
-"""Test vectors of the agent contract. `python -m ucp.contract.vectors` writes the files.
+"""Test vectors of the agent contract: inputs with the correct outputs. `python -m ucp.contract.vectors` writes the
+files.
 
 They cover hashes, messages, dropped datagrams, full blocks, refused missions and requests, secured datagrams (which
 need the extra `secure`), and whole missions in virtual time.
@@ -44,7 +45,7 @@ INDEX = MISSIONS / "index.json"
 
 
 def texts() -> dict[Path, str]:
-    """Return the path and the text of each file."""
+    """Return the text of each file with test vectors, by path."""
     made = {DIRECTORY / f"{name}.json": _json(vectors()) for name, vectors in DOCUMENTS.items()}
     index = {}
     for name, mission in _mission_vectors.MISSIONS.items():
@@ -56,12 +57,12 @@ def texts() -> dict[Path, str]:
 
 
 def write_all() -> None:
-    """Write all files again."""
+    """Write all files with test vectors again."""
     for path, text in texts().items():
         path.parent.mkdir(exist_ok=True)
         path.write_text(text, encoding="ascii")
 
 
 def _json(document: Any) -> str:
-    """Return a document as JSON. Bytes are in base64, as everywhere in the contract."""
+    """Return a document as JSON text. Bytes become base64, as everywhere in the agent contract."""
     return json.dumps(document, indent=1, default=lambda data: base64.b64encode(data).decode("ascii")) + "\n"

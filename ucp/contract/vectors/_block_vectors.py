@@ -1,4 +1,4 @@
-"""Vectors of full blocks: a sequence of logged events, the events that complete a block, and the blocks."""
+"""Test vectors for full blocks: a sequence of logged events, and the blocks that they complete."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -12,7 +12,7 @@ AGENT_ID = 7
 
 
 def _events(sizes: Iterable[int], timestamps_us: Iterable[int]) -> list[LoggableEvent]:
-    """Return events of these sizes in bytes, header included."""
+    """Return events of these sizes in bytes. A size includes the header of the event."""
     return [
         LoggableEvent(timestamp_us, 1 + number % 254, bytes([number % 256]) * (size - EVENT_HEADER_BYTES))
         for number, (size, timestamp_us) in enumerate(zip(sizes, timestamps_us, strict=True))
@@ -43,7 +43,7 @@ CASES: tuple[tuple[str, Settings, list[LoggableEvent]], ...] = (
 
 
 def vectors() -> list[dict[str, Any]]:
-    """Return the vectors. Each event has its branch of Algorithm 1, and the block that it completes, if any."""
+    """Return the test vectors. Each event has its branch of Algorithm 1, and the block that it completes, if any."""
     return [
         {
             "what": what,

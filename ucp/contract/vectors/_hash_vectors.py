@@ -1,4 +1,4 @@
-"""Vectors of hashes of inception blocks, events, blocks and chains (eq. 3.1 to 3.5)."""
+"""Test vectors for the hashes of inception blocks, events, blocks and chains (eq. 3.1 to 3.5)."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ BLOCKS = (
 
 
 def vectors() -> dict[str, Any]:
-    """Return the vectors. `block_data` is the input of the block hash, and the encoding of a block in messages."""
+    """Return the test vectors. `block_data` is the input of the block hash, and the form of a block in messages."""
     return {
         "inception": [_inception(data) for data in INITIAL_DATA],
         "events": [_event(event) for event in EVENTS],

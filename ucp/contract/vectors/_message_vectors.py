@@ -1,4 +1,4 @@
-"""Vectors of messages: the datagram of each message with all of its fields."""
+"""Test vectors for messages: the datagram of each message, with all its fields."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -43,7 +43,7 @@ MESSAGES: tuple[tuple[int, int, Message], ...] = (
 
 
 def vectors() -> list[dict[str, Any]]:
-    """Return the vectors. Hashes are in hexadecimal. A field that the message omits is null."""
+    """Return the test vectors. Hashes are in hexadecimal. A field that the message omits is null."""
     return [
         {
             "message": message.NAME,

@@ -1,4 +1,4 @@
-"""Record the transcripts in `missions/`: a story gives inputs to an agent and records its outputs."""
+"""Record example missions of one agent: a function gives inputs to an agent, and the inputs and outputs are stored."""
 
 import base64
 import json
@@ -32,7 +32,7 @@ MICROSECONDS = 1_000_000
 
 
 class Story:
-    """The inputs and outputs of agent 7. `exchanges` has the lines of the transcript.
+    """A recorded mission of agent 7. `exchanges` contains each input with its outputs.
 
     Times are mission seconds of the agent, and `now` is the time of the last input. The story plays the other agents.
     All of them share one counter of sequence numbers, which the protocol does not use.
@@ -52,7 +52,7 @@ class Story:
     # Inputs
 
     def begin(self, **store: Any) -> None:
-        """Start an incarnation. `store` holds the data of the incarnation before."""
+        """Start the agent. `store` contains the data that it stored before its last end."""
         self._agent: VirtualAgent | None = None
         settings = Settings().to_json() | self._settings
         mission: dict[str, Any] = {
@@ -76,11 +76,11 @@ class Story:
         self._exchange({"mission": mission, "trace": True, **self._of_life(), **store})
 
     def _of_mission(self) -> dict[str, Any]:
-        """Return further keys of the mission."""
+        """Return further keys of the mission file."""
         return {}
 
     def _of_life(self) -> dict[str, Any]:
-        """Return further keys of the line that starts an incarnation."""
+        """Return further keys of the input line that starts the agent."""
         return {}
 
     def log(self, data_bytes: int = 256, *, after_s: float = 1.0, event_id: int = 5) -> None:
@@ -91,7 +91,7 @@ class Story:
         self._exchange({"event_id": event_id, "data": in_base64(data), "timestamp_us": timestamp_us})
 
     def complete_a_block(self) -> None:
-        """Log three events of the largest size, which fill a block."""
+        """Log three events of the largest size, which together complete a block."""
         for _ in range(3):
             self.log()
 
@@ -101,36 +101,36 @@ class Story:
         self.hear_datagram(self._encoded(sender, self._sequence, message), after_s=after_s)
 
     def _encoded(self, sender: int, sequence: int, message: Message) -> bytes:
-        """Return the datagram of a message of another agent."""
+        """Return another agent's message as a datagram."""
         return encode(sender, sequence, message)
 
     def _message(self, datagram: bytes) -> Message | None:
-        """Return the message in a datagram of the agent. None if it has no message."""
+        """Return the message in a datagram of the agent, or None if it contains no message."""
         return decode(datagram).message
 
     def hear_datagram(self, datagram: bytes, *, after_s: float = 0.125) -> None:
-        """Give the agent a datagram, which may be malformed."""
+        """Give the agent a datagram, which may be invalid."""
         self.now += after_s
         self._exchange({"datagram": in_base64(datagram)})
 
     def wait(self, *, late_s: float = 0.0) -> None:
-        """Wait for the next timer. The agent gets it `late_s` after its expiry."""
+        """Wait for the expiry of the next timer. The agent is informed `late_s` mission seconds late."""
         assert self.timer is not None, "no timer runs"
         self.now = self.timer + late_s
         self._exchange({"timer": True})
 
     def wait_until(self, at_s: float) -> None:
-        """Wait until mission second `at_s`, and let all timers expire that are due."""
+        """Wait until mission second `at_s`, and let all due timers expire."""
         self.now = at_s
         self._exchange({"timer": True})
 
     def command(self, name: str, *, after_s: float = 0.5, **keys: Any) -> None:
-        """Give the agent a command of the control socket, or the command `store`."""
+        """Give the agent a command of its control socket, or the command `store`."""
         self.now += after_s
         self._exchange({"command": name, **keys})
 
     def reboot(self, *, down_s: float = 30.0) -> None:
-        """Play a brown-out. The next incarnation starts with the store of this one."""
+        """Let the agent lose power for `down_s` mission seconds, and restart it with its stored data."""
         self.command("store")
         line = len(self.exchanges)
         store = self.output["answer"].pop("store")
@@ -154,30 +154,30 @@ class Story:
 
     @property
     def timer(self) -> float | None:
-        """The mission second at which the next timer expires."""
+        """The mission second at which the agent's next timer expires."""
         ends: float | None = self.output["timer"]
         return ends
 
     @property
     def sent(self) -> list[Message]:
-        """The messages that the agent broadcast."""
+        """All messages that the agent has broadcast."""
         messages = (self._message(base64.b64decode(datagram)) for datagram in self.output["sent"])
         return [message for message in messages if message is not None]
 
     # Answers of other agents to the last request
 
     def vote(self, *votes: tuple[int, bool]) -> None:
-        """Give the agent votes on its last proposed block, as (voter, approve)."""
+        """Give the agent votes on its last proposed block. Each is (voter, approve)."""
         for sender, approve in votes:
             self.hear(sender, BlockAddResponse(self._last(BlockAddRequest).block_hash, approve))
 
     def contain(self, *answers: tuple[int, bool]) -> None:
-        """Give the agent answers to its last query of phase 1, as (responder, contained)."""
+        """Give the agent answers to its last query of reconcile phase 1. Each is (responder, contained)."""
         for sender, contained in answers:
             self.hear(sender, ChainContainResponse(self._last(ChainContainQuery).chain_hash, contained))
 
     def name(self, *answers: tuple[int, Block | None], top_us: int = 0) -> None:
-        """Give the agent answers to its last query of phase 2, as (responder, next block).
+        """Give the agent answers to its last query of reconcile phase 2. Each is (responder, next block).
 
         None stands for "Is Top Of Chain", with the timestamp `top_us`.
         """
@@ -196,19 +196,19 @@ class Story:
         raise AssertionError(f"it has sent no {question.__name__}")
 
     def proposed(self) -> bytes:
-        """Return the block hash of the last proposal."""
+        """Return the block hash of the agent's last proposal."""
         block_hash: bytes = self._last(BlockAddRequest).block_hash
         return block_hash
 
 
 def others_block(agent_id: int, ordinal: int, *, at_s: float = 0.0) -> Block:
-    """Return a block of another agent."""
+    """Return a new block of another agent."""
     timestamp_us = round(at_s * MICROSECONDS) + ordinal
     return Block(agent_id, timestamp_us, LoggableEvent(timestamp_us, ordinal, b"of another agent").encode())
 
 
 def chain_of(*blocks: Block) -> Chain:
-    """Return a chain with these blocks on the inception block of the stories."""
+    """Return a chain with these blocks."""
     chain = Chain(InceptionBlock(INITIAL_DATA))
     for block in blocks:
         chain.append(block)

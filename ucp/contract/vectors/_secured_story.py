@@ -1,4 +1,4 @@
-"""Record a transcript of a secured mission. The other agents seal their messages and open those of the agent."""
+"""Record an example of a secured mission, in which the other agents encrypt and sign their messages."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ MAX_BLOCK_BYTES = 976
 
 
 class SecuredStory(Story):
-    """A story of a secured mission with sealed event data."""
+    """A recorded secured mission with encrypted event data."""
 
     def __init__(self) -> None:
         assert KEYS.public.depot is not None, "the mission seals event data"
@@ -37,21 +37,21 @@ class SecuredStory(Story):
         super().__init__(max_block_bytes=MAX_BLOCK_BYTES)
 
     def chain(self, *blocks: Block) -> Chain:
-        """Return a chain with these blocks on the inception block of this mission."""
+        """Return a chain with these blocks in this mission."""
         chain = Chain(InceptionBlock(self.initial_data))
         for block in blocks:
             chain.append(block)
         return chain
 
     def revoke(self, *agents: int) -> None:
-        """Give the agent the authority's first revocation as a command of the control socket."""
+        """Give the agent the first signed list of excluded vehicles, as a command of the control socket."""
         authority = Ed25519PrivateKey.from_private_bytes(KEYS.authority)
         revocation = Revocation.signed(authority, KEYS.public.mission, 1, agents)
         self.command("revoke", revocation=in_base64(revocation.encode()))
         del self.output["answer"]["revoked"]  # an agent may leave out this key
 
     def hear_again(self) -> None:
-        """Give the agent the last datagram again."""
+        """Give the agent the previous datagram a second time."""
         inputs = (exchange["input"] for exchange in reversed(self.exchanges))
         self.now += 0.125
         self._exchange({"datagram": next(given["datagram"] for given in inputs if "datagram" in given)})
@@ -74,7 +74,9 @@ class SecuredStory(Story):
         return self._peers[sender].seal(sequence, message, request, signature, 0)
 
     def _message(self, datagram: bytes) -> Message | None:
-        """Return the message in a datagram of the agent, and remember its request. None for a revocation."""
+        """Return the message in a datagram of the agent, and store its request. Return None for a list of excluded
+        vehicles.
+        """
         if datagram[3] == REVOCATION:
             return None
         opened = self._opener.open(datagram)

@@ -1,4 +1,4 @@
-"""Vectors of secured missions: the datagram of each message with its inputs, and datagrams that are dropped."""
+"""Test vectors for secured missions: the datagram of each message, and datagrams that an agent must drop."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -26,19 +26,19 @@ NOW_US = 1_795_260_078_064_591
 
 
 def session(agent_id: int, keys: KeySet = KEYS) -> Session:
-    """Return a session of an agent in the epoch of the vectors."""
+    """Return the session of an agent in the epoch of the test vectors."""
     begun = Session(keys.bundle(agent_id), BOOT)
     begun.epochs.set_clock(NOW)
     return begun
 
 
 def signature_of(block: Block) -> bytes:
-    """Return the maker's signature of a block."""
+    """Return the signature of a block by its author."""
     return sign_block(session(block.agent_id).private_key, KEYS.public.mission, block.block_data())
 
 
 def cases() -> Iterator[tuple[str, bytes]]:
-    """Yield each datagram after its description. They reach agent 7 in this order."""
+    """Yield each datagram with its description. They reach agent 7 in this order."""
     other = session(OTHER)
     good = other.seal(1, RequestForBlock(BLOCK_HASH), None, None, 0)
     yield "a plain one", encode(OTHER, 1, RequestForBlock(BLOCK_HASH))
@@ -64,7 +64,7 @@ def cases() -> Iterator[tuple[str, bytes]]:
 
 
 def vectors() -> dict[str, Any]:
-    """Return the vectors. Keys are in hexadecimal, as in a bundle. Datagrams are in base64."""
+    """Return the test vectors. Keys are in hexadecimal, and datagrams are in base64."""
     receiver = SecuredAgent(session(AGENT_ID), AGENT_ID, ROSTER, b"test", tracing=True)
     dropped = []
     for what, datagram in cases():

@@ -1,4 +1,4 @@
-"""Vectors of drops: datagrams that an agent must drop, and similar datagrams that it must handle."""
+"""Test vectors for dropped datagrams: datagrams that an agent must drop, and similar ones that it must handle."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -17,17 +17,17 @@ STRANGER = 5
 
 
 def datagram(code: int, body: bytes, *, sender: int = SENDER, length: int | None = None) -> bytes:
-    """Return a datagram with this type and body, valid or not."""
+    """Return a datagram with this type and body. It may be invalid."""
     return HEADER.pack(MAGIC, VERSION, code, sender, 1, len(body) if length is None else length) + body
 
 
 def block(agent_id: int, data_bytes: int = 12) -> bytes:
-    """Return the block data of a block."""
+    """Return the encoded form of a block."""
     return agent_id.to_bytes(4, "big") + (1_000_000).to_bytes(8, "big") + b"\x01" * data_bytes
 
 
 def cases() -> Iterator[tuple[str, bytes]]:
-    """Yield each datagram after its description."""
+    """Yield each datagram with its description."""
     good = datagram(1, HASH_2)
     yield "a good one", good
     yield "nothing at all", b""
@@ -78,7 +78,7 @@ def cases() -> Iterator[tuple[str, bytes]]:
 
 
 def vectors() -> dict[str, Any]:
-    """Return the vectors. `dropped` is the reason, or null if a handler receives the datagram."""
+    """Return the test vectors. `dropped` is the reason for a drop, or null if a handler receives the datagram."""
     return {
         "agent_id": AGENT_ID,
         "roster": ROSTER,
@@ -87,7 +87,7 @@ def vectors() -> dict[str, Any]:
 
 
 def dropped(data: bytes) -> str | None:
-    """Return the reason why a new agent drops the datagram. None if it handles the datagram."""
+    """Return the reason why a new agent drops the datagram, or None if it handles the datagram."""
     agent = Agent(AGENT_ID, ROSTER, b"")
     agent.receive_datagram(data, 0.0)
     return next(iter(agent.dropped), None)

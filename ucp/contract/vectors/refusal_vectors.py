@@ -1,4 +1,4 @@
-"""Missions that an agent plays or refuses, and requests with their answers, as the contract decides in doubt.
+"""Test vectors for missions that an agent must accept or refuse, and for requests to its control socket.
 
 The missions are in virtual time, where an agent refuses a mission with an error. As a program it ends with status 2. If
 it lacks a feature that the mission needs, the error is `unsupported`, and the exit status is 127.
@@ -16,7 +16,7 @@ UNKNOWN = "a feature of a later version"
 
 
 def vectors() -> dict[str, Any]:
-    """Return the vectors. `plays` is true if an agent with the features `needs` plays the mission."""
+    """Return the test vectors. `plays` is true if an agent with the features `needs` must play the mission."""
     ordinary = Story().exchanges[0]["input"]["mission"]
     return {
         "about": "Missions and requests in doubt; see CONTRACT.md",

@@ -1,4 +1,5 @@
-"""`python -m ucp.contract.vectors.replay COMMAND...`: play the transcripts with an agent, and compare its outputs.
+"""Play the recorded example missions with any agent, and compare its outputs: `python -m ucp.contract.vectors.replay
+COMMAND...`.
 
 The agent is started once, as `COMMAND... --virtual`, and plays all transcripts in turn. The program prints the first
 difference of each transcript with its line. The exit status is 0 without a difference, and 1 otherwise.
@@ -19,7 +20,7 @@ SHOWN = 200
 
 
 class NoAnswerError(Exception):
-    """The agent ended, or its output is not a JSON object."""
+    """An error: the agent ended, or its output is not a JSON object."""
 
 
 class Player:
@@ -56,9 +57,9 @@ class Player:
 
 
 def play(player: Player, transcript: Path) -> str | None:
-    """Play a transcript, and return the first difference, or the reason why the agent cannot play it.
+    """Play a recorded mission. Return the first difference, or the reason why the agent cannot play it, or None.
 
-    None if the agent gives the expected outputs. Raises NoAnswerError.
+    None means that the agent gave the expected outputs. Raises NoAnswerError.
     """
     stores: dict[int, Any] = {}
     with transcript.open(encoding="ascii") as file:
@@ -79,7 +80,7 @@ def play(player: Player, transcript: Path) -> str | None:
 
 
 def differences(got: Any, wanted: Any, where: str = "output") -> Iterator[tuple[str, Any, Any]]:
-    """Yield each difference as (place, value, expected value). Additional keys of an object are no difference."""
+    """Yield each difference as (place, value, expected value). Additional keys of an object do not count."""
     if isinstance(wanted, dict) and isinstance(got, dict):
         for key, value in wanted.items():
             if key in got:
@@ -101,7 +102,7 @@ def _shown(value: Any) -> str:
 
 
 def main(command: list[str]) -> int:
-    """Play all transcripts, and return the exit status."""
+    """Play all recorded missions, and return the exit status."""
     differ = False
     with Player(command) as player:
         for name, about in json.loads(INDEX.read_text(encoding="ascii")).items():

@@ -1,4 +1,4 @@
-"""A Wireshark dissector of UCP in Lua. `python -m ucp.contract.wireshark` prints its path."""
+"""A Wireshark dissector for UCP, written in Lua. `python -m ucp.contract.wireshark` prints the path of its file."""
 
 from pathlib import Path
 

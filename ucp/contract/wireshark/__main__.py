@@ -1,4 +1,6 @@
-"""`wireshark -X lua_script:"$(python -m ucp.contract.wireshark)" CAPTURE`"""
+"""Print the path of the Wireshark dissector: `wireshark -X lua_script:"$(python -m ucp.contract.wireshark)"
+CAPTURE`.
+"""
 
 import sys
 

@@ -21,7 +21,7 @@ PERIOD_S = 1.0
 
 
 class Talker:
-    """A ROS node that sends events. `done` is completed when the text is in the agent's chain."""
+    """A ROS node that sends events to an agent. `done` is completed when the agent's chain contains the text."""
 
     def __init__(self, agent_id: int, text: str) -> None:
         self._text = text

@@ -50,7 +50,7 @@ NO_LOG_FILES = ["--ros-args", "--disable-external-lib-logs"]
 
 
 class RosLoop(Loop):
-    """The loop of `ucp.loop` on a ROS executor. One ROS timer is set to the time of the next callback.
+    """An event loop with the interface of `ucp.loop` on a ROS executor. One ROS timer is set to the next callback.
 
     ROS cannot wait for sockets. A thread waits for them and wakes the executor, which calls back.
     """
