@@ -69,6 +69,7 @@ def explore_command(
     resolved compared with the previous hunt in the same --corpus.
 
     Exit status 0: no run is bad. 1: a run is bad or failed; of a hunt: a run failed, or a finding is not resolved.
+    4: without a hunt, the only bad verdict of a run is `not finished`.
     """
     if for_time is not None or runs is not None:
         if seeds is not None or out is not None:

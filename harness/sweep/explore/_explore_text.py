@@ -12,6 +12,8 @@ from harness.sweep.explore._exploring import Explored, Violation, Watcher
 
 _WORDS = {**BAD_IN_WORDS, ENDED: "an agent crashed or hung"}
 
+_MAX_SEEDS = 10
+"""Maximum number of seeds that a sentence lists."""
 LINE_EVERY_S = 10.0
 REDRAW_EVERY_S = 0.1
 CLEAR_LINE = "\r\x1b[2K"
@@ -53,6 +55,9 @@ def in_words(explored: Explored) -> Iterator[str]:
     yield f"{played} seed{'' if played == 1 else 's'} played" + (
         "" if explored.searched.violation else ": no characteristic is violated"
     )
+    if seeds := explored.searched.unfinished:
+        listed = ", ".join(map(str, seeds[:_MAX_SEEDS])) + (", ..." if len(seeds) > _MAX_SEEDS else "")
+        yield f"not finished: {len(seeds)} of them need a longer mission to be judged, seeds {listed}"
     if explored.shrunk:
         yield from evidence_lines(explored.shrunk.violated)
         yield explored.shrunk.words

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from harness.checker.judgement import Judgement
-from harness.errors import INTERRUPTED, VIOLATED
+from harness.errors import INCOMPLETE, INTERRUPTED, VIOLATED
 from harness.run.parallel import FailedTask, cores, sweep
 from harness.run.simulate import Judge, check_determinism, choose_path, evidence_lines, simulated, write_new_file
 from harness.scenario import Scenario
@@ -25,11 +25,16 @@ class Violation:
 
 @dataclass
 class Searched:
-    """The result of the search. `failed` maps a seed to the reason why its run has no verdict."""
+    """The result of the search.
+
+    `failed` maps a seed to the reason why its run has no verdict. `unfinished` has the seeds of the runs that only
+    needed more time.
+    """
 
     played: int = 0
     violation: Violation | None = None
     failed: dict[int, str] = field(default_factory=dict)
+    unfinished: list[int] = field(default_factory=list)
     interrupted: bool = False
 
 
@@ -40,15 +45,24 @@ def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: 
     the scenario cannot be played.
     """
     searched = Searched()
+
+    def verdict(seed: int) -> tuple[tuple[str, ...], bool]:
+        result = judge(scenario, seed)
+        return result.wrong, result.exit_status == INCOMPLETE
+
     try:
-        with sweep(seeds, lambda seed: judge(scenario, seed).wrong, jobs, what="seeds" if shown else None) as outcomes:
+        with sweep(seeds, verdict, jobs, what="seeds" if shown else None) as outcomes:
             for seed, outcome in outcomes:
                 searched.played += 1
                 if isinstance(outcome, FailedTask):
                     searched.failed[seed] = outcome.reason
-                elif outcome:
-                    searched.violation = Violation(seed, outcome)
+                    continue
+                wrong, needs_time = outcome
+                if wrong:
+                    searched.violation = Violation(seed, wrong)
                     break
+                if needs_time:
+                    searched.unfinished.append(seed)
     except KeyboardInterrupt:
         searched.interrupted = True
     return searched
@@ -86,7 +100,9 @@ class Explored:
     def exit_status(self) -> int:
         if self.interrupted:
             return INTERRUPTED
-        return VIOLATED if self.searched.violation or self.searched.failed else 0
+        if self.searched.violation or self.searched.failed:
+            return VIOLATED
+        return INCOMPLETE if self.searched.unfinished else 0
 
 
 @dataclass(frozen=True)

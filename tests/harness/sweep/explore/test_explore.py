@@ -12,7 +12,7 @@ from harness.checker import Result
 from harness.errors import RunDirectoryError
 from harness.run.simulate import simulate, simulated
 from harness.scenario import Scenario, load_scenario
-from harness.sweep.explore import Explored, explore
+from harness.sweep.explore import Explored, explore, in_words
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.virtual import scenario
 
@@ -103,6 +103,18 @@ def test_run_without_a_verdict_is_reported_with_status_1(tmp_path: Path) -> None
     explored = find(tmp_path / "none.yaml", judge=fails)
     assert explored.exit_status == 1
     assert "a bug" in explored.searched.failed[7]
+
+
+def test_runs_that_need_more_time_are_listed_with_status_4(tmp_path: Path) -> None:
+    def needs_time(asked: Scenario, seed: int) -> Result:
+        result = simulated(asked, seed)
+        if seed not in (3, 7):
+            return result
+        return Result({"liveness": dataclasses.replace(result.judgements["liveness"], verdict="not finished")}, {})
+
+    explored = find(tmp_path / "none.yaml", judge=needs_time)
+    assert (explored.exit_status, explored.searched.unfinished, explored.shrunk) == (4, [3, 7], None)
+    assert any(line.endswith("to be judged, seeds 3, 7") for line in in_words(explored))
 
 
 def test_ctrl_c_while_shrinking_writes_the_smallest_so_far(tmp_path: Path) -> None:
