@@ -5,6 +5,7 @@ edited. Therefore each key of a `RunRecord` has a default that means unknown.
 """
 
 from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -12,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from harness.backend_names import BackendName
 from harness.scenario import Scenario, faults
 from harness.scenario.agent_options import Stagger
+from harness.scenario.expect import Expect
 from harness.scenario.faults import DiskState
 from harness.scenario.verdict_names import FURTHER_CHECKS, CharacteristicVerdict, Verdict
 
@@ -529,6 +531,20 @@ class RunRecord(JudgedRecord):
             f"`processing_s` is {model.processing_s:g} s, so fewer answers collided than with a processor for each "
             "agent"
         )
+
+    @property
+    def expect(self) -> Expect:
+        """The expected results of the scenario. Empty if it has none."""
+        return (self.scenario and self.scenario.expect) or Expect()
+
+    def unmet_expectations(self, chains: Mapping[int, Sequence[str]]) -> Iterator[tuple[str, list[str]]]:
+        """Yield each kind of expectation besides verdicts that the scenario has, with a sentence for each unmet one.
+
+        `chains` has the block hashes of each agent's chain.
+        """
+        found = [(finding.agent_id, finding.handler) for finding in (self.steps.evidence if self.steps else ())]
+        figures: dict[str, float | None] = {name: self.figures.get(name) for name in self.expect.figures}
+        return self.expect.unmet(figures, chains, found)
 
     @property
     def judgements(self) -> dict[str, CharacteristicRecord | JudgementRecord]:

@@ -24,6 +24,19 @@ BundleOption = Annotated[
 ]
 
 
+def complete_scenario(typed: str) -> list[str]:
+    """Return the completions of a scenario argument: names of the library, YAML files and directories."""
+    from harness.scenario.load import scenario_names
+
+    beside = Path(typed).parent if not typed.endswith("/") else Path(typed)
+    files = [f"{path}/" if path.is_dir() else str(path) for path in beside.glob("*") if _may_hold_scenario(path)]
+    return [word for word in [*scenario_names(), *sorted(files)] if word.startswith(typed)]
+
+
+def _may_hold_scenario(path: Path) -> bool:
+    return not path.name.startswith(".") and (path.is_dir() or path.suffix in (".yaml", ".yml"))
+
+
 def opener_of(bundle: Path | None) -> "Opener | None":
     """Return the opener of a secured mission's datagrams. None without a bundle. Raises KeysError, MachineError."""
     if bundle is None:

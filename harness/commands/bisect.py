@@ -12,8 +12,8 @@ from rich.text import Text
 from typer.core import TyperCommand
 from typer.exceptions import TyperException
 
-from harness.commands._shared_options import RARE
-from harness.commands.terminal import complain, print_json
+from harness.commands._shared_options import RARE, complete_scenario
+from harness.commands.terminal import complain, output, print_json
 from harness.errors import HarnessError, InterruptedRunError, MachineError
 from harness.field.bisection import (
     BisectionResult,
@@ -63,7 +63,12 @@ _app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 @_app.command("bisect", cls=BisectCommand)
 def bisect_command(
     subject: Annotated[
-        Path, typer.Argument(metavar="SCENARIO|RUN|RECORD", help="Scenario, run in virtual time, or field records.")
+        Path,
+        typer.Argument(
+            metavar="SCENARIO|RUN|RECORD",
+            help="Scenario, run in virtual time, or field records.",
+            autocompletion=complete_scenario,
+        ),
     ],
     good: Annotated[str | None, typer.Option(metavar="REV", help="Commit with the expected outcome.")] = None,
     bad: Annotated[str, typer.Option(metavar="REV", help="Commit with the changed outcome.")] = "HEAD",
@@ -108,7 +113,7 @@ def bisect_command(
     recorded). 1: it changed. 125: this code cannot be tried. 128: the request is wrong.
     """
     request = _PlayRequest(subject, seed, agent, agent_command or [None], speedup, limit_s)
-    console = Console(stderr=as_json, highlight=False)
+    console = output(stderr=as_json, highlight=False)
     if once:
         if good is not None:
             raise OnceUsageError(

@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 
 from harness.commands._shared_options import refuse_existing, write_new
-from harness.commands.terminal import complain, print_json
+from harness.commands.terminal import complain, output, print_json
 from harness.errors import ScenarioError
 from harness.field.calibrate.calibration import calibrate
 from harness.field.calibrate.page import draw
@@ -50,6 +50,6 @@ def calibrate_command(
     if as_json:
         print_json({"scenario": str(out), **calibration.to_json(), "network": calibration.network(channel)})
         return
-    console = Console(highlight=False)
+    console = output(highlight=False)
     for sentence in (*sentences, str(out)):
         console.print(sentence, soft_wrap=True, markup=False)

@@ -6,11 +6,10 @@ from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.text import Text
 
 from harness.commands._shared_options import refuse_existing, write_new
-from harness.commands.terminal import complain, print_json
+from harness.commands.terminal import complain, output, print_json
 from harness.conformance.conformance_page import read_agents, to_html
 from harness.conformance.conformance_run import ConformanceRequest, conform
 from harness.conformance.results import TITLES, Results
@@ -79,7 +78,7 @@ def conformance_command(
             "the command of the agent is missing: for example, `ucp-harness conformance -- "
             "python3 -m ucp.node` tests the harness's own agent"
         )
-    console = Console(stderr=as_json, highlight=False)
+    console = output(stderr=as_json, highlight=False)
     place = keep or Path("conformance-failures")
     with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as show:
         request = ConformanceRequest(tuple(resolve_command(command, "the agent")), only, _unused_path(place), virtual)
@@ -97,7 +96,7 @@ def conformance_command(
 
 def _test_all(agents: Mapping[str, Sequence[str]], only: str | None, page: Path, *, virtual: bool) -> int:
     """Test each agent, write the page with all results, and return the highest exit status."""
-    console = Console(highlight=False)
+    console = output(highlight=False)
     outcomes: dict[str, Results | str] = {}
     for name, command in agents.items():
         with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as show:

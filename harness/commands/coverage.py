@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from harness import checker
 from harness.archive.archive import RunArchive
-from harness.commands.terminal import StatusLine, complain, print_json, print_lines
+from harness.commands.terminal import StatusLine, complain, output, print_json, print_lines
 from harness.errors import WRONG_REQUEST, RunDirectoryError
 from harness.proof import Bounds, coverage, specification
 from harness.proof.bounds import EVENT_FILLS_BLOCK
@@ -58,7 +57,7 @@ def coverage_command(
     if as_json:
         print_json({"runs": len(runs), **coverage.to_json(reached, state_space)})
     else:
-        console = Console()
+        console = output()
         for line in coverage.in_words(reached, state_space):
             console.print(line, highlight=False, soft_wrap=True, markup=False)
     if not reached.steps:

@@ -7,11 +7,10 @@ from textwrap import shorten
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.text import Text
 
 from harness.archive.archive import RunArchive
-from harness.commands.terminal import complain, print_json
+from harness.commands.terminal import complain, output, print_json
 from harness.report.agent_programs import in_sentence
 from harness.report.difference import AgentDifference, ComparedStep, Difference, FirstDifference, compare
 from harness.run.provenance import differing_versions
@@ -37,7 +36,7 @@ def diff_command(
         versions = {"differing_versions": differing}
         print_json({"a": str(run_a), "b": str(run_b), **difference.to_json(), **versions})
     else:
-        console = Console()
+        console = output()
         for version in differing:
             console.print(Text(f"versions of A and B: {version}"), soft_wrap=True)
         for line in _lines(difference):

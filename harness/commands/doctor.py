@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from harness.commands.terminal import print_json
+from harness.commands.terminal import output, print_json
 from harness.errors import CANNOT_HERE, VIOLATED
 from harness.play.machine import capabilities
 from harness.play.machine.capabilities import examine
@@ -43,7 +43,7 @@ def doctor_command(
             table.add_row(mark, requirement.name, Text(requirement.detail))
             if not requirement.ok and requirement.way_out:
                 table.add_row("", "", Text(f"→ {requirement.way_out}", style="dim"))
-        Console().print(table)
+        output().print(table)
     engines = []
     if measure and able:
         with capabilities.progress_line(Console(stderr=True)) as show_progress:
@@ -52,7 +52,7 @@ def doctor_command(
     if as_json:
         print_json({"findings": records, "measured": [engine.to_json() for engine in engines]} if measure else records)
     elif engines:
-        Console().print(capabilities.render(engines))
+        output().print(capabilities.render(engines))
     if not able:
         raise typer.Exit(CANNOT_HERE)
     if not all(engine.ok for engine in engines):
@@ -72,7 +72,7 @@ def clean_command() -> None:
         cleaned = clean(engine)
     finally:
         engine.close()
-    console = Console()
+    console = output()
     for name in cleaned.removed:
         console.print(f"removed {name}", highlight=False, soft_wrap=True)
     if not cleaned.removed:

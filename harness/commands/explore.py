@@ -9,7 +9,8 @@ from rich.console import Console
 
 from harness.archive.recorded_scenario import load_recorded_scenario
 from harness.archive.run_listing import RUNS
-from harness.commands.terminal import complain, print_json
+from harness.commands._shared_options import complete_scenario
+from harness.commands.terminal import complain, output, print_json
 from harness.run.parallel import cores
 from harness.scenario import Scenario
 from harness.sweep import explore
@@ -26,6 +27,7 @@ def explore_command(
         typer.Argument(
             metavar="SCENARIO|RUN",
             help="Scenario (name or YAML file), or run directory to start from.",
+            autocompletion=complete_scenario,
         ),
     ],
     seeds: Annotated[
@@ -80,7 +82,7 @@ def explore_command(
         _hunt(scenario, secured, first_seed, for_time, runs, corpus, jobs, as_json)
     if corpus is not None or as_json:
         raise typer.BadParameter("--corpus and --json need a hunt: add --for TIME or --runs NUMBER")
-    console = Console()
+    console = output()
     request, recorded_seed = _load_request(scenario, secured)
     if first_seed is None:
         first_seed = recorded_seed or 0
@@ -129,7 +131,7 @@ def _hunt(
     if as_json:
         print_json(night.to_json())
     else:
-        console = Console()
+        console = output()
         for line in guided.in_words(night):
             console.print(line, highlight=False, soft_wrap=True, markup=False)
     for sentence in night.left_out[:3]:

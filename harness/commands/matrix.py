@@ -7,6 +7,7 @@ import typer
 
 from harness.archive.directory import default_path
 from harness.backend_names import BackendName
+from harness.commands._shared_options import complete_scenario
 from harness.commands.terminal import complain, end_sweep, print_json, print_lines
 from harness.errors import INTERRUPTED
 from harness.play.variant import Variant, load_variant
@@ -22,7 +23,9 @@ from ucp.agent_files import write_atomically, write_json_atomically
 
 
 def matrix_command(
-    file: Annotated[Path, typer.Argument(metavar="MATRIX", help="Matrix file (YAML).")],
+    file: Annotated[
+        Path, typer.Argument(metavar="MATRIX", help="Matrix file (YAML).", autocompletion=complete_scenario)
+    ],
     backend: Annotated[BackendName | None, typer.Option(help="Backend of all runs, instead of the file's.")] = None,
     out: Annotated[
         Path | None, typer.Option(help="Directory of results: new, empty, or that of a matrix to continue.")

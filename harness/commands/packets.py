@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from harness.archive.packets import packets_text
 from harness.archive.packets.block_names import BlockNames, run_directories
@@ -18,7 +17,7 @@ from harness.archive.packets.packets_text import Paint, TransmissionText
 from harness.archive.packets.selection import Selection, exchanges_about, in_order
 from harness.archive.packets.transmissions import join
 from harness.commands._shared_options import BundleOption, opener_of
-from harness.commands.terminal import complain, print_lines
+from harness.commands.terminal import complain, output, print_lines
 from harness.errors import WRONG_REQUEST
 
 
@@ -84,5 +83,5 @@ def _output_lines(
 
 def _paint() -> Paint:
     """Return a function that paints text red on a terminal, and leaves it unchanged elsewhere."""
-    console = Console()
+    console = output()
     return partial(typer.style, fg="red") if console.is_terminal and not console.no_color else str

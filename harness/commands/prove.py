@@ -7,11 +7,10 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 import yaml
-from rich.console import Console
 
 from harness import proof as prove
 from harness.commands._shared_options import RARE
-from harness.commands.terminal import StatusLine, complain, print_json
+from harness.commands.terminal import StatusLine, complain, output, print_json
 from harness.errors import INTERRUPTED
 from harness.play.core_version import edited_files
 from harness.play.variant import variant_in_use
@@ -187,7 +186,7 @@ def _print_result(document: dict[str, Any], lines: Iterable[str], as_json: bool)
     if as_json:
         print_json(document)
         return
-    console = Console()
+    console = output()
     for line in lines:
         console.print(line, highlight=False, soft_wrap=True, markup=False)
 

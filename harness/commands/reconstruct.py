@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 
 from harness.commands._shared_options import BundleOption, DepotKey, KeysOption, depot_of, opener_of, trusted_keys
-from harness.commands.terminal import complain, print_json
+from harness.commands.terminal import complain, output, print_json
 from harness.errors import VIOLATED, RunDirectoryError
 from harness.field.ingest import ingest_files
 from harness.field.reconstruct import reconstruct, write
@@ -43,7 +43,7 @@ def reconstruct_command(
     if as_json:
         print_json({"scenario": str(out), **reconstruction.to_json()})
     else:
-        console = Console(highlight=False)
+        console = output(highlight=False)
         for sentence in (reconstruction.sentence, *reconstruction.problems[1:], *reconstruction.remarks, str(out)):
             console.print(sentence, soft_wrap=True, markup=False)
     if reconstruction.problems or reconstruction.wrong_signatures:

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from harness.checker.steps.core_in_use import IN_USE
 from harness.checker.steps.implementation import REFERENCE
-from harness.commands.terminal import complain, print_json
+from harness.commands.terminal import complain, output, print_json
 from harness.errors import VIOLATED, WRONG_REQUEST, InterruptedRunError
 from harness.field.replay import Player, Record, ReplayResult, open_record, open_records
 from harness.field.replay.breakpoints import parse_breakpoint
@@ -49,7 +49,7 @@ def replay_command(
         raise typer.BadParameter("--json prints the result of the whole record: leave out --step and --break")
     if debug and not breaks:
         raise typer.BadParameter("--debug calls the debugger at each --break: add one, such as --break 812")
-    console = Console(highlight=False)
+    console = output(highlight=False)
     try:
         if step or breaks:
             _step_through(console, open_record(record, agent), until, step, breaks or [], debug)

@@ -18,7 +18,15 @@ from harness.archive.archive import RunArchive
 from harness.checker import stored_verdict
 from harness.checker.survival import survival
 from harness.commands._shared_options import KeysOption, trusted_keys
-from harness.commands.terminal import StatusLine, complain, print_json, show_programs, show_result, show_survival
+from harness.commands.terminal import (
+    StatusLine,
+    complain,
+    output,
+    print_json,
+    show_programs,
+    show_result,
+    show_survival,
+)
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, MachineError, RunDirectoryError
 from harness.field.ingest import ingest_files
 from harness.field.replay.field_evidence import field_evidence
@@ -81,11 +89,11 @@ def check_command(
         differences = {"differs_from_stored": stored, "differing_versions": differing}
         print_json({**result.to_json(), "survival": survived.model_dump(), "programs": used_programs, **differences})
     else:
-        show_result(Console(), result)
-        show_programs(Console(), archive.record)
-        show_survival(Console(), survived)
+        show_result(output(), result, archive.record)
+        show_programs(output(), archive.record)
+        show_survival(output(), survived)
         if differing:
-            Console().print(
+            output().print(
                 Text(f"the run and this check differ in {'; '.join(differing)}", style="dim"), soft_wrap=True
             )
     for sentence in stored:
@@ -132,7 +140,7 @@ async def _show(feed: "Feed", run: Path, port: int) -> None:
 
     with closing(ChangeLog()) as log:
         async with Server(log, run, live=False).open(port) as address:
-            show_address(Console(), address)
+            show_address(output(), address)
             await copy_finished_run(feed, log)
             await asyncio.Event().wait()
 

@@ -14,9 +14,9 @@ from harness.archive.directory import default_path
 from harness.archive.recorded_scenario import load_recorded_scenario
 from harness.archive.run_record import CapturedFrames
 from harness.backend_names import BackendName
-from harness.commands._shared_options import RARE
+from harness.commands._shared_options import RARE, complete_scenario
 from harness.commands.report import PORT, show_address
-from harness.commands.terminal import complain, show_programs, show_result, show_rogue, show_survival
+from harness.commands.terminal import complain, output, show_programs, show_result, show_rogue, show_survival
 from harness.errors import HarnessError, ScenarioError
 from harness.play import progress
 from harness.play.backends import BACKENDS
@@ -43,6 +43,7 @@ def run_command(
         typer.Argument(
             metavar="SCENARIO|RUN",
             help="Scenario (name or YAML file), or run directory to play again.",
+            autocompletion=complete_scenario,
         ),
     ],
     seed: Annotated[int | None, typer.Option(min=0, help="Random seed; that of RUN or a new one if not given.")] = None,
@@ -103,7 +104,7 @@ def run_command(
     fate matched no message. 3: this machine cannot play it, or an agent does not support it. 4: the only bad verdict is
     `not finished`. 130: interrupted.
     """
-    console = Console()
+    console = output()
     loaded, recorded_seed = load_recorded_scenario(scenario)
     request = _with_options(loaded, speedup, vehicles, gcs, capture, image_from_host, programs_of(agents or ()))
     if secured:
@@ -185,7 +186,7 @@ def run_command(
 
 def _show(console: Console, finished: Run) -> None:
     if finished.played.outcome != "not supported":
-        show_result(console, finished.result)
+        show_result(console, finished.result, finished.record)
         show_survival(console, finished.survival)
         show_rogue(console, finished.rogue)
     show_programs(console, finished.record)

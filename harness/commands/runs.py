@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from harness.archive.run_listing import RUNS, PastRun, past_runs
 from harness.archive.run_record import RunRecord
-from harness.commands.terminal import MARKS, STYLES, complain, print_json
+from harness.commands.terminal import MARKS, STYLES, complain, output, print_json
 from harness.errors import RunDirectoryError
 from harness.scenario import load
+from harness.scenario.expect import AS_EXPECTED
 from harness.scenario.verdict_names import BAD_IN_WORDS, Kind, kind_of
 
 
@@ -33,7 +33,7 @@ def runs_command(
     elif as_json:
         print_json([_document(run) for run in runs])
     else:
-        Console().print(_table(runs) if runs else f"{folder} has no runs", highlight=False)
+        output().print(_table(runs) if runs else f"{folder} has no runs", highlight=False)
     for run in runs:
         if run.problem:
             complain(run.problem)
@@ -64,9 +64,10 @@ def _table(runs: list[PastRun]) -> Table:
 def _verdict(record: RunRecord) -> tuple[Kind, str]:
     """Return a summary of all verdicts in a few words, and whether it is good, bad or unknown."""
     kinds = {key: kind_of(judgement.verdict) for key, judgement in record.judgements.items()}
-    bad = [BAD_IN_WORDS[key] for key, kind in kinds.items() if kind == "bad" and key in BAD_IN_WORDS]
+    bad = {key: BAD_IN_WORDS[key] for key, kind in kinds.items() if kind == "bad" and key in BAD_IN_WORDS}
     if bad:
-        return "bad", ", ".join(bad)
+        expected = all(record.expect.as_expected(key, record.judgements[key].verdict) for key in bad)
+        return ("unknown", ", ".join([*bad.values(), AS_EXPECTED])) if expected else ("bad", ", ".join(bad.values()))
     if record.outcome != "completed":
         return "unknown", record.outcome
     unjudged = [key for key, kind in kinds.items() if kind == "unknown"]
@@ -105,6 +106,6 @@ def scenarios_command() -> None:
     table = Table.grid(padding=(0, 2))
     for name in load.scenario_names():
         table.add_row(Text(name, style="bold", no_wrap=True), Text(load.first_sentence(name)))
-    console = Console()
+    console = output()
     console.print(table)
     console.print(f"in {load.LIBRARY}, to copy and edit", highlight=False, soft_wrap=True, style="dim")

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 from rich.text import Text
 
+from harness.commands.terminal import output
 from harness.errors import HarnessError, InterruptedRunError, MachineError
 from sitl.airframes import BINARIES, DEFAULTS
 from sitl.ardupilot import ENVIRONMENT, build_of, default_parameters
@@ -43,7 +44,7 @@ def install_into_cache(
 
     The binary is for Linux on x86_64 or ARM, and goes into the user's cache.
     """
-    console = Console()
+    console = output()
     try:
         with _DownloadBar(console, BINARIES[vehicle]) as bar:
             outcome = install(vehicle, version, os.environ, bar, url)
@@ -82,7 +83,7 @@ def list_binaries(
     if as_json:
         sys.stdout.write(json.dumps([asdict(binary) for binary in binaries], indent=1) + "\n")
         return
-    console = Console()
+    console = output()
     for binary in binaries:
         build = f"{binary.version or '-'}{f' ({binary.commit})' if binary.commit else ''}"
         what = f"{binary.vehicle:<7} {build:<21} {megabytes(binary.size_bytes):>8}"

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import sys
 import time
 from collections.abc import Iterable
@@ -18,6 +19,7 @@ from harness import checker
 from harness.archive.run_record import RogueInjection, RunRecord, Survival
 from harness.checker import injections, survival
 from harness.report import agent_programs
+from harness.scenario.expect import AS_EXPECTED
 from harness.scenario.verdict_names import CHARACTERISTICS, Kind
 
 if TYPE_CHECKING:
@@ -27,12 +29,25 @@ STYLES: dict[Kind, str] = {"good": "green", "bad": "bold red", "unknown": "yello
 MARKS: dict[Kind, str] = {"good": "✔", "bad": "✘", "unknown": "-"}
 EVIDENCE_SHOWN = 5
 LINE_EVERY_S = 10.0
+UNLIMITED = 1_000_000
+"""Width of the output in a pipe or file, in characters."""
 
 
-def show_result(console: Console, result: checker.Result) -> None:
-    table = Table.grid(padding=(0, 2))
+def output(*, stderr: bool = False, highlight: bool = True) -> Console:
+    """Return a console. Outside a terminal, its lines are as long as their text, unless COLUMNS sets a width."""
+    console = Console(stderr=stderr, highlight=highlight)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = UNLIMITED
+    return console
+
+
+def show_result(console: Console, result: checker.Result, record: RunRecord) -> None:
+    """Print verdicts and figures. `record` has the expectations of the scenario."""
+    expect, table = record.expect, Table.grid(padding=(0, 2))
     for key, judgement in result.judgements.items():
-        verdict = Text(f"{MARKS[judgement.kind]} {judgement.verdict}", style=STYLES[judgement.kind])
+        expected = expect.remark(key, judgement.verdict) == AS_EXPECTED
+        words = f"{MARKS[judgement.kind]} {expect.in_words(key, judgement.verdict)}"
+        verdict = Text(words, style=STYLES["unknown" if expected else judgement.kind])
         number = key if key in CHARACTERISTICS else ""
         table.add_row(number, judgement.name, verdict, Text(judgement.reason))
         for finding in judgement.evidence[:EVIDENCE_SHOWN]:
@@ -45,6 +60,9 @@ def show_result(console: Console, result: checker.Result) -> None:
     known = {name: value for name, value in result.figures.items() if value is not None}
     words = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in known.items())
     console.print(words, highlight=False, style="dim")
+    for _, unmet in record.unmet_expectations(result.chains):
+        for sentence in unmet:
+            complain(sentence)
 
 
 def show_programs(console: Console, record: RunRecord) -> None:
@@ -67,7 +85,7 @@ def end_sweep(record: "MatrixRecord", table: RenderableType | None, picture: Pat
     if table is None:
         print_json(record.to_json())
     else:
-        console = Console()
+        console = output()
         console.print(table)
         console.print(f"{record.wall_s:.0f} s; {picture}", highlight=False, soft_wrap=True)
     if record.outcome == "interrupted":

@@ -15,12 +15,13 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 class Case:
     """A test case. It passed if `skipped` is None and `wrong` is empty.
 
-    The first line of `wrong` is a complete message. `skipped` is a reason.
+    The first line of `wrong` is a complete message. `skipped` is a reason. `note` is the output of a passed case.
     """
 
     name: str
     wrong: Sequence[str] = ()
     skipped: str | None = None
+    note: str = ""
 
 
 def to_xml(suite: str, classname: str, started_at: str, wall_s: float | None, cases: Iterable[Case]) -> str:
@@ -40,6 +41,8 @@ def to_xml(suite: str, classname: str, started_at: str, wall_s: float | None, ca
             failure.text = _text("\n".join(case.wrong))
         elif case.skipped is not None:
             ElementTree.SubElement(testcase, "skipped", message=_text(case.skipped))
+        elif case.note:
+            ElementTree.SubElement(testcase, "system-out").text = _text(case.note)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 

@@ -10,6 +10,8 @@ from rich.text import Text
 _EPOCH_FROM_US = 1_000_000_000_000_000
 """Timestamps from here on (2001) are since the Unix epoch. Smaller ones are since the start of a virtual run."""
 _LAST_EPOCH_US = 253_402_300_799_000_000
+MAX_WORD = 120
+"""Number of characters of a misspelt word that are compared."""
 
 
 def moment(timestamp_us: int) -> str:
@@ -78,3 +80,11 @@ _CONTROL = dict.fromkeys((*range(32), *range(127, 160)), "�")
 def shown(words: str, style: str = "") -> Text:
     """Return one line of text. Control characters become replacement characters."""
     return Text(words.translate(_CONTROL), style=style)
+
+
+def did_you_mean(word: object, allowed: Iterable[object]) -> str:
+    """Return "; did you mean `loss_15`?" with the nearest of the allowed words. Empty if none is near."""
+    from difflib import get_close_matches  # imported late, because only errors need it
+
+    nearest = get_close_matches(str(word)[:MAX_WORD], map(str, allowed), n=1)
+    return f"; did you mean `{nearest[0]}`?" if nearest else ""

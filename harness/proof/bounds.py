@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from harness.errors import HarnessError
+from harness.present.text import did_you_mean
 from harness.scenario.agent_options import Stagger, Staggered, staggered
 from ucp.quirks import check_quirk
 from ucp.settings import MAX_TIMER_S, Settings
@@ -98,7 +99,8 @@ class Bounds:
         names = [field.name for field in dataclasses.fields(Settings)]
         for name in self.settings:
             if name not in names:
-                raise BoundsError(f"--settings {name} is unknown: use one of {', '.join(names)}")
+                known = f"{', '.join(names)}{did_you_mean(name, names)}"
+                raise BoundsError(f"--settings {name} is unknown: use one of {known}")
         if self.settings.get("answer_spread_s"):
             raise BoundsError(
                 "--settings answer_spread_s has no meaning here, because messages arrive at any time: leave it out"

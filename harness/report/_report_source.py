@@ -43,6 +43,18 @@ class ReportSource:
     def network(self) -> Connectivity:
         return self.archive.network(self.ink)
 
+    @cached_property
+    def chains(self) -> dict[int, tuple[str, ...]]:
+        """The block hashes of each agent's chain."""
+        return {agent_id: export.chain_of_block_hashes for agent_id, export in self.exports.by_agent.items()}
+
+    @property
+    def unmet_expectations(self) -> list[str]:
+        """Sentences about results besides verdicts that the scenario does not expect."""
+        if not self.record.characteristics:
+            return []
+        return [sentence for _, unmet in self.record.unmet_expectations(self.chains) for sentence in unmet]
+
     @property
     def chains_missing(self) -> list[str]:
         """Sentences about agents without a usable export, and about damaged exports."""

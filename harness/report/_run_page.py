@@ -59,6 +59,7 @@ def draw(left: ReportSource) -> str:
             ("Some chains are unknown. The page shows the other chains.", left.chains_missing),
             ("Some files of the run are missing. The page shows the other files.", left.files_missing),
             ("This run differs from its script.", record.unmatched_fates),
+            ("This run differs from the expectations of its scenario.", left.unmet_expectations),
         ],
         verdicts=judged,
         figures=facts.figures(record),
@@ -138,14 +139,10 @@ def write(left: ReportSource) -> Path:
     """Write the report of a run that has already been read. See `write_report`."""
     _write(left.run_dir / "chains.svg", ChainTreePicture(left.exports.by_agent, left.ink).standalone())
     _write(left.run_dir / "report.md", to_markdown(left))
-    _write(left.run_dir / "junit.xml", to_junit(left.record, _chains(left)))
+    _write(left.run_dir / "junit.xml", to_junit(left.record, left.chains))
     page = left.run_dir / "report.html"
     _write(page, draw(left))
     return page
-
-
-def _chains(left: ReportSource) -> dict[int, tuple[str, ...]]:
-    return {agent_id: export.chain_of_block_hashes for agent_id, export in left.exports.by_agent.items()}
 
 
 def _write(path: Path, text: str) -> None:

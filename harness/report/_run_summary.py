@@ -11,7 +11,7 @@ from harness.present.text import escaped, row
 from harness.report import _network_section, _rogue_section, _survival_section, facts
 from harness.report._report_source import ReportSource
 from harness.report.verdict_section import Verdict, headline, verdicts
-from harness.scenario.expect import Expect
+from harness.scenario.expect import AS_EXPECTED, Expect
 
 EVIDENCE_SHOWN = 3
 SENTENCES_SHOWN = 8
@@ -27,7 +27,7 @@ def to_markdown(left: ReportSource) -> str:
     lines += [_short(" \u00b7 ".join(facts.summary(record, left.exports))), ""]
     if ended:
         lines += [f"**{_short(ended[0])}** {_short(ended[1])}".rstrip(), ""]
-    lines += _listed([*left.chains_missing, *left.files_missing, *record.unmatched_fates])
+    lines += _listed([*left.chains_missing, *left.files_missing, *record.unmatched_fates, *left.unmet_expectations])
     lines += [*_verdict_table(judged), *_evidence(judged)] if judged else []
     if figures := facts.figures(record):
         lines += [" \u00b7 ".join(f"{_short(label)} **{_short(figure)}**" for label, figure in figures), ""]
@@ -47,7 +47,7 @@ def _verdict_table(judged: Sequence[Verdict]) -> Iterator[str]:
     yield row(["", "characteristic", "verdict", "reason"])
     yield row(["--:", "---", "---", "---"])
     for verdict in judged:
-        yield row(map(_short, [verdict.number, verdict.name, f"{verdict.icon} {verdict.verdict}", verdict.reason]))
+        yield row(map(_short, [verdict.number, verdict.name, f"{verdict.icon} {verdict.in_words}", verdict.reason]))
     yield ""
 
 
@@ -94,7 +94,7 @@ def to_junit(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> str:
 
 
 def _cases(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> Iterator[Case]:
-    judged, expect = verdicts(record), (record.scenario and record.scenario.expect) or Expect()
+    judged, expect = verdicts(record), record.expect
     if record.outcome == "not supported":
         yield Case("run", skipped=record.outcome_detail or record.outcome)
         return
@@ -102,14 +102,7 @@ def _cases(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> Iterator[C
         yield Case("run", wrong)
     for verdict in judged:
         yield _characteristic(verdict, expect)
-    if expect.figures:
-        figures: dict[str, float | None] = {name: record.figures.get(name) for name in expect.figures}
-        yield Case("expected figures", list(expect.out_of_range(figures)))
-    if expect.common:
-        yield Case("expected chains", list(expect.unexpected_common_blocks(chains)))
-    if expect.deviations:
-        found = [(finding.agent_id, finding.handler) for finding in (record.steps.evidence if record.steps else ())]
-        yield Case("expected deviations", list(expect.unexpected_deviations(found)))
+    yield from (Case(name, wrong) for name, wrong in record.unmet_expectations(chains))
 
 
 def _wrong_with_run(record: RunRecord) -> Iterator[str]:
@@ -121,9 +114,11 @@ def _wrong_with_run(record: RunRecord) -> Iterator[str]:
 
 def _characteristic(verdict: Verdict, expect: Expect) -> Case:
     name, expected = verdict.title, expect.verdict(verdict.key)
+    message = f"{verdict.verdict}: {verdict.reason}" if verdict.reason else verdict.verdict
+    if verdict.remark == AS_EXPECTED:
+        return Case(name, note=f"{AS_EXPECTED}: {message}")
     if verdict.verdict == expected or (expected is None and verdict.kind == "holds"):
         return Case(name)
-    message = f"{verdict.verdict}: {verdict.reason}" if verdict.reason else verdict.verdict
     if expected is None and not verdict.is_bad:
         return Case(name, skipped=message)
     return Case(

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.archive.run_record import CharacteristicRecord, FindingRecord, JudgementRecord, RunRecord
+from harness.scenario.expect import AS_EXPECTED, Expect
 from harness.scenario.verdict_names import ALL_CHECKS, CHARACTERISTICS, FURTHER_CHECKS, kind_of
 
 STATEMENTS = {
@@ -38,6 +39,13 @@ class Verdict:
     evidence: list[dict[str, Any]]
     """Label -> value, for each piece of evidence."""
     evidence_left_out: int
+    remark: str = ""
+    """How the verdict relates to the expected one, such as "as expected". Empty if there is nothing to say."""
+
+    @property
+    def in_words(self) -> str:
+        """The verdict with its remark, such as "violated, as expected"."""
+        return ", ".join(filter(None, (self.verdict, self.remark)))
 
     @property
     def is_bad(self) -> bool:
@@ -63,10 +71,11 @@ def verdicts(record: RunRecord) -> list[Verdict]:
         return []
     judged = record.judgements
     keys = sorted({*record.characteristics, *CHARACTERISTICS}, key=lambda key: (len(key), key))
-    return [_verdict(key, judged.get(key)) for key in [*keys, *(key for key in FURTHER_CHECKS if key in judged)]]
+    keys += [key for key in FURTHER_CHECKS if key in judged]
+    return [_verdict(key, judged.get(key), record.expect) for key in keys]
 
 
-def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None) -> Verdict:
+def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None, expect: Expect) -> Verdict:
     kind, evidence = kind_of(judged.verdict) if judged else "unknown", judged.evidence if judged else []
     return Verdict(
         key=key,
@@ -79,20 +88,27 @@ def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None) ->
         reason=judged.reason if judged else "",
         evidence=[_evidence(finding) for finding in evidence[:EVIDENCE_KEPT]],
         evidence_left_out=max(0, len(evidence) - EVIDENCE_KEPT),
+        remark=expect.remark(key, judged.verdict) if judged else "",
     )
 
 
 def headline(verdicts: list[Verdict], *, completed: bool) -> tuple[str, str]:
-    """Return a summary of the verdicts and its kind. A run that did not complete is never "holds"."""
+    """Return a summary of the verdicts and its kind.
+
+    A run that did not complete is never "holds". A run whose bad verdicts are all expected is "unknown".
+    """
     characteristics = [verdict for verdict in verdicts if verdict.number]
     violated, holding = (sum(verdict.kind == kind for verdict in characteristics) for kind in ("violated", "holds"))
-    beside = [f"{verdict.name}: {verdict.verdict}" for verdict in verdicts if not verdict.number and verdict.is_bad]
+    beside = [f"{verdict.name}: {verdict.in_words}" for verdict in verdicts if not verdict.number and verdict.is_bad]
+    bad = "unknown" if all(verdict.remark == AS_EXPECTED for verdict in verdicts if verdict.is_bad) else "violated"
     if violated:
-        return "; ".join([f"{violated} of {len(characteristics)} characteristics violated", *beside]), "violated"
+        all_expected = all(verdict.remark == AS_EXPECTED for verdict in characteristics if verdict.is_bad)
+        count = f"{violated} of {len(characteristics)} characteristics violated"
+        return "; ".join([f"{count}, {AS_EXPECTED}" if all_expected else count, *beside]), bad
     if not verdicts:
         return "not judged", "unknown"
     words_for_it = "; ".join([f"none violated, {holding} of {len(characteristics)} hold", *beside])
-    return words_for_it, "violated" if beside else "holds" if completed and holding else "unknown"
+    return words_for_it, bad if beside else "holds" if completed and holding else "unknown"
 
 
 def _evidence(finding: FindingRecord) -> dict[str, Any]:

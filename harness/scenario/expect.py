@@ -21,6 +21,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from harness.backend_names import BackendName
+from harness.present.text import did_you_mean
 from harness.scenario.strict_model import Model, VehicleId, VehicleKey
 from harness.scenario.verdict_names import (
     CHARACTERISTICS,
@@ -57,6 +58,9 @@ FigureName = Literal[
 
 CHARACTERISTIC_NUMBERS = {number: int(number) for number in CHARACTERISTICS}
 """Number of a characteristic as a JSON key -> as an integer."""
+
+AS_EXPECTED = "as expected"
+"""The remark on a bad verdict that the scenario expects."""
 
 ChainHash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
@@ -158,7 +162,8 @@ class Expect(Model):
     def _known_figures(cls, figures: Any) -> Any:
         for name in figures if isinstance(figures, Mapping) else ():
             if name not in get_args(FigureName):
-                raise ValueError(f"no figure {shown(name)}: use one of {', '.join(get_args(FigureName))}")
+                known = get_args(FigureName)
+                raise ValueError(f"no figure {shown(name)}: use one of {', '.join(known)}{did_you_mean(name, known)}")
         return figures
 
     @field_validator("deviations")
@@ -195,6 +200,35 @@ class Expect(Model):
     def as_expected(self, key: str, verdict: str) -> bool:
         expected = self.verdict(key)
         return kind_of(verdict) != "bad" if expected is None else verdict == expected
+
+    def remark(self, key: str, verdict: str) -> str:
+        """Return "as expected" for an expected verdict that is not good, "expected: holds" for another verdict than the
+        expected one, and else ""."""
+        expected = self.verdict(key)
+        if verdict == expected:
+            return AS_EXPECTED if kind_of(verdict) != "good" else ""
+        return f"expected: {expected}" if expected else ""
+
+    def in_words(self, key: str, verdict: str) -> str:
+        """Return the verdict with its remark, such as "violated, as expected"."""
+        return ", ".join(filter(None, (verdict, self.remark(key, verdict))))
+
+    def unmet(
+        self,
+        figures: Mapping[str, float | None],
+        chains: Mapping[int, Sequence[str]],
+        found: Iterable[tuple[int, str | None]],
+    ) -> Iterator[tuple[str, list[str]]]:
+        """Yield each kind of expectation besides verdicts that this object has, with a sentence for each that is unmet.
+
+        `chains` has the block hashes of each agent's chain, and `found` an agent and a handler for each deviation.
+        """
+        if self.figures:
+            yield "expected figures", list(self.out_of_range(figures))
+        if self.common:
+            yield "expected chains", list(self.unexpected_common_blocks(chains))
+        if self.deviations:
+            yield "expected deviations", list(self.unexpected_deviations(found))
 
     def out_of_range(self, figures: Mapping[str, float | None]) -> Iterator[str]:
         """Yield a sentence for each figure outside of its range."""

@@ -1,8 +1,9 @@
 """Load a scenario from a file or from the library, and explain validation errors in one sentence."""
 
+import re
 import stat
 from collections.abc import Hashable, Iterator
-from difflib import get_close_matches
+from itertools import islice
 from pathlib import Path
 from typing import Any, get_args
 
@@ -10,6 +11,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from harness.errors import ScenarioError
+from harness.present.text import did_you_mean
 from harness.scenario.scenario import Scenario
 from ucp.short_value import shown, shown_key
 
@@ -47,6 +49,7 @@ def first_sentence(name: str) -> str:
 MAX_PROBLEM = 200
 """Maximum number of characters of a parser message in an error."""
 MAX_NESTING = 50
+MAX_FILES_BESIDE = 1000
 MAX_SCENARIO_BYTES = 8 * 1024 * 1024
 """Maximum size of a scenario file. The events of a flight of two hours with twenty vehicles take half of it."""
 
@@ -129,7 +132,7 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         names = "`ucp-harness scenarios` lists the included scenarios"
-        raise ScenarioError(f"{path}: no such file or {what}; {names}") from None
+        raise ScenarioError(f"{path}: no such file or {what}; {names}{did_you_mean(path, _near(path))}") from None
     except OSError as error:
         raise ScenarioError(f"{str(path)[:MAX_PROBLEM]}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -145,6 +148,13 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
     return document
 
 
+def _near(path: Path) -> Iterator[str]:
+    """Yield the names of the library, and the YAML files beside a missing file."""
+    if len(path.parts) == 1:
+        yield from scenario_names()
+    yield from (str(file) for file in islice(path.parent.glob("*.y*ml"), MAX_FILES_BESIDE))
+
+
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
     """Return the most specific problem that pydantic found, as one sentence."""
     problems: list[Any] = error.errors()
@@ -152,9 +162,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     key = ".".join(shown_key(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
         allowed = _siblings(model, problem["loc"])
-        nearest = get_close_matches(str(problem["loc"][-1]), allowed, n=1)
-        meant = f"; did you mean `{nearest[0]}`?" if nearest else ""
-        return f"`{key}` is unknown: use one of {', '.join(allowed)}{meant}"
+        return f"`{key}` is unknown: use one of {', '.join(allowed)}{did_you_mean(problem['loc'][-1], allowed)}"
     if problem["type"] == "missing":
         return f"`{key}` is missing"
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ").removeprefix("String ")
@@ -163,6 +171,8 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     value = shown(problem["input"])
     if problem["type"] == "list_type" and isinstance(problem["input"], int | float | str):
         message += f", as [{value}]"
+    if problem["type"] == "literal_error":
+        message += did_you_mean(problem["input"], re.findall(r"'([^']*)'", problem["ctx"]["expected"]))
     return (
         f"`{key}` is {value}: it {message}"
         if message.startswith(("should", "must"))

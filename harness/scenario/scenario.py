@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
+from harness.present.text import did_you_mean
 from harness.scenario._network import NetworkModel
 from harness.scenario.agent_options import (
     AgentCommand,
@@ -233,7 +234,7 @@ class Scenario(Model):
         known = [field.name for field in dataclasses.fields(Settings)]
         for name in settings if isinstance(settings, dict) else ():
             if name not in known:
-                raise ValueError(f"{name} is unknown: use one of {', '.join(known)}")
+                raise ValueError(f"{name} is unknown: use one of {', '.join(known)}{did_you_mean(name, known)}")
         return settings
 
     @field_validator("quirks", mode="before")

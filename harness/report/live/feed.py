@@ -241,7 +241,13 @@ class Feed:
             "outcome": record.outcome,
             "detail": record.outcome_detail,
             "judgements": [
-                [key, judgement.name, judgement.verdict, judgement.reason, kind_of(judgement.verdict)]
+                [
+                    key,
+                    judgement.name,
+                    record.expect.in_words(key, judgement.verdict),
+                    judgement.reason,
+                    kind_of(judgement.verdict),
+                ]
                 for key, judgement in record.judgements.items()
             ],
             "report": (self._directory / "report.html").is_file(),

@@ -1,5 +1,6 @@
 """The command line: its help imports no command, and the shell completes names and options."""
 
+import json
 import os
 import re
 import subprocess
@@ -118,6 +119,8 @@ def test_option_version_prints_the_version() -> None:
         ("ucp-harness ch", {"check", "chain"}),
         ("ucp-harness run --backe", {"--backend"}),
         ("ucp-harness sitl pa", {"path"}),
+        ("ucp-harness run loss_1", {"loss_10", "loss_100", "loss_15"}),
+        ("ucp-harness explore scenarios/loss_15", {"scenarios/loss_15.yaml"}),
     ],
 )
 def test_shell_completes_commands_and_options(typed: str, completed: set[str]) -> None:
@@ -128,6 +131,27 @@ def test_shell_completes_commands_and_options(typed: str, completed: set[str]) -
         [COMMAND[0], "-c", script], capture_output=True, text=True, env={**os.environ, **asked}, check=True
     )
     assert set(answer.stdout.split()) == completed
+
+
+@pytest.mark.parametrize(("columns", "lines"), [(None, 1), ("80", 3)])
+def test_piped_table_is_as_wide_as_its_text(tmp_path: Path, columns: str | None, lines: int) -> None:
+    name = "A scenario with a name of more than eighty characters, which a terminal would wrap to several lines"
+    write_run(fly(agents=3, duration_s=100), tmp_path / "runs" / "run", CONNECTED)
+    record = tmp_path / "runs" / "run" / "run.json"
+    document = json.loads(record.read_text())
+    document["scenario"] = {"name": name}
+    record.write_text(json.dumps(document))
+    environment = {key: value for key, value in os.environ.items() if key != "COLUMNS"}
+    printed = harness("runs", tmp_path / "runs", env=environment | ({"COLUMNS": columns} if columns else {})).stdout
+    assert (name in printed) == (columns is None)
+    assert len(printed.splitlines()) >= 1 + lines
+
+
+@pytest.mark.parametrize("name", ["los_15", "scenarios/los_15.yaml"])
+def test_misspelt_scenario_gets_a_suggestion(name: str) -> None:
+    refused = harness("run", name)
+    assert refused.returncode == 2
+    assert refused.stderr.endswith(f"; did you mean `{name.replace('los_', 'loss_')}`?\n")
 
 
 def test_unknown_command_gets_a_suggestion() -> None:

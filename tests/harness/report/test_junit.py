@@ -5,12 +5,19 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+from rich.console import Console
 
 from harness.archive.archive import RunArchive
 from harness.archive.record_file import validate_leniently
 from harness.archive.run_record import RunRecord
+from harness.checker import Result
+from harness.checker.judgement import Judgement
+from harness.commands.terminal import show_result
 from harness.report import write_report
 from harness.report._run_summary import to_junit
+from harness.scenario.verdict_names import Verdict
+from tests.harness.command import harness
+from tests.harness.report.live.runs import film
 from tests.harness.report.runs import result_of, write_run
 
 Case = tuple[str, str, str] | None
@@ -68,10 +75,10 @@ def test_not_applicable_characteristic_is_skipped_with_the_reason() -> None:
 @pytest.mark.parametrize(
     ("expected", "verdict", "tag"),
     [
-        ("violated", "violated", None),
+        ("violated", "violated", "system-out"),
         ("violated", "holds", "failure"),
         ("holds", "not applicable", "failure"),
-        ("not applicable", "not applicable", None),
+        ("not applicable", "not applicable", "system-out"),
     ],
 )
 def test_expected_verdict_decides_over_success(expected: str, verdict: str, tag: str | None) -> None:
@@ -79,7 +86,51 @@ def test_expected_verdict_decides_over_success(expected: str, verdict: str, tag:
     result["scenario"]["expect"] = {"characteristics": {"6": expected}}
     inside = cases(result)["6. one uniform chain"]
     assert (inside and inside[0]) == tag
-    assert inside is None or inside[2].endswith(f"\nexpected: {expected}")
+    assert inside is not None
+    assert (
+        inside[2].startswith("as expected: ") if tag == "system-out" else inside[2].endswith(f"\nexpected: {expected}")
+    )
+
+
+def violated_as_expected() -> dict[str, Any]:
+    result = judged("6", verdict="violated", reason="2 different chains")
+    result["scenario"]["expect"] = {"characteristics": {"6": "violated"}}
+    return result
+
+
+def one_judgement(verdict: Verdict) -> Result:
+    return Result({"6": Judgement("one uniform chain", verdict, "")}, {})
+
+
+def test_all_outputs_call_a_violation_expected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_run(tmp_path / "runs" / "run", {1: "1.1", 2: "1.1 2.1"}, violated_as_expected())
+    write_report(RunArchive(run))
+    note = "<system-out>as expected: violated: 2 different chains</system-out>"
+    assert note in (run / "junit.xml").read_text()
+    assert 'failures="0"' in (run / "junit.xml").read_text()
+    page, summary = (run / "report.html").read_text(), (run / "report.md").read_text()
+    for text in (page, summary):
+        assert "1 of 6 characteristics violated, as expected" in text
+        assert text.count("violated, as expected") == 2
+    assert "characteristic 6 violated, as expected" in " ".join(harness("runs", tmp_path / "runs").stdout.split())
+    ending = film(run)[-1][1]
+    assert ["6", "one uniform chain", "violated, as expected", "2 different chains", "bad"] in ending["judgements"]
+    show_result(Console(width=200), one_judgement("violated"), RunArchive(run).record)
+    assert "✘ violated, as expected" in capsys.readouterr().out
+
+
+def test_page_and_terminal_report_unmet_expectations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result = result_of([1, 2])
+    result["scenario"]["expect"] = {"figures": {"distinct_chains": 7}, "characteristics": {"6": "violated"}}
+    run = write_run(tmp_path / "run", {1: "1.1", 2: "1.1"}, result)
+    write_report(RunArchive(run))
+    unmet = "distinct chains is 2, and should be 7"
+    assert unmet in (run / "report.html").read_text()
+    assert unmet in (run / "report.md").read_text()
+    show_result(Console(width=200), one_judgement("holds"), RunArchive(run).record)
+    printed = capsys.readouterr()
+    assert unmet in printed.err
+    assert "holds, expected: violated" in printed.out
 
 
 def test_expected_figures_are_a_test_case() -> None:

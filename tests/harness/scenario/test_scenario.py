@@ -37,6 +37,10 @@ def test_scenario_with_only_a_name_is_the_experiment_of_the_thesis(tmp_path: Pat
         ("name: x\nspeedpu: 3", "`speedpu` is unknown: use one of name, about, agents"),
         ("name: x\nscenario: {name: y}", "this is a matrix: play it with `ucp-harness matrix "),
         ("name: x\nspeedpu: 3", "; did you mean `speedup`?"),
+        ("name: x\ntimeline: [{at_s: 3, partion: [[1]]}]", "; did you mean `partition`?"),
+        ("name: x\nsettings: {vote_timout_s: 3}", "; did you mean `vote_timeout_s`?"),
+        ("name: x\nvehicles: {kind: ardupilt}", "; did you mean `ardupilot`?"),
+        ("name: x\nexpect: {figures: {mutual_chian: 3}}", "; did you mean `mutual_chain`?"),
         ("name: x\ntimeline: [{at_s: 1, kill: 2}]", "`timeline.0.kill` is 2: it should be a valid list, as [2]"),
         (
             "name: x\nnetwork: {lost: 1}",

@@ -182,7 +182,7 @@ function showStatus() {
   const bad = end.judgements.filter(([, , , , kind]) => kind === "bad");
   const open = end.judgements.filter(([, , , , kind]) => kind === "unknown");
   if (!end.judgements.length) status.textContent = end.outcome === "running" ? "did not end normally" : end.outcome;
-  else if (bad.length) { status.textContent = bad.map(([, name, verdict]) => `${name}: ${verdict}`).join(", "); status.classList.add("bad"); }
+  else if (bad.length) { status.textContent = bad.map(([, name, verdict]) => `${name}: ${verdict}`).join("; "); if (!bad.every(([, , verdict]) => verdict.endsWith("as expected"))) status.classList.add("bad"); }
   else if (open.length) status.textContent = `not judged: ${open.map(([, name]) => name).join(", ")}`;
   else { status.textContent = "all good"; status.classList.add("good"); }
   $("report").hidden = !end.report;
