@@ -1,7 +1,8 @@
 """Errors for users: one sentence that names the cause and a solution, and the exit status of the command line."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Self
 
 VIOLATED, WRONG_REQUEST, CANNOT_HERE, INCOMPLETE, INTERRUPTED = 1, 2, 3, 4, 130
@@ -45,6 +46,19 @@ class MachineError(HarnessError):
     """This machine cannot fulfil the request, for example because a package is missing."""
 
     exit_status = CANNOT_HERE
+
+
+@contextmanager
+def extra(name: str, purpose: str) -> Iterator[None]:
+    """Import packages of an extra of this package inside of the context.
+
+    Raises MachineError with the install command if a package is missing. `purpose` is the subject of its sentence.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        why = f"{purpose} needs the package {error.name}: run `pip install 'ucp-harness[{name}]'`"
+        raise MachineError(why) from None
 
 
 class UnsupportedError(MachineError):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -130,13 +131,29 @@ def home_position(vehicle: Autopilot) -> Any:
 
 def autopilot_version(vehicle: Autopilot) -> Any:
     """Return the version of this package, without a commit. It is sent on request only."""
-    parts = [min(int(part), 255) for part in version("ucp-harness").split(".")[:3]]
+    parts = [min(part, 255) for part in release(_installed())]
     number = int.from_bytes([*parts, mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL], "big")
     capabilities = mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     none = [0] * 8
     return mavlink.MAVLink_autopilot_version_message(
         capabilities, number, 0, 0, 0, none, none, none, 0, 0, vehicle.sysid
     )
+
+
+def release(installed: str) -> tuple[int, int, int]:
+    """Return the three numbers of a version such as "1.2.3", "1.2.3rc1" or "1.3.dev7"."""
+    found = re.match(r"(\d+)(?:\.(\d+))?(?:\.(\d+))?", installed)
+    assert found is not None, "versions start with a number"
+    major, minor, micro = (int(part or 0) for part in found.groups())
+    return major, minor, micro
+
+
+def _installed() -> str:
+    """Return the version of the package. An image of containers has its files only, without a version."""
+    try:
+        return version("ucp-harness")
+    except PackageNotFoundError:
+        return "0"
 
 
 def _cms(speed_ms: float) -> int:

@@ -21,7 +21,7 @@ class WheelSchemas(BuildHookInterface):  # type: ignore[type-arg]
             return
         folder = Path(self._folder.name)
         subprocess.run([sys.executable, "-m", "harness.json_schemas", str(folder)], cwd=self.root, check=True)
-        for path in folder.rglob("*.schema.json"):
+        for path in sorted(folder.rglob("*.schema.json")):  # the order of files in the wheel
             build_data["force_include"][str(path)] = path.relative_to(folder).as_posix()
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from harness.errors import MachineError, RunDirectoryError, ScenarioError
+from harness.errors import MachineError, RunDirectoryError, ScenarioError, extra
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
@@ -41,13 +41,11 @@ def opener_of(bundle: Path | None) -> "Opener | None":
     """Return the opener of a secured mission's datagrams. None without a bundle. Raises KeysError, MachineError."""
     if bundle is None:
         return None
-    try:
+    with extra("secure", "--bundle"):
         from harness.play.keyring import KeysError
         from ucp.secure.bundle import load_bundle
         from ucp.secure.keyfile import KeyFileError
         from ucp.secure.opening import Opener
-    except ModuleNotFoundError:
-        raise MachineError("--bundle needs the package cryptography: run `pip install 'ucp-harness[secure]'`") from None
     try:
         return Opener(load_bundle(bundle))
     except KeyFileError as error:
@@ -64,12 +62,8 @@ def depot_of(path: Path | None) -> "Depot | None":
     """Return the depot whose key is in the file. None without a file. Raises KeysError, MachineError."""
     if path is None:
         return None
-    try:
+    with extra("secure", "--depot-key"):
         from harness.play.keyring.key_directory import load_depot_key
-    except ModuleNotFoundError:
-        raise MachineError(
-            "--depot-key needs the package cryptography: run `pip install 'ucp-harness[secure]'`"
-        ) from None
     return load_depot_key(path)
 
 

@@ -10,15 +10,13 @@ import typer
 
 from harness.commands._shared_options import refuse_existing, roster_of
 from harness.commands.terminal import complain, print_json, print_lines
-from harness.errors import MachineError
+from harness.errors import extra
 from harness.scenario.load import parse
 
-try:
+with extra("secure", "the command keys"):
     from harness.play.keyring.inspection import in_words, inspect
     from harness.play.keyring.key_directory import Home, KeysError, write_revocation
     from ucp.secure.bundle import DEFAULT_EPOCH_S, MAX_EPOCH_S
-except ModuleNotFoundError:
-    raise MachineError("keys need the package cryptography: run `pip install 'ucp-harness[secure]'`") from None
 
 SEVERAL_MISSIONS = 1
 

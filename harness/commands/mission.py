@@ -11,7 +11,7 @@ import typer
 
 from harness.commands._shared_options import RARE, roster_of
 from harness.commands.terminal import complain, print_json, print_lines
-from harness.errors import WRONG_REQUEST, MachineError
+from harness.errors import WRONG_REQUEST, extra
 from harness.field.depot.mission_comparison import compare
 from harness.field.depot.mission_files import MissionFileError, Plan, write
 from harness.scenario import Scenario, load_scenario
@@ -149,10 +149,8 @@ def _scenario(path: Path | None, agents: str | None, name: str | None) -> Scenar
 
 
 def _home(directory: Path) -> "Home":
-    try:
+    with extra("secure", "--keys"):
         from harness.play.keyring.key_directory import Home
-    except ModuleNotFoundError:
-        raise MachineError("keys need the package cryptography: run `pip install 'ucp-harness[secure]'`") from None
     return Home(directory)
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.errors import MachineError, ScenarioError
+from harness.errors import ScenarioError, extra
 from harness.scenario import Scenario
 from ucp.sealed import seal_to
 
@@ -57,14 +57,10 @@ def mission_keys(scenario: Scenario, secret: bytes) -> MissionKeys | None:
     if scenario.security is None:
         return None
     security = scenario.security
-    try:
-        from harness.play.keyring.key_directory import Authority
-        from ucp.secure.bundle import KeySet
-    except ModuleNotFoundError:
-        raise MachineError(
-            "a secured mission needs the package cryptography: run `pip install 'ucp-harness[secure]'`, or remove "
-            "`security`"
-        ) from None
+    require_key_packages(scenario)
+    from harness.play.keyring.key_directory import Authority
+    from ucp.secure.bundle import KeySet
+
     if security.keys == FRESH:
         fresh = KeySet.derived(secret, scenario.roster, seals=security.seal)
         bundles = {agent_id: fresh.bundle(agent_id) for agent_id in scenario.roster}
@@ -80,6 +76,13 @@ def mission_keys(scenario: Scenario, secret: bytes) -> MissionKeys | None:
             f"{keys.public.fingerprint}: use the directory of this mission, or correct the fingerprint"
         )
     return keys
+
+
+def require_key_packages(scenario: Scenario) -> None:
+    """Raise MachineError if the mission is secured and the package cryptography is missing."""
+    if scenario.security is not None:
+        with extra("secure", "a secured mission"):
+            import cryptography  # noqa: F401
 
 
 def refuse_revocations(scenario: Scenario) -> None:

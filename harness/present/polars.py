@@ -4,11 +4,9 @@ Polars was chosen over pandas for three reasons. It writes Parquet itself, where
 columns have one declared type even with missing values. Its import takes a third of the time.
 """
 
-from harness.errors import MachineError
+from harness.errors import extra
 
-try:
+with extra("data", "a table"):
     import polars as pl
-except ImportError:
-    raise MachineError("tables need further packages: `pip install 'ucp-harness[data]'`") from None
 
 __all__ = ["pl"]

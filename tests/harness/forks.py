@@ -34,14 +34,22 @@ def same_interpreter(environ: Mapping[str, str]) -> bool:
 
 
 def call(
-    arguments: list[str], environ: Mapping[str, str], cwd: Path, typed: str, deadline_s: float
+    arguments: list[str],
+    environ: Mapping[str, str],
+    cwd: Path,
+    typed: str,
+    deadline_s: float,
+    packages: Path | None = None,
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command until it ends and until all its children have closed standard output and error."""
+    """Run the command until it ends and until all its children have closed standard output and error.
+
+    With `packages`, the command imports from the standard library and from this directory only.
+    """
     (stdin, keyboard), (out, stdout), (err, stderr) = os.pipe(), os.pipe(), os.pipe()
     with os.fdopen(keyboard, "w") as stream:
         stream.write(typed)
     request = json.dumps({"arguments": arguments, "environ": dict(environ), "cwd": str(cwd)})
-    server = _server()
+    server = _server(packages)
     server.settimeout(deadline_s)
     socket.send_fds(server, [request.encode()], [stdin, stdout, stderr])
     for end in (stdin, stdout, stderr):
@@ -76,11 +84,13 @@ class _PipeReader(threading.Thread):
 
 
 @functools.cache
-def _server() -> socket.socket:
+def _server(packages: Path | None) -> socket.socket:
     own_end, server_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    alone = ["-S", "-P"] if packages else []  # neither `site-packages` nor the working directory
     process = subprocess.Popen(
-        [sys.executable, "-m", __name__, str(server_end.fileno())],
+        [sys.executable, *alone, "-m", __name__, str(server_end.fileno())],
         cwd=REPOSITORY,
+        env={**os.environ, **({"PYTHONPATH": str(packages)} if packages else {})},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         pass_fds=[server_end.fileno()],
@@ -106,9 +116,11 @@ def _serve(channel: socket.socket) -> None:
     fast_exit = _FastExit()
     atexit.register(fast_exit)  # before all others, so it is called after them
     from harness.cli import COMMANDS
+    from harness.errors import MachineError
 
     for command in COMMANDS.values():
-        import_module(command.location.partition(":")[0])
+        with suppress(MachineError):  # an extra is missing
+            import_module(command.location.partition(":")[0])
     del sys.modules["harness.cli"]  # a fork runs it as __main__, as `python -m` does
     gc.freeze()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -145,7 +157,8 @@ def _run_command(arguments: list[str], environ: dict[str, str], cwd: str) -> Non
     os.environ.update(environ)
     os.chdir(cwd)
     sys.argv = ["ucp-harness", *arguments]
-    sys.path[0] = cwd
+    if not sys.flags.safe_path:
+        sys.path[0] = cwd
     runpy.run_module("harness.cli", run_name="__main__", alter_sys=True)
 
 

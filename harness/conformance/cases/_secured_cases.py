@@ -101,7 +101,7 @@ async def _secured(bench: Bench) -> AsyncIterator[tuple[SecuredPeers, "KeySet"]]
     try:
         from ucp.secure.bundle import KeySet, write_bundle
     except ModuleNotFoundError as error:
-        raise CannotJudgeError(f"{error.name} is not installed here: pip install ucp-harness[secure]") from None
+        raise CannotJudgeError(f"{error.name} is not installed here: run `pip install 'ucp-harness[secure]'`") from None
     keys = KeySet.derived(os.urandom(32), ROSTER)
 
     def prepare(directory: Path) -> None:

@@ -23,7 +23,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
-from harness.errors import MachineError
+from harness.errors import MachineError, extra
 from harness.field.adapters.adapter import Adapter, ChainExport, Datagram, LoggedEvent, Observation, TraceLine, Unusable
 from harness.field.adapters.bags import (
     MAGICS,
@@ -140,8 +140,6 @@ class RosBag(Adapter):
 
 
 def _types(store: str) -> Any:
-    try:
+    with extra("ros", "reading a ROS bag"):
         from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise MachineError("reading ROS bags needs the package rosbags: `pip install ucp-harness[ros]`") from None
     return get_typestore(Stores[store])

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from harness.errors import MachineError, ScenarioError
 from harness.play._ground_station_check import refuse_unreachable_ground_station
+from harness.play._vehicle_keys import require_key_packages
 from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.scenario import Scenario
 from harness.scenario.changes import NetworkChange, timeline_of
@@ -22,6 +23,7 @@ def refuse_unplayable(scenario: Scenario) -> None:
     refuse_unsupported_network(scenario)
     choose_vehicles(scenario)
     refuse_unreachable_ground_station(scenario)
+    require_key_packages(scenario)
 
 
 def refuse_virtual_time_keys(scenario: Scenario) -> None:

@@ -9,6 +9,7 @@ from harness.archive.directory import RunDirectory
 from harness.errors import AgentFailedError, InterruptedRunError, MachineError, ScenarioError
 from harness.play._ground_station_check import refuse_unreachable_ground_station
 from harness.play._pace import Pace
+from harness.play._vehicle_keys import require_key_packages
 from harness.play.backend import Backend
 from harness.play.progress import Progress, Snapshot
 from harness.play.simulation.air import VirtualAir
@@ -46,6 +47,7 @@ class SimulationBackend(Backend):
         if befall:
             raise ScenarioError(no_vehicles([*befall]))
         refuse_unreachable_ground_station(scenario)
+        require_key_packages(scenario)
         if scenario.foreign:
             _refuse_what_foreign_agents_cannot(scenario)
 

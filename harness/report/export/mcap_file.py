@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import IO, Any
 
 from harness.archive.exports import MAX_EXPORT_BYTES, RUN_FILE, export_paths
-from harness.errors import MachineError
+from harness.errors import extra
 from harness.report.export._exported_run import ExportedRun
 from harness.report.export._links import FIELD, vehicle_frame
 from harness.report.export._samples import LogLine, LossSample, Position, Telemetry
 from harness.report.export._topics import Topics
 
-try:
+with extra("export", "writing MCAP"):
     from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
     from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
     from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -26,8 +26,6 @@ try:
     from mcap_protobuf.schema import register_schema
 
     from harness.report.export._scene import Scene, colours_of
-except ImportError:
-    raise MachineError("writing MCAP needs further packages: `pip install ucp-harness[export]`") from None
 
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _SEVERITIES = (Log.FATAL, Log.FATAL, Log.FATAL, Log.ERROR, Log.WARNING, Log.INFO, Log.INFO, Log.DEBUG)

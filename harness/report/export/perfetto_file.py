@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import IO, Any
 
 from harness.archive.history import Message
-from harness.errors import MachineError
+from harness.errors import extra
 from harness.report.export._exported_run import ExportedRun
 from harness.report.export._samples import HandlerRunSample, LogLine, NetworkSample, Position, ReplicationSample, Sample
 from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
-try:
+with extra("export", "writing a Perfetto trace"):
     from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import (
         BUILTIN_CLOCK_BOOTTIME,
         BUILTIN_CLOCK_REALTIME,
@@ -31,8 +31,6 @@ try:
         TrackEvent,
     )
     from perfetto.trace_builder.proto_builder import StreamingTraceProtoBuilder
-except ImportError:
-    raise MachineError("writing Perfetto traces needs a further package: `pip install ucp-harness[export]`") from None
 
 SWARM = "swarm"
 MAX_TEXT = 500

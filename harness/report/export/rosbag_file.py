@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from harness.archive.history import LATEST_S
 from harness.archive.traces import Gap, Header
-from harness.errors import MachineError
+from harness.errors import MachineError, extra
 from harness.report.export._exported_run import ExportedRun
 from harness.report.export._links import FIELD, LinkLine, Links, vehicle_frame
 from harness.report.export._samples import (
@@ -28,12 +28,10 @@ from harness.report.export._samples import (
     Telemetry,
 )
 
-try:
+with extra("export", "writing a ROS bag"):
     import numpy
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
-except ImportError:
-    raise MachineError("writing ROS bags needs a further package: `pip install ucp-harness[export]`") from None
 
 Timed = tuple[int, str, Any]
 """Time, topic and message."""

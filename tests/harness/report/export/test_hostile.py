@@ -3,14 +3,11 @@
 import json
 import os
 import shutil
-import sys
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from harness.errors import MachineError
 from tests.harness.command import harness, sentences
 from tests.harness.mission import edit
 
@@ -52,20 +49,6 @@ def test_interrupted_run_is_exported_up_to_its_end(copy: Path, tmp_path: Path) -
         "agents/1.trace.jsonl: truncated in the middle of a line; the part before is read",
         "the end of the run is not recorded: the run is still active, or it was killed",
     ]
-
-
-@pytest.mark.parametrize(
-    ("room", "package"), [("mcap", "mcap.writer"), ("perfetto", "perfetto"), ("rosbag", "rosbags")]
-)
-def test_missing_package_is_named_with_the_install_command(
-    room: str, package: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in [name for name in sys.modules if name.split(".")[0] == package.split(".")[0]]:
-        monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.setitem(sys.modules, package, None)
-    monkeypatch.delitem(sys.modules, f"harness.report.export.{room}_file", raising=False)
-    with pytest.raises(MachineError, match=r"pip install ucp-harness\[export\]"):
-        import_module(f"harness.report.export.{room}_file")
 
 
 def test_excessive_roster_is_refused(copy: Path, tmp_path: Path) -> None:

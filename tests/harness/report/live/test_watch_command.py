@@ -31,7 +31,7 @@ def test_used_port_is_reported_before_the_run_begins(tmp_path: Path) -> None:
 
 def test_missing_package_is_reported_with_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "aiohttp", None)
-    with pytest.raises(MachineError, match=r"pip install ucp-harness\[watch\]"):
+    with pytest.raises(MachineError, match=r"pip install 'ucp-harness\[watch\]'"):
         require_packages()
 
 
