@@ -1,4 +1,4 @@
-"""The report of a run: one page that loads nothing, a summary in Markdown, and JUnit XML.
+"""Write the report of a run: one HTML page that loads no other files, a Markdown summary, and JUnit XML.
 
 `_report_source` reads the run directory, `_run_page` lays out the page, and `_run_summary` writes the short forms. Each
 picture has a module of its own, which draws plain values and reads no files.

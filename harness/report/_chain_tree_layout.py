@@ -1,4 +1,4 @@
-"""Positions of all marks of a chain tree: rows grow upwards with time, and columns do not overlap.
+"""Compute the positions of all marks in a picture of the chain tree. Time grows upwards, and columns do not overlap.
 
 Each subtree is packed against the subtrees to its left by its outline, row by row (after Reingold and Tilford, "Tidier
 Drawings of Trees", 1981). A block stands below the middle of its successors. If more than half of the agents follow one
@@ -29,7 +29,7 @@ MARGIN = 8
 
 @dataclass(slots=True)
 class PlacedMark:
-    """A mark with its centre `x` and top `y`; units are CSS pixels, y grows downwards."""
+    """A mark of the picture with its position: centre `x` and top `y` in CSS pixels. y grows downwards."""
 
     mark: Mark
     width: float
@@ -42,11 +42,11 @@ class PlacedMark:
 
     @property
     def rows(self) -> range:
-        """The rows that the mark occupies. The gap above a row belongs to this row."""
+        """The rows that the mark occupies, including the gap above each row."""
         return range(self.row, self.row + math.ceil((self.height + ROW_GAP) / ROW_HEIGHT))
 
     def walk(self) -> Iterator["PlacedMark"]:
-        """Yield this mark and all marks above it. Each mark follows the mark below it."""
+        """Yield this mark and all marks above it. Each mark follows the mark on which it stands."""
         to_visit = [self]
         while to_visit:
             placed = to_visit.pop()
@@ -75,7 +75,9 @@ class _Outline:
             self._rows[row] = (-width / 2 - self.shift, width / 2 - self.shift)
 
     def distance_to(self, right: "_Outline", gap: float = COLUMN_GAP) -> float:
-        """Return the smallest distance from this root to a root on its right that leaves `gap` between the subtrees."""
+        """Return the smallest distance between this root and a root on its right that leaves `gap` between the two
+        subtrees.
+        """
         shared = self._rows.keys() & right._rows.keys()
         return max(
             (self._rows[row][1] + self.shift - right._rows[row][0] - right.shift + gap for row in shared),
@@ -83,7 +85,7 @@ class _Outline:
         )
 
     def merged_with(self, other: "_Outline", x: float) -> "_Outline":
-        """Merge the outline whose root is at `x` into this one. The smaller outline is merged into the larger one."""
+        """Merge another outline into this one, and return the result. The root of the other is at `x`."""
         other.shift += x
         large, small = (self, other) if len(self._rows) >= len(other._rows) else (other, self)
         by = small.shift - large.shift
@@ -112,7 +114,7 @@ def lay_out(root: Mark) -> Layout:
 
 
 def _sized(root: Mark) -> PlacedMark:
-    """Return the marks with sizes and rows.
+    """Return all marks with their sizes and rows, but without positions.
 
     All boxes are as wide as the longest label, except the inception block's.
     """
@@ -149,9 +151,7 @@ def _width(characters: int) -> float:
 
 
 def _offsets(placed_marks: list[PlacedMark]) -> dict[int, float]:
-    """Return the distance of each mark from the mark that it stands on or beside, by `id` of the mark; the root has
-    none.
-    """
+    """Return the horizontal distance of each mark from the mark below it, by `id` of the mark."""
     offsets: dict[int, float] = {}
     outlines: dict[int, _Outline] = {}
     beside = {id(item.beside) for item in placed_marks}

@@ -1,4 +1,4 @@
-"""The map section of the report: the tracks of the vehicles, and small maps of the swarm at notable moments."""
+"""Draw the map in the report: the flight paths of the vehicles, and small maps of the swarm at important moments."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ MOMENTS = 6
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """A small map of the swarm.
+    """A small map of the swarm at one moment.
 
     `at` is the time, `what` the event at this time or "", and `network` the network's state.
     """
@@ -45,7 +45,7 @@ class Moment:
 
 @dataclass(frozen=True, slots=True)
 class MapSection:
-    """The map with its legend. If nothing can be drawn, `tracks` is None and `notes` give the reason."""
+    """The map with its legend. If it cannot be drawn, `tracks` is None and `notes` contains the reason."""
 
     tracks: Markup | None
     legend: list[tuple[Markup, str]]
@@ -57,7 +57,9 @@ class MapSection:
 def section(
     tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink], types: Mapping[int, VehicleType]
 ) -> MapSection | None:
-    """Return the section, or None if no vehicle moved and no file is damaged. `types` holds the known vehicle types."""
+    """Return the map section, or None if no vehicle moved and no file is damaged. `types` contains the known vehicle
+    types.
+    """
     if not any(_moved(tracks, vehicle) for vehicle in tracks.by_vehicle):
         return MapSection(None, [], [], tracks.problems) if tracks.problems else None
     return _drawn(tracks, network, ink, types)
@@ -100,7 +102,7 @@ def _drawn(
 def _notable_moments(
     known: Sequence[Division], network: Connectivity, tracks: Tracks, end_s: float
 ) -> list[tuple[float, Division | None]]:
-    """Return up to `MOMENTS` + 1 moments with the division of the network at each one.
+    """Return up to `MOMENTS` + 1 moments to show, each with the partition of the network at that moment.
 
     The moments are the start, the end, the most important network changes and the time of the worst losses. The
     importance of a change is the number of affected vehicles multiplied by the duration of the new state.
@@ -152,7 +154,7 @@ def _moment(
 
 
 def _legend(flown: Sequence[Flight], *, rebooted: bool) -> list[tuple[Markup, str]]:
-    """Return a legend of the marks that this map contains."""
+    """Return a legend of all marks that this map contains."""
     parts: dict[str, set[int]] = {}
     for flight in flown:
         for segment in flight.segments:
@@ -177,7 +179,7 @@ def _legend(flown: Sequence[Flight], *, rebooted: bool) -> list[tuple[Markup, st
 
 
 def _in_words(losses: Collection[float]) -> str:
-    """Return a phrase with the range of the losses, or "" if they are negligible."""
+    """Return a phrase with the smallest and largest loss rate, or "" if they are negligible."""
     least, most = min(losses, default=0.0), max(losses, default=0.0)
     if not quality(most):
         return ""
@@ -186,7 +188,7 @@ def _in_words(losses: Collection[float]) -> str:
 
 
 def _legend_of_moments(moments: Sequence[Moment], types: set[VehicleType]) -> list[tuple[Markup, str]]:
-    """Return legend entries for lossy links, and for vehicle types if there are several."""
+    """Return legend entries for links with losses, and for vehicle types if there are several."""
     drawn = "".join(moment.picture for moment in moments)
     entries = [
         (map_svg.sample(f"q{which}"), words)
@@ -198,7 +200,7 @@ def _legend_of_moments(moments: Sequence[Moment], types: set[VehicleType]) -> li
 
 
 def _description(tracks: Tracks, area_extent: Extent, moments: Sequence[Moment]) -> str:
-    """Return a text alternative for the map."""
+    """Return a text that describes the map for readers who cannot see it."""
     count = len(tracks.by_vehicle)
     states = "; ".join(
         f"at {moment.at}{f', {moment.what}' if moment.what else ''}: {moment.network}" for moment in moments

@@ -1,4 +1,4 @@
-"""The network section of the report: the settings at the start, the states over time, and the recorded events."""
+"""Show the network in the report: its conditions at the start, their changes over time, and all recorded events."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ REASONS = {
 
 @dataclass(frozen=True, slots=True)
 class NetworkStrip:
-    """Names of the lanes from top to bottom, and a picture of their states over mission time."""
+    """A picture of the network's conditions over mission time, and the names of its rows from top to bottom."""
 
     names: list[str]
     picture: Markup
@@ -39,7 +39,7 @@ class NetworkStrip:
 def strip(
     network: Connectivity, faults: Sequence[FaultRecord], end_s: float, channel: ChannelRecord | None = None
 ) -> NetworkStrip | None:
-    """Draw the recorded network states up to `end_s`. Return None if there are none."""
+    """Draw the recorded network conditions up to `end_s`. Return None if there are none."""
     if not network.states:
         return None
     partitions = [
@@ -58,7 +58,9 @@ def strip(
 
 
 def _load(channel: ChannelRecord, end_s: float) -> list[_network_strip.Span]:
-    """Return the load of the channel over time. Intervals of the same load, rounded to percent, form one span."""
+    """Return the load of the shared channel over time. Neighbouring intervals with the same load in percent are
+    joined.
+    """
     loads = [round(share, 2) for share in channel.load] + [0.0]
     changes = [number for number, load in enumerate(loads) if number == 0 or load != loads[number - 1]]
     states = [(number * channel.load_interval_s, text.percent(loads[number]), loads[number]) for number in changes]
@@ -66,7 +68,7 @@ def _load(channel: ChannelRecord, end_s: float) -> list[_network_strip.Span]:
 
 
 def channel(record: RunRecord) -> list[str]:
-    """Sentences on the shared channel: its model, its load, and the reasons of losses."""
+    """Return sentences about the shared radio channel: its model, its load, and the reasons for losses."""
     if (found := record.channel) is None:
         return []
     mean = sum(found.load) * found.load_interval_s / record.mission_s if record.mission_s else 0.0
@@ -94,7 +96,7 @@ def _played_by(channel: ChannelRecord) -> str:
 
 
 def _pairs(network: Connectivity, end_s: float) -> list[tuple[str, list[_network_strip.Span]]]:
-    """Return a lane for each group of pairs with equal losses over time, the largest losses first.
+    """Return a row for each group of vehicle pairs with equal losses over time. The largest losses come first.
 
     Return no lanes if all pairs have equal losses.
     """
@@ -131,7 +133,7 @@ def initial_state(states: Sequence[NetworkState]) -> str | None:
 
 
 def event_rows(record: RunRecord) -> list[tuple[str, str, str]]:
-    """Return time, event and details of each fault and operator command, in time order."""
+    """Return the time, name and details of each fault and operator command, in order of time."""
     rows = [(fault.at_s, fault.what, _fault_detail(fault)) for fault in record.faults]
     station, refused = record.ground_station, "; refused" if in_virtual_time(record.backend) else ""
     if station is not None:
@@ -153,7 +155,7 @@ def _fault_detail(fault: FaultRecord) -> str:
 
 
 def _command_detail(command: OperatorCommand) -> str:
-    """Return a text like "vehicle 2: MAV_CMD_DO_SET_MODE; param1 1, param2 6; 3 times until 2:05".
+    """Return a text about a command, such as "vehicle 2: MAV_CMD_DO_SET_MODE; param1 1, param2 6; 3 times until 2:05".
 
     Parameters with the value 0 are left out.
     """
@@ -168,7 +170,7 @@ def _command_detail(command: OperatorCommand) -> str:
 
 
 def ground_station(record: RunRecord) -> str | None:
-    """Return a sentence about the traffic with the ground station, or None if there was no ground station."""
+    """Return a sentence about the messages between vehicles and the ground station, or None if there was none."""
     if (station := record.ground_station) is None:
         return None
     dropped = f", and {text.value(station.dropped)} were dropped" if station.dropped else ""

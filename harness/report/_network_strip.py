@@ -1,4 +1,4 @@
-"""A strip of the network over mission time: partitions, losses, and a tick for each fault.
+"""Draw the network conditions over mission time: partitions, losses, and a tick for each fault.
 
 Horizontal positions are percentages of the width. The strip therefore fits any screen, and its text is never scaled.
 """
@@ -17,7 +17,7 @@ _LANE = 24
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A state of the network from one mission second to another."""
+    """An interval of mission seconds in which the network condition was the same."""
 
     from_s: float
     to_s: float
@@ -27,7 +27,7 @@ class Span:
 
 
 def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[Span]:
-    """Turn changes (at_s, text, level) into spans. Each span lasts until the next change. Level 0 gives no span."""
+    """Convert changes (at_s, text, level) to intervals. Each lasts until the next change. Level 0 gives no interval."""
     spans: list[Span] = []
     in_time = sorted(changes, key=lambda change: change[0])
     for number, (at_s, text, level) in enumerate(in_time):
@@ -38,7 +38,7 @@ def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[Spa
 
 
 def draw(lanes: Sequence[tuple[str, list[Span]]], ticks: Sequence[tuple[float, str]], end_s: float) -> Markup:
-    """Draw the named lanes from top to bottom. `ticks` are pairs (at_s, text)."""
+    """Draw the rows from top to bottom. `ticks` are pairs (at_s, text)."""
     parts: list[Markup] = []
     for number, (name, spans) in enumerate(lanes):
         parts.append(
@@ -69,7 +69,7 @@ def draw(lanes: Sequence[tuple[str, list[Span]]], ticks: Sequence[tuple[float, s
 
 
 def _span(lane: str, span: Span, y: float, end_s: float) -> Markup:
-    """Draw a span as a nested <svg>, which clips a text that is too long."""
+    """Draw an interval as a nested <svg>, which cuts off a text that is too long."""
     filled = max(2.0, _LANE * span.level)
     return Markup(
         '<svg x="{}" y="{}" width="{}" height="{}"><title>{}</title><rect class="span" y="{:.1f}" width="100%"'

@@ -1,4 +1,4 @@
-"""The input of a report: the archive of a run, a colour for each agent, and a sentence for each missing or damaged
+"""Read the input of a report: the files of a run, a colour for each agent, and a sentence about each missing or damaged
 file.
 """
 
@@ -19,7 +19,7 @@ from harness.report import _swarm_section, facts
 
 @dataclass(frozen=True)
 class ReportSource:
-    """The input of a report, made by `read_source`."""
+    """The input of a report. The function `read_source` creates it."""
 
     archive: RunArchive
     run_dir: Path
@@ -35,7 +35,7 @@ class ReportSource:
 
     @cached_property
     def traces(self) -> dict[int, Trace]:
-        """The traces by agent. Large traces are read without the handler runs that only received a message."""
+        """The traces by agent. In large traces, handler runs that only received a message are left out."""
         traces = self.archive.traces
         return {agent: trace.skimmed() for agent, trace in traces.items()} if self.archive.large else traces
 
@@ -57,7 +57,7 @@ class ReportSource:
 
     @property
     def chains_missing(self) -> list[str]:
-        """Sentences about agents without a usable export, and about damaged exports."""
+        """Sentences about agents without a usable chain export, and about damaged exports."""
         return [*_swarm_section.missing(self.archive), *map(self.archive.within, self.exports.errors)]
 
     @property
@@ -73,7 +73,7 @@ class ReportSource:
 
 
 def read_source(archive: RunArchive) -> ReportSource:
-    """Read the input of a report.
+    """Return the input of a report from the archive of a run.
 
     Raises RunDirectoryError if the directory holds no run, or a run of another version.
     """

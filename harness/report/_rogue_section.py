@@ -1,4 +1,4 @@
-"""The rogue section of the report: the datagrams that the rogue node sent, and the agents' reactions."""
+"""Show injected messages in the report: the datagrams that the rogue node sent, and how the agents reacted."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,9 @@ MAX_ROWS = 500
 
 @dataclass(frozen=True, slots=True)
 class InjectionRow:
-    """One outcome of an injection. `message` is a message type, or the reason why agents refuse the datagrams."""
+    """A table row about one result of an injection. `message` is a message type, or the reason for refused
+    datagrams.
+    """
 
     at: str
     what: str
@@ -25,14 +27,14 @@ class InjectionRow:
 
 @dataclass(frozen=True, slots=True)
 class RogueSection:
-    """Rows of the table. `left_out` is the number of rows above `MAX_ROWS`."""
+    """The table of injections. `left_out` is the number of rows beyond `MAX_ROWS`."""
 
     rows: list[InjectionRow]
     left_out: int
 
 
 def section(injections: Sequence[RogueInjection]) -> RogueSection | None:
-    """Return the section, or None if the record contains no injections."""
+    """Return the table of injections, or None if the record contains none."""
     rows = [row for injection in injections for row in _rows(injection)]
     return RogueSection(rows[:MAX_ROWS], max(0, len(rows) - MAX_ROWS)) if rows else None
 

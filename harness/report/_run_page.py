@@ -1,4 +1,4 @@
-"""The page of a run, and all files of its report.
+"""Create the HTML page of a run, and write all files of its report.
 
 The page loads nothing. Its Content-Security-Policy allows only its own style sheet and the script of its timeline. The
 page also works without the script. The template escapes all text from agents and scenarios.
@@ -41,7 +41,7 @@ _TEMPLATE = Path(__file__).with_name("page.html.j2")
 
 
 def draw(left: ReportSource) -> str:
-    """Return the page as HTML."""
+    """Return the page of a run as HTML."""
     record, exports, ink = left.record, left.exports, left.ink
     judged, outcome = verdict_section.verdicts(record), facts.outcome(record)
     timeline_section = timeline.section(left, name_blocks(exports.by_agent))
@@ -86,7 +86,7 @@ def draw(left: ReportSource) -> str:
 
 
 def _again(left: ReportSource, scenario: str) -> str:
-    """Return the command that plays the run again. Empty if the record lacks the scenario."""
+    """Return the command that plays the run again. It is empty if the record does not contain the scenario."""
     if not scenario:
         return ""
     given = SCENARIO_FILE if len(scenario) <= MAX_SCENARIO else str(left.run_dir)
@@ -96,7 +96,9 @@ def _again(left: ReportSource, scenario: str) -> str:
 def _pictures(
     exports: Mapping[int, Export], before: Mapping[int, Export], ink: Mapping[int, Ink]
 ) -> list[dict[str, Any]]:
-    """Return the chain trees at the end of the mission and after the final reconcile, or one tree if both are equal."""
+    """Return a picture of the chains at the end of the mission and one after the final reconcile. If both are equal,
+    return one.
+    """
     if not exports:
         return []
     if not before:
@@ -136,7 +138,7 @@ def write_report(archive: RunArchive) -> Path:
 
 
 def write(left: ReportSource) -> Path:
-    """Write the report of a run that has already been read. See `write_report`."""
+    """Write the report of a run from input that was already read. See `write_report`."""
     _write(left.run_dir / "chains.svg", ChainTreePicture(left.exports.by_agent, left.ink).standalone())
     _write(left.run_dir / "report.md", to_markdown(left))
     _write(left.run_dir / "junit.xml", to_junit(left.record, left.chains))

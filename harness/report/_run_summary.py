@@ -1,4 +1,4 @@
-"""The short forms of a report: report.md for people, and junit.xml for build servers."""
+"""Write short forms of a report: report.md for readers, and junit.xml for build servers."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -72,7 +72,9 @@ def _happened(happened: Sequence[tuple[str, str, str]]) -> Iterator[str]:
 
 
 def _listed(sentences: Iterable[str]) -> list[str]:
-    """Return a Markdown list of the sentences, shortened to `SENTENCES_SHOWN`; no lines without a sentence."""
+    """Return the sentences as a Markdown list, limited to `SENTENCES_SHOWN` entries. Without sentences, return no
+    lines.
+    """
     all_sentences = list(sentences)
     items = [f"- {_short(sentence)}" for sentence in all_sentences[:SENTENCES_SHOWN]]
     if len(all_sentences) > SENTENCES_SHOWN:
@@ -85,7 +87,7 @@ def _short(text: str) -> str:
 
 
 def to_junit(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> str:
-    """Return the run as JUnit XML. `chains` holds the block hashes of each agent's chain.
+    """Return the run as JUnit XML. `chains` contains the block hashes of each agent's chain.
 
     A characteristic fails if it is violated, or if its verdict differs from the verdict that the scenario expects. A
     characteristic that is not applicable is skipped with its reason.

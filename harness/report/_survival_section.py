@@ -1,4 +1,4 @@
-"""The survival section of the report: the blocks that were lost together with vehicles."""
+"""Show in the report which blocks were lost together with vehicles."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from harness.report.chain_tree import ranges
 
 @dataclass(frozen=True, slots=True)
 class LostBlockRow:
-    """A block that a lost vehicle completed, or that no vehicle holds any more."""
+    """A table row about a block that a lost vehicle completed, or that no vehicle holds any more."""
 
     name: str
     ink: Ink | None
@@ -37,7 +37,7 @@ class SurvivalSection:
 
 
 def section(survived: Survival | None, ink: Mapping[int, Ink]) -> SurvivalSection | None:
-    """Return the section, or None if the record contains no survival figures."""
+    """Return the section about lost blocks, or None if the record does not contain it."""
     if survived is None:
         return None
     return SurvivalSection(in_words(survived), [_row(loss, ink) for loss in survived.losses])

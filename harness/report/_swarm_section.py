@@ -1,4 +1,4 @@
-"""The swarm section of the report: a table of the agents with their vehicles, and a table of the blocks."""
+"""Show the swarm in the report: a table of agents with their vehicles, and a table of blocks."""
 
 import shlex
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ def agent_inks(archive: RunArchive) -> dict[int, Ink]:
 
 
 def missing(archive: RunArchive) -> list[str]:
-    """Return one sentence for each reason why agents have no usable export."""
+    """Return one sentence for each reason why agents have no usable chain export."""
     by_reason: dict[str, list[int]] = {}
     for agent_id in archive.roster:
         if agent_id not in archive.exports.by_agent:
@@ -59,7 +59,9 @@ VEHICLE_FAULTS_KEY = "befallen"
 
 
 def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
-    """Return column labels, and a row (agent ID, ink, cells by column) for each agent with its vehicle."""
+    """Return the column titles and a row for each agent with its vehicle. A row is (agent ID, colour, cells by
+    column).
+    """
     record, exports = archive.record, archive.exports.by_agent
     mixed = bool(programs(record))
     rows = []
@@ -96,7 +98,7 @@ def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
 
 
 def _vehicle_faults(recorded: Any) -> str:
-    """Return the faults of a vehicle, like "lose_gps at 40 s, wind at 80 s: not simulated"."""
+    """Return a text about the faults of a vehicle, such as "lose_gps at 40 s, wind at 80 s: not simulated"."""
     try:
         return ", ".join(
             f"{it['what']} at {it['at_s']:g} s{'' if it['parameters'] else ': not simulated'}" for it in recorded
@@ -118,7 +120,7 @@ def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
 
 
 def counts(exports: Mapping[int, Export], record: RunRecord) -> str | None:
-    """Return a sentence about completed blocks that are in no chain, and about chain blocks that no record says
+    """Return a sentence about completed blocks that are in no chain, and about blocks in chains that no record lists as
     completed.
 
     Return None if the completed blocks are exactly the blocks in the chains.
@@ -144,7 +146,7 @@ def _count_are(count: int) -> str:
 
 
 def block_rows(exports: Mapping[int, Export], ink: Mapping[int, Ink]) -> list[BlockRow]:
-    """Return a row for each block in a chain, oldest first."""
+    """Return a row for each block that is in a chain. The oldest is first."""
     names, held_by = name_blocks(exports), holders(exports)
     blocks = {block.block_hash: block for export in exports.values() for block in export.chain}
     return [

@@ -1,4 +1,4 @@
-"""Charts below the lanes of the timeline: lengths of chains, copies of blocks, and the cycle of a livelock."""
+"""Draw charts below the timeline: lengths of chains, copies of blocks, and an endless cycle of the agents."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ Figure = Callable[[Replication], float | None]
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """A chart. `lines` are pairs of a sample and its meaning."""
+    """A chart. `lines` contains pairs of a line sample and its meaning."""
 
     name: str
     lines: list[tuple[Markup, str]]
@@ -45,14 +45,16 @@ _LINE_CLASSES = ("broken", "whole")
 def draw(
     spreads: Sequence[Replication], faults: Sequence[FaultRecord], shades: Sequence[Shade], end_s: float
 ) -> list[Chart]:
-    """Return a chart for each group of figures. `spreads` holds at least one replication state, in time order."""
+    """Return a chart for each group of figures. `spreads` contains the numbers of copies over time, with at least one
+    entry.
+    """
     moments = thin_states(spreads, end_s)
     behind = draw_background(shades, faults, HEIGHT)
     return [_chart(name, figures, moments, behind, end_s) for name, figures in _CHARTS]
 
 
 def thin_states(spreads: Sequence[Replication], end_s: float) -> Sequence[Replication]:
-    """Reduce a long sequence to the states that are visible at full zoom-out.
+    """Return those states of a long sequence that are visible when the whole run is shown.
 
     Each interval of one picture column keeps the state with the shortest mutual chain and the last state.
     """
@@ -106,7 +108,7 @@ def _chart(
 
 
 def _steps(moments: Sequence[Replication], figure: Figure, per_px: float, end_s: float) -> str:
-    """Return a step line as an SVG path. The line starts at the first known value."""
+    """Return a step line as an SVG path, which starts at the first known value."""
     path = ""
     last: float | None = None
     for moment in moments:
@@ -134,7 +136,7 @@ _TEXT = 28
 
 
 def cycle_chart(cycle: Cycle, end_s: float) -> Chart:
-    """Draw a recurring cycle up to the end of the run at mission second `end_s`."""
+    """Draw an endless cycle of the agents up to `end_s`, the end of the run in mission seconds."""
     start_s = max(0.0, min(cycle.since_s, end_s))
     period_s = cycle.period_s if cycle.period_s is not None and cycle.period_s > 0 else end_s - start_s
     fault_text = "; ".join(f"agent {finding.agent_id}, {finding.detail}" for finding in findings(cycle))[:MAX_TEXT]

@@ -1,4 +1,4 @@
-"""The lanes of the timeline. Each agent has one lane: votes at the top, commits in the middle, reconciles at the
+"""Draw the timeline. Each agent has a row with its votes at the top, commits in the middle, and reconciles at the
 bottom.
 
 No information depends on colour alone. Votes without approval are hollow, phases have different heights, faults have
@@ -104,7 +104,7 @@ def draw(
 def _legend(
     history: History, faults: Sequence[FaultRecord], shades: Sequence[Shade], *, by_phase: bool
 ) -> list[tuple[Markup, str]]:
-    """Return a legend of the marks that the picture contains."""
+    """Return a legend of all marks that the picture contains."""
     outcomes = {vote.outcome for vote in history.votes}
     phases = {phase.name for reconcile in history.reconciles for phase in reconcile.phases}
     entries = [
@@ -144,12 +144,12 @@ def _legend(
 
 
 def block_label(block: str, names: Mapping[str, str]) -> str:
-    """Return the name of the block, or the first 12 digits of its hash if no export contains the block."""
+    """Return the name of the block, or the first 12 digits of its hash if no export contains it."""
     return names.get(block, block[:12])
 
 
 def phases_in_words(reconcile: Reconcile) -> str:
-    """Return the phases with their numbers of rounds, in the order in which the phases began."""
+    """Return the phases of a reconcile with their numbers of rounds, in the order in which they began."""
     rounds: dict[str, int] = {}
     for phase in reconcile.phases:
         rounds[phase.name] = rounds.get(phase.name, 0) + phase.rounds
@@ -157,7 +157,7 @@ def phases_in_words(reconcile: Reconcile) -> str:
 
 
 def group_commits(commits: Sequence[Commit], end_s: float) -> list[list[Commit]]:
-    """Group the commits of each agent into at most about `MAX_COMMITS` marks.
+    """Combine neighbouring commits of each agent, so that about `MAX_COMMITS` marks remain.
 
     Commits in one group lie close together.
     """
@@ -175,13 +175,13 @@ def group_commits(commits: Sequence[Commit], end_s: float) -> list[list[Commit]]
 
 
 def _longest(spans: Sequence[Span]) -> list[Span]:
-    """Return the `MAX_BARS` longest spans in time order. The earlier of two equally long spans is kept."""
+    """Return the `MAX_BARS` longest intervals in order of time. Of two equally long ones, the earlier is kept."""
     kept = sorted(spans, key=lambda span: (round(span.start_s - span.end_s, 3), span.start_s))[:MAX_BARS]
     return sorted(kept, key=attrgetter("start_s"))
 
 
 def _css_class(outcome: str) -> str:
-    """Return the CSS class of a vote. All outcomes except approval and disapproval are undecided."""
+    """Return the CSS class of a vote. All results except approval and disapproval count as undecided."""
     return {"approved": "approved", "not approved": "refused"}.get(outcome, "undecided")
 
 
@@ -246,7 +246,7 @@ def _commit(group: Sequence[Commit], lane_height: int, names: Mapping[str, str])
 
 
 def _tie(tie: Tie, lane_height: int) -> Markup:
-    """Draw a dot. A stroke of length 0 with round caps stays round when the view is stretched."""
+    """Draw a dot as a line of length 0 with round ends. It stays round when the picture is stretched."""
     return Markup('<path class="tie" d="M{} {}h0"><title>{}</title></path>').format(
         format_number(tie.at_s),
         n(lane_height - 3 - _PHASES_HEIGHT / 2),
@@ -255,7 +255,7 @@ def _tie(tie: Tie, lane_height: int) -> Markup:
 
 
 def _running_background(agent: int, faults: Sequence[FaultRecord], lane_height: int, end_s: float) -> list[Markup]:
-    """Draw the background of a lane while the agent runs, and a broken line while it is paused."""
+    """Draw the background of a row while its agent runs, and a broken line while the agent is paused."""
     ran: list[tuple[float, float]] = []
     paused: list[tuple[float, float]] = []
     since_s: float | None = 0.0

@@ -1,4 +1,4 @@
-"""Common parts of the pictures over mission time: a zoomable view, marks pinned to a second, and the axis.
+"""Provide the common parts of all pictures over mission time: the zoomable view, marks, and the axis.
 
 In a view, one horizontal unit is a mission second and one vertical unit is a pixel. Zooming changes the viewBox of the
 view. Shapes in the view are stretched, but strokes are not (`vector-effect` in `timeline.css`). Marks that must keep
@@ -18,7 +18,7 @@ TICK_HEIGHT = 22
 
 @dataclass(frozen=True, slots=True)
 class Shade:
-    """A period of mission time with a partition, and its description."""
+    """An interval of mission time with a partition, and its description."""
 
     start_s: float
     end_s: float
@@ -26,7 +26,7 @@ class Shade:
 
 
 def format_seconds(moment: float) -> str:
-    """Format mission seconds to the millisecond, for example "300.25 s"."""
+    """Return mission seconds with three decimals, for example "300.25 s"."""
     return f"{format_number(moment)}\u00a0s"
 
 
@@ -49,7 +49,7 @@ def plot(view: Iterable[Markup], pinned: Iterable[Markup], height: float, end_s:
 
 
 def pin(at_s: float, end_s: float, y: float, shape: Markup) -> Markup:
-    """Place the origin of the shape at this second, independent of the zoom."""
+    """Place a shape at this mission second, independent of the zoom."""
     return Markup('<svg class="pin" data-at="{}" x="{}%" y="{}">{}</svg>').format(
         format_number(at_s), format_number(100 * at_s / end_s), n(y), shape
     )

@@ -1,4 +1,4 @@
-"""The timeline section of the report: the actions of each agent, and charts of the spread of the data.
+"""Show the timeline in the report: the actions of each agent, and charts of the number of copies of blocks.
 
 Without its script the page shows the whole run, and tables list the votes and reconciles.
 """
@@ -45,7 +45,7 @@ MAX_FAULTS = 500
 
 @dataclass(frozen=True, slots=True)
 class TimelineTable:
-    """Rows of a table. `left_out` is the number of rows above `MAX_ROWS`."""
+    """The rows of a table. `left_out` is the number of rows beyond `MAX_ROWS`."""
 
     rows: list[list[str]]
     left_out: int
@@ -53,7 +53,9 @@ class TimelineTable:
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """The timeline. `messages` is the JSON from which the script draws arrows, or "null" if messages are left out."""
+    """The timeline. `messages` is JSON from which the script of the page draws arrows, or "null" if messages are left
+    out.
+    """
 
     end_s: float
     agents: list[tuple[int, Ink]]
@@ -69,14 +71,14 @@ class Timeline:
 
 @dataclass(frozen=True, slots=True)
 class TimelineSection:
-    """The timeline, and notes about the parts that were left out."""
+    """The timeline, with notes about the parts that were left out."""
 
     drawn: Timeline
     notes: list[str]
 
 
 def section(left: ReportSource, names: Mapping[str, str]) -> TimelineSection | None:
-    """Return the section, or None if there is no trace. `names` maps block hashes to names."""
+    """Return the timeline section, or None if there is no trace. `names` contains the names of blocks by hash."""
     traces, ink = left.traces, left.ink
     if not traces:
         return None
@@ -133,14 +135,14 @@ def end_s(left: ReportSource) -> float:
 
 
 def _planned_s(record: RunRecord) -> float:
-    """Return the planned duration of a completed run in mission seconds, or 0."""
+    """Return the planned duration in mission seconds if the run was completed, otherwise 0."""
     if record.scenario is None or record.scenario.duration_s > LATEST_S or facts.outcome(record) is not None:
         return 0.0
     return record.scenario.duration_s
 
 
 def _shades(network: Connectivity, end_s: float) -> tuple[list[Shade], int]:
-    """Return the partitions with their times, and the number of shorter partitions above `MAX_SHADES`."""
+    """Return the partitions with their times, and the number of shorter partitions that exceed `MAX_SHADES`."""
     known = divisions(network.states)
     ends = [*(division.at_s for division in known[1:]), end_s]
     shades = [
@@ -155,7 +157,7 @@ def _shades(network: Connectivity, end_s: float) -> tuple[list[Shade], int]:
 def _messages(
     messages: Sequence[Message] | None, agents: Sequence[int], names: Mapping[str, str]
 ) -> tuple[str, list[str]]:
-    """Return the received messages as JSON, and notes about left-out messages.
+    """Return the received messages as JSON, and notes about messages that were left out.
 
     The JSON holds the message names, the agent IDs, and one list for each message: time, lane of the sender, index of
     the name, block, and a pair [lane, time] for each receipt.
@@ -211,7 +213,7 @@ def _reconcile_row(reconcile: Reconcile) -> list[str]:
 
 
 def _in_words(history: History, agents: int, end_s: float, unknown: bool) -> str:
-    """Return a text alternative for the lanes. `unknown` adds that unknown words in the traces may hide events."""
+    """Return a text that describes the timeline. `unknown` adds that undefined names in traces may hide events."""
     approved = sum(vote.outcome == "approved" for vote in history.votes)
     return (
         f"Timeline of {agents} agents over {text.duration(round(end_s, 1))}: {len(history.votes)} votes, {approved} of"

@@ -1,4 +1,4 @@
-"""The programs that the agents ran, for runs with agents other than the harness's own."""
+"""List the programs that the agents of a run executed, if they are not the harness's own agent."""
 
 import shlex
 from collections.abc import Iterable, Mapping
@@ -13,7 +13,7 @@ from harness.scenario import Scenario
 
 @dataclass(frozen=True)
 class Program:
-    """A program of one or more agents. `command` is the scenario's command, or None for the harness's own agent.
+    """The program of one or more agents. `command` is None for the harness's own agent.
 
     `version` is the version that the agents reported, or None.
     """
@@ -24,7 +24,7 @@ class Program:
 
     @property
     def in_words(self) -> str:
-        """A phrase like "agent 2 ran ./my_agent --fast (1.4)" or "agents 1, 3 ran the harness's own"."""
+        """Return a phrase such as "agent 2 ran ./my_agent --fast (1.4)" or "agents 1, 3 ran the harness's own"."""
         program = "the harness's own" if self.command is None else shlex.join(self.command)
         of_version = "" if self.version is None else f" ({self.version})"
         return f"agent{'s' * (len(self.agents) > 1)} {', '.join(ranges([*self.agents]))} ran {program}{of_version}"
@@ -34,12 +34,12 @@ class Program:
 
 
 def programs(record: RunRecord) -> list[Program]:
-    """Return the programs in the order of their first agents. Return none if all agents are the harness's own."""
+    """Return the programs in the order of their first agents. The list is empty if all agents are the harness's own."""
     return [] if record.scenario is None else asked_for(record.scenario, record.agents)
 
 
 def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingProxyType({})) -> list[Program]:
-    """Return the programs that a scenario asks for.
+    """Return the programs that a scenario requests for its agents.
 
     `agents` are the records of the agents, if the scenario was played.
     """

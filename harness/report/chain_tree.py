@@ -1,4 +1,4 @@
-"""The chains of all agents as a tree. Equal beginnings of chains share a branch.
+"""Combine the chains of all agents into a tree. Chains with equal beginnings share a branch.
 
 A block appears once for each history that it follows. If diverged agents hold the same block, it is therefore on two
 branches (Figure 4.4). `marks` turns the tree into marks to draw: a box for each block, an oval where chains end and, on
@@ -24,7 +24,7 @@ OVAL_LINE_CHARACTERS = 14
 
 @dataclass(slots=True)
 class Node:
-    """A block after one history. In the inception block, `block` is None."""
+    """A block in the tree. In the inception block, `block` is None."""
 
     block: ExportedBlock | None
     holders: list[int] = field(default_factory=list)
@@ -35,13 +35,13 @@ class Node:
 
     @property
     def is_plain(self) -> bool:
-        """True for a block with exactly one successor at which no chain ends."""
+        """True if the block has exactly one successor, and no chain ends at it."""
         return self.block is not None and len(self.children) == 1 and not self.ends
 
 
 @dataclass(slots=True)
 class Mark:
-    """A mark to draw, and the marks above it."""
+    """A mark of the picture, together with all marks above it."""
 
     kind: Literal["block", "ellipsis", "oval"]
     nodes: list[Node]
@@ -54,7 +54,7 @@ class Mark:
 
 
 def chain_tree(exports: Mapping[int, Export]) -> Node:
-    """Return the inception block with the chains of all agents above it."""
+    """Return the inception block as the root of a tree with the chains of all agents."""
     inception = Node(None)
     for agent_id, export in sorted(exports.items()):
         node = inception
@@ -67,7 +67,7 @@ def chain_tree(exports: Mapping[int, Export]) -> Node:
 
 
 def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
-    """Return the agents whose chains contain each block, by block hash. The history of the block does not matter."""
+    """Return the agents whose chains contain each block, by block hash."""
     held_by: dict[str, list[int]] = {}
     for agent_id, export in sorted(exports.items()):
         for block_hash in dict.fromkeys(export.chain_of_block_hashes):
@@ -76,8 +76,7 @@ def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def marks(inception: Node, names: Mapping[str, str], *, abridged: bool) -> Mark:
-    """Return the mark of the inception block with all marks above it. `names` come from
-    `harness.archive.exports.name_blocks`.
+    """Return the mark of the inception block with all marks above it. `names` contains the names of blocks.
 
     The marks above a block are ordered by their lowest agent ID.
     """
@@ -99,7 +98,7 @@ def marks(inception: Node, names: Mapping[str, str], *, abridged: bool) -> Mark:
 
 
 def _stretch(below: Mark, first: Node, names: Mapping[str, str], abridged: bool) -> tuple[Mark, Node]:
-    """Add marks from `first` to the next block that is not plain, above `below`.
+    """Add marks above `below`, from the block `first` to the next block where the tree branches or a chain ends.
 
     Return the topmost mark and its node.
     """
@@ -127,7 +126,7 @@ def _name(node: Node, names: Mapping[str, str]) -> str:
 
 
 def ranges(agent_ids: list[int]) -> list[str]:
-    """Shorten [1, 2, 3, 5, 6] to ranges: "1 to 3", "5", "6", with an en dash for "to".
+    """Return agent IDs as ranges: [1, 2, 3, 5, 6] gives "1 to 3", "5", "6", with an en dash for "to".
 
     A range has three or more consecutive IDs.
     """
@@ -144,7 +143,7 @@ def ranges(agent_ids: list[int]) -> list[str]:
 
 
 def wrapped(parts: list[str]) -> list[str]:
-    """Join the parts with commas, and break the text into lines of similar length. Longer texts get wider lines."""
+    """Join the parts with commas, and divide the text into lines of similar length."""
     characters = len(", ".join(parts))
     widest = max(OVAL_LINE_CHARACTERS, round((2.5 * characters) ** 0.5))
     even = math.ceil(characters / math.ceil(characters / widest)) + 1

@@ -1,5 +1,4 @@
-"""The chain tree as SVG, as in Figures 4.1 to 4.7 of the thesis. It grows from bottom to top, with a colour for each
-agent.
+"""Draw the tree of chains as SVG, as in Figures 4.1 to 4.7 of the thesis, with a colour for each agent.
 
 The colours are attributes, so that programs without style sheets also draw them. `chain_tree.css` adds a dark scheme.
 """
@@ -35,7 +34,7 @@ _DOTS_LENGTH = 2 * _DOT_SPACING + 1  # three dots; the last one lies just before
 
 
 class ChainTreePicture:
-    """A chain tree that can be drawn abridged or with all blocks.
+    """A picture of the tree of chains, either shortened or with all blocks.
 
     `key` keeps the identifiers of several pictures on one page distinct. `names` maps block hashes to names, if the
     caller knows more names than these exports contain.
@@ -60,20 +59,20 @@ class ChainTreePicture:
         """Number of blocks that the abridged form omits."""
 
     def draw(self, form: Literal["abridged", "full"]) -> Markup:
-        """Return the SVG for a page that includes STYLE. One page can contain both forms."""
+        """Return the picture as SVG for a page that includes STYLE. One page may contain both forms."""
         if form == "abridged":
             return self._draw(self._abridged, form, Markup(""))
         return self._draw(lay_out(marks(self._tree, self._names, abridged=False)), form, Markup(""))
 
     def standalone(self) -> str:
-        """Return the abridged tree as the text of an SVG file."""
+        """Return the shortened picture as the text of an SVG file."""
         paper = Markup('<style>{}</style><rect class="ground" width="100%" height="100%" fill="#ffffff"/>').format(
             STYLE
         )
         return str(self._draw(self._abridged, "abridged", paper))
 
     def description(self) -> str:
-        """Return a text alternative for the picture."""
+        """Return a text that describes the picture."""
         agents = self._tree.holders
         if not agents:
             return "No chain: only the inception block."
@@ -130,7 +129,7 @@ class ChainTreePicture:
         )
 
     def _shape(self, placed: PlacedMark) -> Markup:
-        """Draw one mark with a tooltip that names it and its holders."""
+        """Draw one mark with a tooltip that lists the agents holding it."""
         mark = placed.mark
         text = _text(placed, "#1c2126")
         if mark.kind == "ellipsis":
@@ -174,7 +173,9 @@ class ChainTreePicture:
 
 
 def _path(below: PlacedMark, above: PlacedMark) -> str:
-    """Return a path from the top of `below` to the bottom of `above`. It turns two corners if they are not aligned."""
+    """Return an SVG path from the top of one mark to the bottom of another. It has two corners if they are not
+    aligned.
+    """
     start, end = below.y, above.y + above.height
     if above.x == below.x:
         return f"M{_n(below.x)} {_n(start)}V{_n(end)}"
@@ -188,13 +189,13 @@ def _path(below: PlacedMark, above: PlacedMark) -> str:
 
 
 def _path_beside(block: PlacedMark, oval: PlacedMark) -> str:
-    """Return a path from the right side of the block to the oval. The bottoms of both are level."""
+    """Return an SVG path from the right side of a block to an oval beside it."""
     middle = block.y + block.height / 2
     return f"M{_n(block.x + block.width / 2)} {_n(middle)}H{_n(oval.x - oval.width / 2)}"
 
 
 def _rectangle(placed: PlacedMark) -> Markup:
-    """Return an unfinished <rect> element."""
+    """Return the beginning of a <rect> element."""
     return Markup('<rect x="{}" y="{}" width="{}" height="{}"').format(
         _n(placed.x - placed.width / 2), _n(placed.y), _n(placed.width), _n(placed.height)
     )

@@ -1,4 +1,4 @@
-"""Facts of a run that the page and report.md share: settings, outcome, figures, and gaps in captures."""
+"""Collect the facts that report.html and report.md share: settings, result, figures, and gaps in captures."""
 
 import shlex
 from collections.abc import Mapping
@@ -36,7 +36,7 @@ FIGURES = {
 
 
 def vehicle_types(record: RunRecord) -> dict[int, VehicleType]:
-    """Return the type of each vehicle according to the scenario."""
+    """Return the type of each vehicle as the scenario defines it."""
     if record.scenario is None:
         return {}
     return {vehicle: record.scenario.vehicles.type_of(vehicle) for vehicle in record.scenario.roster}
@@ -47,7 +47,7 @@ def title(record: RunRecord) -> str:
 
 
 def summary(record: RunRecord, exports: Exports) -> list[str]:
-    """Return short phrases about the outcome, the swarm, the main settings, and the place and time of the run."""
+    """Return short phrases about the result, the swarm, the main settings, and the place and time of the run."""
     scenario = record.scenario
     parts: list[str] = [] if record.outcome == "running" else [record.outcome]
     agents = len({*record.known_agents, *exports.by_agent})
@@ -71,7 +71,7 @@ def summary(record: RunRecord, exports: Exports) -> list[str]:
 
 
 def outcome(record: RunRecord) -> tuple[str, str] | None:
-    """Return a headline and details if the run did not complete, or None."""
+    """Return a headline and details if the run was not completed, otherwise None."""
     if record.outcome == "completed":
         return None
     detail = record.outcome_detail
@@ -83,12 +83,12 @@ def outcome(record: RunRecord) -> tuple[str, str] | None:
 
 
 def figures(record: RunRecord) -> list[tuple[str, str]]:
-    """Return pairs of label and value."""
+    """Return the figures of the run as pairs of label and value."""
     return [(FIGURES.get(key, text.label(key)), text.value(figure)) for key, figure in record.figures.items()]
 
 
 def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
-    """Return a sentence about frames that captures dropped, or None."""
+    """Return a sentence about frames that packet captures missed, or None."""
     lacking = sorted(int(vehicle) for vehicle, frames in captured.items() if frames.dropped)
     if not lacking:
         return None
@@ -99,13 +99,13 @@ def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
 
 
 def link_qualities() -> list[str]:
-    """Return the words of a map's legend for each quality of a link, from 0 on."""
+    """Return the legend text for each quality of a link. The best quality has number 0."""
     limits = map(text.percent, QUALITY_LIMITS)
     return ["link", *(f"link that loses {low} to {high}" for low, high in pairwise(limits))]
 
 
 def command_again(record: RunRecord, scenario: str) -> str:
-    """Return the command that plays the run again. `scenario` is the path of its scenario.
+    """Return the command that plays the run again. `scenario` is the path of its scenario file.
 
     In virtual time, the command gives the same exports and traces, to the byte.
     """
@@ -116,7 +116,7 @@ def command_again(record: RunRecord, scenario: str) -> str:
 
 
 def scenario_text(record: RunRecord) -> str:
-    """Return the recorded scenario as YAML, without keys that have their defaults. Empty if none is recorded."""
+    """Return the recorded scenario as YAML without default values. It is empty if no scenario is recorded."""
     if record.scenario is None:
         return ""
     return to_yaml(record.scenario.model_dump(mode="json", exclude_defaults=True), [])

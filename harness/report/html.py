@@ -1,4 +1,4 @@
-"""A page in one file. Its Content-Security-Policy allows only its own styles and its own script.
+"""Create a page in one file. Its Content-Security-Policy allows only the styles and the script inside it.
 
 The template escapes every text except Markup.
 """
@@ -21,7 +21,7 @@ PAGE_STYLE = PALETTE + (_HERE / "page.css").read_text(encoding="utf-8")
 
 
 def render(template: Path, *, styles: Sequence[str], script: str = "", **content: Any) -> str:
-    """Fill `template`, which extends `base.html.j2`. The styles and the script are allowed by their digests."""
+    """Return the page made from `template`. Its styles and its script are allowed by their digests."""
     environment = Environment(
         loader=FileSystemLoader([template.parent, _HERE]),
         autoescape=True,
@@ -40,5 +40,5 @@ def render(template: Path, *, styles: Sequence[str], script: str = "", **content
 
 
 def _digest(text: str) -> str:
-    """Return the SHA-256 digest in the form that a Content-Security-Policy uses."""
+    """Return the SHA-256 digest in the form for a Content-Security-Policy."""
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")

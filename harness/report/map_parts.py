@@ -1,4 +1,4 @@
-"""Geometry of the map, and the division of the network into parts.
+"""Compute the geometry of the map, and which vehicles were connected at each time.
 
 A part is a group of two or more vehicles that reach each other but not the whole swarm. A vehicle that reaches no other
 vehicle is alone. A part keeps its letter in the next state if more than half of its vehicles stay together.
@@ -25,7 +25,7 @@ MAX_NAMED = 6
 
 @dataclass(frozen=True, slots=True)
 class Division:
-    """The parts of the network from `at_s` on, by number from 0. All other living vehicles are alone.
+    """The groups of connected vehicles from `at_s` on, by number from 0. All other living vehicles are alone.
 
     If all vehicles reach each other, all are in `together`, and there are no parts.
     """
@@ -41,22 +41,22 @@ class Division:
         return self.together | self.alone | frozenset().union(*self.parts.values())
 
     def place_of(self, vehicle: int) -> tuple[int | None, frozenset[int]]:
-        """Return the vehicle's part, and the vehicles that it reaches."""
+        """Return the number of the vehicle's group, and the vehicles that it reaches."""
         return self.part_of(vehicle), self.reachable_from(vehicle)
 
     def part_of(self, vehicle: int) -> int | None:
-        """Return the number of the vehicle's part, or None."""
+        """Return the number of the vehicle's group, or None if it has none."""
         return next((number for number, members in self.parts.items() if vehicle in members), None)
 
     def reachable_from(self, vehicle: int) -> frozenset[int]:
-        """Return the vehicles that this vehicle reaches, and itself."""
+        """Return the vehicles that this vehicle reaches, including itself."""
         part = self.part_of(vehicle)
         if part is not None:
             return self.parts[part]
         return self.together if vehicle in self.together else frozenset({vehicle})
 
     def changed_since(self, before: "Division") -> int:
-        """Return the number of vehicles that were lost, came back, or reach other vehicles than before.
+        """Return the number of vehicles that were lost, came back, or reach different vehicles than before.
 
         Vehicles that live in only one of the two states are ignored in the comparison of reached vehicles.
         """
@@ -65,7 +65,7 @@ class Division:
         return moved + len(self.living ^ before.living)
 
     def in_words(self) -> str:
-        """Return a text like "all 5 connected" or "A 1-3; B 4, 5; alone 6"."""
+        """Return a text such as "all 5 connected" or "A 1-3; B 4, 5; alone 6"."""
         if self.together:
             return f"all {len(self.together)} connected" if len(self.together) > 1 else "1 vehicle"
         phrases = [f"{letter(number)} {listed(members)}" for number, members in self.parts.items()]
@@ -80,7 +80,7 @@ class Division:
 
 @dataclass(frozen=True, slots=True)
 class TrackSegment:
-    """A section of a track in which the vehicle's place in the network is constant.
+    """A section of a flight path in which the vehicle belongs to the same group.
 
     `division` is the one at its start.
     """
@@ -92,7 +92,7 @@ class TrackSegment:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """The track of a vehicle from its start, or its first known position, until its loss or the end of the run."""
+    """The path of a vehicle from its start, or its first known position, to its loss or the end of the run."""
 
     vehicle: int
     segments: list[TrackSegment]
@@ -108,7 +108,7 @@ class Flight:
 
 
 def letter(number: int) -> str:
-    """Return the letters A, B, ... Z, A2, B2, ..."""
+    """Return a letter for a number: A, B, ... Z, A2, B2, ..."""
     return chr(ord("A") + number % 26) + (str(number // 26 + 1) if number >= 26 else "")
 
 
@@ -132,7 +132,7 @@ def divisions(states: Sequence[Topology]) -> list[Division]:
 
 
 def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]) -> dict[int, frozenset[int]]:
-    """Number the parts. A part keeps the number of a former part if it contains more than half of its vehicles.
+    """Number the groups. A group keeps the number of an earlier group if it contains more than half of its vehicles.
 
     Other parts get the lowest free numbers.
     """
@@ -148,7 +148,9 @@ def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]
 
 
 def longest_divisions(all_divisions: Sequence[Division], end_s: float, most: int) -> list[Division]:
-    """Return the first division and the longest others, at most `most`. Each lasts until the next one that is kept."""
+    """Return the first grouping and the longest others, at most `most` in all. Each lasts until the next returned
+    one.
+    """
     if len(all_divisions) <= most:
         return list(all_divisions)
     ends = [*(division.at_s for division in all_divisions[1:]), end_s]
@@ -159,7 +161,7 @@ def longest_divisions(all_divisions: Sequence[Division], end_s: float, most: int
 def flights(
     vehicle: int, tracks: Tracks, network: Connectivity, all_divisions: Sequence[Division], end_s: float
 ) -> Iterator[Flight]:
-    """Yield the flights of a vehicle and of the vehicles that replaced it after a loss."""
+    """Yield the paths of a vehicle, and of the vehicles that replaced it after a loss."""
     wreck: Fix | None = None
     for begin_s, until_s, lost in network.airborne_intervals(vehicle, end_s):
         flown = [fix for fix in tracks.by_vehicle[vehicle] if begin_s <= fix.at_s <= until_s]
@@ -200,7 +202,7 @@ INVISIBLE_PX = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """A rectangle of land, in metres north and east of the field's centre."""
+    """A rectangle on the ground, in metres north and east of the field's centre."""
 
     south_m: float
     north_m: float
@@ -217,7 +219,7 @@ class Extent:
 
 
 def extent(fixes: Sequence[Fix]) -> Extent:
-    """Return an extent around the fixes. There must be at least one fix."""
+    """Return a rectangle around the positions. There must be at least one position."""
     north, east = [fix.north_m for fix in fixes], [fix.east_m for fix in fixes]
     shortest = max(MIN_SPAN_M, MIN_ASPECT * max(max(north) - min(north), max(east) - min(east)))
     return Extent(*_widen(min(north), max(north), shortest), *_widen(min(east), max(east), shortest))
@@ -231,7 +233,7 @@ def _widen(low: float, high: float, shortest: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Projection:
-    """A projection of `land` into a rectangle in pixels. `left` and `top` are its upper left corner."""
+    """A projection of `land` into a rectangle of pixels. `left` and `top` are its upper left corner."""
 
     land: Extent
     left: float
@@ -261,14 +263,14 @@ class Projection:
         return self.x(fix.east_m), self.y(fix.north_m)
 
     def ticks_m(self) -> tuple[list[float], list[float]]:
-        """Return round metres north and round metres east, in equal steps."""
+        """Return round numbers of metres north and east, in equal steps, for the axes."""
         every = svg.step(max(self.land.width_m, self.land.height_m), 9)
         return _multiples(every, self.land.south_m, self.land.north_m), _multiples(
             every, self.land.west_m, self.land.east_m
         )
 
     def scale_bar_m(self) -> float:
-        """Return a round length of about a fifth of the map's width, or more."""
+        """Return a round length for the scale bar, at least about a fifth of the map's width."""
         return svg.step(self.land.width_m, 5)
 
 
@@ -277,7 +279,7 @@ def _multiples(every: float, low: float, high: float) -> list[float]:
 
 
 def thin(lines: Sequence[Sequence[Point]], most: int) -> list[list[Point]]:
-    """Simplify the lines to half a pixel, or further until they have at most `most` points in total.
+    """Simplify the lines to an accuracy of half a pixel, or less until they have at most `most` points in all.
 
     Each line keeps both its ends.
     """
@@ -313,7 +315,7 @@ def simplify(line: Sequence[Point], tolerance: float) -> list[Point]:
 
 
 def _distance(point: Point, start: Point, end: Point) -> float:
-    """Return the distance from the point to the segment between the other two points."""
+    """Return the distance from a point to the straight line between two other points."""
     (x, y), (x1, y1), (x2, y2) = point, start, end
     dx, dy = x2 - x1, y2 - y1
     length = dx * dx + dy * dy

@@ -1,4 +1,4 @@
-"""The map as SVG: tracks, parts of the network, and vehicle IDs.
+"""Draw the map as SVG: flight paths, groups of connected vehicles, and vehicle IDs.
 
 No information depends on colour alone. Parts have letters and dashes, vehicles have IDs, and each mark has a tooltip.
 The colours are in `map.css`, so the page must include STYLE.
@@ -30,7 +30,7 @@ Box = tuple[float, float, float, float]
 def tags(
     tagged: Sequence[tuple[int, Point]], crosses: Sequence[Point], to_px: Projection, ink: Mapping[int, Ink]
 ) -> Markup:
-    """Draw ID tags that overlap neither each other nor the `crosses`.
+    """Draw tags with vehicle IDs that overlap neither each other nor the `crosses`.
 
     A vehicle without room for a tag has only its tooltip.
     """
@@ -46,7 +46,7 @@ def tags(
 
 
 def _boxes(digits: int, place: Point) -> list[Box]:
-    """Return candidate boxes of a tag, the best first."""
+    """Return possible boxes for a tag. The best is first."""
     width = digits * DIGIT + PADDING
     boxes = []
     for distance in (NEAR, FAR):
@@ -111,7 +111,7 @@ _MOMENT_WIDTH, _MOMENT_HEIGHT = 300, 240
 
 
 def css_class(division: Division | None, vehicle: int) -> str:
-    """Return the CSS class for a vehicle in this division of the network."""
+    """Return the CSS class of a vehicle in this grouping of the network."""
     if division is None:
         return "unknown"
     if vehicle in division.together:
@@ -127,7 +127,7 @@ def draw_tracks(
     ink: Mapping[int, Ink],
     description: str,
 ) -> Markup:
-    """Draw the map. `reboots` are places and agents of reboots, and `description` is a text alternative."""
+    """Draw the map. `reboots` contains positions and agents of reboots, and `description` describes the picture."""
     to_px = Projection(land, _LEFT, _TOP, _ROOM_WIDTH, _ROOM_HEIGHT)
     return Markup(
         '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
@@ -155,7 +155,7 @@ def draw_moment(
     types: Mapping[int, VehicleType],
     description: str,
 ) -> Markup:
-    """Draw the living vehicles of the `swarm`, the losses of their `links`, and the places of `lost` vehicles."""
+    """Draw the living vehicles, the loss rates of their links, and the places where vehicles were lost."""
     to_px = Projection(land, 1, 1, _MOMENT_WIDTH, _MOMENT_HEIGHT)
     at = {vehicle: to_px(fix) for vehicle, fix in swarm.items()}
     dots = (_dot(vehicle, place, division, ink[vehicle], types.get(vehicle, "copter")) for vehicle, place in at.items())
@@ -179,7 +179,7 @@ def draw_moment(
 
 
 def _links(at: Mapping[int, Point], links: Mapping[tuple[int, int], float], division: Division | None) -> Markup:
-    """Draw the links in order of falling loss, so that good links are on top."""
+    """Draw the links. Those with small loss rates are drawn last, so that they are on top."""
     drawn: dict[tuple[int, str], list[str]] = {}
     shortest = sorted(links, key=lambda pair: math.dist(at[pair[0]], at[pair[1]]))
     for vehicle, neighbour in shortest[:MAX_LINKS]:
@@ -212,7 +212,7 @@ def _shape(vehicle_type: VehicleType, place: Point) -> str:
 
 
 def sample(which: str) -> Markup:
-    """Draw a legend sample.
+    """Draw a sample for the legend.
 
     `which` is one of LOOKS, "start", "end", "lost", "reboot", a link quality such as "q1", or a vehicle type.
     """
@@ -272,7 +272,7 @@ def frame(to_px: Projection) -> Markup:
 
 
 def _track_paths(segments: Sequence[TrackSegment], to_px: Projection) -> Markup:
-    """Draw the tracks. Tracks in parts are on top of the others."""
+    """Draw the flight paths. Those in groups of connected vehicles are on top."""
     lines = thin([[to_px(fix) for fix in segment.fixes] for segment in segments], MAX_POINTS)
     classes = [css_class(segment.division, segment.vehicle) for segment in segments]
     drawn = sorted(zip(classes, segments, lines, strict=True), key=lambda way: TRACK_CLASSES.index(way[0]))
@@ -302,7 +302,7 @@ def _connection_text(division: Division | None, vehicle: int) -> str:
 def _marks(
     flights: Sequence[Flight], reboots: Iterable[tuple[Fix, int]], to_px: Projection, ink: Mapping[int, Ink]
 ) -> Markup:
-    """Draw starts, reboots and ends, and tags at the ends."""
+    """Draw the starts, reboots and ends of flight paths, with tags at the ends."""
     parts = []
     for flight in flights:
         colours, start, end = ink[flight.vehicle], flight.start, flight.end

@@ -1,4 +1,4 @@
-"""The verdict section of the report: the characteristics and the further checks, with reasons and evidence."""
+"""Show the verdicts in the report: the characteristics and the further checks, with reasons and evidence."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -53,12 +53,12 @@ class Verdict:
 
     @property
     def topic(self) -> str:
-        """ "characteristic 6" or "steps"."""
+        """The name of the check in a sentence, such as "characteristic 6" or "steps"."""
         return f"characteristic {self.number}" if self.number else self.name
 
     @property
     def title(self) -> str:
-        """ "6. one uniform chain" or "steps"."""
+        """The title of the check, such as "6. one uniform chain" or "steps"."""
         return f"{self.number}. {self.name}" if self.number else self.name
 
 

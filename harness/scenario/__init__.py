@@ -1,4 +1,4 @@
-"""Scenarios: the descriptions of runs, as short YAML files that pydantic validates.
+"""Define scenarios: short YAML files that describe runs. The package pydantic validates them.
 
 An error names the key, the value and the allowed values. Each module contains one part of a scenario.
 """

@@ -1,4 +1,4 @@
-"""The radio channel of a scenario that all vehicles share.
+"""Describe the radio channel of a scenario, which all vehicles share.
 
 A preset sets all figures, and the other keys replace single ones. `netem.channel` has the model, the presets with their
 sources, and the limits of each figure. A key that the preset's kind of radio lacks is an error.
@@ -110,7 +110,7 @@ class ChannelModel(Model):
     """LoRa: symbols of the preamble, without the 4.25 symbols that follow."""
 
     def radio(self) -> "Radio":
-        """Return the radio. Raises ValueError for a key of another kind of radio, or a value out of range."""
+        """Return the radio model. Raises ValueError for a key of another kind of radio, or a value out of range."""
         from dataclasses import fields, replace
 
         from netem.channel import PRESETS
@@ -123,7 +123,7 @@ class ChannelModel(Model):
         return replace(radio, **self._figures())
 
     def to_json(self) -> dict[str, Any]:
-        """Return the preset, the processing time and all figures of the radio."""
+        """Return the preset, the processing time and all figures of the radio model as JSON."""
         from dataclasses import asdict
 
         return {**{key: getattr(self, key) for key in OWN_KEYS}, **asdict(self.radio())}

@@ -1,4 +1,4 @@
-"""The network of a scenario: loss, delay, partitions, and the radio's loss over distance.
+"""Describe the network of a scenario: loss, delay, partitions, and radio loss that depends on distance.
 
 The conditions have three layers: those of all links, those of single receivers, and those of single links. A layer
 replaces the keys that it contains. `netem.conditions` defines the values and their valid combinations. This module
@@ -110,7 +110,7 @@ class RandomDelay(Model):
 
 
 def _number_or(mapping: type[Model], number: Any) -> BeforeValidator:
-    """Validate a mapping as the model, any other value as a number. An error then concerns one of the two only."""
+    """Return a validator for either a mapping or a number, so that an error message concerns only one of them."""
     numbers = TypeAdapter(number)
 
     def choose(value: Any) -> Any:
@@ -120,7 +120,7 @@ def _number_or(mapping: type[Model], number: Any) -> BeforeValidator:
 
 
 def _or_none(number: Any) -> BeforeValidator:
-    """Accept the word none, and validate any other value as a number. An error then concerns the number only."""
+    """Return a validator for either the word none or a number, so that an error message concerns only the number."""
     numbers = TypeAdapter(number)
     return BeforeValidator(lambda value: value if value == "none" else numbers.validate_python(value))
 
@@ -214,11 +214,13 @@ class NetworkLayer(ConditionOverrides):
         return self
 
     def by_scope(self) -> NetworkValues:
-        """Return the conditions by scope. Raises ConditionsError if two entries concern the same link."""
+        """Return the conditions by scope: all links, one receiver, or one link. Raises ConditionsError if entries
+        overlap.
+        """
         return {None: self.given(), **_values_of(self.receivers, self.links)}
 
     def named_vehicles(self) -> Iterator[tuple[str, int]]:
-        """Yield each vehicle ID, with the key that contains it."""
+        """Yield each vehicle ID in the network section, with the key that contains it."""
         return _named(self.receivers, self.links)
 
 
@@ -284,15 +286,17 @@ class NetworkModel(Model):
         return self
 
     def named_vehicles(self) -> Iterator[tuple[str, int]]:
-        """Yield each vehicle ID, with the key that contains it."""
+        """Yield each vehicle ID in the network section, with the key that contains it."""
         return _named(self.receivers, self.links)
 
     def by_scope(self) -> NetworkValues:
-        """Return the conditions by scope. Raises ConditionsError if two entries concern the same link."""
+        """Return the conditions by scope: all links, one receiver, or one link. Raises ConditionsError if entries
+        overlap.
+        """
         return {None: {key: getattr(self, key) for key in KEYS}, **_values_of(self.receivers, self.links)}
 
     def conditions(self, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
-        """Return the conditions of this model. Raises ConditionsError if they contradict each other."""
+        """Return the network conditions. Raises ConditionsError if they contradict each other."""
         return conditions_of(self.by_scope(), partition)
 
 
@@ -319,19 +323,19 @@ def _values_of(receivers: Mapping[int, ReceiverOverrides], links: Sequence[LinkO
 
 
 def overlay(network: NetworkValues, layer: NetworkValues) -> NetworkValues:
-    """Return the network with the values of the layer. Other values stay."""
+    """Return the network conditions, with values replaced by those of the layer."""
     return {scope: network.get(scope, {}) | layer.get(scope, {}) for scope in (*network, *layer)}
 
 
 def scope_in_words(scope: Scope) -> str:
-    """Return the scope in words to put after a key, as in "loss from 1 to 2"."""
+    """Return a phrase about the affected links for the end of a sentence, as in "loss from 1 to 2"."""
     if scope is None:
         return ""
     return f" from {scope[0]} to {scope[1]}" if isinstance(scope, tuple) else f" to {scope}"
 
 
 def conditions_of(network: NetworkValues, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
-    """Return the conditions of a network. Raises ConditionsError if its keys contradict each other."""
+    """Return network conditions from single values. Raises ConditionsError if the values contradict each other."""
     for_all = network[None]
     conditions: dict[Scope, LinkConditions] = {}
     known: dict[tuple[Any, ...], LinkConditions] = {}  # of many links there are few kinds

@@ -1,4 +1,4 @@
-"""The agents of a scenario: commands, containers, events, keys, staggered timers and mistakes.
+"""Describe the agents of a scenario: commands, containers, events, keys, timers and deliberate errors.
 
     agent_command: [./my_agent, --fast]
     agent_command: {2: [./my_agent, --fast], 5: [./another_agent]}
@@ -30,7 +30,7 @@ file."""
 
 
 def _commands(asked: Any) -> Any:
-    """Raise ValueError unless the value is a command or a mapping of commands.
+    """Raise ValueError unless the value is a command, or a mapping from agents to commands.
 
     Without this check, pydantic would report one error for each member of the union.
     """
@@ -94,14 +94,14 @@ QuirkValues = Annotated[dict[str, QuirkValue], WithJsonSchema(_schema())]
 
 
 def check_quirks(asked: Mapping[Any, Any]) -> None:
-    """Raise ValueError if a quirk does not exist or cannot have its value."""
+    """Raise ValueError if a deliberate error (quirk) does not exist or cannot have its value."""
     for name, quirk in asked.items():
         value = quirk.get("value", True) if isinstance(quirk, Mapping) else quirk
         check_quirk(str(name), value.value if isinstance(value, QuirkOfAgents) else value)
 
 
 def quirks_of_agent(asked: Mapping[str, bool | float | QuirkOfAgents], agent_id: int) -> Quirks:
-    """Return the quirks in the mission file of this agent."""
+    """Return the deliberate errors (quirks) in the mission file of this agent."""
     own: Quirks = {}
     for name, value in asked.items():
         if not isinstance(value, QuirkOfAgents):
@@ -112,7 +112,7 @@ def quirks_of_agent(asked: Mapping[str, bool | float | QuirkOfAgents], agent_id:
 
 
 def quirks_in_words(asked: Mapping[str, bool | float | QuirkOfAgents]) -> Iterator[str]:
-    """Yield each quirk in force with its agents, such as "ignore_commit 0.2 (all agents)"."""
+    """Yield each deliberate error that is switched on, with its agents, such as "ignore_commit 0.2 (all agents)"."""
     for name, quirk in asked.items():
         value = quirk.value if isinstance(quirk, QuirkOfAgents) else quirk
         if value:
@@ -153,7 +153,9 @@ Stagger = dict[Staggered, Annotated[float, Field(ge=0, le=MAX_TIMER_S)]]
 
 
 def staggered(settings: Settings, stagger: Mapping[Staggered, float], place: int) -> Settings:
-    """Return the settings of the agent with index `place` in the roster. Raises ValueError if a timer gets too long."""
+    """Return the settings of the agent at index `place`. Its timers differ by `stagger`. Raises ValueError if one is
+    too long.
+    """
     longer = {name: getattr(settings, name) + step_s * place for name, step_s in stagger.items() if step_s}
     return dataclasses.replace(settings, **longer) if longer else settings
 
@@ -189,7 +191,7 @@ class ScriptedEvent(Model):
 
     @property
     def logged(self) -> LoggableEvent:
-        """The recorded event. It has a `timestamp_us`."""
+        """The recorded event. Its `timestamp_us` must be set."""
         assert self.timestamp_us is not None, "it is of a flight"
         return LoggableEvent(self.timestamp_us, self.event_id, self.event_data)
 

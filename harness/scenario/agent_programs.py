@@ -1,4 +1,4 @@
-"""The option `--ucp-agent [ID=]COMMAND` of `run` and of pytest: other programs as the agents of a scenario."""
+"""Parse the option `--ucp-agent [ID=]COMMAND`, which chooses other programs as the agents of a scenario."""
 
 import re
 import shlex
@@ -15,7 +15,7 @@ Programs = Mapping[int | None, list[str]]
 
 
 def programs_of(options: Iterable[str]) -> Programs:
-    """Return the programs that the options name. Raises ScenarioError."""
+    """Return the programs that the options name. Raises ScenarioError for an invalid option."""
     programs: dict[int | None, list[str]] = {}
     for option in options:
         prefix = _AGENT_PREFIX.match(option)
@@ -27,7 +27,7 @@ def programs_of(options: Iterable[str]) -> Programs:
 
 
 def command_keys(scenario: Scenario, programs: Programs) -> dict[str, Any]:
-    """Return the keys that replace the agents of the scenario. Without programs there are none."""
+    """Return the scenario keys that select these programs. Without programs, there are none."""
     if not programs:
         return {}
     others = programs.get(None)

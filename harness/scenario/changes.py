@@ -1,4 +1,4 @@
-"""The timeline of a run as values: network changes, faults and injections.
+"""Represent the timeline of a run as objects: network changes, faults and injections.
 
 The timeline is computed before the run from the scenario alone. Therefore every backend plays the same timeline. The
 checker does not use it.
@@ -25,8 +25,7 @@ NO_MORE_FATES = "no more fates"
 
 @dataclass(frozen=True)
 class NetworkChange:
-    """Network conditions from mission second `at_s` on. `what` is a name, and `detail` describes the conditions in
-    words."""
+    """New network conditions from mission second `at_s` on, with a name (`what`) and a description (`detail`)."""
 
     at_s: float
     what: str
@@ -42,7 +41,7 @@ class NetworkChange:
     """Preset of the channel that vehicles share. A channel may lose any message."""
 
     def to_json(self, at_s: float) -> dict[str, Any]:
-        """Return the record of this change at mission second `at_s`."""
+        """Return the record of this change, made at mission second `at_s`."""
         return {
             "at_s": at_s,
             "what": self.what,
@@ -56,7 +55,9 @@ class NetworkChange:
 
 @dataclass(frozen=True)
 class TimedInjection:
-    """An injection, which starts at mission second `at_s`. Injections are numbered from 1 in time order."""
+    """An injection of messages that starts at mission second `at_s`. Injections are numbered from 1 in order of
+    time.
+    """
 
     at_s: float
     what: InjectionName
@@ -69,7 +70,7 @@ class TimedInjection:
         return self.injection.in_words()
 
     def to_json(self, at_s: float) -> dict[str, Any]:
-        """Return the record of this injection with a start at mission second `at_s`."""
+        """Return the record of this injection, started at mission second `at_s`."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail}
         return {**record, **planned_key(self.at_s, at_s), **_hand(self.by_hand)}
 
@@ -82,7 +83,7 @@ Change = NetworkChange | Fault | TimedInjection
 
 
 def timeline_of(scenario: Scenario) -> list[Change]:
-    """Return all changes of the scenario in time order. The first is the initial state of the network, at 0 s."""
+    """Return all changes of the scenario in order of time. The first is the initial state of the network."""
     first, *states = _network_states(scenario)
     return [
         first,
@@ -91,14 +92,13 @@ def timeline_of(scenario: Scenario) -> list[Change]:
 
 
 def injections_of(scenario: Scenario) -> list[TimedInjection]:
-    """Return the injections of the scenario in time order."""
+    """Return the injections of the scenario in order of time."""
     entries = [(entry.at_s, *entry.injection) for entry in scenario.timeline_in_order() if entry.injection]
     return [TimedInjection(at_s, what, injection, number) for number, (at_s, what, injection) in enumerate(entries, 1)]
 
 
 def silent_injections(begun: Sequence[TimedInjection], sent: Mapping[int, int]) -> list[str]:
-    """Return a sentence for each injection that sent nothing. `sent` maps the number of an injection to its
-    datagrams."""
+    """Return a sentence for each injection that sent nothing. `sent` contains the number of datagrams by injection."""
     return [
         f"{injected.what} at {injected.at_s:g} s ({injected.detail}) sent nothing, for nothing like it was heard"
         for injected in begun
@@ -107,7 +107,7 @@ def silent_injections(begun: Sequence[TimedInjection], sent: Mapping[int, int]) 
 
 
 def _network_states(scenario: Scenario) -> list[Change]:
-    """Return all states of the network. Changes at the same instant form one state."""
+    """Return all states of the network. Changes at the same time form one state."""
     changes = [_change(step.at_s, step.what, step.network.conditions()) for step in scenario.network_steps()]
     if (channel := scenario.network.channel) is None:
         return [*changes]
@@ -116,8 +116,9 @@ def _network_states(scenario: Scenario) -> list[Change]:
 
 
 def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the records of network changes, with `fully_connected` false until `at_s`, the end of the scripted
-    fates."""
+    """Return the records of network changes, marked as not fully connected until `at_s`, when scripted deliveries
+    end.
+    """
     since = round(at_s + 0.001, 3)  # include messages of the same instant
     before = [{**state, "fully_connected": False} for state in network if state["at_s"] < since]
     after = [state for state in network if state["at_s"] >= since]
@@ -126,7 +127,7 @@ def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[
 
 
 def final_reconcile(at_s: float) -> NetworkChange:
-    """Return the change that clears all conditions, so that all vehicles receive all messages."""
+    """Return the change that removes all network conditions, so that all messages arrive."""
     return replace(_change(at_s, FINAL_RECONCILE, NetworkConditions()), clears_all=True)
 
 
@@ -138,7 +139,8 @@ MAX_DESCRIBED_LINKS = 8
 
 
 def describe(conditions: NetworkConditions) -> str:
-    """Return conditions in words: "loss 15 %, loss 50 % to 3, loss 90 % from 1 to 2, partition 1 2 | 3 4 5".
+    """Return network conditions as text, such as "loss 15 %, loss 50 % to 3, loss 90 % from 1 to 2, partition 1 2 | 3 4
+    5".
 
     The text has the differences of each receiver from the default, and of each link from its receiver.
     """

@@ -1,4 +1,4 @@
-"""Expected results of the runs of a scenario: verdicts, figures, chains and deviations, by backend and seed.
+"""Describe the expected results of a scenario: verdicts, figures, chains and deviations, by backend and seed.
 
 expect:
   characteristics: {1: holds, 5: holds, 6: not applicable}
@@ -94,7 +94,7 @@ class NumberRange(Model):
         return (self.min is None or figure >= self.min) and (self.max is None or figure <= self.max)
 
     def describe(self) -> str:
-        """Return the range in words, such as "at least 40"."""
+        """Return the range as text, such as "at least 40"."""
         if self.min == self.max:
             return f"{self.min:g}"
         words = [f"at least {self.min:g}"] if self.min is not None else []
@@ -102,7 +102,7 @@ class NumberRange(Model):
 
 
 def _exactly(value: Any) -> Any:
-    """Return the range from a number to itself, or the value unchanged if it is a range."""
+    """Return a range that contains only this number. A value that is already a range is returned unchanged."""
     if isinstance(value, Mapping | NumberRange):
         return value
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -189,7 +189,7 @@ class Expect(Model):
         return values
 
     def verdict(self, key: str) -> str | None:
-        """Return the expected verdict of a check. None if the scenario does not name one."""
+        """Return the expected verdict of a check, or None if the scenario expects none."""
         if key in FURTHER_CHECKS:
             expected: str | None = getattr(self, key)
             if key == "steps" and self.deviations:
@@ -231,7 +231,7 @@ class Expect(Model):
             yield "expected deviations", list(self.unexpected_deviations(found))
 
     def out_of_range(self, figures: Mapping[str, float | None]) -> Iterator[str]:
-        """Yield a sentence for each figure outside of its range."""
+        """Yield a sentence for each figure that is outside its expected range."""
         for name, wanted in self.figures.items():
             figure = figures.get(name)
             if figure is None or figure not in wanted:
@@ -239,7 +239,9 @@ class Expect(Model):
                 yield f"{name.replace('_', ' ')} is {shown}, and should be {wanted.describe()}"
 
     def unexpected_chains(self, top_chain_hashes: Mapping[int, str]) -> Iterator[str]:
-        """Yield a sentence for each agent with an unexpected chain. `top_chain_hashes` come from the exports."""
+        """Yield a sentence for each agent whose chain differs from the expected one. `top_chain_hashes` come from
+        exports.
+        """
         for agent_id, wanted in self.chains.items():
             ended = top_chain_hashes.get(agent_id)
             if ended is None:
@@ -248,14 +250,14 @@ class Expect(Model):
                 yield f"agent {agent_id} ends with the chain hash {ended[:12]} on top, but must end with {wanted[:12]}"
 
     def named_agents(self) -> Iterator[tuple[str, int]]:
-        """Yield each agent ID, with the key that contains it."""
+        """Yield each agent ID in the expectations, with the key that contains it."""
         yield from (("chains", agent) for agent in self.chains)
         yield from (("deviations", agent) for agent in self.deviations)
         for index, common in enumerate(self.common):
             yield from ((f"common.{index}.agents", agent) for agent in common.agents)
 
     def unexpected_common_blocks(self, chains: Mapping[int, Sequence[str]]) -> Iterator[str]:
-        """Yield a sentence for each chain, or common part of chains, with an unexpected length."""
+        """Yield a sentence for each chain, or common part of chains, whose length differs from the expected one."""
         for common in self.common:
             there = all(agent in chains for agent in common.agents)
             levels = zip(*(chains[agent] for agent in common.agents), strict=False) if there else ()
@@ -266,7 +268,7 @@ class Expect(Model):
                 yield f"{common_to} {_has(shared)}, and should have {common.blocks.describe()}"
 
     def unexpected_deviations(self, found: Iterable[tuple[int, str | None]]) -> Iterator[str]:
-        """Yield a sentence for each agent with an unexpected first deviation.
+        """Yield a sentence for each agent whose first deviation differs from the expected one.
 
         `found` has an agent and a handler for each deviation, in time order.
         """

@@ -1,4 +1,4 @@
-"""Scripted fates: the delivery or loss of single messages, decided before the random network conditions.
+"""Describe scripted deliveries: rules that decide whether and when single messages arrive.
 
 fates:
   - {message: Commit Block, block: "4.11", receiver: 2, drop: true}
@@ -110,7 +110,7 @@ class Fate(Model):
         return self
 
     def describe(self) -> str:
-        """Return the fate in words, such as "drop Commit Block of block 4.11 to 2"."""
+        """Return the rule as text, such as "drop Commit Block of block 4.11 to 2"."""
         what = (
             "drop"
             if self.drop

@@ -1,4 +1,4 @@
-"""Injections and scripted datagrams: messages of a run that no agent sent.
+"""Describe injected messages: messages in a run that no agent sent.
 
 timeline:
   - {at_s: 100, replay: {message: Commit Block, sender: 2, count: 3}}
@@ -46,7 +46,7 @@ class _MatchingMessages(Model):
 
     @property
     def lasts_s(self) -> float:
-        """Mission seconds from the start of the injection until its last datagram."""
+        """The number of mission seconds from the start of the injection to its last datagram."""
         return 0.0
 
     def in_words(self) -> str:

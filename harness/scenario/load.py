@@ -1,4 +1,4 @@
-"""Load a scenario from a file or from the library, and explain validation errors in one sentence."""
+"""Load a scenario from a file or from the included library, and explain validation errors in one sentence."""
 
 import re
 import stat
@@ -23,13 +23,14 @@ missing."""
 
 
 def scenario_names() -> list[str]:
-    """Return the names of all scenarios of the library in alphabetical order."""
+    """Return the names of all included scenarios in alphabetical order."""
     return sorted(path.stem for path in LIBRARY.glob("*.yaml"))
 
 
 def find_file(path: Path) -> Path:
-    """Return the file of the library with this name. Return `path` itself if it exists, or if the library has no such
-    name."""
+    """Return the file of the included scenario with this name. If `path` exists or no such name is known, return
+    `path`.
+    """
     file_name = f"{path}.yaml"
     if len(path.parts) != 1 or not LIBRARY.is_dir() or file_name not in (file.name for file in LIBRARY.iterdir()):
         return path
@@ -70,7 +71,7 @@ def load_scenario(path: Path | str) -> Scenario:
 
 
 def parse(document: dict[str, Any], beside: Path | None = None) -> Scenario:
-    """Return the scenario of a YAML document. Files that the document names are in the directory `beside`.
+    """Return the scenario in a YAML document. Files that it names are relative to the directory `beside`.
 
     Raises ScenarioError. Its message names the key, the value and the allowed values.
     """
@@ -81,7 +82,7 @@ def parse(document: dict[str, Any], beside: Path | None = None) -> Scenario:
 
 
 class _Loader(yaml.SafeLoader):
-    """A safe loader that rejects duplicate keys and deep nesting.
+    """A safe YAML loader that rejects duplicate keys and deep nesting.
 
     YAML forbids duplicate keys, but the safe loader of PyYAML uses the last one. Deep nesting would take its scanner
     long.
@@ -103,7 +104,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the value of a YAML text. Raises ScenarioError with a message that starts with "not YAML"."""
+    """Return the value of a YAML text. Raises ScenarioError whose message starts with "not YAML"."""
     try:
         return yaml.load(text, _Loader)  # noqa: S506  (a safe loader)
     except RecursionError:
@@ -118,7 +119,7 @@ def parse_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path, what: str) -> dict[str, Any]:
-    """Return the mapping in a YAML file, or in the library file of this name. `what` is its kind, for errors.
+    """Return the mapping in a YAML file, or in the included file of this name. Error messages call it `what`.
 
     Raises ScenarioError.
     """
@@ -181,7 +182,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 def _siblings(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
-    """Return the allowed keys at this location."""
+    """Return the keys that are allowed at this place of the document."""
     current = model
     for part in location[:-1]:
         for name, field in current.model_fields.items():
@@ -192,7 +193,7 @@ def _siblings(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
 
 
 def _models(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the models in a type annotation."""
+    """Yield the model classes in a type annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):

@@ -1,4 +1,4 @@
-"""The states of the network during a mission, from the scenario, its timeline, and its schedules.
+"""Compute the states of the network during a mission from the scenario, its timeline, and its schedules.
 
 A change of the timeline lasts until a later change of the same value, or ends after `for_s`. Two temporary changes of
 the same value must not overlap, unless one lies within the other. The inner one then applies, and after its end the
@@ -22,7 +22,7 @@ PARTITION = "partition"
 
 @dataclass
 class NetworkState:
-    """The network at one instant."""
+    """The network at one moment of the mission."""
 
     roster: tuple[int, ...]
     lasting: NetworkValues
@@ -34,7 +34,7 @@ class NetworkState:
     """Active temporary changes of the timeline, in the order of their start."""
 
     def without_partition(self) -> NetworkConditions:
-        """Return the conditions without partitions and cuts. Raises ConditionsError."""
+        """Return the network conditions without partitions and cut links. Raises ConditionsError."""
         network = self.lasting
         for entry in self.temporary:
             network = overlay(network, entry.changes())
@@ -44,7 +44,7 @@ class NetworkState:
         return conditions_of(network)
 
     def conditions(self) -> NetworkConditions:
-        """Return the conditions. Raises ConditionsError if they contradict each other."""
+        """Return the network conditions. Raises ConditionsError if they contradict each other."""
         conditions = self.without_partition().with_partition(self._undivided_groups())
         cut = sorted(pair for layer in self.layers for pair in layer.cut)
         severed = {pair: replace(conditions.link(*pair), loss=1.0) for pair in cut}
@@ -62,7 +62,7 @@ class NetworkState:
         return tuple(group for group in together if group)
 
     def play(self, entry: TimelineEntry) -> None:
-        """Apply an entry of the timeline."""
+        """Apply an entry of the timeline to this state."""
         if entry.for_s is not None:
             self.temporary.append(entry)
         elif entry.network_key in (PARTITION, "heal"):
@@ -73,7 +73,7 @@ class NetworkState:
 
 @dataclass(frozen=True)
 class NetworkStep:
-    """A change of the network at one instant. `what` is its name, and `keys` are its places in the scenario."""
+    """A change of the network at one moment. `what` is its name, and `keys` are its places in the scenario."""
 
     at_s: float
     what: str
@@ -89,7 +89,7 @@ def network_steps(
     schedules: Sequence[Schedule],
     end_s: float,
 ) -> Iterator[NetworkStep]:
-    """Yield every change of the network in time order, the first at 0 s. Changes at the same instant form one step."""
+    """Yield every change of the network in order of time, beginning at 0 s. Changes at the same time are combined."""
     network = NetworkState(roster, model.by_scope(), [EMPTY_LAYER for _ in schedules])
     begins: dict[float, list[int]] = defaultdict(list)
     ends: dict[float, list[int]] = defaultdict(list)
@@ -121,7 +121,7 @@ def network_steps(
 
 
 def refuse_ambiguous_overlaps(timeline: Sequence[TimelineEntry]) -> None:
-    """Raise ValueError if two changes of the same value overlap ambiguously."""
+    """Raise ValueError if two temporary changes of the same value overlap, so that the result is ambiguous."""
     active: dict[tuple[Scope, str], list[tuple[float, int]]] = defaultdict(list)
     for number, entry in sorted(enumerate(timeline), key=lambda numbered: numbered[1].at_s):
         until_s = math.inf if entry.for_s is None else entry.ends_at_s
@@ -140,7 +140,7 @@ def refuse_ambiguous_overlaps(timeline: Sequence[TimelineEntry]) -> None:
 
 
 def changed_values(entry: TimelineEntry) -> Iterator[tuple[Scope, str]]:
-    """Yield the scope and the key of each value that the entry changes. The partition is a key of all links."""
+    """Yield each value that the entry changes, as its scope and its key."""
     if entry.network_key in (PARTITION, "heal"):
         yield None, "the partition"
     elif entry.network_key:

@@ -1,4 +1,4 @@
-"""The model of a scenario. `Scenario.model_json_schema()` documents every key."""
+"""The model of a scenario. `Scenario.model_json_schema()` returns the description of every key."""
 
 import dataclasses
 from collections import Counter
@@ -63,7 +63,7 @@ class AgentClock(Model):
     """Relative error of the rate. A clock with a drift of 0.01 gains one second in 100 mission seconds."""
 
     def shows(self, mission_s: float) -> float:
-        """Return the time, in seconds, that the clock shows at this mission second."""
+        """Return the time in seconds that the clock shows at this mission second."""
         return self.offset_s + (1 + self.drift) * mission_s
 
     def mission_s(self, shown_s: float) -> float:
@@ -145,11 +145,11 @@ class Scenario(Model):
 
     @property
     def roster(self) -> tuple[int, ...]:
-        """The IDs of the agents, ascending."""
+        """The IDs of the agents in ascending order."""
         return tuple(range(1, self.agents + 1)) if isinstance(self.agents, int) else tuple(sorted(self.agents))
 
     def secured(self) -> "Scenario":
-        """Return the scenario with fresh keys, or unchanged if it has keys."""
+        """Return the scenario with new keys, or unchanged if it already has keys."""
         return self if self.security else self.model_copy(update={"security": SecurityOptions()})
 
     def settings_of(self, agent_id: int) -> Settings:
@@ -164,7 +164,9 @@ class Scenario(Model):
 
     @property
     def rogue(self) -> int | None:
-        """The vehicle ID of the rogue node, different from all agents. None if the timeline injects nothing."""
+        """The vehicle ID of the rogue node, which differs from all agents, or None if the timeline injects no
+        messages.
+        """
         if not any(entry.injection for entry in self.timeline):
             return None
         taken = set(self.roster)
@@ -176,33 +178,33 @@ class Scenario(Model):
         return self.roster if self.rogue is None else (*self.roster, self.rogue)
 
     def command_of(self, agent_id: int) -> list[str] | None:
-        """Return the command of this agent, without the mission file. None for a reference agent."""
+        """Return the command of this agent without the mission file, or None for the harness's own agent."""
         asked = self.agent_command
         return asked.get(agent_id) if isinstance(asked, dict) else asked
 
     @property
     def foreign(self) -> tuple[int, ...]:
-        """The IDs of agents with a command in `agent_command`, ascending."""
+        """The IDs of agents with a command in `agent_command`, in ascending order."""
         return tuple(agent_id for agent_id in self.roster if self.command_of(agent_id) is not None)
 
     def quirks_of(self, agent_id: int) -> Quirks:
-        """Return the mistakes that this agent makes on purpose."""
+        """Return the deliberate errors (quirks) of this agent."""
         return quirks_of_agent(self.quirks, agent_id)
 
     @property
     def has_wrong_agents(self) -> bool:
-        """True if any agent makes mistakes on purpose."""
+        """True if any agent makes deliberate errors."""
         return any(active_quirks(self.quirks_of(agent_id)) for agent_id in self.roster)
 
     def flight_of(self, vehicle: int) -> Flight | None:
-        """Return the flight of this vehicle. None if no flight names it."""
+        """Return the flight plan of this vehicle, or None if it has none."""
         return next((flight for flight in self.flight if vehicle in flight.vehicles), None)
 
     def timeline_in_order(self) -> list[TimelineEntry]:
         return sorted(self.timeline, key=lambda entry: entry.at_s)
 
     def faults_in_order(self) -> list[Fault]:
-        """Return all faults by time. Faults at the same instant are in the order of their timeline entries."""
+        """Return all faults in order of time. Faults at the same time keep the order of their timeline entries."""
         return [fault for _, fault in self._faults_with_their_keys()]
 
     def _faults_with_their_keys(self) -> list[tuple[str, Fault]]:
@@ -212,7 +214,7 @@ class Scenario(Model):
         return sorted(course, key=lambda keyed: keyed[1].at_s)
 
     def network_steps(self) -> Iterator[NetworkStep]:
-        """Yield every change of the network by the timeline and the schedules, in time order."""
+        """Yield every change of the network by the timeline and the schedules, in order of time."""
         return network_steps(self.network, self.roster, self.timeline, self.schedule, self.duration_s)
 
     @field_validator("agents", mode="before")

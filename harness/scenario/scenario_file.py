@@ -1,4 +1,4 @@
-"""Write a scenario as a readable file: a comment at the top, and one line for each event, fate or change."""
+"""Write a scenario as a readable file: a comment at the top, and one line for each event or change."""
 
 from collections.abc import Callable, Iterable, Iterator
 from textwrap import wrap
@@ -36,7 +36,7 @@ Document = dict[str, Any]
 def to_yaml(
     document: Document, comment: Iterable[str], remark: Callable[[Document], str | None] = lambda entry: None
 ) -> str:
-    """Return the text of the file. `remark` returns a comment for an entry of a list, or None."""
+    """Return the scenario as YAML text. `remark` returns a comment for an entry of a list, or None."""
     lines = [f"# {line}".rstrip() for line in comment]
     for key in sorted(document, key=lambda key: ORDER.index(key) if key in ORDER else len(ORDER)):
         lines += _lines(key, _plain(document[key]), remark)
@@ -89,13 +89,13 @@ def _is_long(value: Any) -> bool:
 
 
 def in_one_line(value: Any) -> str:
-    """Return the value as YAML in one line."""
+    """Return the value as YAML in a single line."""
     written: str = yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=1e9, allow_unicode=True)
     return written.strip()[1:-1]
 
 
 def _plain(value: Any) -> Any:
-    """Return the value with whole numbers without a decimal point, and with agent IDs in keys as numbers."""
+    """Return the value with integers in place of whole decimal numbers, also for agent IDs that are keys."""
     if isinstance(value, dict):
         named = ((int(key) if isinstance(key, str) and key.isdecimal() else key, item) for key, item in value.items())
         return {key: _plain(item) for key, item in named}

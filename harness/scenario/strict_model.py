@@ -1,4 +1,4 @@
-"""The base of all scenario models: strict pydantic models and the types of their values."""
+"""The base class of all scenario models: strict pydantic models, and the types of their values."""
 
 import base64
 import binascii
@@ -50,7 +50,7 @@ def _pairs_pattern(sign: str) -> str:
 
 
 def parse_pairs(text: str) -> list[tuple[int, float]]:
-    """Return (number, seconds) for each entry, in the order of the text."""
+    """Return the pairs (number, seconds) that the text contains, in the same order."""
     pairs = (re.split(r"[@+]", entry) for entry in text.split())
     return [(int(number), float(seconds)) for number, seconds in pairs]
 
@@ -61,7 +61,7 @@ def format_pairs(pairs: Iterable[tuple[int, float]], sign: str) -> str:
 
 
 def _check_pairs(sign: str, example: str) -> BeforeValidator:
-    """Raise an error that shows an example, instead of the regular expression."""
+    """Return a validator whose error message shows an example, in place of the regular expression."""
 
     def check(text: Any) -> Any:
         if isinstance(text, str) and len(text) <= MAX_CHARACTERS and not re.match(_pairs_pattern(sign), text):

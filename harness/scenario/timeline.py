@@ -1,4 +1,4 @@
-"""The timeline and the schedules of a scenario: changes of the network, faults and injections.
+"""Describe the timeline and the schedules of a scenario: changes of the network, faults and injections.
 
     schedule:
       - {ramp: {loss: [0, 0.5]}, from_s: 100, until_s: 400}
@@ -86,12 +86,12 @@ class _TimelineEntryBase(NetworkDisturbance):
 
     @property
     def injection(self) -> tuple[InjectionName, Injection] | None:
-        """The name and the parameters of the injection. None if the entry has none."""
+        """The name and the parameters of the injection in this entry, or None."""
         return next(((name, injection) for name in INJECTIONS if (injection := getattr(self, name)) is not None), None)
 
     @property
     def fault(self) -> Fault | None:
-        """The fault of this entry. None if the entry has none."""
+        """The fault in this entry, or None."""
         for kind in TIMELINE_FAULTS:
             if (agents := getattr(self, kind.what)) is not None:
                 return kind(self.at_s, tuple(agents), **{key: getattr(self, key) for key in kind.further_keys()})
@@ -99,12 +99,12 @@ class _TimelineEntryBase(NetworkDisturbance):
 
     @property
     def network_key(self) -> str | None:
-        """The key that changes the network. None if the entry has none."""
+        """The key in this entry that changes the network, or None."""
         return next((key for key in NETWORK_KEYS if getattr(self, key) is not None), None)
 
     @property
     def ends_at_s(self) -> float:
-        """Mission second at which the effect of the entry ends."""
+        """The mission second at which the effect of the entry ends."""
         if (fault := self.fault) is not None:
             return fault.stages()[-1].at_s
         lasts_s = self.injection[1].lasts_s if self.injection else self.for_s or 0.0
@@ -130,7 +130,7 @@ class _TimelineEntryBase(NetworkDisturbance):
 
 
 def _keys_of_faults() -> dict[str, Any]:
-    """Return the fields of an entry for faults: the name of each fault, with a list of agents, and its further keys."""
+    """Return the model fields for faults in a timeline entry: the name of each fault, and its further keys."""
     annotations: dict[str, Any] = {}
     descriptions: dict[str, str] = {}
     for kind in TIMELINE_FAULTS:
@@ -160,7 +160,7 @@ Pairs = frozenset[tuple[int, int]]
 
 @dataclass(frozen=True)
 class Layer:
-    """The change of the network by a schedule, for some time. An empty layer changes nothing."""
+    """A temporary change of the network by a schedule. An empty layer changes nothing."""
 
     values: NetworkValues = field(default_factory=dict)
     partition: tuple[frozenset[int], ...] = ()
@@ -200,11 +200,11 @@ class Ramp(Model):
         return self
 
     def _ends(self) -> tuple[NetworkValues, NetworkValues]:
-        """Return the first and the last network."""
+        """Return the network at the beginning and at the end of the ramp."""
         return (self.network[0].by_scope(), self.network[1].by_scope()) if self.network else ({}, {})
 
     def at(self, share: float) -> NetworkValues:
-        """Return the conditions after this share, 0 to 1, of the ramp."""
+        """Return the network conditions after this share of the ramp, from 0 to 1."""
         short = {key: ends for key in ("loss", "delay") if (ends := getattr(self, key)) is not None}
         first, last = (
             overlay({None: {key: ends[number] for key, ends in short.items()}}, end)
@@ -293,7 +293,7 @@ class Schedule(Model):
             yield from ((f"ramp.network.{number}.{key}", vehicle) for key, vehicle in end.named_vehicles())
 
     def steps(self, roster: Sequence[int], end_s: float) -> list[LayerStep]:
-        """Return the steps of the schedule in time order. Raises ValueError above MAX_STEPS."""
+        """Return the steps of the schedule in order of time. Raises ValueError if there are more than MAX_STEPS."""
         until = end_s if self.until_s is None else self.until_s
         every = self.every_s or 10.0
         if (until - self.from_s) / every > MAX_STEPS:
@@ -334,7 +334,9 @@ def _isolate(shuffled: list[int]) -> Layer:
 
 
 def _majorities_ring(shuffled: list[int]) -> Layer:
-    """Return a layer in which each vehicle hears itself and its neighbours on a ring, a different majority for each."""
+    """Return a change in which each vehicle receives only its neighbours on a ring. These form a different majority for
+    each vehicle.
+    """
     size = len(shuffled)
     reach = (size // 2 + 1) // 2
     heard = {

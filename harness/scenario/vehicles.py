@@ -1,4 +1,4 @@
-"""The vehicles of a scenario and their flight plans."""
+"""Describe the vehicles of a scenario and their flight plans."""
 
 import math
 import os
@@ -27,7 +27,7 @@ RESERVED_SHORT_OPTIONS = frozenset({"-I", "-O", "-M", "-s", "-C"})
 
 
 def _from_file(read: Callable[[str, Path], Any], written_out: Any) -> BeforeValidator:
-    """Replace a text by the content of the file with this name, in the directory of the scenario file.
+    """Return a validator that replaces a file name by the content of that file in the scenario's directory.
 
     `read` reads the file. `written_out` is the type of a value that is no text.
     """
@@ -194,7 +194,7 @@ class Vehicles(Model):
         )
 
     def home_of(self, vehicle: int, index: int) -> Home:
-        """Return the home of a vehicle with this index in the roster. Raises VehicleError for an impossible place."""
+        """Return the home position of the vehicle at this index. Raises VehicleError if it is not a place on Earth."""
         own, first = self.each.get(vehicle, EachVehicle()).home, self.field
         if own is not None:
             return Home(own[0], own[1], own[2], own[3] % 360)
@@ -204,11 +204,11 @@ class Vehicles(Model):
 
     @property
     def field(self) -> Home:
-        """The home of the first vehicle, and the middle of the field."""
+        """The home position of the first vehicle, which is the middle of the field."""
         return Home(*self.home[:3], self.home[3] % 360)
 
     def check_frames(self, roster: tuple[int, ...]) -> None:
-        """Raise ValueError for an unknown frame, and for a frame of another type of vehicle."""
+        """Raise ValueError for an unknown frame, or for a frame of a different vehicle type."""
         for vehicle in roster:
             frame, own = self.setup_of(vehicle).frame, self.type_of(vehicle)
             try:

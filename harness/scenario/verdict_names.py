@@ -1,4 +1,4 @@
-"""The checks and their verdicts.
+"""List the checks and their possible verdicts.
 
 The six characteristics (Section 4.3) concern the chains of a swarm. Three further checks concern its behaviour and its
 records. They have keys instead of numbers.
@@ -47,5 +47,5 @@ _BAD = frozenset(("violated", "deviates", "contradict", "not finished", "never f
 
 
 def kind_of(verdict: str) -> Kind:
-    """Return whether a verdict is good, bad or unknown. A bad verdict leads to exit status 1 or 4."""
+    """Return the class of a verdict: good, bad or unknown. A bad verdict leads to exit status 1 or 4."""
     return "good" if verdict in _GOOD else "bad" if verdict in _BAD else "unknown"

@@ -1,4 +1,4 @@
-"""Compare two run directories: scenario keys, traces and exported chains."""
+"""Compare two run directories: the keys of their scenarios, their traces, and their exported chains."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -17,7 +17,7 @@ from ucp.trigger import Trigger
 
 @dataclass(frozen=True)
 class ComparedStep:
-    """A handler run in the form in which runs are compared. `t` (mission seconds) and `line` only locate it.
+    """A handler run in a form that can be compared. `t` (mission seconds) and `line` are not compared.
 
     `changes` holds (operation, block) and `sent` holds (message, block). A block is given by its name, None for no
     block.
@@ -34,7 +34,7 @@ class ComparedStep:
 
     @classmethod
     def of(cls, line: HandlerRunLine, names: Mapping[str, str]) -> "ComparedStep":
-        """Make a step from a line of a trace.
+        """Return the comparable form of a trace line.
 
         `names` maps block hashes to names; other blocks get 12 digits of their hash.
         """
@@ -56,7 +56,7 @@ def name(block_hash: str, names: Mapping[str, str]) -> str:
 
 
 def completed_blocks(lines: Iterable[HandlerRunLine], agent_id: int) -> dict[str, str]:
-    """Return hash -> `<agent>.<ordinal>` for each block that the agent completed in any incarnation."""
+    """Return a name such as 3.2 for each block that the agent completed, by block hash."""
     names: dict[str, str] = {}
     for line in lines:
         if b'"complete"' in line.text:
@@ -68,7 +68,7 @@ def completed_blocks(lines: Iterable[HandlerRunLine], agent_id: int) -> dict[str
 
 @dataclass(frozen=True)
 class KeyDifference:
-    """A key such as `network.loss` or `timeline.0.at_s`, and its value in each run.
+    """A scenario key such as `network.loss` or `timeline.0.at_s`, with its value in each run.
 
     A missing key has the value None.
     """
@@ -79,7 +79,9 @@ class KeyDifference:
 
 
 def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
-    """Yield the innermost keys that differ, in the order of `a`. Lists of different lengths differ as a whole."""
+    """Yield the innermost keys whose values differ, in the order of `a`. Lists of different length count as one
+    difference.
+    """
     if isinstance(a, dict) and isinstance(b, dict):
         pairs = [(name, a.get(name), b.get(name)) for name in {**a, **b}]
     elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
@@ -94,7 +96,7 @@ def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
 
 @dataclass(frozen=True)
 class FirstDifference:
-    """The first handler run in which the traces of an agent differ. A trace that ended before has None."""
+    """The first handler run in which the traces of an agent differ. It is None for a trace that ended before."""
 
     number: int
     a: ComparedStep | None
@@ -102,13 +104,13 @@ class FirstDifference:
 
     @property
     def at_s(self) -> float:
-        """The earlier time of the two handler runs, in mission seconds."""
+        """The earlier time of the two differing handler runs, in mission seconds."""
         return min(step.t for step in (self.a, self.b) if step is not None)
 
 
 @dataclass(frozen=True)
 class ChainDifference:
-    """The first place, counted from 1, at which the exported chains of an agent differ, with the names of both blocks.
+    """The first position (from 1) at which the exported chains of an agent differ, with the names of both blocks.
 
     A chain that ended before has None. An agent without an export has an empty chain.
     """
@@ -126,7 +128,7 @@ class AgentDifference:
 
 @dataclass(frozen=True)
 class Difference:
-    """The differences of two runs.
+    """All differences between two runs.
 
     keys: differing keys of the scenario, and `seed`. agents: every agent of the roster. Both fields are None for an
     agent without a difference. handler_runs: the number of equal handler runs of all agents, up to the first difference
@@ -143,7 +145,9 @@ class Difference:
 
     @property
     def first(self) -> int | None:
-        """The agent with the first difference in mission time, or None. Ties go to the lowest ID."""
+        """The agent whose difference is the earliest in mission time, or None. Of several agents, the lowest ID is
+        chosen.
+        """
         at_s = {
             agent_id: difference.run.at_s for agent_id, difference in self.agents.items() if difference.run is not None
         }
@@ -151,7 +155,7 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """`identical`, `same but for times`, or `differ`. Different keys alone do not change the verdict."""
+        """The verdict: `identical`, `same but for times`, or `differ`. Scenario keys do not affect it."""
         if any(difference.run or difference.chain for difference in self.agents.values()):
             return "differ"
         return "identical" if self.exact else "same but for times"
@@ -169,7 +173,7 @@ class Difference:
 
 
 def compare(a: Path, b: Path) -> Difference:
-    """Compare two run directories.
+    """Return the differences between two run directories.
 
     Raises RunDirectoryError if a directory is no run, or if the rosters or backends differ.
     """
@@ -216,7 +220,7 @@ class _Run:
         yield from self.exports.errors
 
     def requested(self) -> dict[str, Any]:
-        """Return the seed and the scenario as JSON."""
+        """Return the seed and the scenario of the run as a JSON object."""
         scenario = self.record.scenario
         return {"seed": self.record.seed, **(scenario.model_dump(mode="json", by_alias=True) if scenario else {})}
 
@@ -236,7 +240,9 @@ def _check_comparable(a: _Run, b: _Run) -> None:
 
 
 def _compare_traces(a: _Run, b: _Run, agent_id: int) -> tuple[int, bool, FirstDifference | None]:
-    """Return the number of equal handler runs, whether they are equal to the last byte, and the first difference."""
+    """Return the number of equal handler runs, true if the traces are equal to the last byte, and the first
+    difference.
+    """
     equal, exact = 0, True
     for line_a, line_b in zip_longest(a.archive.trace_lines(agent_id), b.archive.trace_lines(agent_id)):
         if line_a is None or line_b is None or (line_a.incarnation, line_a.text) != (line_b.incarnation, line_b.text):

@@ -1,4 +1,4 @@
-"""A run to export: its archive, the clock of its mission, and all its samples.
+"""Read all data of a run that can be exported: its files, its clock, and all recorded values.
 
 The run may have been interrupted, some files may be damaged, or `import` may have made it from field logs. The export
 contains everything that can be read. `problems` holds a sentence for each thing that cannot.
@@ -55,8 +55,7 @@ MAX_LINKED = 100
 
 
 class ExportedRun:
-    """A run to export. If nothing else records positions, they are read from logged events. `depot` opens sealed
-    events.
+    """A run to export. Positions come from logged events if no other file contains them. `depot` decrypts events.
 
     Raises RunDirectoryError if the directory holds no run, and ExportError if it holds nothing to export.
     """
@@ -82,13 +81,13 @@ class ExportedRun:
 
     @cached_property
     def agents(self) -> list[int]:
-        """IDs of all agents that any file of the run mentions, in ascending order."""
+        """The IDs of all agents that appear in any file of the run, in ascending order."""
         archive = self.archive
         return sorted({*archive.roster, *archive.traces, *archive.exports.by_agent})
 
     @cached_property
     def block_names(self) -> dict[str, str]:
-        """Block hash -> name, such as "4.11"."""
+        """The names of blocks by hash, such as "4.11"."""
         return name_blocks(self.archive.exports.by_agent)
 
     def block(self, block_hash: str) -> str:
@@ -97,7 +96,7 @@ class ExportedRun:
 
     @cached_property
     def history(self) -> History:
-        """Votes, reconciles and messages of the agents."""
+        """The votes, reconciles and messages of all agents."""
         return history_of(self.archive.traces, self.faults, self.end_s)
 
     @cached_property
@@ -123,13 +122,13 @@ class ExportedRun:
 
     @property
     def problems(self) -> list[str]:
-        """A sentence for each damaged or missing file. The list is complete after `samples` is exhausted."""
+        """A sentence for each damaged or missing file. The list is complete after all of `samples` were read."""
         archive = self.archive
         sentences = [*archive.problems, *archive.gaps, *self.tracks.problems, *self.network.problems, *self._problems]
         return list(dict.fromkeys(map(archive.within, sentences)))
 
     def add_problem(self, sentence: str) -> None:
-        """Add a sentence to `problems`."""
+        """Add a sentence to the list of problems."""
         self._problems.append(sentence)
 
     @cached_property
@@ -141,7 +140,7 @@ class ExportedRun:
         return list(log_files(self.directory))
 
     def samples(self) -> Iterator[Sample]:
-        """Yield all samples in time order. Telemetry and logs are read on the way."""
+        """Yield all recorded values in order of time. Telemetry and logs are read during the loop."""
         streams: list[Iterable[Sample]] = [
             self.positions(),
             self._losses(),
@@ -159,8 +158,8 @@ class ExportedRun:
         return merge(*streams, key=attrgetter("at_ns"))
 
     def positions(self) -> Iterator[Position]:
-        """Yield the recorded positions of the vehicles, or the positions that agents logged as events if none are
-        recorded.
+        """Yield the recorded positions of the vehicles. If there are none, yield the positions that agents logged as
+        events.
         """
         positions = self._by_tracks() if self.tracks.by_vehicle else self._by_events()
         return iter(sorted(positions, key=attrgetter("at_ns")))
@@ -178,7 +177,7 @@ class ExportedRun:
                 yield Position(self.time.at(fix.at_s), vehicle, metres, place)
 
     def _by_events(self) -> Iterator[Position]:
-        """Yield logged positions. The first one becomes the centre of the field."""
+        """Yield the positions in logged events. The first one becomes the centre of the field."""
         if not self.archive.exports.by_agent:
             return
         untimed, field = 0, None
@@ -251,7 +250,7 @@ class ExportedRun:
             yield ReconcileSample(self.time.at(reconcile.end_s, reconcile.agent), reconcile)
 
     def _log_lines(self) -> Iterator[LogLine]:
-        """Yield faults and operator commands, and at the end of the run the verdicts."""
+        """Yield the faults, the operator commands, and at the end of the run the verdicts."""
         for state in self.archive.record.network[:1]:
             yield LogLine(self.time.at(0.0), "info", FAULTS, f"{state.what}: {state.detail}")
         for fault in self.faults:

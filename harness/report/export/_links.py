@@ -1,4 +1,4 @@
-"""Lines for the links between moving vehicles.
+"""Draw lines for the radio links between moving vehicles.
 
 Lines are drawn again after vehicles have moved, at most once per mission second. The number of links grows with the
 square of the number of vehicles, so lines of large swarms are drawn less often.
@@ -16,12 +16,12 @@ PAIRS_A_SECOND = 100
 
 
 def vehicle_frame(vehicle: int) -> str:
-    """Return the name of the frame that moves with the vehicle."""
+    """Return the name of the coordinate frame that moves with the vehicle."""
     return f"vehicle_{vehicle}"
 
 
 class LinkLine(NamedTuple):
-    """The link between two vehicles. `loss` is the larger loss of both directions, and below 1."""
+    """The link between two vehicles. `loss` is the larger loss rate of both directions. It is below 1."""
 
     low: Metres
     high: Metres
@@ -29,12 +29,12 @@ class LinkLine(NamedTuple):
 
     @property
     def colour(self) -> dict[str, float]:
-        """A colour from green (no loss) to faint red, as red, green, blue and opacity from 0 to 1."""
+        """The colour of the link, from green (no loss) to faint red, as red, green, blue and opacity from 0 to 1."""
         return {"r": self.loss, "g": 1.0 - self.loss, "b": 0.1, "a": 1.0 - 0.7 * self.loss}
 
 
 class Links:
-    """The current places of the vehicles and the current `losses` of their links."""
+    """The current positions of the vehicles, and the current loss rates of their links."""
 
     def __init__(self) -> None:
         self.losses: dict[Link, float] = {}
@@ -43,7 +43,7 @@ class Links:
         self._moved_ns = -1
 
     def move(self, position: Position) -> list[LinkLine] | None:
-        """Store the new position. Return the lines before this movement if they are due, or None.
+        """Store a new position. If a picture of the previous positions is due, return its lines, otherwise None.
 
         All movements of one instant belong together, so the lines are complete when the first later movement arrives.
         """

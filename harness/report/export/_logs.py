@@ -1,4 +1,4 @@
-"""The logs of a run's programs as samples, each line at the time with which it begins.
+"""Read the log files of a run's programs. Each line gets the time with which it begins.
 
 Agents may use any log format. A line without a time gets the time of the previous line, and a first line without a time
 gets the start of the mission. No log states its time zone. The reader assumes the zone in which the first line is
@@ -26,14 +26,14 @@ _BAD = re.compile(r"\bwarn(ing)?\b", re.IGNORECASE)
 
 
 def log_files(directory: Path) -> Iterator[tuple[str, Path]]:
-    """Yield the name and path of each log: of the lab, the rogue node, the agents and the vehicles."""
+    """Yield the name and path of each log file: those of the network, the rogue node, the agents and the vehicles."""
     files = chain(directory.glob("*.log"), directory.glob("agents/**/*.log"), directory.glob("vehicles/*/output.log"))
     for path in sorted(islice(files, MAX_FILES)):
         yield str(path.relative_to(directory)).encode("utf-8", "replace").decode(), path
 
 
 def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) -> Iterator[LogLine]:
-    """Yield the lines of a log. Add a sentence to `problems` if a part cannot be read."""
+    """Yield the lines of a log file. If a part cannot be read, add a sentence to `problems`."""
     at_ns, zone_s = time.at(0.0), None
     try:
         with BoundedFile(path, MAX_BYTES) as file:
@@ -55,8 +55,8 @@ def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) ->
 
 
 def _zone_s(ahead_s: float) -> float:
-    """Return the offset of the time zone in seconds, from the difference between the first line and the mission's
-    start.
+    """Return the time zone of a log in seconds, from the difference between its first line and the start of the
+    mission.
 
     Return infinity if no zone matches, as in virtual time.
     """
@@ -65,7 +65,9 @@ def _zone_s(ahead_s: float) -> float:
 
 
 def _seconds(timed: re.Match[str]) -> float | None:
-    """Return the seconds since the Unix epoch as if the zone were UTC, or None if the text is no valid time."""
+    """Return the time in seconds since the Unix epoch as if its zone were UTC, or None if the text is not a valid
+    time.
+    """
     try:
         whole = datetime.fromisoformat(timed[1]).replace(tzinfo=UTC).timestamp()
     except ValueError:

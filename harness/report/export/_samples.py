@@ -1,4 +1,4 @@
-"""Samples of a run. Each has a time in nanoseconds since the Unix epoch.
+"""Define the recorded values of a run. Each has a time in nanoseconds since the Unix epoch.
 
 Mission second 0 is the epoch that the agents received: wall time, or 0 in virtual time. With a speedup, mission time
 runs faster than the wall clock, like the timestamps of blocks.
@@ -25,7 +25,7 @@ Metres = tuple[float, float, float]
 
 
 class Place(NamedTuple):
-    """Latitude and longitude in degrees, and altitude in metres above mean sea level."""
+    """A position on Earth: latitude and longitude in degrees, and altitude in metres above mean sea level."""
 
     lat_deg: float
     lon_deg: float
@@ -34,7 +34,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """The position of a vehicle relative to the centre of the field.
+    """The position of a vehicle at one time, relative to the centre of the field.
 
     `place` is None if the field's location is unknown.
     """
@@ -47,7 +47,7 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class LossSample:
-    """New losses of some links, 0 to 1. A link is a pair (sender, receiver). Other links keep their losses."""
+    """A change of loss rates. A link is a pair (sender, receiver). Links that are not listed keep their loss rate."""
 
     at_ns: int
     losses: Mapping[Link, float]
@@ -55,7 +55,7 @@ class LossSample:
 
 @dataclass(frozen=True, slots=True)
 class NetworkSample:
-    """The groups of connected vehicles, the largest first, and the losses of the existing links."""
+    """A change of the network: the groups of connected vehicles (largest first), and the loss rates of their links."""
 
     at_ns: int
     groups: Components
@@ -65,7 +65,7 @@ class NetworkSample:
 
 @dataclass(frozen=True, slots=True)
 class HandlerRunSample:
-    """A handler run."""
+    """A handler run of an agent."""
 
     at_ns: int
     agent: int
@@ -83,7 +83,7 @@ class DropSample:
 
 @dataclass(frozen=True, slots=True)
 class MessageSample:
-    """A message, at the time of sending."""
+    """A message, at the time at which it was sent."""
 
     at_ns: int
     message: Message
@@ -91,7 +91,7 @@ class MessageSample:
 
 @dataclass(frozen=True, slots=True)
 class VoteSample:
-    """A vote, at its end."""
+    """A vote, at the time at which it ended."""
 
     at_ns: int
     vote: Vote
@@ -99,7 +99,7 @@ class VoteSample:
 
 @dataclass(frozen=True, slots=True)
 class ReconcileSample:
-    """A reconcile, at its end or interruption."""
+    """A reconcile, at the time at which it ended or was interrupted."""
 
     at_ns: int
     reconcile: Reconcile
@@ -107,7 +107,7 @@ class ReconcileSample:
 
 @dataclass(frozen=True, slots=True)
 class ReplicationSample:
-    """The replication of the blocks, at the time of a change."""
+    """The number of copies of the blocks, at the time of a change."""
 
     at_ns: int
     replication: Replication
@@ -124,7 +124,7 @@ class Telemetry:
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """A line of a log, a fault, a network change or a verdict. `source` names its origin."""
+    """A line of a log, a fault, a network change or a verdict. `source` is the name of its origin."""
 
     at_ns: int
     level: Level
@@ -155,7 +155,7 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class MissionTime:
-    """The clock of the mission.
+    """The clock of the mission, which converts between mission seconds and time since the Unix epoch.
 
     `epoch_ns` is mission second 0. `by_agent` holds the epochs of agents with other clocks.
     """
@@ -174,18 +174,18 @@ class MissionTime:
         return (at_ns - self.epoch_ns) / _NS
 
     def of_wall(self, wall_s: float) -> int | None:
-        """Return the time of a wall clock value in Unix seconds, or None if it is outside any mission."""
+        """Return the time of a wall clock value in Unix seconds, or None if it is far outside the mission."""
         mission_s = (wall_s - self.epoch_ns / _NS) * self.speedup
         return self.at(mission_s) if abs(mission_s) <= LATEST_S else None
 
     def of_timestamp(self, timestamp_us: int) -> int | None:
-        """Return the time of a block's or event's timestamp, or None if it is outside any mission."""
+        """Return the time of a block's or event's timestamp, or None if it is far outside the mission."""
         at_ns = timestamp_us * 1000
         return at_ns if abs(self.mission_s(at_ns)) <= LATEST_S else None
 
 
 def mission_time(headers: Mapping[int, Header], record: RunRecord, problems: list[str]) -> MissionTime:
-    """Return the clock from the headers of the traces, or else from the record.
+    """Return the clock of the mission from the headers of the traces, or otherwise from run.json.
 
     Add a sentence for each invalid clock.
     """
@@ -214,7 +214,7 @@ def _speedup(headers: Mapping[int, Header], record: RunRecord) -> float:
 
 
 def _start_ns(record: RunRecord) -> int:
-    """Return the start time of the run, the best estimate of the mission's start without a trace; 0 in virtual time."""
+    """Return the start time of the run, as an estimate of the start of the mission. It is 0 in virtual time."""
     try:
         start = datetime.fromisoformat(record.started_at or "")
     except ValueError:

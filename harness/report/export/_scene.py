@@ -1,4 +1,4 @@
-"""The swarm in Foxglove's 3D view: a shape for each vehicle, and a line for each link, coloured by its loss.
+"""Draw the swarm for Foxglove's 3D view: a shape for each vehicle, and a line for each link coloured by its loss rate.
 
 Each vehicle is drawn once, in its own moving frame. Links are drawn again after movements.
 """
@@ -22,7 +22,7 @@ _TEXT = Color(r=1.0, g=1.0, b=1.0, a=1.0)
 
 
 def colours_of(vehicles: Iterable[int]) -> dict[int, Any]:
-    """Return the colours that the vehicles have in reports."""
+    """Return for each vehicle the colour that it has in reports."""
     return {vehicle: _colour(ink.fill) for vehicle, ink in inks(vehicles).items()}
 
 
@@ -32,7 +32,7 @@ def _colour(fill: str) -> Any:
 
 
 class Scene:
-    """The scene over time. `links` holds the current losses."""
+    """The 3D view over time. `links` contains the current loss rates."""
 
     def __init__(self, record: RunRecord, colours: Mapping[int, Any]) -> None:
         self.links = Links()
@@ -40,7 +40,7 @@ class Scene:
         self._drawn: set[int] = set()
 
     def move(self, position: Position) -> Iterator[Any]:
-        """Yield the SceneUpdates that are due after a movement."""
+        """Yield the updates of the view (SceneUpdate messages) that are due after a movement."""
         if (lines := self.links.move(position)) is not None:
             yield _drawn_links(position.at_ns, lines)
         if position.vehicle not in self._drawn:

@@ -1,4 +1,4 @@
-"""Read the telemetry logs of the vehicles. Damaged parts of a log are skipped."""
+"""Read the telemetry logs of the vehicles, and skip damaged parts."""
 
 import re
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ _LIFE = re.compile(r"([1-9]\d{0,4})(?:-([1-9]\d{0,3}))?")
 
 
 def telemetry_logs(directory: Path) -> list[tuple[int, Path]]:
-    """Return the vehicle and path of each log. Each incarnation of a vehicle has its own directory."""
+    """Return the vehicle and the path of each telemetry log. A restarted vehicle has several."""
     logs = []
     for path in islice((directory / "vehicles").glob(f"*/{NAME}"), MAX_FILES):
         if named := _LIFE.fullmatch(path.parent.name):
@@ -25,7 +25,7 @@ def telemetry_logs(directory: Path) -> list[tuple[int, Path]]:
 
 
 def read_telemetry(vehicle: int, path: Path, time: MissionTime, problems: list[str]) -> Iterator[Telemetry]:
-    """Yield the messages of a log. Afterwards add sentences about damaged parts to `problems`."""
+    """Yield the messages of a telemetry log. Then add sentences about damaged parts to `problems`."""
     damaged = untimed = 0
     if not path.is_file():
         problems.append(f"{path}: cannot be read: it is not a file")

@@ -1,4 +1,4 @@
-"""Samples as topics of JSON objects for plots. Each kind of sample has a topic with a JSON Schema.
+"""Convert recorded values to JSON objects for plots. Each kind of value has a topic with a JSON schema.
 
 An unknown value has no key, because plotting tools do not support null. Each object also contains the mission second.
 """
@@ -34,7 +34,7 @@ _LARGEST = 2**53
 
 
 def schema(**properties: Schema) -> Schema:
-    """Return the schema of an object with these keys, all of which are optional."""
+    """Return the JSON schema of an object with these keys, all of which are optional."""
     return {"type": "object", "properties": {"mission_s": _NUMBER, **properties}}
 
 
@@ -72,7 +72,7 @@ SCHEMAS: dict[str, Schema] = {
 
 
 class Topics:
-    """Convert samples to objects. `schemas` holds the schemas of all used topics, by name."""
+    """Converts recorded values to JSON objects. `schemas` contains the JSON schemas of all used topics by name."""
 
     def __init__(self, recording: ExportedRun) -> None:
         self._recording = recording
@@ -82,7 +82,7 @@ class Topics:
         self.schemas["ucp.LinkLosses"] = schema(**links)
 
     def of(self, sample: Sample) -> Iterator[tuple[str, str, Object]]:
-        """Yield topic, schema name and object for each object of a sample."""
+        """Yield the topic, the schema name and the JSON object for each part of a recorded value."""
         for topic, name, values in self._of(sample):
             known = {key: value for key, value in values.items() if _is_plottable(value)}
             yield topic, name, {"mission_s": round(self._recording.time.mission_s(sample.at_ns), 6), **known}
@@ -173,7 +173,7 @@ class Topics:
 
 
 def _is_plottable(value: Any) -> bool:
-    """Return whether the value is known and can be written as JSON."""
+    """Return true if the value is known and can be written as JSON."""
     return math.isfinite(value) if isinstance(value, float) else value is not None
 
 
@@ -194,7 +194,7 @@ def _link(link: Link) -> str:
 
 
 def _whole(number: Any) -> int | None:
-    """Return the number, or None if it is no whole number that all tools can show."""
+    """Return the number if it is an integer that all tools can show, otherwise None."""
     return number if isinstance(number, int) and abs(number) <= _LARGEST else None
 
 
@@ -207,7 +207,7 @@ def _mavlink_schema(message: type[Any]) -> Schema:
 
 
 def _lengths(message: type[Any]) -> Iterable[int]:
-    """Return the number of elements of each field, or 0 for a field that is no array."""
+    """Return the number of elements of each field, which is 0 for a field that is not an array."""
     in_order: Mapping[str, int] = dict(zip(message.ordered_fieldnames, message.array_lengths, strict=True))
     return [in_order[name] for name in message.fieldnames]
 

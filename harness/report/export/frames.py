@@ -1,4 +1,4 @@
-"""Tables of a run for notebooks: its handler runs and its blocks, as polars DataFrames.
+"""Return tables of a run for notebooks: its handler runs and its blocks, as polars DataFrames.
 
 Each batch of records becomes columns before the next is read, so memory holds the finished columns and one batch.
 `DataFrame.write_parquet` keeps a large table in a file.
@@ -57,7 +57,7 @@ _BLOCK: Columns[HeldBlock] = {
 
 
 def handler_runs_frame(archive: RunArchive) -> pl.DataFrame:
-    """Return a table with one row for each handler run of a run.
+    """Return a table with one row for each handler run.
 
     - `agent`, `life` and `line` locate the row: agent ID, incarnation (from 1), and line number in the trace.
     - `t_s` is the time in mission seconds.
@@ -76,7 +76,7 @@ def handler_runs_frame(archive: RunArchive) -> pl.DataFrame:
 
 
 def blocks_frame(archive: RunArchive) -> pl.DataFrame:
-    """Return a table with one row for each block that an agent holds at the end of a run.
+    """Return a table with one row for each block that an agent holds at the end.
 
     - `holder` is the agent that holds the block.
     - `place` is `chain`, `deque` or `stack`, and `position` counts from 0.

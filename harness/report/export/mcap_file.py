@@ -1,4 +1,4 @@
-"""Write a run as MCAP. Foxglove, Lichtblick and PlotJuggler open this file without a plug-in.
+"""Write a run as an MCAP file, which Foxglove, Lichtblick and PlotJuggler open without a plug-in.
 
 Where Foxglove has its own schema, the file uses it in protobuf: LocationFix (for maps) and FrameTransform (for the 3D
 view) for positions, SceneUpdate for links and vehicles, Log for lines of logs. Everything else becomes the JSON topics
@@ -33,7 +33,8 @@ _SEVERITIES = (Log.FATAL, Log.FATAL, Log.FATAL, Log.ERROR, Log.WARNING, Log.INFO
 
 
 def write_mcap(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
-    """Write a new file, and return the number of messages. `progress` receives the mission second from time to time.
+    """Write a new MCAP file, and return its number of messages. `progress` is called with the mission second from time
+    to time.
 
     Raises OSError.
     """
@@ -71,7 +72,7 @@ def _write(recording: ExportedRun, writer: "_Writer", progress: Callable[[float]
 
 
 class _Writer:
-    """An MCAP file. A channel is registered at its first message."""
+    """An MCAP file that is being written. A channel is added with its first message."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._writer = Writer(file)
@@ -81,7 +82,7 @@ class _Writer:
         self.messages = 0
 
     def position(self, position: Position, colour: Any) -> None:
-        """Write a position for the map and for the 3D view."""
+        """Write a position, both for the map and for the 3D view."""
         frame = vehicle_frame(position.vehicle)
         transform = FrameTransform(parent_frame_id=FIELD, child_frame_id=frame)
         transform.timestamp.FromNanoseconds(position.at_ns)
@@ -121,7 +122,9 @@ class _Writer:
         self.messages += 1
 
     def attach(self, recording: ExportedRun) -> None:
-        """Attach run.json and the exports. Unreadable files are skipped, because `problems` already mentions them."""
+        """Attach run.json and the chain exports to the file. Unreadable files are skipped, because `problems` already
+        lists them.
+        """
         begin_ns = recording.time.at(0.0)
         for path in (recording.directory / RUN_FILE, *export_paths(recording.directory)):
             if path.is_file() and path.stat().st_size <= MAX_EXPORT_BYTES:

@@ -44,7 +44,8 @@ Event = tuple[int, int, Any]
 
 
 def write_perfetto(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
-    """Write a new file, and return the number of events. `progress` receives the mission second from time to time.
+    """Write a new trace file, and return its number of events. `progress` is called with the mission second from time
+    to time.
 
     Raises OSError.
     """
@@ -71,7 +72,7 @@ def _write(recording: ExportedRun, file: IO[bytes], progress: Callable[[float], 
 
 
 class _Arrows:
-    """Numbers of arrows. Each pair of a message and a receiver has its own arrow."""
+    """The numbers of all arrows. Each pair of a message and a receiver has its own arrow."""
 
     def __init__(self, messages: Iterable[Message]) -> None:
         numbers = count(1)
@@ -99,7 +100,7 @@ class _Arrows:
 
 
 class _Trace:
-    """Convert samples to packets, and describe each track at its first use."""
+    """Converts recorded values to packets, and describes each track when it is first used."""
 
     def __init__(self, recording: ExportedRun) -> None:
         self._recording = recording
@@ -117,14 +118,14 @@ class _Trace:
             self._track(group, rank=rank)
 
     def clocks(self) -> Any:
-        """Return a packet which states that times are wall time."""
+        """Return a packet that declares the times as wall time."""
         packet = TracePacket(trusted_packet_sequence_id=_SEQUENCE)
         for clock in (BUILTIN_CLOCK_BOOTTIME, BUILTIN_CLOCK_REALTIME):
             packet.clock_snapshot.clocks.add(clock_id=clock, timestamp=self._recording.time.epoch_ns)
         return packet
 
     def new_tracks(self) -> Iterator[Any]:
-        """Yield descriptions of tracks that are used for the first time."""
+        """Yield descriptions of the tracks that are used for the first time."""
         new, self._new = self._new, []
         yield from new
 
@@ -203,7 +204,7 @@ class _Trace:
         return at_ns, 0, self._packet(at_ns, _agent(agent), track, TrackEvent.TYPE_SLICE_END)
 
     def _count(self, at_ns: int, group: str, name: str, value: float) -> Iterator[Event]:
-        """Yield a counter event if the value has changed."""
+        """Yield a counter event if the value has changed since the last one."""
         if self._counters.get((group, name)) != value and abs(value) <= _LARGEST:
             self._counters[group, name] = value
             packet = self._packet(at_ns, group, name, TrackEvent.TYPE_COUNTER)
@@ -219,7 +220,7 @@ class _Trace:
         return packet
 
     def _track(self, group: str, name: str = "", *, rank: int = 0, counter: bool = False) -> int:
-        """Return the ID of a track in a group, or of the group itself without a name."""
+        """Return the ID of a track in a group. Without a name, return the ID of the group itself."""
         if (group, name) not in self._tracks:
             uuid = self._tracks[group, name] = next(self._uuids)
             packet = TracePacket(trusted_packet_sequence_id=_SEQUENCE)

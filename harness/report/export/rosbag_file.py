@@ -1,4 +1,4 @@
-"""Write a run as a ROS 2 bag for ros2 bag, RViz, rqt and PlotJuggler, without ROS.
+"""Write a run as a ROS 2 bag for ros2 bag, RViz, rqt and PlotJuggler. ROS need not be installed.
 
 Positions, transforms, links and logs use message types that every ROS installation contains. The agents' traces and
 exports are on the topics that the bag adapter reads (`harness.field.adapters.rosbag_adapter`), so `ucp-harness import`
@@ -46,8 +46,8 @@ _NS = 1_000_000_000
 
 
 def write_rosbag(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
-    """Write a new directory, and return the number of messages. `progress` receives the mission second from time to
-    time.
+    """Write a new ROS 2 bag, and return its number of messages. `progress` is called with the mission second from time
+    to time.
 
     Raises OSError, and MachineError if the database cannot be written.
     """
@@ -74,7 +74,7 @@ def _write(recording: ExportedRun, path: Path, progress: Callable[[float], None]
 
 
 class _Messages:
-    """The samples of a run as ROS messages."""
+    """The recorded values of a run as ROS messages."""
 
     def __init__(self, recording: ExportedRun) -> None:
         self._recording = recording
@@ -96,7 +96,7 @@ class _Messages:
             yield end_ns, "/rosout", _log(end_ns, LEVELS["warning"], "export", problem)
 
     def _trace(self, agent: int) -> Iterator[Timed]:
-        """Yield the lines of the agent's trace without changes."""
+        """Yield the lines of the agent's trace unchanged."""
         time = self._recording.time
         at_ns = time.at(0.0, agent)
         for entry in self._recording.archive.traces[agent].entries():
@@ -134,14 +134,14 @@ class _Messages:
                 yield f"/vehicle_{vehicle}/mavlink", _bytes(bytes(message.get_msgbuf()))
 
     def _count(self, topic: str, kind: str, value: float) -> Iterator[tuple[str, Any]]:
-        """Yield the value if it has changed."""
+        """Yield the value if it has changed since the last call."""
         if self._counts.get(topic) != value:
             self._counts[topic] = value
             yield topic, _message(f"std_msgs/msg/{kind}", data=value)
 
 
 def _message(name: str, /, **fields: Any) -> Any:
-    """Return a message of this type."""
+    """Return a new ROS message of this type."""
     return _STORE.types[name](**fields)
 
 
@@ -207,7 +207,7 @@ def _transform(position: Position) -> Any:
 
 
 def _markers(at_ns: int, lines: list[LinkLine]) -> Any:
-    """Return one list of lines. RViz rejects an empty list, so without links the old marker is deleted."""
+    """Return one marker with all lines. RViz rejects an empty list, so without lines the old marker is deleted."""
     marker: Any = _STORE.types["visualization_msgs/msg/Marker"]
     origin = (0.0, 0.0, 0.0)
     marker_message = marker(

@@ -1,4 +1,4 @@
-"""`python -m harness.report.live DIRECTORY PORT`: the server of the live page, as a process beside the run.
+"""Serve the live page of a run in a separate process: `python -m harness.report.live DIRECTORY PORT`.
 
 A separate process takes no time from the run and cannot break it. `harness.report.live.server_process` describes the
 messages between the two processes. After the run the server stays while a page is open. It ends at once if the process
@@ -48,13 +48,13 @@ def _print(line: str) -> None:
 
 
 def _send_request(page: int, request: Any) -> None:
-    """Send a page's request to the process of the run."""
+    """Send the request of a browser page to the process of the run."""
     if isinstance(request, dict):
         _print(json.dumps([page, request.get("number"), request]))
 
 
 async def _read_until_over(reader: asyncio.StreamReader, server: Server, log: ChangeLog) -> bool:
-    """Read messages until the run is over. Return False if the process of the run ended instead."""
+    """Read messages until the run is over. Return False if the process of the run ended early."""
     while line := await reader.readline():
         kind, *rest = json.loads(line)
         if kind == "over":

@@ -1,4 +1,4 @@
-"""The actions of one agent, read from its trace line by line, as changes for the page.
+"""Follow the trace of one agent line by line, and convert it to changes for the live page.
 
 A change is a list that becomes a line of JSON: its kind, its mission second, and further values.
 `harness.report.live.feed` lists all kinds. Most lines of a trace only receive a message. A regular expression
@@ -29,7 +29,7 @@ _NO_CHANGES = b'"changes":[],"sent":[]'
 
 
 class Receipt(NamedTuple):
-    """An agent received message `seq` of `sender`."""
+    """The reception of message `seq` of `sender` by an agent."""
 
     t: float
     sender: int
@@ -37,7 +37,7 @@ class Receipt(NamedTuple):
 
 
 class SentMessage(NamedTuple):
-    """An agent broadcast its message `seq`. `block` is the key of the message's block, if it has one."""
+    """The broadcast of message `seq` by an agent. `block` identifies the block that the message concerns, if any."""
 
     t: float
     seq: int
@@ -46,7 +46,7 @@ class SentMessage(NamedTuple):
 
 
 class AgentCourse:
-    """The actions of one agent. The caller takes `changes`, `sent` and `receipts`, and clears them."""
+    """The actions of one agent so far. Callers take the lists `changes`, `sent` and `receipts`, and empty them."""
 
     def __init__(self, agents: Path, agent_id: int) -> None:
         self.agent_id = agent_id
@@ -70,7 +70,9 @@ class AgentCourse:
         self._incarnation = HistoryReader(agent_id)
 
     def read(self, until_s: float, at_most: int) -> bool:
-        """Read up to `until_s`, but at most `at_most` lines. Return whether entries up to `until_s` remain."""
+        """Read up to mission second `until_s`, but at most `at_most` lines. Return true if entries up to `until_s`
+        remain.
+        """
         for _ in range(at_most):
             entry = self._ahead or self._next()
             if entry is None:
@@ -90,14 +92,14 @@ class AgentCourse:
 
     @property
     def next_s(self) -> float | None:
-        """Mission second of the entry that was read ahead, or None."""
+        """The mission second of the entry that was read in advance, or None."""
         return None if self._ahead is None else self._ahead.t
 
     def close(self) -> None:
         self._trace.close()
 
     def _next(self) -> Receipt | HandlerRun | DroppedDatagram | None:
-        """Return the next entry with a valid time, or None."""
+        """Return the next entry that has a valid time, or None."""
         while self.problem is None:
             line = self._trace.next()
             if line is None:
@@ -123,7 +125,7 @@ class AgentCourse:
         return bool(self._held.not_in_chain) and b'"idle":true' in line
 
     def _begin(self) -> None:
-        """Begin an incarnation."""
+        """Reset the state for a new start of the agent."""
         if self._has_started:
             self.changes.append(["z", self.at_s, self.agent_id])
         self._has_started, self._held, self._idle_too_early = True, HeldBlocks(), False
@@ -156,7 +158,7 @@ class AgentCourse:
             self.changes.append(["c", run.t, self.agent_id, moves, run.state.top[:KEY_LENGTH], how])
 
     def _report_activity(self, run: HandlerRun) -> None:
-        """Report the votes, reconciles and phases that the handler run began or ended."""
+        """Report the votes, reconciles and phases that began or ended with the handler run."""
         for step in self._incarnation.feed(run):
             match step:
                 case ActivityStart("vote"):
@@ -176,7 +178,7 @@ class AgentCourse:
         self.changes.append(["s", t, self.agent_id, activity, detail])
 
     def _report_violations(self, run: HandlerRun) -> None:
-        """Report a violation of characteristic 2 or 3 when it first becomes visible."""
+        """Report a violation of characteristic 2 or 3 when it first appears."""
         for operation, block in run.changes:
             if operation.endswith("+") and self._held.copies[block] > 1 and block not in self._duplicates:
                 self._duplicates.add(block)

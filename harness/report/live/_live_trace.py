@@ -1,4 +1,4 @@
-"""Follow a growing trace line by line, through all incarnations of its agent.
+"""Follow a growing trace file line by line, including all restarts of its agent.
 
 An agent that is a process writes the trace of each incarnation into its own directory (`7.trace.jsonl`, then
 `7-2/7.trace.jsonl`). At the end of the run, all incarnations are joined in the first file. In virtual time, one file
@@ -16,7 +16,7 @@ _CHUNK_BYTES = 256 * 1024
 
 
 class GrowingFile:
-    """The complete lines of a growing file. A file that does not exist yet has no lines yet.
+    """The complete lines of a growing file. The file may be created later.
 
     `trouble` is the reason why no more lines can be read, or None.
     """
@@ -41,7 +41,7 @@ class GrowingFile:
             self._file = None
 
     def _read(self) -> bool:
-        """Read a chunk. Return whether there was one."""
+        """Read a part of the file. Return true if there was new data."""
         if self.trouble is not None:
             return False
         try:
@@ -63,7 +63,7 @@ class GrowingFile:
 
 
 class AgentTrace:
-    """The lines of one agent's trace, incarnation by incarnation."""
+    """The lines of one agent's trace, across its restarts."""
 
     def __init__(self, agents: Path, agent_id: int) -> None:
         self._agents, self._agent_id = agents, agent_id

@@ -1,4 +1,6 @@
-"""The network conditions, faults, and positions of the vehicles, as changes for the page."""
+"""Follow the network conditions, faults and vehicle positions of a run, and convert them to changes for the live
+page.
+"""
 
 from collections.abc import Callable, Collection
 from itertools import combinations
@@ -28,7 +30,7 @@ TimedLine = TypeVar("TimedLine", _NetworkEntry, TrackLine)
 
 
 class _TimedFile(Generic[TimedLine]):
-    """A growing file of entries with times.
+    """A growing file whose entries have times.
 
     `model` validates each line, and `play` processes it at its mission second.
     """
@@ -44,7 +46,9 @@ class _TimedFile(Generic[TimedLine]):
         self.problems: dict[str, None] = {}
 
     def read(self, until_s: float, at_most: int) -> bool:
-        """Read up to `until_s`, but at most `at_most` lines. Return whether entries up to `until_s` remain."""
+        """Read up to mission second `until_s`, but at most `at_most` lines. Return true if entries up to `until_s`
+        remain.
+        """
         name = self._file.path.name
         for _ in range(at_most):
             entry, self.ahead = self.ahead, None
@@ -73,7 +77,7 @@ class _TimedFile(Generic[TimedLine]):
 
 
 class Surroundings:
-    """The network and the vehicles. The caller takes `changes` and clears them."""
+    """The network and the vehicles of a run so far. Callers take the list `changes` and empty it."""
 
     def __init__(self, directory: Path, vehicles: Collection[int]) -> None:
         self.changes: list[Change] = []
@@ -85,27 +89,27 @@ class Surroundings:
         self._tracks = _TimedFile(directory / TRACKS_FILE, TrackLine, self._play_positions)
 
     def read(self, until_s: float, at_most: int) -> bool:
-        """Read up to `until_s`, but at most `at_most` lines of each file.
+        """Read up to mission second `until_s`, but at most `at_most` lines of each file.
 
-        Return whether entries up to `until_s` remain.
+        Return true if entries up to `until_s` remain.
         """
         more = self._conditions.read(until_s, at_most)
         return self._tracks.read(until_s, at_most) or more
 
     @property
     def at_s(self) -> float:
-        """Mission second of the last entry that was read."""
+        """The mission second of the last entry that was read."""
         return max(self._conditions.at_s, self._tracks.at_s)
 
     @property
     def next_s(self) -> float | None:
-        """Mission second of the earliest entry that was read ahead, or None."""
+        """The mission second of the earliest entry that was read in advance, or None."""
         ahead = (self._conditions.ahead, self._tracks.ahead)
         return min((line.at_s for line in ahead if line is not None), default=None)
 
     @property
     def problems(self) -> list[str]:
-        """A sentence for each file with unreadable parts."""
+        """A sentence for each file that cannot be read completely."""
         return [*self._conditions.problems, *self._tracks.problems]
 
     def close(self) -> None:
@@ -113,7 +117,7 @@ class Surroundings:
         self._tracks.close()
 
     def _play_network_entry(self, line: _NetworkEntry) -> None:
-        """Process a change of the network or of agents.
+        """Process one entry: a change of the network or a fault of agents.
 
         Raises ValueError, TypeError, AttributeError or KeyError if the line is invalid.
         """
@@ -143,7 +147,7 @@ class Surroundings:
 
 
 def _state_after(fault: type[Fault]) -> str:
-    """Return the state of agents after a fault in one word, or "" if the fault does not change it."""
+    """Return the state of an agent after a fault in one word, or "" if the fault does not change the state."""
     states = {
         "gone": fault.removes_vehicle,
         "down": fault.ends_incarnation,

@@ -1,4 +1,4 @@
-"""The log of all changes of a feed. Any number of readers read it, each at its own speed.
+"""Store all changes for the live page in a log. Any number of browsers can read it at their own speed.
 
 The log is an unnamed temporary file. Memory use is therefore bounded, and a slow reader does not delay the others.
 """
@@ -21,7 +21,7 @@ _encode = partial(json.dumps, separators=(",", ":"), check_circular=False)
 
 
 class ChangeLog:
-    """Changes, one in a line. `size` is in bytes."""
+    """A log with one change per line. `size` is its size in bytes."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115
@@ -29,7 +29,7 @@ class ChangeLog:
         self._full = False
 
     def append(self, changes: Iterable[Change]) -> None:
-        """Append changes. Raises OSError if the disk is full."""
+        """Append changes to the log. Raises OSError if the disk is full."""
         lines = "".join([_encode(change) + "\n" for change in changes]).encode()
         if self._full or not lines:
             return
@@ -42,7 +42,7 @@ class ChangeLog:
         self.size += len(lines)
 
     def read(self, start: int, *, may_skip: bool = False) -> tuple[int, str]:
-        """Return the end of the next complete lines from `start` on, and these lines; no lines at the end of the log.
+        """Return the next complete lines from position `start` on. The first value is the position after them.
 
         With `may_skip`, a reader that is far behind gets no messages and positions.
         """

@@ -1,4 +1,4 @@
-"""A run directory as one stream of changes, during the run or afterwards.
+"""Read a run directory as one stream of changes, during the run or afterwards.
 
 A change is a list: its kind, its mission second, and further values. Blocks are identified by `KEY_LENGTH` digits of
 their hashes.
@@ -56,7 +56,7 @@ MAX_KEPT = 100_000
 
 @dataclass
 class _Broadcast:
-    """A broadcast message. `message` is None while only receivers have recorded it."""
+    """A broadcast message. `message` is None while only its receivers have recorded it."""
 
     mask: int
     polls: int
@@ -65,14 +65,14 @@ class _Broadcast:
     block: str | None = None
 
     def add_receiver(self, bit: int) -> bool:
-        """Add the receiver with this bit. Return whether it is new."""
+        """Add the receiver with this bit. Return true if it is new."""
         before = self.mask
         self.mask |= bit
         return self.mask != before
 
 
 class Feed:
-    """The changes of a run directory, poll by poll.
+    """The stream of changes in a run directory.
 
     Raises RunDirectoryError if the directory is no run, has nothing to show, or has more than `MAX_VEHICLES` vehicles.
     """
@@ -103,7 +103,7 @@ class Feed:
         self._record_stamp = self._stamp()
 
     def run_change(self, *, live: bool) -> Change:
-        """Return the change that describes the run. `live` states whether the run is still active."""
+        """Return the first change, which describes the run. `live` is true if the run is still active."""
         record, scenario = self._record, self._record.scenario
         return [
             "run",
@@ -129,13 +129,13 @@ class Feed:
         ]
 
     def _is_flown(self) -> bool:
-        """Return whether the vehicles are programs. Only these can suffer vehicle faults."""
+        """Return true if the vehicles are real programs. Only these can have vehicle faults."""
         record, scenario = self._record, self._record.scenario
         has_vehicles = scenario is not None and scenario.vehicles.kind != "none"
         return has_vehicles and record.backend is not None and not in_virtual_time(record.backend)
 
     def poll(self, until_s: float = float("inf")) -> tuple[list[Change], bool]:
-        """Return new changes up to a mission second, and whether more remain up to then."""
+        """Return the new changes up to a mission second, and true if more remain up to that time."""
         more = self._surroundings.read(until_s, LINES_AT_ONCE)
         for course in self._courses:
             more |= course.read(until_s, LINES_AT_ONCE)
@@ -152,19 +152,19 @@ class Feed:
         return [*changes, *self._notes()], more
 
     def final_changes(self) -> list[Change]:
-        """Return the remaining changes and the outcome of the run."""
+        """Return the remaining changes and the result of the run."""
         changes = [*self._take_changes(), *self._messages(report_all=True)]
         return [*changes, *self._notes(), ["end", self._ending()]]
 
     @property
     def next_s(self) -> float | None:
-        """Mission second of the earliest entry that was read ahead, or None."""
+        """The mission second of the earliest entry that was read in advance, or None."""
         ahead = (self._surroundings.next_s, *(course.next_s for course in self._courses))
         return min((at_s for at_s in ahead if at_s is not None), default=None)
 
     @property
     def over(self) -> bool:
-        """True if the record contains the outcome and the verdicts of the run."""
+        """True if run.json contains the result and the verdicts of the run."""
         stamp = self._stamp()
         if stamp != self._record_stamp:
             self._record_stamp = stamp
@@ -228,7 +228,7 @@ class Feed:
         return ["m", broadcast.t, sender, broadcast.message, broadcast.block, f"{broadcast.mask:x}", sequence]
 
     def _notes(self) -> Iterator[Change]:
-        """Yield sentences about problems that were not reported yet."""
+        """Yield sentences about new problems with the files."""
         damaged = (course.problem for course in self._courses)
         for sentence in chain(self._surroundings.problems, damaged):
             if sentence is not None and sentence not in self._reported_problems:

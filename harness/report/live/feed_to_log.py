@@ -1,4 +1,4 @@
-"""Copy a feed into a change log: at the speed of a live run, or at once after the run."""
+"""Copy the stream of changes to the log: at the speed of an active run, or all at once for a finished run."""
 
 import asyncio
 
@@ -11,7 +11,7 @@ STRIDE_S = 20.0
 
 
 async def copy_finished_run(feed: Feed, log: ChangeLog) -> None:
-    """Write all changes of a finished run in time order."""
+    """Write all changes of a finished run in order of time."""
     until_s = 0.0
     log.append([feed.run_change(live=False)])
     while True:
@@ -27,7 +27,7 @@ async def copy_finished_run(feed: Feed, log: ChangeLog) -> None:
 
 
 async def copy_live_run(feed: Feed, log: ChangeLog, ended: asyncio.Event) -> None:
-    """Write the changes of a run until its record has an outcome, or `ended` is set because its process ended."""
+    """Write the changes of an active run until it has a result, or until `ended` is set because its process ended."""
     log.append([feed.run_change(live=True)])
     while True:
         over = feed.over or ended.is_set()

@@ -1,4 +1,4 @@
-"""The web server of the page. It listens on 127.0.0.1 only, and requires the token in the page's address.
+"""The web server of the live page. It listens on 127.0.0.1 only, and requires the secret token in the page's address.
 
 The table of served files is made at the start, so no address can reach another file. The Content-Security-Policy lets
 browsers load from this server only. Three checks keep out other pages in the same browser: they do not know the token,
@@ -56,7 +56,7 @@ def _files() -> Mapping[str, _File]:
 
 
 class _Page:
-    """An open page."""
+    """A page that is open in a browser."""
 
     def __init__(self, socket: web.WebSocketResponse) -> None:
         self.socket = socket
@@ -64,7 +64,7 @@ class _Page:
 
 
 class Server:
-    """Serve one change log. `live` states whether the run is still active."""
+    """A web server for the log of one run. `live` is true if the run is still active."""
 
     def __init__(
         self, log: ChangeLog, directory: Path, *, live: bool, on_request: RequestHandler | None = None
@@ -79,7 +79,7 @@ class Server:
 
     @contextlib.asynccontextmanager
     async def open(self, port: int) -> AsyncIterator[str]:
-        """Yield the address of the page.
+        """Run the server inside the context, and yield the address of the page.
 
         Port 0 means any free port. Raises MachineError if the port is not available.
         """
@@ -109,7 +109,7 @@ class Server:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Reject requests without the token, and requests from other pages."""
+        """Refuse requests without the secret token, and requests from other web pages."""
         token = request.path.split("/")[1]
         origin = request.headers.get("Origin")
         foreign = request.host not in self._hosts or origin not in (None, *(f"http://{host}" for host in self._hosts))
@@ -142,7 +142,9 @@ class Server:
         )
 
     async def _report(self, request: web.Request) -> web.StreamResponse:
-        """Return the run's report. Its author is unknown, so the browser treats it as a page without an origin."""
+        """Return the report of the run. The browser treats it as a page without rights, because its author is
+        unknown.
+        """
         path = self._directory / "report.html"
         if not path.is_file():
             raise web.HTTPNotFound
@@ -169,16 +171,16 @@ class Server:
 
     @property
     def readers(self) -> int:
-        """Number of open pages."""
+        """The number of open pages."""
         return len(self._pages)
 
     def answer(self, page: int, answer: Change) -> None:
-        """Send an answer to one page, if it is still open."""
+        """Send an answer to one page, if that page is still open."""
         if page in self._pages:
             self._pages[page].answers.append(json.dumps(answer) + "\n")
 
     async def _send_changes(self, page: _Page) -> None:
-        """Send answers and changes at the speed of the browser."""
+        """Send answers and changes, no faster than the browser reads them."""
         start, caught_up = 0, False
         while not page.socket.closed:
             if page.answers:
@@ -191,7 +193,7 @@ class Server:
                 await asyncio.sleep(UPDATE_S)
 
     async def _listen(self, page: int, socket: web.WebSocketResponse) -> None:
-        """Receive requests of the page until it closes."""
+        """Receive requests from the page until it is closed."""
         async for message in socket:
             if message.type is WSMsgType.TEXT and self._on_request is not None and self.live:
                 with contextlib.suppress(ValueError, RecursionError):

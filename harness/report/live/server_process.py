@@ -1,4 +1,4 @@
-"""The page of a live run. Its server is a separate process, started before the run and stopped after it.
+"""Manage the live page of an active run. Its web server is a separate process.
 
 The two processes exchange lines of JSON. The run sends `["t", mission second]`, `["hand", state]` and answers to
 requests. The server first sends the page's address, and then `[page, number, request]` for each request.
@@ -32,7 +32,8 @@ _NO_REASON = "it does not say why"
 
 
 class LivePage:
-    """The process of the server, and the requests that it forwards from pages. `address` is the address of the page.
+    """The process of the web server, and the requests that it forwards from browsers. `address` is the address of the
+    page.
 
     The run never waits for the server. Threads write to the server and read from it.
     """
@@ -66,14 +67,14 @@ class LivePage:
         """After the run: a sentence about an early end of the server, or None."""
 
     def tee(self, progress: Progress) -> Progress:
-        """Return a progress display that also informs the page."""
+        """Return a progress display that forwards everything to `progress` and also updates the page."""
         return _ProgressTee(progress, self)
 
     def set_snapshot(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot
 
     def run_is_over(self) -> bool:
-        """Inform the server that the run is over. Return whether a page is open."""
+        """Inform the web server that the run is over. Return true if a page is open."""
         self._ended.set()
         self._state_sender.join()
         self._send(["over"])
@@ -89,7 +90,7 @@ class LivePage:
         return bool(self._readers)
 
     def wait(self) -> None:
-        """Wait until all pages are closed, or until Ctrl-C."""
+        """Wait until all pages are closed, or until the user presses Ctrl-C."""
         with suppress(KeyboardInterrupt):
             self._process.wait()
 
@@ -116,13 +117,13 @@ class LivePage:
         return self._last_lines[-1] if self._last_lines else _NO_REASON
 
     def _read_errors(self) -> None:
-        """Read the errors of the server. Without a reader, a full pipe would block the server."""
+        """Read the error output of the web server. Without a reader, a full pipe would block it."""
         for line in _required(self._process.stderr):
             if line.strip():
                 self._last_lines.append(line.strip())
 
     def _send(self, what: list[Any]) -> None:
-        """Queue a line. A failed or hung server must not affect the run."""
+        """Send a line to the web server without waiting. A failed or hung server must not affect the run."""
         with suppress(queue.Full):
             self._outgoing.put_nowait(what)
 
@@ -177,7 +178,7 @@ class LivePage:
 
 
 class _ProgressTee:
-    """A progress display that also informs the page."""
+    """A progress display that also updates the live page."""
 
     def __init__(self, progress: Progress, live_page: LivePage) -> None:
         self._progress, self._page = progress, live_page
@@ -205,7 +206,7 @@ def _required(stream: IO[str] | None) -> IO[str]:
 
 
 def _perform(interventions: Interventions, request: dict[str, Any]) -> Future[float]:
-    """Perform a request. Raises ValueError, TypeError, KeyError or AttributeError if the request is invalid."""
+    """Execute the request of a page. Raises ValueError, TypeError, KeyError or AttributeError if it is invalid."""
     match request["do"]:
         case "happen":
             return interventions.ask(request["entry"])
@@ -225,7 +226,9 @@ def _perform(interventions: Interventions, request: dict[str, Any]) -> Future[fl
 
 @contextmanager
 def live_page(directory: Path, port: int, interventions: Interventions) -> Iterator[LivePage]:
-    """Run a server for a run in that directory. Raises MachineError if it cannot start."""
+    """Run a web server for the run in this directory inside the context. Raises MachineError if it cannot be
+    started.
+    """
     server = LivePage(directory, port, interventions)
     try:
         yield server

@@ -1,4 +1,4 @@
-"""Gather exports, and the source of their events."""
+"""Read the chain exports of a swarm, and find out the kind of their events."""
 
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Logbook:
-    """Exports by agent.
+    """The chain exports of a swarm by agent.
 
     names: names of the blocks by hash. telemetry: whether the events come from the source `mavlink`, which is assumed
     for exports without a run. absent: a sentence for each agent of the mission without an export. errors: a sentence
@@ -37,12 +37,14 @@ class Logbook:
         return self.names.get(block_hash, block_hash[:12])
 
     def mission_s(self, timestamp_us: int) -> float | None:
-        """Return the mission second of a timestamp. None if the start is unknown, or for the inception block."""
+        """Return the mission second of a timestamp. Return None for the inception block, or if the start of the mission
+        is unknown.
+        """
         mission_s = None if self.epoch_us is None else (timestamp_us - self.epoch_us) / 1e6
         return mission_s if mission_s is not None and abs(mission_s) <= LATEST_S else None
 
     def only(self, agent_id: int) -> "Logbook":
-        """Return a logbook with one agent's export.
+        """Return a logbook that contains only this agent's export.
 
         Blocks keep their names. Raises ExportError if there is no export.
         """
@@ -55,7 +57,7 @@ class Logbook:
 
 
 def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
-    """Return the logbook of an archive. `depot` opens sealed events.
+    """Return the logbook of an archive. `depot` decrypts encrypted events.
 
     Raises RunDirectoryError if there are no exports, and ExportError if nothing is sealed to this depot.
     """
@@ -77,7 +79,7 @@ def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
 
 
 def logged_telemetry(record: RunRecord) -> bool:
-    """Return whether the events are telemetry.
+    """Return true if the events are telemetry of vehicles.
 
     Without vehicles they are random; without a run record they are telemetry.
     """

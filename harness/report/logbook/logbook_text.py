@@ -1,4 +1,4 @@
-"""The logbook as text for people, and as JSON for programs."""
+"""Write the logbook as text for readers, and as JSON for programs."""
 
 import contextlib
 from collections.abc import Iterator, Mapping
@@ -16,7 +16,7 @@ _BYTES_SHOWN = 8
 
 
 def lines(logbook: Logbook, decode: bool) -> Iterator[str]:
-    """Yield the lines of each agent's chain, oldest block first. With `decode`, each event is described."""
+    """Yield the lines of each agent's chain. The oldest block is first. With `decode`, each event is described."""
     vehicle_types = _vehicle_types(logbook) if decode else {}
     for agent_id, export in logbook.exports.items():
         yield f"agent {agent_id}: a chain of {_count(len(export.chain), 'block')}, top {_short(export.top_chain_hash)}"
@@ -31,7 +31,7 @@ def lines(logbook: Logbook, decode: bool) -> Iterator[str]:
 
 
 def document(logbook: Logbook, decode: bool) -> dict[str, Any]:
-    """Return the logbook as a JSON document. Data and hashes are hexadecimal, times are microseconds.
+    """Return the logbook as a JSON object. Data and hashes are hexadecimal, and times are in microseconds.
 
     `events` is null for a block whose events are unreadable or sealed.
     """
@@ -50,7 +50,7 @@ def document(logbook: Logbook, decode: bool) -> dict[str, Any]:
 
 
 def words(event: LoggableEvent, telemetry: bool, of_type: int | None = None) -> str:
-    """Return a description of an event. `of_type` is the MAV_TYPE of the vehicle that logged it."""
+    """Return a description of an event. `of_type` is the type (MAV_TYPE) of the vehicle that logged it."""
     description = describe(event.event_id, event.data, of_type) if telemetry else ""
     if description and description != "unreadable":
         return description
@@ -60,7 +60,7 @@ def words(event: LoggableEvent, telemetry: bool, of_type: int | None = None) -> 
 
 
 def _vehicle_types(logbook: Logbook) -> dict[int, int]:
-    """Return the MAV_TYPE of each agent's vehicle, from the first mode change that the agent logged."""
+    """Return the type (MAV_TYPE) of each agent's vehicle, from the first change of flight mode that it logged."""
     types: dict[int, int] = {}
     if not logbook.telemetry:
         return types
@@ -74,7 +74,7 @@ def _vehicle_types(logbook: Logbook) -> dict[int, int]:
 
 
 def _time(timestamp_us: int, logbook: Logbook) -> str:
-    """Return a timestamp in words, after its mission second if that is another number."""
+    """Return a timestamp as text, with its mission second in front if that is a different number."""
     mission_s = logbook.mission_s(timestamp_us) if logbook.epoch_us else None
     return moment(timestamp_us) if mission_s is None else f"{mission_s:8.1f} s  {moment(timestamp_us)}"
 

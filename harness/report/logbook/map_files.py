@@ -1,4 +1,4 @@
-"""Tracks and events as map files: GeoJSON (RFC 7946) and KML 2.2."""
+"""Write flight paths and events as map files: GeoJSON (RFC 7946) and KML 2.2."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -9,7 +9,7 @@ from ucp.telemetry import describe
 
 
 def geojson(tracks: Iterable[Track]) -> dict[str, Any]:
-    """Return a FeatureCollection. Altitudes are above mean sea level, like those of the autopilot.
+    """Return a GeoJSON FeatureCollection. Altitudes are metres above mean sea level.
 
     The property `times` of a LineString holds the time of each position. A vehicle with a single position has no
     LineString. Other events are at the last position of the vehicle, which is `position_age_s` seconds older. An event
@@ -49,7 +49,7 @@ ElementTree.register_namespace("gx", _GX)
 
 
 def kml(tracks: Iterable[Track]) -> str:
-    """Return a document with a folder for each vehicle: its track, and a placemark with a time for every other event.
+    """Return a KML document. The folder of each vehicle contains its flight path and its other events with their times.
 
     Altitudes are above mean sea level. An event is at the last position of the vehicle. Events before the first
     position are left out.

@@ -1,4 +1,4 @@
-"""Positions of the vehicles over time, from logged events or from the recorded tracks of the run.
+"""Find the positions of vehicles over time, from logged events or from the recorded flight paths of the run.
 
 A vehicle's events are taken from every surviving copy of its blocks: from each chain, deque and reconcile stack of the
 logbook. The track of a lost vehicle therefore reaches as far as other agents hold its blocks.
@@ -22,7 +22,7 @@ LAST_TIMESTAMP_US = 253_402_300_799_999_999
 
 
 class GlobalPosition(Protocol):
-    """A position in 1e-7 degrees, and in millimetres above mean sea level."""
+    """A position in units of 1e-7 degrees, with an altitude in millimetres above mean sea level."""
 
     @property
     def lat_e7(self) -> int: ...
@@ -34,7 +34,7 @@ class GlobalPosition(Protocol):
 
 @dataclass(frozen=True)
 class LogEntry:
-    """One event in block `block`. `position` is the event's own or the vehicle's last one, or None if there is none.
+    """One event in block `block`. `position` is its own position or the vehicle's previous one, or None.
 
     `position_age_s` is the age of the position at the time of the event, in seconds.
     """
@@ -48,7 +48,7 @@ class LogEntry:
 
 @dataclass(frozen=True)
 class Track:
-    """All events of one agent, oldest first. `fixes` are its positions with their timestamps in microseconds."""
+    """All events of one agent. The oldest is first. `fixes` contains its positions with timestamps in microseconds."""
 
     agent_id: int
     entries: list[LogEntry]
@@ -56,7 +56,9 @@ class Track:
 
 
 def tracks(logbook: Logbook) -> list[Track]:
-    """Return a track of each agent that logged positions, by agent ID; no tracks if the events are not telemetry."""
+    """Return the track of each agent that logged positions, by agent ID. There are none if the events are not
+    telemetry.
+    """
     if not logbook.telemetry:
         return []
     blocks: dict[int, dict[tuple[int, str], ExportedBlock]] = {}
@@ -73,7 +75,7 @@ def coordinates(position: GlobalPosition) -> tuple[float, float, float]:
 
 
 def utc(timestamp_us: int) -> str:
-    """Format a timestamp up to the year 9999 as in RFC 3339, to the millisecond. Virtual runs begin in 1970."""
+    """Return a timestamp in the format of RFC 3339, with milliseconds. The year is at most 9999."""
     at = datetime.fromtimestamp(timestamp_us // 1_000_000, UTC)
     return f"{at:%Y-%m-%dT%H:%M:%S}.{timestamp_us // 1000 % 1000:03d}Z"
 
@@ -92,7 +94,7 @@ def _events(logbook: Logbook, blocks: Iterable[ExportedBlock]) -> list[tuple[Log
 
 
 def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> Track:
-    """Return a track of these events, sorted by time. Events with an impossible time are left out."""
+    """Return a track of these events in order of time. Events with an impossible time are left out."""
     track = Track(agent_id, [], [])
     possible = [pair for pair in logged if pair[0].timestamp_us <= LAST_TIMESTAMP_US]
     for event, block in sorted(possible, key=lambda pair: pair[0].timestamp_us):
@@ -106,7 +108,7 @@ def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> Trac
 
 
 class RoundedPosition(NamedTuple):
-    """A position in 1e-7 degrees, and in millimetres above mean sea level."""
+    """A position in units of 1e-7 degrees, with an altitude in millimetres above mean sea level."""
 
     lat_e7: int
     lon_e7: int
@@ -114,7 +116,7 @@ class RoundedPosition(NamedTuple):
 
 
 def recorded_tracks(record: RunRecord, recorded: Tracks) -> list[Track]:
-    """Return a track without events for each recorded vehicle, around the home of the scenario."""
+    """Return a track without events for each recorded vehicle, relative to the home position in the scenario."""
     if record.scenario is None:
         return []
     home = record.scenario.vehicles.field

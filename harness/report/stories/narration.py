@@ -1,4 +1,4 @@
-"""The actions of agents as text of a story: instant by instant, and within an instant causes before effects.
+"""Describe the actions of agents as text: one moment after another, and within a moment causes before effects.
 
 In a real network, the order of receivers of one message is random. The text therefore does not depend on it. Within an
 instant, actions are ordered by their distance from the first cause, and then by agent ID: a timer ends and an agent
@@ -26,7 +26,7 @@ as punctual. A slow machine is late more often the faster it plays a mission."""
 
 @dataclass
 class Action:
-    """An action of an agent: a handler run that an input triggered, and the handler runs that it triggered locally."""
+    """An action of an agent: a handler run that an input triggered, with all handler runs that followed from it."""
 
     agent_id: int
     position: int
@@ -52,12 +52,12 @@ class Action:
 
     @property
     def answer(self) -> MessageTrigger | None:
-        """The trigger, if it is an answer to a query or request."""
+        """The trigger of the action, if it is the answer to a query or request. Otherwise None."""
         trigger = self.runs[0].trigger
         return trigger if isinstance(trigger, MessageTrigger) and trigger.message in ANSWERS else None
 
     def message(self, sequence: int) -> SentMessage | None:
-        """Return the sent message with this number."""
+        """Return the message with this sequence number that the action sent, or None."""
         return next((sent for run in self.runs for sent in run.sent if sent.seq == sequence), None)
 
     @property
@@ -67,7 +67,9 @@ class Action:
 
     @property
     def answers_another_agent(self) -> bool:
-        """True for the receipt of an answer to another agent. Answers are broadcasts, so all agents receive them."""
+        """True if the action received an answer for another agent. Answers are broadcasts, so all agents receive
+        them.
+        """
         if self.answer is None or self.cause is None:
             return False
         asked_by = self.cause.sender
@@ -75,7 +77,7 @@ class Action:
 
 
 class Narrator:
-    """The story of the traces of all agents on the roster."""
+    """Writes a story from the traces of all agents."""
 
     def __init__(self, traces: Mapping[int, Trace], roster: Sequence[int]) -> None:
         self._traces = traces
@@ -87,7 +89,7 @@ class Narrator:
         )
 
     def answer(self, section: Section, *, first: bool = False) -> list[str]:
-        """Return the lines of a section. The first section also contains earlier actions."""
+        """Return the lines for one section. The first section also includes earlier actions."""
         from_s = 0 if first else section.from_s
         actions = [
             action for action in self._actions if from_s <= action.instant and _before(action.instant, section.until_s)
@@ -98,7 +100,7 @@ class Narrator:
         return [*lines, *(self._chains(section.until_s) if section.shows_chains else [])]
 
     def _instant(self, actions: Sequence[Action]) -> Iterator[str]:
-        """Yield the lines of an instant. Agents with equal actions at the same distance share their lines."""
+        """Yield the lines for one moment. Agents with equal actions share their lines."""
         equal: dict[tuple[int, int, object], list[Action]] = {}
         for action in actions:
             key = action.distance, action.agent_id, self._kind(action)
@@ -149,7 +151,7 @@ class Narrator:
         return f"completes {name}" if operation == "complete" else f"{operation[:-1]} {operation[-1]}{name}"
 
     def _missing_receivers(self, action: Action, sent: SentMessage) -> str:
-        """Return a note about agents that did not receive the message.
+        """Return a note about the agents that did not receive the message.
 
         An answer only matters to the agent that asked.
         """
@@ -158,7 +160,7 @@ class Narrator:
         return f", not to {_listed(missed)}" if missed else ""
 
     def _chains(self, until_s: int | None) -> list[str]:
-        """Return the chains as a tree with the agents at the ends."""
+        """Return the chains as a tree with agents at its ends."""
         chains: dict[int, list[str]] = {}
         for agent_id, trace in self._traces.items():
             positions = {action.position: action.instant for action in self._actions if action.agent_id == agent_id}
@@ -177,7 +179,7 @@ class Narrator:
 
 
 def _actions_with_causes(traces: Mapping[int, Trace]) -> list[Action]:
-    """Return all actions, each with its cause."""
+    """Return all actions, each with the action that caused it."""
     actions = [action for agent_id, trace in traces.items() for action in _actions(agent_id, trace)]
     sent: dict[tuple[int, int], list[Action]] = defaultdict(list)
     for action in actions:
@@ -217,7 +219,7 @@ def _set_cause(action: Action, sent: Mapping[tuple[int, int], Sequence[Action]])
 
 
 def _actions(agent_id: int, trace: Trace) -> Iterator[Action]:
-    """Yield the actions of a trace. Local events belong to the action that triggered them."""
+    """Yield the actions in a trace. Local events belong to the action that triggered them."""
     action: Action | None = None
     for position, run in enumerate(trace.runs):
         if not has_possible_time(run):

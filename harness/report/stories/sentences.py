@@ -1,4 +1,4 @@
-"""The sentences of a story, and their translation into a scenario's script and timeline."""
+"""Translate the sentences of a story into entries of a scenario."""
 
 import re
 from collections.abc import Callable
@@ -26,7 +26,7 @@ SENTENCES = (
 
 
 class StoryEntries:
-    """The scenario entries of the sentences so far: `script` for events, `timeline` for the rest, and the end."""
+    """The scenario entries for all sentences so far: `script` for events, `timeline` for the rest, and the end."""
 
     def __init__(self) -> None:
         self.script: list[dict[str, Any]] = []
@@ -34,7 +34,7 @@ class StoryEntries:
         self.ends_at_s: int | None = None
 
     def add(self, at_s: int, sentence: str) -> None:
-        """Add a sentence. Raises ScenarioError if its form is unknown."""
+        """Add a sentence of the story. Raises ScenarioError if its form is unknown."""
         if sentence == "end":
             self.ends_at_s = at_s
         elif sentence == "heal":

@@ -1,4 +1,4 @@
-"""The file of a story: scenario keys, then sentences with their seconds, and below them the indented reactions.
+"""Read and write story files: scenario keys, then sentences with their seconds, and below them the agents' reactions.
 
     # Figure 3.8: the course of a vote.
     agents: 3
@@ -37,7 +37,7 @@ SPEEDUP = 10.0
 
 @dataclass(frozen=True)
 class Section:
-    """The answer after line `line` (from 0), for mission seconds from `from_s` to `until_s`."""
+    """The place for the reactions after line `line` (from 0), for mission seconds from `from_s` to `until_s`."""
 
     line: int
     from_s: int
@@ -47,7 +47,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Story:
-    """A story file. `lines` are its lines without the answers. Each section follows one of them."""
+    """A story file. `lines` contains its lines without the reactions of agents."""
 
     path: Path
     text: str
@@ -57,14 +57,14 @@ class Story:
 
     @property
     def in_virtual_time(self) -> Scenario:
-        """The scenario with a constant message delay. It keeps the order of each sender's messages."""
+        """The scenario of the story, with a constant message delay that keeps messages in order."""
         if self.scenario.network.delay:
             return self.scenario
         network = self.scenario.network.model_copy(update={"delay": DELAY_S})
         return self.scenario.model_copy(update={"network": network})
 
     def with_answers(self, answers: Sequence[Sequence[str]]) -> str:
-        """Return the file's text with these answers, one for each section."""
+        """Return the text of the file with these reactions, one list of lines for each section."""
         after = {section.line: answer for section, answer in zip(self.sections, answers, strict=True)}
         lines: list[str] = []
         for number, line in enumerate(self.lines):
@@ -78,7 +78,7 @@ class Story:
 
 
 def is_story(path: Path) -> bool:
-    """Return whether a line of the file is a sentence. Other tools use the same suffix."""
+    """Return true if the file is a story. Other tools use the same file name suffix."""
     try:
         with path.open(encoding="utf-8") as file:
             return any(_SENTENCE.fullmatch(line.rstrip("\n")) for line in islice(file, MAX_LINES))
@@ -87,7 +87,7 @@ def is_story(path: Path) -> bool:
 
 
 def read_story(path: Path) -> Story:
-    """Read a story. Raises ScenarioError with the file and the line."""
+    """Read a story file. Raises ScenarioError that names the file and the line."""
     try:
         if not path.is_file() or path.stat().st_size > MAX_BYTES:
             raise ScenarioError(f"{path}: not a file, or too large for a story")
@@ -148,18 +148,18 @@ def _parsed(path: Path, text: str) -> Story:
 
 
 def _in_its_line(problem: str, entry_lines: Mapping[str, Sequence[int]]) -> str:
-    """Replace the name of a scenario entry in an error message by the line of its sentence."""
+    """Return an error message in which the line of the sentence replaces the name of the scenario entry."""
     entry = _ENTRY.match(problem)
     return f"line {entry_lines[entry[2]][int(entry[3])]}: {entry[1]}{problem[entry.end() :]}" if entry else problem
 
 
 def _gap(lines: Sequence[str]) -> list[str]:
-    """Return an empty line if the last line is a sentence, so that a comment stands apart from it."""
+    """Return an empty line if the last line is a sentence, to separate it from a comment."""
     return [""] if _SENTENCE.fullmatch(lines[-1]) else []
 
 
 def _sections(sentences: Sequence[tuple[int, int, bool]]) -> list[Section]:
-    """Return one section for each second, after the last sentence of that second."""
+    """Return one section for each second, placed after the last sentence of that second."""
     last = {
         at_s: (line, any(chains for _, other_s, chains in sentences if other_s == at_s)) for line, at_s, _ in sentences
     }

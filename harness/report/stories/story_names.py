@@ -1,4 +1,4 @@
-"""Names of blocks, chains and messages in a story."""
+"""Name the blocks, chains and messages in a story."""
 
 import base64
 import binascii
@@ -29,7 +29,7 @@ MAX_FULL_CHAIN = 4
 
 
 class LocalChain:
-    """The chain of an agent, replayed from its trace: block hashes and chain hashes, oldest first."""
+    """The chain of an agent as its trace describes it: block hashes and chain hashes. The oldest is first."""
 
     def __init__(self, trace: Trace) -> None:
         try:
@@ -51,7 +51,7 @@ class LocalChain:
 
 
 def _digest(block_hash: str) -> bytes:
-    """Return the bytes of the hash, or no bytes if the text is no hash."""
+    """Return the hash as bytes, or no bytes if the text is not a hash."""
     try:
         return bytes.fromhex(block_hash)
     except ValueError:
@@ -59,7 +59,7 @@ def _digest(block_hash: str) -> bytes:
 
 
 class Names:
-    """Names of blocks as in the figures of the thesis, and names of chains by their blocks."""
+    """Names of blocks as in the figures of the thesis. A chain is named by its blocks."""
 
     def __init__(self, traces: Mapping[int, Trace]) -> None:
         self._blocks = {
@@ -84,7 +84,7 @@ class Names:
         return [self.block(block_hash) for block_hash in block_hashes]
 
     def chain(self, chain_hash: bytes) -> str:
-        """Return "1.1 2.1", or "1.1 .. 4.2" for a long chain."""
+        """Return a name of the chain, such as "1.1 2.1", or "1.1 .. 4.2" if it is long."""
         blocks = self._chains.get(chain_hash)
         return "an unknown chain" if blocks is None else _chain_text(blocks)
 
@@ -101,7 +101,7 @@ def _chain_text(blocks: Sequence[str]) -> str:
 
 
 class NameSource(Protocol):
-    """A source of names for blocks and chains."""
+    """An object that returns names for blocks and chains."""
 
     def block(self, block_hash: str) -> str: ...
 
@@ -140,7 +140,7 @@ _FORMATS: dict[type[Message], Callable[[Any, NameSource], str]] = {
 
 
 def message_text(sent: SentMessage, names: Names) -> str:
-    """Return the text of a message that a trace contains."""
+    """Return the text of a message in a trace."""
     if sent.datagram is None:
         return f"{sent.message} (not recorded)"
     try:
@@ -151,5 +151,5 @@ def message_text(sent: SentMessage, names: Names) -> str:
 
 
 def in_words(message: Message, names: NameSource) -> str:
-    """Return a text such as "Chain Contain Query (1.1 2.1)"."""
+    """Return a text about a message, such as "Chain Contain Query (1.1 2.1)"."""
     return f"{message.NAME} ({_FORMATS[type(message)](message, names)})"

@@ -1,4 +1,4 @@
-"""Faults of agents and vehicles, a class for each. This package finds the classes in its files.
+"""Faults of agents and vehicles, with a class for each. This package finds the classes in its modules.
 
 No other module lists the faults: to add one, add its class to a file in this directory.
 """
@@ -26,7 +26,7 @@ for file in iter_modules(__path__):
 
 
 def _below(kind: type[Fault]) -> Iterator[type[Fault]]:
-    """Yield the subclasses that have a name, in the order of their definition."""
+    """Yield the subclasses that are faults with a name, in the order of their definition."""
     for derived in kind.__subclasses__():
         if derived.what:
             yield derived
@@ -41,5 +41,7 @@ _BY_NAME = {kind.what: kind for kind in KINDS}
 
 
 def fault_class(what: str) -> type[Fault]:
-    """Return the class of the fault with this name, or `Fault`, which does nothing, for an unknown name."""
+    """Return the class of the fault with this name. For an unknown name, return the class `Fault`, which does
+    nothing.
+    """
     return _BY_NAME.get(what, Fault)

@@ -1,4 +1,4 @@
-"""The base class of all faults. A fault changes agents or their vehicles at one mission second.
+"""The base class of all faults. A fault changes agents or their vehicles at one moment of the mission.
 
 The class of a fault holds everything about it: its name in YAML, in records and in pytest, the states of an agent
 before and after it, its effect on agents, vehicles and data, the calls to the backend, and the texts of the report.
@@ -31,41 +31,45 @@ BAR = "M0-6v12"
 
 
 class AgentOperations(Protocol):
-    """The operations of a backend on an agent and its vehicle. None of them waits for mission time to pass."""
+    """The operations on an agent and its vehicle that a backend must provide. None of them waits for mission time to
+    pass.
+    """
 
     async def end_incarnation(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
-        """End the agent, and its vehicle if `with_vehicle` is true. `disk_kept` keeps the data on its disk."""
+        """End the agent, and also its vehicle if `with_vehicle` is true. `disk_kept` keeps the data on its disk."""
 
     async def begin_incarnation(self, agent_id: int, *, new_vehicle: bool = False) -> None:
-        """Start the agent again, with the kept data of its disk, and on a new vehicle if `new_vehicle` is true."""
+        """Start the agent again with the data on its disk. It gets a new vehicle if `new_vehicle` is true."""
 
     async def fall(self, agent_id: int) -> None:
         """Let the vehicle of the agent fall to the ground."""
 
     async def pause(self, agent_id: int) -> None:
-        """Stop the agent. Its incoming messages wait."""
+        """Stop the agent temporarily. Its incoming messages wait."""
 
     async def resume(self, agent_id: int) -> None: ...
 
     async def stop_logging(self, agent_id: int) -> None:
-        """Stop the event logging of the agent until it starts again."""
+        """Stop the logging of events by the agent until the agent starts again."""
 
     async def switch_off(self, agent_id: int) -> None:
-        """Make the agent export its chain, then end it and its vehicle."""
+        """Let the agent export its chain, and then end it and its vehicle."""
 
     async def reconcile(self, agent_id: int) -> None:
-        """Make the agent start a reconcile."""
+        """Let the agent start a reconcile."""
 
     async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
-        """Send the revocation of the agent's keys from the ground to the vehicles in `heard_by`."""
+        """Send a message from the ground that excludes the agent. The vehicles in `heard_by` receive it."""
 
     async def set_circumstance(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
-        """Make the vehicle of the agent simulate a circumstance. The run record says whether it did."""
+        """Let the vehicle of the agent simulate an event such as a GPS failure. The run record states whether it
+        could.
+        """
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of `agents` at mission second `at_s`.
+    """A fault of the agents `agents` at mission second `at_s`.
 
     Further fields of a subclass are keys of its timeline entry. The entry needs all of them. Their annotations declare
     the allowed values. `Fault` itself stands for an unknown fault and has no effect.
@@ -114,7 +118,7 @@ class Fault:
         """Apply the fault to one of the agents."""
 
     def stages(self) -> "Sequence[Fault]":
-        """Return all faults of this timeline entry, in time order."""
+        """Return all faults that this timeline entry causes, in order of time."""
         return [self]
 
     def check(self, vehicles: Vehicles) -> None:
@@ -122,27 +126,27 @@ class Fault:
 
     @property
     def further_vehicles(self) -> Sequence[int]:
-        """Vehicle IDs in the further keys."""
+        """The vehicle IDs in the additional keys of the fault."""
         return ()
 
     @property
     def disk_after(self) -> DiskState | None:
-        """State of the disks after the fault. None if the fault does not concern disks."""
+        """The state of the disks after the fault, or None if the fault does not concern disks."""
         return None
 
     @classmethod
     def loses_data(cls, disk: DiskState | None) -> bool:
-        """True if the agents lose all their data, given the state of their disks."""
+        """True if the agents lose all their data in this fault, given the present state of their disks."""
         return cls.ends_incarnation and not cls.exports_chain and disk != "kept"
 
     @classmethod
     def further_keys(cls) -> list[str]:
-        """Return the keys of its timeline entry besides `at_s` and the name of the fault."""
+        """Return the keys of the timeline entry, other than `at_s` and the name of the fault."""
         return [field.name for field in fields(cls) if field.name not in Fault.__dataclass_fields__]
 
     @classmethod
     def entry_keys(cls, *agents: int, **further: Any) -> dict[str, Any]:
-        """Return the keys of a timeline entry for the call of a test."""
+        """Return the keys of a timeline entry, as arguments for the call in a pytest test."""
         return {cls.what: list(agents), **cls.default_values, **further}
 
     @property
@@ -151,7 +155,7 @@ class Fault:
         return agents if self.disk_after is None else f"{agents}, disk {self.disk_after}"
 
     def to_json(self, at_s: float) -> dict[str, Any]:
-        """The record of this fault, made at `at_s`."""
+        """Return the record of this fault, made at mission second `at_s`."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
         hand = {"by_hand": True} if self.by_hand else {}
         disk = {} if self.disk_after is None else {"disk": self.disk_after}
@@ -163,5 +167,5 @@ SAME_TIME_S = 0.001
 
 
 def planned_key(planned_s: float, at_s: float) -> dict[str, float]:
-    """Return the key `planned_s` of a record, if the change was made later than planned."""
+    """Return the key `planned_s` for a record, if the change was made later than planned. Otherwise return no key."""
     return {} if abs(planned_s - at_s) < SAME_TIME_S else {"planned_s": planned_s}

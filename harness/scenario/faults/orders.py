@@ -1,4 +1,4 @@
-"""Orders from the ground: reconcile, revoke keys, stop logging events."""
+"""Orders from the ground to agents: reconcile, exclude a vehicle, or stop logging events."""
 
 from dataclasses import dataclass
 from typing import Annotated

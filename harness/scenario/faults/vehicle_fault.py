@@ -1,5 +1,4 @@
-"""Faults of a vehicle rather than of its agent: battery, compass, fence, GPS, ground station, motor, remote control
-and wind."""
+"""Faults of a vehicle: battery, compass, fence, GPS, ground station, motor, remote control and wind."""
 
 from __future__ import annotations
 
@@ -43,7 +42,7 @@ class VehicleFault(Fault):
 
     @property
     def circumstance(self) -> Circumstance:
-        """The circumstance that the vehicles simulate."""
+        """The event, such as a GPS failure, that the vehicles simulate."""
         raise NotImplementedError
 
     def check(self, vehicles: Vehicles) -> None:
@@ -58,7 +57,7 @@ class VehicleFault(Fault):
 
     @property
     def vehicles_in_words(self) -> str:
-        """The vehicles in words: "vehicles 1 2"."""
+        """The vehicles as text, such as "vehicles 1 2"."""
         return f"vehicle{'s' if len(self.agents) > 1 else ''} {' '.join(map(str, self.agents))}"
 
     @property
