@@ -1,8 +1,9 @@
 """Send forgeries, replays and repeated nonces to secured agents: `python -m benchmarks.forgeries [--each 1000000]`.
 
-An agent with keys, which has received messages of others, gets `--each` forged datagrams of each of ten classes. A row
-counts the accepted ones, says whether the state of the agent changed, and gives the number of datagrams that it rejects
-in a second of processor time. The time to make them does not count. `--only CLASS ...` selects classes.
+An agent with keys, which has received messages of others, gets `--each` forged datagrams of each class. A row counts
+the accepted ones, shows whether the state of the agent changed, and gives the processor time for one datagram, also as
+a multiple of the time for a datagram with a wrong tag. The time to make them does not count. `--only CLASS ...`
+selects classes. Mission time stands still, so the budget for wrong signatures does not refill.
 
 `--replays RUNS` plays simulated missions in which all agents receive each datagram again later. `--nonces RUNS` plays
 simulated missions with reboots, with and without their disk, and counts repeated pairs of key and nonce.
@@ -17,6 +18,8 @@ from itertools import cycle, islice
 from random import Random
 from typing import Any
 
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
 from harness.play.simulation.air import StrayDatagram, VirtualAir
 from harness.run.simulate import MemoryRecorder, simulate, simulate_in_memory
 from harness.scenario import Scenario
@@ -24,7 +27,8 @@ from ucp.block import Block
 from ucp.messages import BlockAddRequest, BlockResponse, ChainContainResponse, CommitBlock, Message, encode
 from ucp.secure.bundle import KeySet
 from ucp.secure.crypto_suite import SenderKeys
-from ucp.secure.envelope import CLEAR, SIGNATURE_BYTES
+from ucp.secure.envelope import CLEAR, SIGNATURE_BYTES, ClearHeader
+from ucp.secure.revocation import Revocation
 from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
 from ucp.trace import RecordedBytes
@@ -73,20 +77,20 @@ def pool(maker: Session, draw: Random, first: int = 1) -> list[bytes]:
     return made
 
 
-# The ten classes: each generator is endless
+# The classes: each generator is endless
 
 
 def at_random(draw: Random) -> Iterator[bytes]:
     while True:
         noise = draw.randbytes(draw.randrange(200))
         yield noise
-        yield b"UC\2" + noise
+        yield b"UC\3" + noise
         yield _header(draw, len(noise)) + noise
 
 
 def _header(draw: Random, length: int) -> bytes:
     numbers = draw.randrange(1, 11), draw.choice(ROSTER), draw.randrange(2**32), length, EPOCH
-    return CLEAR.pack(b"UC", 2, *numbers, make_boot(1_000_000, bytes(8)), 0)
+    return CLEAR.pack(b"UC", 3, *numbers, make_boot(1_000_000, bytes(8)), 0)
 
 
 def bits_flipped(draw: Random) -> Iterator[bytes]:
@@ -155,11 +159,30 @@ def lengths_that_lie(draw: Random) -> Iterator[bytes]:
         yield good + draw.randbytes(draw.randrange(1, 100))
 
 
+def forged_revocations(draw: Random) -> Iterator[bytes]:
+    """Yield revocations of an outsider, each with a number that no agent knows."""
+    body = Revocation.signed(Ed25519PrivateKey.generate(), KEYS.public.mission, 7, [1]).encode()
+    for number in cycle(range(8, 2**16)):
+        signed = number.to_bytes(2, "big") + body[2:]
+        yield ClearHeader(10, 2, 0, EPOCH, make_boot(1_000_000, bytes(8)), number).pack(len(signed)) + signed
+
+
+def revocations_of_an_insider(draw: Random) -> Iterator[bytes]:
+    insider = session(2)
+    yield from cycle(insider.seal_revocation(draw.randbytes(2) + b"\0\1" + draw.randbytes(68), 7) for _ in range(POOL))
+
+
+def unknown_boots(draw: Random) -> Iterator[bytes]:
+    for good in cycle(pool(session(2), draw)):
+        yield good[: CLEAR.size - 18] + make_boot(2_000_000, draw.randbytes(8)) + good[CLEAR.size - 2 :]
+
+
 CLASSES: dict[str, Callable[[Random], Iterator[bytes]]] = {
     made.__name__: made
     for made in (
         *(at_random, bits_flipped, truncated, another_sender, another_mission),
         *(an_old_epoch, unsigned, wrong_private_key, parts_swapped, lengths_that_lie),
+        *(forged_revocations, revocations_of_an_insider, unknown_boots),
     )
 }
 
@@ -175,7 +198,7 @@ def all_of(agent: SecuredAgent) -> dict[str, Any]:
         "epoch": session.epochs.current,
         "keys": len(session.epochs._sender_keys),
         "signatures": dict(agent.signatures),
-        "revocation": agent.revocation,
+        "revoked": agent.revoked,
         "heard": {
             sender: (life.boot, life.window._newest, tuple(life.window._words), dict(life.requests))
             for sender, life in session._incarnations.items()
@@ -255,7 +278,7 @@ def nonces(seeds: Iterable[int]) -> tuple[int, int]:
     def taken_down(keys: SenderKeys, sequence: int, body: bytes, clear: bytes) -> bytes:
         nonlocal sealed, twice
         sealed += 1
-        nonce = hash((keys._mask, keys._nonce(sequence))), sequence
+        nonce = hash((keys._iv, keys._nonce(sequence))), sequence
         twice += nonce in used
         used.add(nonce)
         return sealing(keys, sequence, body, clear)
@@ -291,15 +314,19 @@ def main() -> None:
         say(f"{arguments.replays} runs, {dropped} datagrams dropped as replayed, {len(bad)} findings")
         say(f"{same} have the chains of the run without replays")
     else:
-        say(f"{'class':20}{'forged':>9}{'accepted':>10}{'changed':>9}{'rejected/s':>12}  why")
+        say(f"{'class':26}{'forged':>9}{'accepted':>10}{'changed':>9}{'us each':>9}{'ratio':>7}  why")
+        _, _, seconds, why = forge(another_mission, arguments.each)
+        wrong_tag_us = seconds / why.total() * 1e6
         for name in arguments.only:
-            say(row(name, arguments.each))
+            say(row(name, arguments.each, wrong_tag_us))
 
 
-def row(name: str, each: int) -> str:
+def row(name: str, each: int, wrong_tag_us: float) -> str:
     accepted, changed, seconds, why = forge(CLASSES[name], each)
     forged, reasons = why.total(), ", ".join(f"{reason} {count}" for reason, count in why.most_common())
-    return f"{name:20}{forged:9}{accepted:10}{'yes' if changed else 'no':>9}{forged / seconds:12.0f}  {reasons}"
+    us = seconds / forged * 1e6
+    costs = f"{us:9.1f}{us / wrong_tag_us:7.1f}"
+    return f"{name:26}{forged:9}{accepted:10}{'yes' if changed else 'no':>9}{costs}  {reasons}"
 
 
 def say(line: str) -> None:

@@ -356,7 +356,7 @@ class Node:
         except (TypeError, ValueError) as error:
             why = str(error) if isinstance(error, MalformedDatagramError) else "not in base64"
             raise CommandError(f"no revocation: {why}") from None
-        return {"revoked": sorted(agent.revocation.revoked) if agent.revocation else []}
+        return {"revoked": sorted(agent.revoked)}
 
     def _reconcile(self, request: dict[str, Any]) -> dict[str, Any]:
         if not self.clock.running:

@@ -16,7 +16,7 @@ example with ARP.
 A received datagram gets the layer of its message if and only if the codec accepts the datagram. Otherwise its body is
 Raw after the UCP header. A datagram without a UCP header is Raw as a whole.
 
-Datagrams of secured missions have version 2. SecuredUCP is their clear header. The layer Sealed or Revocation follows
+Datagrams of secured missions have version 3. SecuredUCP is their clear header. The layer Sealed follows
 it. `opened` decrypts a Sealed packet with the bundle of a vehicle:
 
     from ucp.scapy import SecuredUCP, opened
@@ -34,7 +34,6 @@ from scapy.fields import (
     ByteEnumField,
     ByteField,
     FieldLenField,
-    FieldListField,
     IntField,
     LenField,
     LongField,
@@ -69,8 +68,6 @@ from ucp.secure.envelope import (
     CLEAR_FIELDS,
     NAMES,
     REVOCATION,
-    SEAL_BYTES,
-    SIGNATURE_BYTES,
     TAG_BYTES,
     read_clear_header,
 )
@@ -112,10 +109,10 @@ class BlockTimestampField(LongField):
 
 
 class CiphertextField(XStrField):
-    """The encrypted bytes before the authentication tag and the signature."""
+    """The encrypted bytes before the authentication tag."""
 
     def getfield(self, pkt: Packet, s: bytes) -> tuple[bytes, bytes]:
-        return s[-SEAL_BYTES:], s[:-SEAL_BYTES]
+        return s[-TAG_BYTES:], s[:-TAG_BYTES]
 
 
 _FIELDS: dict[Kind, Callable[[str], Any]] = {
@@ -220,40 +217,23 @@ class SecuredUCP(Packet):
 
     def guess_payload_class(self, payload: bytes) -> type[Packet]:
         try:
-            clear = read_clear_header(self.original)
+            read_clear_header(self.original)
         except MalformedDatagramError:
             return conf.raw_layer
-        if clear.type != REVOCATION:
-            return Sealed
-        whole = len(payload) >= 4 and len(payload) == 4 + 4 * int.from_bytes(payload[2:4], "big") + SIGNATURE_BYTES
-        return Revocation if whole else conf.raw_layer
+        return Sealed
 
     def mysummary(self) -> str:
         return self.sprintf("UCP %SecuredUCP.sender%: %SecuredUCP.type%, sealed")
 
 
 class Sealed(Packet):
-    """The encrypted part of a datagram with its masked signature. `opened` decrypts it."""
+    """The encrypted part of a datagram. `opened` decrypts it, except for a revocation, which has no message."""
 
     name = "Sealed"
     fields_desc = _fields(
         {},
         CiphertextField("ciphertext", b""),
         XStrFixedLenField("tag", bytes(TAG_BYTES), TAG_BYTES),
-        XStrFixedLenField("masked_signature", bytes(SIGNATURE_BYTES), SIGNATURE_BYTES),
-    )
-
-
-class Revocation(Packet):
-    """A signed list of vehicles that are excluded from the mission. `count` is computed if it is omitted."""
-
-    name = "Revocation"
-    fields_desc = _fields(
-        {},
-        ShortField("number", 1),
-        FieldLenField("count", None, count_of="revoked"),
-        FieldListField("revoked", [], IntField("agent_id", 0), count_from=lambda revocation: revocation.count),
-        XStrFixedLenField("signature", bytes(SIGNATURE_BYTES), SIGNATURE_BYTES),
     )
 
 
@@ -318,7 +298,6 @@ LAYERS: dict[type[Message], type[Packet]] = {
 
 for _message, _layer in LAYERS.items():
     bind_layers(UCP, _layer, type=TYPE_CODES[_message])
-bind_layers(SecuredUCP, Revocation, type=REVOCATION)
 bind_top_down(UDP, UCP, sport=PORT, dport=PORT)
 bind_bottom_up(UDP, UCP, dport=PORT)
 

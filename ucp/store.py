@@ -38,21 +38,22 @@ class StoreError(Exception):
 
 @dataclass(slots=True)
 class SecuredState:
-    """Additional stored data of a secured agent: its start time, the signatures of blocks, and the newest list of
-    excluded vehicles.
+    """Additional stored data of a secured agent: its start time, the signatures of blocks, and the received lists
+    of excluded vehicles.
     """
 
     started_us: int
     signatures: Mapping[bytes, bytes] = field(default_factory=dict, repr=False)
-    revocation: bytes | None = None
+    revocations: tuple[bytes, ...] = ()
 
     def replay(self, entry: dict[str, Any]) -> None:
         """Add the new data of an entry in the file."""
         self.started_us = max(self.started_us, int(entry.get("started_us", 0)))
         new = {bytes.fromhex(name): base64.b64decode(text) for name, text in entry.get("signatures", {}).items()}
         self.signatures = {**self.signatures, **new}
-        if (revocation := entry.get("revocation")) is not None:
-            self.revocation = base64.b64decode(revocation)
+        if (revocation := entry.get("revocation")) is not None:  # earlier versions stored only the newest one
+            self.revocations = (base64.b64decode(revocation),)
+        self.revocations = (*self.revocations, *map(base64.b64decode, entry.get("revocations", ())))
 
     def entry(self, before: "SecuredState | None" = None) -> dict[str, Any]:
         """Return the data that are new since `before`, as an entry for the file."""
@@ -62,8 +63,8 @@ class SecuredState:
             before = SecuredState(self.started_us)
         if signed := self.signatures.keys() - before.signatures.keys():
             new["signatures"] = {name.hex(): _base64(self.signatures[name]) for name in sorted(signed)}
-        if self.revocation is not None and self.revocation != before.revocation:
-            new["revocation"] = _base64(self.revocation)
+        if revoked := [body for body in self.revocations if body not in before.revocations]:
+            new["revocations"] = [_base64(body) for body in revoked]
         return new
 
 

@@ -211,7 +211,7 @@ class VirtualAgent:
             return {"ok": False, "error": str(error)}
         except MalformedDatagramError as malformed:
             return {"ok": False, "error": f"no revocation: {malformed.reason}"}
-        return {"ok": True, "revoked": sorted(agent.revocation.revoked) if agent.revocation else []}
+        return {"ok": True, "revoked": sorted(agent.revoked)}
 
     def _stop_events(self, given: dict[str, Any], now: float) -> dict[str, Any]:
         self._generating = False

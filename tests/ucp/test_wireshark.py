@@ -143,18 +143,16 @@ def test_packet_list_names_message_and_sender(tmp_path: Path) -> None:
 
 def test_dissector_shows_the_clear_fields_of_secured_datagrams(tmp_path: Path) -> None:
     body = Revocation(3, frozenset((2, 9)), bytes(range(64))).encode()
-    sealed, revokes = session(2).seal(7, CommitBlock(LOGGED, A), None, None, 1), session(1).revocation_datagram(3, body)
+    sealed, revokes = session(2).seal(7, CommitBlock(LOGGED, A), None, None, 1), session(1).seal_revocation(body, 3)
     for datagram, layer in zip((sealed, revokes), layers(tmp_path, (sealed, revokes)), strict=True):
         header = shown("ucpchain", dict(zip(CLEAR_FIELDS, CLEAR.unpack_from(datagram), strict=True)))
         assert {name: layer[name] for name in header} == header
         assert experts(layer) == {}
-    tree, revocation = layers(tmp_path, (sealed, revokes))
-    assert [tree[f"ucpchain.{name}"].replace(":", "") for name in ("ciphertext", "tag", "masked_signature")] == [
-        part.hex() for part in (sealed[CLEAR.size : -80], sealed[-80:-64], sealed[-64:])
-    ]
-    assert (revocation["ucpchain.number"], revocation["ucpchain.revoked"]) == ("3", ["2", "9"])
-    broken = revokes[: CLEAR.size - 24] + (len(body) + 1).to_bytes(2, "big") + revokes[14:] + b"x"
-    assert experts(layers(tmp_path, [broken])[0]) == {"ucpchain.malformed": "wrong length"}
+        assert [layer[f"ucpchain.{name}"].replace(":", "") for name in ("ciphertext", "tag")] == [
+            part.hex() for part in (datagram[CLEAR.size : -16], datagram[-16:])
+        ]
+    short = revokes[: CLEAR.size - 24] + (15).to_bytes(2, "big") + revokes[14 : CLEAR.size] + bytes(15)
+    assert experts(layers(tmp_path, [short])[0]) == {"ucpchain.malformed": "wrong length"}
     assert "Commit Block from 2, secured" in tshark(tmp_path, [frame(sealed)])
     for captured in (50, 70, 100):
         assert set(experts(layers(tmp_path, [sealed], captured)[0])) == {"ucpchain.cut_off"}
@@ -180,7 +178,7 @@ def test_dissector_gives_the_same_reasons_as_the_codec(tmp_path: Path) -> None:
     for datagram, layer in zip(datagrams, layers(tmp_path, datagrams), strict=True):
         reason = None
         try:
-            read_clear_header(datagram) if datagram[:3] == b"UC\2" else decode(datagram)
+            read_clear_header(datagram) if datagram[:3] == b"UC\3" else decode(datagram)
         except MalformedDatagramError as malformed:
             reason = malformed.reason
         assert experts(layer).get("ucpchain.malformed") == reason, datagram.hex()

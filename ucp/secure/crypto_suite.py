@@ -13,14 +13,11 @@ from cryptography.exceptions import InvalidSignature, InvalidTag
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-from ucp.secure.envelope import SIGNATURE_BYTES
-
 KEY_BYTES = 32
 NONCE_BYTES = 12
 MAX_CACHED_KEYS = 1024
 
 _SENDER = b"UCP sender\0"
-_MASK = b"UCP signature mask\0"
 _EPOCH = b"UCP epoch\0"
 
 
@@ -43,36 +40,27 @@ def next_epoch_secret(secret: bytes, mission: bytes) -> bytes:
 class SenderKeys:
     """The keys that seal the datagrams of one sender in one epoch and one incarnation. `repr` hides them."""
 
-    __slots__ = ("_aead", "_iv", "_mask")
+    __slots__ = ("_aead", "_iv")
 
     def __init__(self, epoch_secret: bytes, mission: bytes, epoch: int, sender: int, boot: bytes) -> None:
         info = _SENDER + mission + epoch.to_bytes(4, "big") + sender.to_bytes(4, "big") + boot
-        derived = expand(epoch_secret, info, 2 * KEY_BYTES + NONCE_BYTES)
+        derived = expand(epoch_secret, info, KEY_BYTES + NONCE_BYTES)
         self._aead = ChaCha20Poly1305(derived[:KEY_BYTES])
-        self._iv = int.from_bytes(derived[KEY_BYTES : KEY_BYTES + NONCE_BYTES], "big")
-        self._mask = derived[KEY_BYTES + NONCE_BYTES :]
+        self._iv = int.from_bytes(derived[KEY_BYTES:], "big")
 
-    def encrypt(self, sequence: int, body: bytes, clear: bytes) -> bytes:
-        """Return the ciphertext and its tag. The caller must use each sequence once."""
-        return self._aead.encrypt(self._nonce(sequence), body, clear)
+    def encrypt(self, position: int, plain: bytes, clear: bytes) -> bytes:
+        """Return the ciphertext and its tag. The caller must use each position once."""
+        return self._aead.encrypt(self._nonce(position), plain, clear)
 
-    def decrypt(self, sequence: int, ciphertext: bytes, clear: bytes) -> bytes | None:
-        """Return the body. None if ciphertext, tag and clear header do not belong together."""
+    def decrypt(self, position: int, ciphertext: bytes, clear: bytes) -> bytes | None:
+        """Return the plaintext. None if ciphertext, tag and clear header do not belong together."""
         try:
-            return self._aead.decrypt(self._nonce(sequence), ciphertext, clear)
+            return self._aead.decrypt(self._nonce(position), ciphertext, clear)
         except InvalidTag:
             return None
 
-    def mask_signature(self, sequence: int, signature: bytes) -> bytes:
-        """Return the masked form of a signature, or the signature of a masked form. Masking is an XOR."""
-        return (int.from_bytes(signature, "big") ^ self.keystream(sequence)).to_bytes(SIGNATURE_BYTES, "big")
-
-    def keystream(self, sequence: int) -> int:
-        """Return the mask for the signature of the datagram with this sequence, as an integer of 64 bytes."""
-        return int.from_bytes(expand(self._mask, _MASK + sequence.to_bytes(4, "big"), SIGNATURE_BYTES), "big")
-
-    def _nonce(self, sequence: int) -> bytes:
-        return (self._iv ^ sequence).to_bytes(NONCE_BYTES, "big")
+    def _nonce(self, position: int) -> bytes:
+        return (self._iv ^ position).to_bytes(NONCE_BYTES, "big")
 
 
 class SignatureClaim(NamedTuple):

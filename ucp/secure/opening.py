@@ -29,12 +29,12 @@ class Opener:
     def open(self, datagram: bytes) -> OpenedDatagram:
         """Return the content of a datagram.
 
-        Raises MalformedDatagramError if the datagram is a revocation (which is not sealed), is not authentic, belongs
+        Raises MalformedDatagramError if the datagram is a revocation, which has no message, is not authentic, belongs
         to an epoch before the bundle's, or comes from a sender that is not on the roster.
         """
         clear = read_clear_header(datagram)
         if clear.type == REVOCATION:
-            raise MalformedDatagramError("not sealed")
+            raise MalformedDatagramError("no message")
         public_key = self._public.vehicles.get(clear.sender)
         if public_key is None:
             raise MalformedDatagramError("sender not on the roster")

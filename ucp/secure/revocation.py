@@ -1,11 +1,11 @@
 """A revocation: a message in which the authority lists all vehicles whose keys are revoked so far.
 
-Revocations have consecutive numbers, so a receiver knows the newer one of two. A receiver verifies a revocation with
-the authority's public key and needs no group secret, so a revocation is not encrypted. Its body consists of: number
-(u16), count (u16), `count` agent IDs (u32), and the signature (64 bytes). The signature is Ed25519 over a domain tag,
-the mission's ID and the body before the signature.
+The authority numbers its revocations. The number is information for people: receivers revoke all agents that any
+revocation lists. The body of a revocation consists of: number (u16), count (u16), `count` agent IDs (u32), and the
+signature (64 bytes). The signature is Ed25519 over a domain tag, the mission's ID and the body before the signature.
 """
 
+import hashlib
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -69,6 +69,28 @@ class Revocation:
         except (InvalidSignature, ValueError):
             raise RevocationError("the authority of this mission did not sign it") from None
         return cls(number, revoked, signature)
+
+
+def listed_agents(body: bytes) -> frozenset[int] | None:
+    """Return the agents that a body lists, without verifying its signature. None if it has the wrong length."""
+    if len(body) < _HEAD.size:
+        return None
+    _, count = _HEAD.unpack_from(body)
+    if not 1 <= count <= MAX_REVOKED or len(body) != _HEAD.size + 4 * count + _SIGNATURE_BYTES:
+        return None
+    return frozenset(struct.unpack_from(f">{count}I", body, _HEAD.size))
+
+
+def revocations_digest(revoked: Iterable[int]) -> int:
+    """Return the first 16 bits of the SHA-256 of the agent IDs (u32) in ascending order. 0 stands for no agents.
+
+    A set of agents whose digest would be 0 has the digest 1.
+    """
+    agents = sorted(revoked)
+    if not agents:
+        return 0
+    digest = hashlib.sha256(struct.pack(f">{len(agents)}I", *agents)).digest()
+    return int.from_bytes(digest[:2], "big") or 1
 
 
 def _signed_part(number: int, revoked: frozenset[int]) -> bytes:

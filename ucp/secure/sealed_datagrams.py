@@ -63,11 +63,17 @@ def decrypt(
 
     Raises MalformedDatagramError if the keys do not decrypt the datagram.
     """
-    signed, signature = datagram[:-SIGNATURE_BYTES], datagram[-SIGNATURE_BYTES:]
-    body = keys.decrypt(clear.sequence, signed[CLEAR.size :], signed[: CLEAR.size])
-    if body is None:
+    plain, header = decrypted(keys, datagram, clear), datagram[: CLEAR.size]
+    body, signature = plain[:-SIGNATURE_BYTES], plain[-SIGNATURE_BYTES:]
+    return body, SignatureClaim(public_key, signature, domain + header + body)
+
+
+def decrypted(keys: SenderKeys, datagram: bytes, clear: ClearHeader) -> bytes:
+    """Return the plaintext of a datagram. Raises MalformedDatagramError."""
+    plain = keys.decrypt(clear.position, datagram[CLEAR.size :], datagram[: CLEAR.size])
+    if plain is None:
         raise MalformedDatagramError("not authentic")
-    return body, SignatureClaim(public_key, keys.mask_signature(clear.sequence, signature), domain + signed)
+    return plain
 
 
 def parse_body(clear: ClearHeader, body: bytes) -> OpenedDatagram:

@@ -11,16 +11,16 @@ are recorded as they were received.
 
 import struct
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 from ucp.agent import Agent, drop_reason
 from ucp.export import export_chain
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
+from ucp.secure._known_revocations import KnownRevocations
 from ucp.secure._signatures import BlockSignatures
-from ucp.secure.envelope import BOOT_BYTES, CLEAR, LAST_SEQUENCE, REQUESTS, REVOCATION, ClearHeader
+from ucp.secure.envelope import BOOT_BYTES, LAST_SEQUENCE, REQUESTS, REVOCATION, ClearHeader
 from ucp.secure.export_head import head_of
-from ucp.secure.revocation import Revocation, RevocationError
+from ucp.secure.revocation import RevocationError
 from ucp.secure.sealed_datagrams import OpenedDatagram, Request
 from ucp.secure.session import Session
 from ucp.store import SecuredState, StoredState
@@ -60,8 +60,7 @@ class SecuredAgent(Agent):
         if missing := sorted(self.roster - session.public_keys.keys()):
             raise ValueError(f"the session has no public keys of the agents {missing}")
         self.session = session
-        self.revocation: Revocation | None = None
-        """The newest known revocation."""
+        self._revocations = KnownRevocations(session.authority, session.mission)
         self.problem: str | None = None
         """The reason why the agent sends no more. None if it sends."""
         self._signatures = BlockSignatures(session, self.state)
@@ -83,8 +82,7 @@ class SecuredAgent(Agent):
     def sign_head(self, exported_at_us: int) -> dict[str, Any]:
         """Return the signed head of an export at this time. Each head has the next number."""
         self._exports += 1
-        revoked = self.revocation.revoked if self.revocation else ()
-        head = head_of(self.state, self.session.boot, self._exports, exported_at_us, revoked)
+        head = head_of(self.state, self.session.boot, self._exports, exported_at_us, self.revoked)
         return head.sign(self.session.private_key, self.session.mission)
 
     # From the air
@@ -96,12 +94,11 @@ class SecuredAgent(Agent):
             if reason := self._drop_reason(clear):
                 raise MalformedDatagramError(reason)
             if clear.type == REVOCATION:
-                if not self.revoke(data[CLEAR.size :], now, {"from": clear.sender}):
-                    raise MalformedDatagramError("known already")
+                self._receive_revocation(self.session.open_revocation(data, clear), clear.sender, now)
                 return
-            opened = self.session.open(data, clear)
-            if clear.revocations < self._revocation_number:
-                self._schedule_revocation(now)
+            opened = self.session.open(data, clear, now)
+            if clear.revocations != self._revocations.digest:
+                self._schedule_revocations(now)
             self._check_opened(opened)
         except MalformedDatagramError as malformed:
             self._drop(now, malformed.reason, RecordedBytes(in_base64(data)))
@@ -113,7 +110,7 @@ class SecuredAgent(Agent):
             return "own sender"
         if clear.sender not in self.roster:
             return "sender not on the roster"
-        if clear.type != REVOCATION and self.revocation is not None and clear.sender in self.revocation.revoked:
+        if clear.type != REVOCATION and clear.sender in self.revoked:
             return "revoked sender"
         return None
 
@@ -125,6 +122,7 @@ class SecuredAgent(Agent):
         if opened.request is not None and not self.session.is_newest_request(opened.request, opened.clear.type):
             raise MalformedDatagramError("answers no request")
         if type(message) in CARRY_A_BLOCK and not self._signatures.is_genuine(message.block, opened.block_signature):  # type: ignore[union-attr]
+            self.session.count_wrong_signature(sender)
             raise MalformedDatagramError("block not signed by its maker")
 
     def _handle_opened(self, opened: OpenedDatagram, now: float) -> None:
@@ -149,48 +147,63 @@ class SecuredAgent(Agent):
             return ()
         self.session.epochs.set_clock(self.state.now)
         outgoing = []
-        if self._revocation_due and self.revocation is not None:
+        if self._revocation_due:
             self._revocation_due = False
-            outgoing.append(
-                OutgoingDatagram(self.session.revocation_datagram(self.revocation.number, self.revocation.encode()))
-            )
+            digest = self._revocations.digest
+            outgoing += [
+                OutgoingDatagram(self.session.seal_revocation(body, digest)) for body in self._revocations.bodies
+            ]
         for sequence, message, plain in due:
             if sequence > LAST_SEQUENCE:
                 self.problem = "the agent has used all sequence numbers of this boot: restart it so that it sends again"
                 continue
             signature = self.signatures.get(message.block.block_hash) if type(message) in CARRY_A_BLOCK else None  # type: ignore[union-attr]
             request = self._answered_requests.pop(sequence, None)
-            sealed = self.session.seal(sequence, message, request, signature, self._revocation_number)
+            sealed = self.session.seal(sequence, message, request, signature, self._revocations.digest)
             outgoing.append(OutgoingDatagram(sealed, sequence, message, plain))
         return outgoing
 
     # Revocations
 
     @property
-    def _revocation_number(self) -> int:
-        return 0 if self.revocation is None else self.revocation.number
+    def revoked(self) -> frozenset[int]:
+        """All agents that a known revocation lists."""
+        return self._revocations.revoked
 
-    def revoke(self, body: bytes, now: float, origin: Mapping[str, Any] | None = None) -> bool:
-        """Accept the body of a revocation, and return whether it is newer than the known one.
+    def _receive_revocation(self, body: bytes, sender: int, now: float) -> None:
+        """Accept a revocation from the air. Raises MalformedDatagramError."""
+        if self._revocations.adds_nothing(body):
+            raise MalformedDatagramError("known already")
+        budget = self.session.revocation_budget
+        if not budget.has_token(now):
+            raise MalformedDatagramError("too many wrong signatures")
+        try:
+            self.revoke(body, now, {"from": sender})
+        except MalformedDatagramError:
+            budget.take()
+            raise
+
+    def revoke(self, body: bytes, now: float, origin: Mapping[str, Any] | None = None) -> None:
+        """Accept the body of a revocation. A revocation of known agents only has no effect.
 
         `origin` is written to the trace. Raises MalformedDatagramError if the authority did not sign the revocation.
         """
-        if 0 < int.from_bytes(body[:2], "big") <= self._revocation_number:
-            return False
         try:
-            revocation = Revocation.decode(body, self.session.authority, self.session.mission)
+            is_new = self._revocations.add(body)
         except RevocationError:
             raise MalformedDatagramError("not signed by the authority") from None
-        self.revocation = revocation
+        if not is_new:
+            return
         request = {"command": "revoke", "revocation": in_base64(body), **(origin or {})}
         if self._tracing:
             self._trace.append(CommandEntry(now, "revoke", request))
         self._revocation_sent_at = None
-        self._schedule_revocation(now)
-        return True
+        self._schedule_revocations(now)
 
-    def _schedule_revocation(self, now: float) -> None:
-        """Broadcast the newest revocation with the next datagrams, at most once per REVOCATION_INTERVAL_S."""
+    def _schedule_revocations(self, now: float) -> None:
+        """Broadcast the known revocations with the next datagrams, at most once per REVOCATION_INTERVAL_S."""
+        if not self.revoked:
+            return
         if self._revocation_sent_at is None or now >= self._revocation_sent_at + REVOCATION_INTERVAL_S:
             self._revocation_due, self._revocation_sent_at = True, now
 
@@ -198,8 +211,7 @@ class SecuredAgent(Agent):
 
     def secured_state(self) -> SecuredState:
         """Return the state that a secured agent stores on disk in addition to the state of every agent."""
-        revocation = None if self.revocation is None else self.revocation.encode()
-        return SecuredState(self.started_us, dict(self.signatures), revocation)
+        return SecuredState(self.started_us, dict(self.signatures), self._revocations.bodies)
 
     @property
     def started_us(self) -> int:
@@ -214,9 +226,5 @@ class SecuredAgent(Agent):
             self._signatures.restore(secured.signatures)
             if self.started_us <= secured.started_us:
                 self.session.boot = make_boot(secured.started_us + 1, self.session.boot[_BOOT_TIME.size :])
-            if secured.revocation is not None:
-                with suppress(RevocationError):  # the store may be older than the present keys
-                    self.revocation = Revocation.decode(
-                        secured.revocation, self.session.authority, self.session.mission
-                    )
+            self._revocations.restore(secured.revocations)
         super().boot(recovered, now)

@@ -1,9 +1,10 @@
 """Seal and open the datagrams of one incarnation of a vehicle.
 
-The construction is that of Group OSCORE (RFC 10021). The sender derives its own key from the group secret, encrypts and
-authenticates the datagram with it (AEAD), and signs the result. Because of the signature, a vehicle with the group
-secret cannot send in the name of another vehicle. Each datagram contains all data that a receiver needs, so there are
-no round trips.
+The construction follows Group OSCORE (RFC 10021). The sender signs the datagram, derives its own key from the group
+secret, and encrypts and authenticates datagram and signature with it (AEAD). Because of the signature, a vehicle with
+the group secret cannot send in the name of another vehicle. Because the encryption covers the signature, a sender
+without the group secret cannot make a receiver verify one. Each datagram contains all data that a receiver needs, so
+there are no round trips.
 
 A receiver does its cheapest checks first. A datagram changes no state of the session before its signature is verified.
 """
@@ -11,9 +12,11 @@ A receiver does its cheapest checks first. A datagram changes no state of the se
 from collections.abc import Callable
 
 from ucp.messages import TYPE_CODES, MalformedDatagramError, Message
+from ucp.secure._budget import Budget
 from ucp.secure._epochs import Epochs
 from ucp.secure._window import ReplayWindow
 from ucp.secure.bundle import Bundle
+from ucp.secure.crypto_suite import SenderKeys
 from ucp.secure.envelope import (
     LAST_SEQUENCE,
     REQUEST,
@@ -22,6 +25,7 @@ from ucp.secure.envelope import (
     REVOCATION,
     SEAL_BYTES,
     SIGNATURE_BYTES,
+    TAG_BYTES,
     WITH_BLOCK,
     ClearHeader,
 )
@@ -31,8 +35,14 @@ from ucp.secure.sealed_datagrams import (
     CryptoFunctions,
     OpenedDatagram,
     Request,
+    decrypted,
     signing_domain,
 )
+
+WRONG_SIGNATURES_PER_S = 1000.0
+"""Wrong signatures of senders that a receiver verifies in a mission second, about a tenth of a processor core."""
+REVOCATIONS_PER_S = 50.0
+"""Wrong signatures of the authority that a receiver verifies in a mission second."""
 
 
 class _Incarnation:
@@ -71,6 +81,11 @@ class Session:
         self.epochs = Epochs(bundle, save_bundle, crypto.sender_keys)
         self._domain = signing_domain(self.mission)
         self._incarnations: dict[int, _Incarnation] = {}
+        self._control = 0
+        """Sequence of the next control datagram."""
+        per_s = WRONG_SIGNATURES_PER_S / len(self.public_keys)
+        self._budgets = {agent_id: Budget(per_s) for agent_id in self.public_keys}
+        self.revocation_budget = Budget(REVOCATIONS_PER_S)
         self._own_requests: dict[int, int] = {}
         """Type of a request -> sequence of this vehicle's newest request of this type."""
 
@@ -90,11 +105,8 @@ class Session:
         epoch = self.epochs.current
         assert 0 <= sequence <= LAST_SEQUENCE, "a nonce is used once"
         clear = ClearHeader(code, self.agent_id, sequence, epoch, self.boot, revocations).pack(len(body) + SEAL_BYTES)
-        keys = self.epochs.sender_keys(epoch, self.agent_id, self.boot)
-        self.epochs.remember(epoch, self.agent_id, self.boot, keys)
-        ciphertext = keys.encrypt(sequence, body, clear)
-        signature = self.private_key.sign(self._domain + clear + ciphertext)
-        return clear + ciphertext + keys.mask_signature(sequence, signature)
+        signature = self.private_key.sign(self._domain + clear + body)
+        return clear + self._own_keys().encrypt(sequence, body + signature, clear)
 
     def record_sent(self, sequence: int, message: Message) -> None:
         """Record a sent message. If it is a request, answers to earlier requests of its type no longer count."""
@@ -102,15 +114,25 @@ class Session:
         if code in REQUESTS:
             self._own_requests[code] = sequence
 
-    def revocation_datagram(self, number: int, revocation: bytes) -> bytes:
-        """Return the datagram of a revocation. It is not sealed, so receivers need only the authority's public key."""
-        clear = ClearHeader(REVOCATION, self.agent_id, 0, self.epochs.current, self.boot, number)
-        return clear.pack(len(revocation)) + revocation
+    def seal_revocation(self, body: bytes, revocations: int) -> bytes:
+        """Return the sealed datagram of a revocation."""
+        header = ClearHeader(REVOCATION, self.agent_id, self._control, self.epochs.current, self.boot, revocations)
+        self._control += 1
+        clear = header.pack(len(body) + TAG_BYTES)
+        return clear + self._own_keys().encrypt(header.position, body, clear)
+
+    def _own_keys(self) -> SenderKeys:
+        epoch = self.epochs.current
+        keys = self.epochs.sender_keys(epoch, self.agent_id, self.boot)
+        self.epochs.remember(epoch, self.agent_id, self.boot, keys)
+        return keys
 
     # From the air
 
-    def open(self, datagram: bytes, clear: ClearHeader) -> OpenedDatagram:
-        """Return the content of a datagram with this header. The sender must be another vehicle of the mission.
+    def open(self, datagram: bytes, clear: ClearHeader, now: float) -> OpenedDatagram:
+        """Return the content of a datagram with this header, received at mission second `now`.
+
+        The sender must be another vehicle of the mission.
 
         Raises MalformedDatagramError.
         """
@@ -125,7 +147,7 @@ class Session:
             and not incarnation.window.is_fresh(clear.sequence)
         ):
             raise MalformedDatagramError("replayed")
-        body = self._authenticate(datagram, clear)
+        body = self._authenticate(datagram, clear, now)
         if incarnation is None or clear.boot != incarnation.boot:
             incarnation = self._incarnations[clear.sender] = _Incarnation(clear.boot)
         incarnation.window.accept(clear.sequence)
@@ -135,14 +157,30 @@ class Session:
             incarnation.requests[clear.type] = max(clear.sequence, incarnation.requests.get(clear.type, 0))
         return self.crypto.parse_body(clear, body)
 
-    def _authenticate(self, datagram: bytes, clear: ClearHeader) -> bytes:
+    def open_revocation(self, datagram: bytes, clear: ClearHeader) -> bytes:
+        """Return the body of a revocation. Raises MalformedDatagramError.
+
+        The sender need not be authentic. The caller verifies the signature of the authority.
+        """
+        if not self.epochs.can_open(clear.epoch):
+            raise MalformedDatagramError("epoch out of range")
+        return decrypted(self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot), datagram, clear)
+
+    def _authenticate(self, datagram: bytes, clear: ClearHeader, now: float) -> bytes:
         """Return the decrypted body. Raises MalformedDatagramError if decryption or the signature fails."""
         keys = self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot)
         body, claim = self.crypto.decrypt(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
+        if not self._budgets[clear.sender].has_token(now):
+            raise MalformedDatagramError("too many wrong signatures")
         if not self.crypto.verify(claim):
+            self.count_wrong_signature(clear.sender)
             raise MalformedDatagramError("not signed by its sender")
         self.epochs.remember(clear.epoch, clear.sender, clear.boot, keys)
         return body
+
+    def count_wrong_signature(self, sender: int) -> None:
+        """Take a token for a wrong signature from the budget of the sender."""
+        self._budgets[sender].take()
 
     def is_newest_request(self, request: Request, code: int) -> bool:
         """Return whether a response of type `code` counts: no newer request of its type by the same sender is known.

@@ -58,6 +58,18 @@ class SecuredPeers:
         self._sequence += 1
         return self.sessions[sender].seal(self._sequence, message, None, None, 0)
 
+    def revocation_in(self, datagram: bytes) -> bytes | None:
+        """Return the body of a revocation. None for any other datagram."""
+        from ucp.secure.envelope import REVOCATION, read_clear_header
+
+        try:
+            clear = read_clear_header(datagram)
+            if clear.type != REVOCATION:
+                return None
+            return self.sessions[ASKING_PEER].open_revocation(datagram, clear)
+        except MalformedDatagramError:
+            return None
+
     async def receive(self, count: int, what: str) -> "list[OpenedDatagram]":
         """Return the next datagrams of the tested agent, decrypted with the keys of another agent.
 
@@ -126,7 +138,7 @@ async def _authentic(bench: Bench) -> None:
         )
         earlier_session = Session(keys.bundle(ASKING_PEER), bytes(16))
         fresh = peers.sealed(ASKING_PEER, query)
-        parts = {"header": 9, "ciphertext": CLEAR.size, "tag": len(fresh) - 80, "signature": len(fresh) - 1}
+        parts = {"header": 9, "ciphertext": CLEAR.size, "signature": len(fresh) - 80, "tag": len(fresh) - 1}
         hostile = {
             "that is a replay": before,
             "in plain": encode(ASKING_PEER, 1, query),
@@ -173,17 +185,13 @@ async def _revoked(bench: Bench) -> None:
     async with _secured(bench) as (peers, keys):
         authority = Ed25519PrivateKey.from_private_bytes(keys.authority)
         forged = Revocation.signed(Ed25519PrivateKey.generate(), keys.public.mission, 2, [ASKING_PEER]).encode()
-        peers.agent.peer_socket.send(peers.sessions[LOST_PEER].revocation_datagram(2, forged))
+        peers.agent.peer_socket.send(peers.sessions[LOST_PEER].seal_revocation(forged, 2))
         await peers.require_single_answer("a revocation that the authority did not sign")
         body = Revocation.signed(authority, keys.public.mission, 1, [LOST_PEER]).encode()
-        peers.agent.peer_socket.send(peers.sessions[ASKING_PEER].revocation_datagram(1, body))
+        peers.agent.peer_socket.send(peers.sessions[ASKING_PEER].seal_revocation(body, 1))
         await asyncio.sleep(SILENCE_S)
-        passed_on = [data for _, data in peers.agent.peer_socket.take()]
-        require(
-            any(data.endswith(body) for data in passed_on),
-            "the revocation, passed on",
-            f"{len(passed_on)} other datagrams",
-        )
+        passed_on = [peers.revocation_in(data) for _, data in peers.agent.peer_socket.take()]
+        require(body in passed_on, "the revocation, passed on", f"{len(passed_on)} other datagrams")
         peers.agent.peer_socket.send(peers.sealed(LOST_PEER, ChainContainQuery(INCEPTION)))
         await asyncio.sleep(SILENCE_S)
         received = peers.agent.peer_socket.take()

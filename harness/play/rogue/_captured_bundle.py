@@ -41,7 +41,7 @@ class CapturedKeys:
         self._receiver.epochs.set_clock(now)
         try:
             clear = read_clear_header(datagram)
-            opened = self._receiver.open(datagram, clear)
+            opened = self._receiver.open(datagram, clear, now)
         except (MalformedDatagramError, KeyError):  # the sender belongs to another mission
             return None
         message = opened.datagram.message

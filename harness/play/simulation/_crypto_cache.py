@@ -22,8 +22,6 @@ from ucp.secure.sealed_datagrams import CryptoFunctions, decrypt, parse_body
 DATAGRAMS_CACHED = 1024
 SIGNATURES_CACHED = 4096
 SENDERS_CACHED = 256
-KEYSTREAMS_CACHED = 64
-"""Number of cached keystreams of each sender."""
 VERIFIED_EVERY = 128
 
 
@@ -32,25 +30,12 @@ def cached_crypto() -> CryptoFunctions:
     signatures = RecordedSignatures()
     return CryptoFunctions(
         read=lru_cache(DATAGRAMS_CACHED)(read_clear_header),
-        sender_keys=lru_cache(SENDERS_CACHED)(CachedSenderKeys),
+        sender_keys=lru_cache(SENDERS_CACHED)(SenderKeys),
         decrypt=lru_cache(DATAGRAMS_CACHED)(decrypt),
         parse_body=lru_cache(DATAGRAMS_CACHED)(parse_body),
         signer=signatures.signer,
         verify=lru_cache(SIGNATURES_CACHED)(signatures.verified),
     )
-
-
-class CachedSenderKeys(SenderKeys):
-    """The keys of a sender, with cached keystreams. The sender and all its receivers use the same keystream."""
-
-    __slots__ = ("_keystreams",)
-
-    def __init__(self, epoch_secret: bytes, mission: bytes, epoch: int, sender: int, boot: bytes) -> None:
-        super().__init__(epoch_secret, mission, epoch, sender, boot)
-        self._keystreams = lru_cache(KEYSTREAMS_CACHED)(super().keystream)
-
-    def keystream(self, sequence: int) -> int:
-        return self._keystreams(sequence)
 
 
 class RecordedSignatures:

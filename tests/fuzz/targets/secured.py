@@ -31,7 +31,7 @@ from ucp.secure._epochs import MAX_CACHED_KEYS, MAX_EPOCHS_AHEAD
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import KeySet
 from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret
-from ucp.secure.envelope import CLEAR, MAGIC, SEAL_BYTES, VERSION, read_clear_header
+from ucp.secure.envelope import CLEAR, MAGIC, SEAL_BYTES, TAG_BYTES, VERSION, ClearHeader, read_clear_header
 from ucp.secure.opening import Opener
 from ucp.secure.revocation import Revocation
 from ucp.secure.sealed_datagrams import CRYPTO_FUNCTIONS, NO_REQUEST, CryptoFunctions, Request, signing_domain
@@ -128,11 +128,9 @@ class _Driven:
         header = code, sender, sequence, len(body) + SEAL_BYTES, epoch, boot, lies % 3
         clear = CLEAR.pack(MAGIC, VERSION, *header)
         keys = SenderKeys(self._secrets[epoch], KEYS.public.mission, epoch, sender, boot)
-        signed = clear + keys.encrypt(sequence, body, clear)
         private_key = Ed25519PrivateKey.from_private_bytes(KEYS.vehicles[signer])
-        datagram = signed + keys.mask_signature(
-            sequence, private_key.sign(signing_domain(KEYS.public.mission) + signed)
-        )
+        signature = private_key.sign(signing_domain(KEYS.public.mission) + clear + body)
+        datagram = clear + keys.encrypt(sequence, body + signature, clear)
         self._said = [*self._said, datagram][-KEPT:]
         return datagram
 
@@ -176,8 +174,11 @@ class _Driven:
         ).encode()
         if who % 4 == 3:
             body = program.take(program.byte())
-        header = 10, 2 + who % 3, program.byte(), len(body), program.byte(), bytes(16), self._number % 2**16
-        return CLEAR.pack(MAGIC, VERSION, *header) + body
+        sender, sequence, epoch = 2 + who % 3, program.byte(), program.byte() % len(self._secrets)
+        header = ClearHeader(10, sender, sequence, epoch, bytes(16), self._number % 2**16)
+        clear = header.pack(len(body) + TAG_BYTES)
+        keys = SenderKeys(self._secrets[epoch], KEYS.public.mission, epoch, sender, bytes(16))
+        return clear + keys.encrypt(header.position, body, clear)
 
     def _receive(self, data: bytes) -> None:
         agent, before = self.agent, _of(self.agent)
@@ -236,7 +237,7 @@ def _of(agent: SecuredAgent) -> dict[str, Any]:
         "timers": [timer.deadline for timer in state.timers],
         "keys": {*session.epochs._sender_keys},
         "signatures": dict(agent.signatures),
-        "revocation": agent.revocation,
+        "revoked": agent.revoked,
         "heard": {
             sender: (life.boot, life.window._newest, tuple(life.window._words), dict(life.requests))
             for sender, life in session._incarnations.items()

@@ -36,7 +36,7 @@ def sealed(bundle: Bundle, crypto: CryptoFunctions, sequence: int = 0) -> bytes:
 
 def result_of(datagram: bytes, receiver: Session) -> str:
     try:
-        return type(receiver.open(datagram, receiver.crypto.read(datagram)).datagram.message).__name__
+        return type(receiver.open(datagram, receiver.crypto.read(datagram), 0.0).datagram.message).__name__
     except MalformedDatagramError as dropped:
         return dropped.reason
 

@@ -14,11 +14,11 @@ from scapy.packet import Raw
 from tests.ucp.datagrams import all_messages
 from tests.ucp.secure.swarm import KEYS, session
 from ucp.messages import ChainContainQuery, Message, encode
-from ucp.scapy import UCP, Revocation, Sealed, SecuredUCP, message_of, opened
+from ucp.scapy import UCP, Sealed, SecuredUCP, message_of, opened
 from ucp.secure.bundle import KeySet
 from ucp.secure.envelope import CLEAR, CLEAR_FIELDS, MalformedDatagramError, read_clear_header
 from ucp.secure.opening import EPOCHS_AHEAD, Opener
-from ucp.secure.revocation import Revocation as SignedRevocation
+from ucp.secure.revocation import Revocation
 from ucp.secure.secured_agent import make_boot
 from ucp.secure.session import Session
 
@@ -81,19 +81,16 @@ def test_opener_opens_later_epochs_and_rejects_earlier_and_far_ones() -> None:
         reads.open(far.pack(len(datagrams[0]) - CLEAR.size) + datagrams[0][CLEAR.size :])
 
 
-def test_scapy_reads_a_revocation_without_keys() -> None:
+def test_revocation_is_shown_as_sealed_and_has_no_message() -> None:
     authority = Ed25519PrivateKey.from_private_bytes(KEYS.authority)
-    body = SignedRevocation.signed(authority, KEYS.public.mission, 3, [2, 9]).encode()
-    datagram = session(1).revocation_datagram(3, body)
-    packet = UCP(datagram)
-    assert (packet[Revocation].number, packet[Revocation].count, packet[Revocation].revoked) == (3, 2, [2, 9])
-    crafted = SecuredUCP(sender=1, boot=packet.boot, revocations=3) / Revocation(bytes(packet[Revocation]))
-    assert bytes(crafted) == datagram
-    with pytest.raises(MalformedDatagramError, match="not sealed"):
+    body = Revocation.signed(authority, KEYS.public.mission, 3, [2, 9]).encode()
+    packet = UCP(session(1).seal_revocation(body, 3))
+    assert len(packet[Sealed].ciphertext) == len(body)
+    with pytest.raises(MalformedDatagramError, match="no message"):
         opened(packet, opener())
 
 
 @given(st.binary(max_size=200), st.integers(0, 10))
 def test_scapy_shows_random_secured_datagrams_without_an_error(noise: bytes, code: int) -> None:
-    datagram = b"UC\2" + bytes([code]) + noise
+    datagram = b"UC\3" + bytes([code]) + noise
     assert bytes(UCP(datagram)) == datagram

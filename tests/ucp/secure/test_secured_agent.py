@@ -89,7 +89,7 @@ def test_each_invalid_datagram_is_dropped_with_its_reason() -> None:
         (proposal + bytes(MAX_DATAGRAM_BYTES), "oversized"),
         (b"XX" + proposal[2:], "wrong magic"),
         (encode(1, 0, BlockAddRequest(bytes(32), bytes(32))), "not secured"),
-        (proposal[:2] + b"\3" + proposal[3:], "wrong version"),
+        (proposal[:2] + b"\2" + proposal[3:], "wrong version"),
         (proposal[:4] + bytes(4) + proposal[8:], "impossible sender"),
         (proposal[:-1], "wrong length"),
         (proposal[:3] + b"\x0b" + proposal[4:], "unknown type"),
@@ -178,7 +178,7 @@ def test_rebooted_agent_gets_a_later_boot_although_its_clock_went_back() -> None
     after.boot(recovered, 1.0)
     assert after.started_us == 6
     assert after.signatures == before.signatures
-    assert complete_a_block(after, 1.0)[0][:3] == b"UC\2"
+    assert complete_a_block(after, 1.0)[0][:3] == b"UC\3"
 
 
 def test_repr_of_a_secured_agent_contains_no_secret() -> None:

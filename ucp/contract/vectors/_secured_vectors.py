@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from typing import Any
 
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
 from ucp.block import Block
 from ucp.contract.vectors._hash_vectors import BLOCKS
 from ucp.contract.vectors._message_vectors import BLOCK_HASH, MESSAGES
@@ -11,6 +13,7 @@ from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import KeySet
 from ucp.secure.crypto_suite import expand
 from ucp.secure.envelope import CLEAR, REQUEST_OF
+from ucp.secure.revocation import Revocation, revocations_digest
 from ucp.secure.sealed_datagrams import Request
 from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
@@ -42,7 +45,7 @@ def cases() -> Iterator[tuple[str, bytes]]:
     other = session(OTHER)
     good = other.seal(1, RequestForBlock(BLOCK_HASH), None, None, 0)
     yield "a plain one", encode(OTHER, 1, RequestForBlock(BLOCK_HASH))
-    yield "version 3", good[:2] + b"\3" + good[3:]
+    yield "version 2", good[:2] + b"\2" + good[3:]
     yield "half a header", good[:20]
     yield "without its last byte", good[:-1]
     yield "type 11", good[:3] + b"\x0b" + good[4:]
@@ -52,7 +55,10 @@ def cases() -> Iterator[tuple[str, bytes]]:
     yield "nine epochs ahead", good[:14] + (EPOCH + 9).to_bytes(4, "big") + good[18:]
     yield "with another revocation's number", good[:35] + b"\1" + good[36:]
     yield "of another mission", session(OTHER, OTHER_KEYS).seal(1, RequestForBlock(BLOCK_HASH), None, None, 0)
-    yield "with another signature", good[:-1] + bytes([good[-1] ^ 1])
+    yield "with another tag", good[:-1] + bytes([good[-1] ^ 1])
+    imposter = session(1)
+    imposter.agent_id = OTHER
+    yield "signed by another sender", imposter.seal(9, RequestForBlock(BLOCK_HASH), None, None, 0)
     yield "a good one", good
     yield "the same again", good
     yield "of an earlier life", good[: CLEAR.size - 18] + bytes(16) + good[CLEAR.size - 2 :]
@@ -60,7 +66,14 @@ def cases() -> Iterator[tuple[str, bytes]]:
     yield "an answer to what was not asked", other.seal(2, BlockAddResponse(BLOCK_HASH, True), stale, None, 0)
     forged = CommitBlock(Block(1, 5, b"never made"), BLOCK_HASH)
     yield "a block that its maker did not sign", other.seal(3, forged, None, bytes(64), 0)
-    yield "type 10, without the signature of the authority", other.revocation_datagram(1, bytes(72))
+    yield "type 10, without the signature of the authority", other.seal_revocation(b"\0\1" * 2 + bytes(68), 1)
+    yield "type 10, not sealed", other.seal_revocation(bytes(72), 1)[: CLEAR.size] + bytes(88)
+    authority = Ed25519PrivateKey.from_private_bytes(KEYS.authority)
+    revocation = Revocation.signed(authority, KEYS.public.mission, 2, [1, OTHER]).encode()
+    yield "a revocation", other.seal_revocation(revocation, revocations_digest([1, OTHER]))
+    earlier = Revocation.signed(authority, KEYS.public.mission, 1, [1]).encode()
+    yield "a revocation of revoked agents only", other.seal_revocation(earlier, revocations_digest([1]))
+    yield "of a revoked sender", other.seal(4, RequestForBlock(BLOCK_HASH), None, None, 0)
 
 
 def vectors() -> dict[str, Any]:

@@ -1,5 +1,5 @@
 -- UCP in Wireshark and tshark: the header, nine messages, blocks and their events, on UDP port 14600. Of a secured
--- mission, version 2, the header in clear and revocations; what is sealed, `ucp-harness packets --bundle` opens.
+-- mission, version 3, it shows the clear header. `ucp-harness packets --bundle` opens the sealed part.
 --
 --     wireshark -X lua_script:ucp.lua capture.pcapng
 --
@@ -14,7 +14,7 @@ local PORT = 14600
 local MAGIC = "UC"
 local VERSION = 1
 local HEADER_BYTES = 14
-local SECURED_VERSION = 2
+local SECURED_VERSION = 3
 local CLEAR_BYTES = 36
 local BOOT_BYTES = 16
 local TAG_BYTES = 16
@@ -64,14 +64,9 @@ local fields = {
   event_data = ProtoField.bytes("ucpchain.event.data", "Data"),
   epoch = ProtoField.uint32("ucpchain.epoch", "Epoch"),
   boot = ProtoField.bytes("ucpchain.boot", "Boot"),
-  revocations = ProtoField.uint16("ucpchain.revocations", "Newest revocation known"),
+  revocations = ProtoField.uint16("ucpchain.revocations", "Digest of the known revocations"),
   ciphertext = ProtoField.bytes("ucpchain.ciphertext", "Ciphertext"),
   tag = ProtoField.bytes("ucpchain.tag", "Tag"),
-  masked_signature = ProtoField.bytes("ucpchain.masked_signature", "Masked signature"),
-  number = ProtoField.uint16("ucpchain.number", "Number"),
-  count = ProtoField.uint16("ucpchain.count", "Count"),
-  revoked = ProtoField.uint32("ucpchain.revoked", "Revoked agent"),
-  signature = ProtoField.bytes("ucpchain.signature", "Signature"),
 }
 ucp.fields = fields
 
@@ -238,33 +233,20 @@ local function header(reader, info)
   end
 end
 
-local function sealed(reader)
-  if reader:left() < TAG_BYTES + SIGNATURE_BYTES then
+local function sealed(reader, info)
+  local least = info.code == REVOCATION and TAG_BYTES or TAG_BYTES + SIGNATURE_BYTES
+  if reader:left() < least then
     return "wrong length"
   end
-  if reader:left() > TAG_BYTES + SIGNATURE_BYTES then
-    reader:add(fields.ciphertext, reader:left() - TAG_BYTES - SIGNATURE_BYTES)
+  if reader:left() > TAG_BYTES then
+    reader:add(fields.ciphertext, reader:left() - TAG_BYTES)
   end
   reader:add(fields.tag, TAG_BYTES)
-  reader:add(fields.masked_signature, SIGNATURE_BYTES)
-end
-
-local function revocation(reader)
-  if reader:left() < 4 or reader:left() ~= 4 + 4 * reader.tvb(reader.at + 2, 2):uint() + SIGNATURE_BYTES then
-    return "wrong length"
-  end
-  reader:add(fields.number, 2)
-  reader:add(fields.count, 2)
-  while reader:left() > SIGNATURE_BYTES do
-    reader:add(fields.revoked, 4)
-  end
-  reader:add(fields.signature, SIGNATURE_BYTES)
 end
 
 local function body(reader, info)
   if info.secured then
-    local read = info.code == REVOCATION and revocation or sealed
-    return read(reader)
+    return sealed(reader, info)
   end
   for _, part in ipairs(BODIES[info.code]) do
     local read, field = part[1], part[2]

@@ -1,0 +1,50 @@
+"""The revocations that an agent knows. A revoked agent stays revoked: the union of all revocations counts.
+
+The files of the authority may be lost, copied or used in any order, so a revocation with a higher number need not list
+the agents of an earlier one. An agent therefore keeps each revocation that lists a further agent. Agents compare a
+digest of the union with each datagram, and broadcast their revocations if the digests differ.
+"""
+
+from collections.abc import Iterable
+from contextlib import suppress
+
+from ucp.secure.revocation import Revocation, RevocationError, listed_agents, revocations_digest
+
+
+class KnownRevocations:
+    """Revocations that the authority signed. None of them is covered by another one."""
+
+    def __init__(self, authority: bytes, mission: bytes) -> None:
+        self._authority = authority
+        self._mission = mission
+        self._held: tuple[Revocation, ...] = ()
+        self.revoked: frozenset[int] = frozenset()
+        """All revoked agents."""
+        self.digest = 0
+        """A number of 16 bits for the set of revoked agents. 0 stands for none."""
+
+    @property
+    def bodies(self) -> tuple[bytes, ...]:
+        """The bodies of the revocations."""
+        return tuple(revocation.encode() for revocation in self._held)
+
+    def adds_nothing(self, body: bytes) -> bool:
+        """Return whether a body lists known agents only. The signature is not verified."""
+        listed = listed_agents(body)
+        return listed is not None and listed <= self.revoked
+
+    def add(self, body: bytes) -> bool:
+        """Add the body of a revocation, and return whether it lists a further agent. Raises RevocationError."""
+        revocation = Revocation.decode(body, self._authority, self._mission)
+        if revocation.revoked <= self.revoked:
+            return False
+        self._held = (*(held for held in self._held if not held.revoked <= revocation.revoked), revocation)
+        self.revoked |= revocation.revoked
+        self.digest = revocations_digest(self.revoked)
+        return True
+
+    def restore(self, bodies: Iterable[bytes]) -> None:
+        """Add revocations from disk. Those of other keys than the present ones are left out."""
+        for body in bodies:
+            with suppress(RevocationError):
+                self.add(body)
