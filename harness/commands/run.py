@@ -234,9 +234,7 @@ def _show_end(console: Console, finished: Run) -> None:
     if finished.played.outcome == "not supported":
         complain(f"{finished.played.outcome_detail}; the run has no verdict")
     elif finished.played.outcome != "completed":
-        complain(
-            f"{finished.played.outcome_detail}; the chains and traces written before that are exported and checked"
-        )
+        complain(f"{finished.played.outcome_detail}; the chains and traces that were written are checked")
     for error in finished.result.errors:
         complain(error)
     for sentence in finished.played.unmatched_fates:

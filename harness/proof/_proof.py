@@ -23,7 +23,7 @@ from harness.proof.questions import _livelock
 from harness.proof.questions._convergence import Liveness
 from harness.proof.questions._graph_cycles import cycles
 from harness.proof.questions._livelock import Livelock
-from harness.run.simulate import ENDED, choose_path
+from harness.run.simulate import choose_path
 
 """Exit status: the proof reached a limit before it had explored all states."""
 CLAIMS = {
@@ -60,7 +60,7 @@ PLAYED = {
     "3": "3",
     "4": "4",
     "hang": "liveness",
-    "crash": ENDED,
+    "crash": "steps",
     "steps": "steps",
 }
 """Kind of flaw -> the check that shows it in a simulated run."""

@@ -17,6 +17,7 @@ from harness.checker.recorded_inputs import Blocks, decoded
 from harness.checker.records import cross_examine
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
+from harness.checker.steps import end_of_record
 from harness.checker.steps._late_timers import JudgedTimers
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, OptionalParts
@@ -58,6 +59,11 @@ def check(evidence: Evidence) -> Judgement:
             if (deviation := wrongly_dropped(header, line, aside)) is not None:
                 deviations.append(deviation)
         lost += [follower.lost for follower in followers if follower.lost]
+        recorded = evidence.recorded(agent_id)
+        if (deviation := end_of_record.crash(trace, recorded)) is not None:
+            deviations.append(deviation)
+        elif (why := end_of_record.failure(recorded)) is not None:
+            unjudged[agent_id] = why
         steps += len(trace.runs)
     if deviations:
         return deviates(evidence, deviations, steps, lost)

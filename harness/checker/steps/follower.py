@@ -207,6 +207,14 @@ class Follower:
 
     # Lines that may be lost
 
+    def has_effect(self, sender: int, message: Message, at_s: float) -> bool:
+        """Handle a message that no line shows. Return whether the agent changed, counted or sent anything."""
+        core = self._core
+        core.now = self._header.local(at_s)
+        core.running = handler = self._on_message[type(message)]
+        branch = handler.run(core, sender, message)
+        return bool(core.changes or core.outbox or core.started or core.triggered) or branch in COUNTING
+
     def play_lost_message(self, sender: int, message: Message, at_s: float) -> bool:
         """Handle a message that has no line in the trace. Return true if its line could be lost, because it changed no
         block.

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from harness.checker.steps.trace_header import CheckedHeader
+from harness.field._vehicle_captures import AgentCapture, Sighting, seconds_of
 from harness.field.reconstruct._agent_inputs import (
     BootedFromDisk,
     Cause,
@@ -23,7 +24,6 @@ from harness.field.reconstruct._agent_inputs import (
     ReconcileRequested,
     TimerExpired,
 )
-from harness.field.reconstruct._other_records import AgentCapture, Sighting, seconds_of
 from harness.play.simulation.air import NEVER
 from ucp.agent import Agent
 from ucp.events import LoggableEvent

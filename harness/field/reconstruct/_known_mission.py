@@ -14,9 +14,10 @@ from harness.archive.traces import Header
 from harness.checker.judgement import agents
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import FieldError
+from harness.field._vehicle_captures import AgentCapture
 from harness.field.ingest import Flight
 from harness.field.reconstruct._inferring import infer
-from harness.field.reconstruct._other_records import AgentCapture, OtherRecords
+from harness.field.reconstruct._other_records import OtherRecords
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.events import MalformedEventsError, decode_events
 from ucp.messages import BlockAddResponse, decode

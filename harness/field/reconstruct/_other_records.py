@@ -4,56 +4,26 @@ import base64
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from harness.archive.exports import Export
-from harness.archive.packets.capture_reader import Capture
-from harness.archive.packets.datagram import NotUcpError, unwrap
-from harness.archive.packets.pcap import OUTBOUND, CaptureFile
 from harness.archive.traces import Trace
 from harness.checker.judgement import agents
 from harness.checker.recorded_inputs import decoded, event_of, sealed_of
 from harness.checker.steps.trace_header import CheckedHeader
 from harness.errors import CaptureError
+from harness.field._vehicle_captures import AgentCapture, read_capture
 from harness.field.ingest import Flight
 from harness.play.simulation.recorded_seals import RecordedSeals
 from ucp.block import MAX_EVENT_DATA_BYTES, Block
-from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent, MalformedEventsError, decode_events
-from ucp.messages import HEADER, BlockResponse, CommitBlock, MalformedDatagramError, decode
+from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError, decode
 from ucp.sealed import SEAL_BYTES, sealed_to
-from ucp.secure.envelope import REVOCATION
-from ucp.secure.envelope import VERSION as SECURED
 
 if TYPE_CHECKING:
     from ucp.secure.opening import Opener
     from ucp.secure.sealing import Depot
-
-NANOSECONDS = 1_000_000_000
-
-
-@dataclass(slots=True)
-class Sighting:
-    """A datagram at the network interface of a vehicle. `at_s` is the mission second on the vehicle's clock."""
-
-    at_s: float
-    outbound: bool
-    sender: int
-    sequence: int
-    datagram: bytes
-
-
-@dataclass
-class AgentCapture:
-    """The datagrams in the capture of a vehicle, in order. `epoch_us` is its mission second 0."""
-
-    epoch_us: float
-    speedup: float
-    sightings: list[Sighting] = field(default_factory=list)
-    unreadable: int = 0
-    """Number of sealed datagrams that no given key decrypts."""
 
 
 class OtherRecords:
@@ -71,7 +41,7 @@ class OtherRecords:
         self._blocks: dict[str, Block] = {}
         for agent_id, path in sorted(flight.captures.items()):
             try:
-                self.captures[agent_id] = _read(path, agent_id, flight.epoch_us, opener)
+                self.captures[agent_id] = read_capture(path, agent_id, flight.epoch_us, opener)
             except CaptureError as error:
                 self.problems.append(str(error))
         unreadable = {agent_id: capture.unreadable for agent_id, capture in self.captures.items() if capture.unreadable}
@@ -191,39 +161,3 @@ def _sent(trace: Trace) -> Iterator[tuple[int, bytes]]:
                 except MalformedDatagramError:
                     continue
                 yield sent.seq, base64.b64decode(sent.datagram.text)
-
-
-def _read(path: Path, agent_id: int, epoch_us: int | None, opener: "Opener | None") -> AgentCapture:
-    """Read the capture of an agent. Raises CaptureError."""
-    capture_file = Capture(0, path)
-    capture_file.read({}, most_frames=1)
-    frames = [*CaptureFile(path)]
-    if capture_file.comment is not None:
-        capture = AgentCapture(float(capture_file.comment.epoch_us), capture_file.comment.speedup)
-    else:
-        first_ns = min((frame.time_ns for frame in frames), default=0)
-        capture = AgentCapture(float(epoch_us if epoch_us is not None else first_ns // 1000), 1.0)
-    epoch_ns = capture.epoch_us * 1000
-    for frame in frames:
-        try:
-            datagram, direction = unwrap(frame)
-            is_sealed = len(datagram) >= HEADER.size and datagram[2] == SECURED
-            if is_sealed and opener is not None:
-                datagram = opener.open(datagram).datagram.encode()
-            sender, sequence, _ = decode(datagram)
-        except NotUcpError:
-            continue
-        except MalformedDatagramError:
-            capture.unreadable += is_sealed and datagram[3] != REVOCATION
-            continue
-        outbound = direction == OUTBOUND or (not direction and sender == agent_id)
-        if outbound == (sender == agent_id):
-            at_s = (frame.time_ns - epoch_ns) / NANOSECONDS * capture.speedup
-            capture.sightings.append(Sighting(at_s, outbound, sender, sequence, datagram))
-    capture.sightings.sort(key=lambda sighting: sighting.at_s)
-    return capture
-
-
-def seconds_of(event: LoggableEvent, capture: AgentCapture) -> float:
-    """Return the mission second at which an event was logged, on the clock of the capture."""
-    return (event.timestamp_us - capture.epoch_us) / MICROSECONDS

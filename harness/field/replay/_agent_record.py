@@ -15,9 +15,13 @@ from harness.archive.run_record import JudgedRecord
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.lost_lines import lost_lines
+from harness.checker.steps.end_of_record import Arrival, sent_to, unfinished
+from harness.checker.steps.follower import Follower
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import FieldError
+from harness.field._vehicle_captures import AgentCapture, Sighting
 from ucp.clock import MICROSECONDS
+from ucp.messages import decode
 from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
 
@@ -47,6 +51,9 @@ class FlightRecords(Protocol):
     @property
     def record(self) -> JudgedRecord | None:
         """The record of the run. None for a flight in the field."""
+
+    def capture(self, agent_id: int) -> AgentCapture | None:
+        """Return the capture of the agent's vehicle. None without one, or if it is not needed."""
 
 
 class Record:
@@ -119,6 +126,12 @@ class Record:
                             found.setdefault(key, []).append(base64.b64decode(datagram.text, validate=True))
         return found
 
+    @cached_property
+    def arrivals(self) -> list[Sighting] | None:
+        """The datagrams that reached the vehicle of the agent, in order. None without a capture of the vehicle."""
+        capture = self.flight.capture(self.agent_id)
+        return None if capture is None else [seen for seen in capture.sightings if not seen.outbound]
+
     @property
     def end_s(self) -> float:
         """The mission second of the last line."""
@@ -145,6 +158,28 @@ class Record:
         exported_s = (self.flight.exports[self.agent_id].exported_at_us - epoch_us) / MICROSECONDS
         exported_s = (exported_s - self.header.offset_s) / self.header.rate
         return exported_s if exported_s >= self.end_s else None
+
+    def ends_open(self, follower: Follower) -> str | None:
+        """Return a sentence about the end of the record, if the agent left no export and others went on.
+
+        Without any export, the mission may have ended at different times, and only a due timer proves an early end.
+        `follower` is in the state after the last line.
+        """
+        trace, flight = self.trace, self.flight
+        if trace.cut_off or trace.problem or self.agent_id in flight.exports:
+            return None
+        if any(position == len(trace.runs) for position in (*(gap.position for gap in trace.gaps), *trace.jumps)):
+            return None
+        others = [other.runs[-1].t for agent, other in flight.traces.items() if agent != self.agent_id and other.runs]
+        others_until_s = max(others, default=0.0) - self.header.late_s
+        return unfinished(follower, trace, others_until_s, self._coming() if flight.exports else None)
+
+    def _coming(self) -> Iterator[Arrival]:
+        """Yield the messages that reached the vehicle of the agent, or were sent to it if it has no capture."""
+        if self.arrivals is None:
+            yield from sent_to(self.agent_id, self.flight.traces)
+        for seen in self.arrivals or ():
+            yield Arrival(seen.at_s, decode(seen.datagram).message.NAME, seen.sender, seen.sequence, arrived=True)
 
     def was_paused(self, since: float, until: float) -> bool:
         """Return whether the agent was paused, or may have been, at any time between two mission seconds.

@@ -13,14 +13,16 @@ from itertools import islice
 from harness.archive.vocabulary import IGNORED_KINDS, first_unknown, unknown_names
 from harness.checker.reference.algorithms import ON_TIMER
 from harness.checker.reference.state import State
-from harness.checker.steps import wrongly_dropped
+from harness.checker.steps import end_of_record, wrongly_dropped
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.follower import Follower, OptionalParts
 from harness.checker.steps.implementation import REFERENCE, Implementation
 from harness.checker.steps.single_line import LINES_AFTER, damage_that_explains
 from harness.field.replay._agent_record import Entry, Record
+from harness.field.replay._ignored_messages import ignored_messages
 from harness.field.replay._resumption import ClockSet, Resumption
 from harness.field.replay.replay_names import RecordedBlocks
+from ucp.messages import Message
 from ucp.trace import HandlerRun
 
 CHECKPOINT_STEPS = 1000
@@ -55,6 +57,12 @@ class ReplayResult:
         for deviation in deviations:
             self.deviations.append(deviation)
             self.positions.append(position)
+
+    def insert(self, position: int, deviation: Deviation) -> None:
+        """Add a deviation that was found after later ones."""
+        number = bisect_left(self.positions, position)
+        self.deviations.insert(number, deviation)
+        self.positions.insert(number, position)
 
     @property
     def first(self) -> Deviation | None:
@@ -159,7 +167,7 @@ class Player:
             self.forward()
 
     def to_end(self) -> ReplayResult:
-        """Play the rest. The result includes steps that are missing after the last line."""
+        """Play the rest. The result includes steps that are missing after the last line, and ignored messages."""
         self.to(len(self.entries))
         result = self.result.copy()
         whole = len(self.entries) == len(self.record.entries) and self._incarnation == self.record.incarnations
@@ -167,7 +175,44 @@ class Player:
             follower = self._follower.copy()
             follower.end(until_s)
             result.add(self.position, follower.deviations)
+        elif whole:
+            self._judge_end(result)
+        if self.record.arrivals and (ignored := ignored_messages(self.record, self._earlier().at)) is not None:
+            result.insert(*ignored)
         return result
+
+    def _judge_end(self, result: ReplayResult) -> None:
+        """Add the reason why the record ends, if the agent did not end it itself."""
+        record = self.record
+        if record.flight.record is not None:
+            recorded = record.flight.record.agents.get(str(record.agent_id))
+            if (deviation := end_of_record.crash(record.trace, recorded)) is not None:
+                result.add(self.position, [deviation])
+            elif (why := end_of_record.failure(recorded)) is not None:
+                result.lost.append(why)
+                result.unjudged += 1
+        elif self._follower.lost is None and (sentence := record.ends_open(self._follower)) is not None:
+            result.lost.append(sentence)
+            result.unjudged += 1
+
+    def at(self, position: int) -> "Player":
+        """Go to a position, and return this player."""
+        self.to(position)
+        return self
+
+    def _earlier(self) -> "Player":
+        """Return a copy of this player at the beginning."""
+        earlier = copy(self)
+        earlier.to(0, replay=True)
+        return earlier
+
+    def has_effect(self, sender: int, message: Message, at_s: float) -> bool:
+        """Return whether the agent would do anything with a message that arrives here."""
+        return self._follower.copy().has_effect(sender, message, at_s)
+
+    def handler_of(self, message: Message) -> str:
+        """Return the name of the handler of a message."""
+        return str(self._implementation.on_message[type(message)].name)
 
     def _follow(self, entry: Entry, run: HandlerRun) -> None:
         follower, result = self._follower, self.result
@@ -227,7 +272,7 @@ class Player:
             return None
         if self.record.doubts is None:
             doubting = _DoubtingPlayer(self.record)
-            doubting.to_end()
+            doubting.to(len(doubting.entries))
             found = {position: why for position, why in doubting.found.items() if why is not None}
             self.record.doubts = found if len(found) <= MAX_DOUBTS else {}
         return self.record.doubts.get(self.position)

@@ -14,7 +14,8 @@ from harness.archive.packets.pcap import MAGICS
 from harness.archive.run_record import JudgedRecord
 from harness.archive.traces import HEADER, MAX_LINE_BYTES, SUFFIX, Trace, read_trace
 from harness.checker.evidence import check_variant
-from harness.errors import FieldError, RunDirectoryError
+from harness.errors import CaptureError, FieldError, RunDirectoryError
+from harness.field._vehicle_captures import AgentCapture, read_capture
 from harness.field.ingest import Flight, IngestResult, ingest_files
 from harness.field.replay._agent_record import Record
 from harness.gc_pause import gc_paused
@@ -43,6 +44,9 @@ class _RunRecords:
     def record(self) -> JudgedRecord | None:
         return self._archive.judged_record
 
+    def capture(self, agent_id: int) -> None:
+        """Return None: the counters of the run show messages that an agent ignored."""
+
 
 class _DirectoryRecords:
     """The records of the same mission in the directory of a trace."""
@@ -63,12 +67,19 @@ class _DirectoryRecords:
         return {agent_id: export for agent_id, export in exports.items() if export.inception.block_data == own_flights}
 
     @cached_property
-    def traces(self) -> Mapping[int, Trace]:
+    def _flight(self) -> Flight:
         flights = ingest_files([self._directory]).flights
         own_flights = (
             flight for flight in flights if self._header in (trace.header for trace in flight.traces.values())
         )
-        return next(own_flights, Flight(None)).traces
+        return next(own_flights, Flight(None))
+
+    @property
+    def traces(self) -> Mapping[int, Trace]:
+        return self._flight.traces
+
+    def capture(self, agent_id: int) -> AgentCapture | None:
+        return _capture(self._flight, agent_id)
 
 
 class IngestedRecords:
@@ -79,6 +90,18 @@ class IngestedRecords:
     def __init__(self, flight: Flight) -> None:
         self.exports = flight.exports
         self.traces = flight.traces
+        self._flight = flight
+
+    def capture(self, agent_id: int) -> AgentCapture | None:
+        return _capture(self._flight, agent_id)
+
+
+def _capture(flight: Flight, agent_id: int) -> AgentCapture | None:
+    path = flight.captures.get(agent_id)
+    try:
+        return None if path is None else read_capture(path, agent_id, flight.epoch_us)
+    except CaptureError:
+        return None
 
 
 def open_record(path: Path, agent_id: int | None = None) -> Record:

@@ -5,11 +5,13 @@ Inputs are messages, events to log, and the ends of timers. `simulation.py` play
 
 import base64
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from random import Random
 from typing import TYPE_CHECKING, cast
 
+from harness.errors import AgentFailedError
 from harness.gc_pause import gc_paused
 from harness.play._shared_channel import ChannelTraffic
 from harness.play.backend import agent_seed
@@ -176,10 +178,16 @@ class EventLoop:
             self._now = until
 
     def _play(self, until: float) -> None:
+        inputs = self._air.inputs_until(until)
+        while (crash := self._play_to_crash(inputs)) is not None:
+            self.fail(crash)
+
+    def _play_to_crash(self, inputs: Iterator[ScheduledInput]) -> AgentFailedError | None:
+        """Play the inputs. Return the failure of the first agent that crashes, or None at the end."""
         alive = self._alive
         incarnation: Incarnation | None = None
         try:
-            for scheduled in self._air.inputs_until(until):
+            for scheduled in inputs:
                 self._now, _, number, what = scheduled
                 incarnation = alive[number]
                 if incarnation is None:
@@ -193,11 +201,26 @@ class EventLoop:
                 else:
                     self._handle_other_input(number, incarnation, what)
                 if self._found is not None:
-                    return
+                    return None
         except Exception as error:
             if (crash := core_crash(incarnation, error)) is None:
                 raise
-            raise crash from error
+            return crash
+        return None
+
+    @contextmanager
+    def _containing_crash(self, number: int) -> Iterator[None]:
+        """Let the mission go on without this agent if it crashes in the context."""
+        try:
+            yield
+        except Exception as error:
+            if (crash := core_crash(self._alive[number], error)) is None:
+                raise
+            self.fail(crash)
+
+    def fail(self, error: AgentFailedError) -> None:
+        """Record that an agent crashed. Its record ends, and the others go on."""
+        raise NotImplementedError
 
     def _handle_message(self, number: int, incarnation: Incarnation, flight: MessageInFlight) -> None:
         """Give a message to the agent, if it can affect the agent."""

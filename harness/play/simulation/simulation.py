@@ -18,7 +18,6 @@ from harness.play._radio_range import TRACK_S, RadioRange, tracks_of
 from harness.play.agent_control import Status
 from harness.play.mission import RunOutcome, SoughtRun
 from harness.play.rogue.rogue_line import OF_NO_INJECTION, line_of
-from harness.play.simulation._crash import core_crash
 from harness.play.simulation._event_loop import ANY_INCARNATION, EventLoop
 from harness.play.simulation._recurrence import CHECK_AFTER_S, AgentAtRest, Recurrence
 from harness.play.simulation._simulated_agent import DiskContents
@@ -210,7 +209,8 @@ class Simulation(EventLoop):
             self._rogue.begin(change, self._now)
             return
         for agent_id in change.agents:
-            await change.apply(self, agent_id)
+            with self._containing_crash(self._number[agent_id]):
+                await change.apply(self, agent_id)
         self._recorder.changed(record)
 
     def _apply_conditions(self, change: NetworkChange, **more: Any) -> None:
@@ -286,7 +286,10 @@ class Simulation(EventLoop):
                 if incarnation and incarnation.waiting is None
             }
             for number, incarnation in incarnations.items():
-                self._tally_answers(number, incarnation)
+                with self._containing_crash(number):
+                    self._tally_answers(number, incarnation)
+            if any(self._alive[number] is not incarnation for number, incarnation in incarnations.items()):
+                return False  # an agent crashed
             wakes_s = {
                 number: incarnation.deadline
                 for number, incarnation in incarnations.items()
@@ -318,14 +321,10 @@ class Simulation(EventLoop):
         number = self._number[agent_id]
         incarnation = self._alive[number]
         if incarnation is not None and incarnation.waiting is None:
-            self._tally_answers(number, incarnation)
-            try:
+            with self._containing_crash(number):
+                self._tally_answers(number, incarnation)
                 incarnation.agent.begin_reconcile(incarnation.local_s(self._now))
-            except Exception as error:
-                if (crash := core_crash(incarnation, error)) is None:
-                    raise
-                raise crash from error
-            self._finish_input(number, incarnation)
+                self._finish_input(number, incarnation)
 
     async def top_chain_hashes(self) -> dict[int, str]:
         return {incarnation.agent.agent_id: incarnation.top_chain_hash for incarnation in self.living()}
@@ -343,7 +342,7 @@ class Simulation(EventLoop):
         return played
 
     def fail(self, error: "AgentFailedError | AgentLacksError") -> None:
-        """Record that an agent crashed, hung, or does not support the mission. This ends the mission."""
+        """Record that an agent crashed, hung, or does not support the mission. Its record ends."""
         number = self._number[error.agent_id]
         if (incarnation := self._alive[number]) is not None:
             incarnation.ended_at = self._now
@@ -367,7 +366,8 @@ class Simulation(EventLoop):
     def _outcome_so_far(self) -> RunOutcome:
         for number, incarnation in enumerate(self._alive):
             if incarnation is not None:
-                self._tally_answers(number, incarnation)
+                with self._containing_crash(number):
+                    self._tally_answers(number, incarnation)
         last_s, network = self._script.last_s, self.played.network
         return dataclasses.replace(
             self.played,

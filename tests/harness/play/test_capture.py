@@ -161,7 +161,7 @@ def test_crashed_capture_ends_the_run_with_one_sentence_and_status_3(tmp_path: P
     status, _, err = running.end()
     assert status == 3
     assert sentences(err) == [
-        "The capture of packets failed: SIGKILL; the chains and traces written before that are exported and checked",
+        "The capture of packets failed: SIGKILL; the chains and traces that were written are checked",
     ]
     recorded = running.record()
     assert recorded["outcome"] == "failed"

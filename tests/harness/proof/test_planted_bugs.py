@@ -60,7 +60,7 @@ CRASHES = Bug(
         pytest.param(RESTS_WITH_DEQUE, 2, (), "2", "2", id="an agent rests with a block in its deque"),
         pytest.param(DROPS_FRONT, 2, (), "2", "2", id="a commit that crosses a vote drops the block"),
         pytest.param(KEEPS_FLAG, 2, (), "hang", "liveness", id="a reconcile never ends"),
-        pytest.param(CRASHES, 3, ("--network", "lossless", "--agents", 3), "crash", "ended", id="a tie crashes"),
+        pytest.param(CRASHES, 3, ("--network", "lossless", "--agents", 3), "crash", "steps", id="a tie crashes"),
     ],
 )
 def test_planted_bug_is_found_and_its_scenario_plays_it(

@@ -117,8 +117,8 @@ def test_crashed_agent_ends_the_run_and_the_others_export(tmp_path: Path) -> Non
     status, _, err = run.end()
     assert status == 1
     assert sentences(err)[0] == (
-        "agent 2 ended by itself with SIGKILL; its log is agents/2.log; the chains and traces written before that are "
-        "exported and checked"
+        "agent 2 ended by itself with SIGKILL; its log is agents/2.log; the chains and traces that were written are "
+        "checked"
     )
     record = run.record()
     assert record["agents"]["2"]["outcome"] == "crashed"

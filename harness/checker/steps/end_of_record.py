@@ -1,0 +1,112 @@
+"""Describe the end of a record that the agent did not end itself. A dying agent leaves no line of its last handler.
+
+With the record of a run, the reason is known. A crash in a handler is a deviation, because no Algorithm ends in an
+error. From the field, only other records show that the mission went on after the last line. They do not show whether
+the agent died in a handler or lost its power, so the sentence names the next input and both possibilities.
+"""
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+from harness.archive.run_record import AgentRecord
+from harness.archive.traces import Trace
+from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
+from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.follower import Follower
+
+FAILED = ("crashed", "hung", "broken")
+"""Outcomes of agents that ended against their will."""
+_NAMED = re.compile(r"Algorithm \d+, (\w+)")
+_OF_MESSAGE = {message.NAME: handler for message, handler in ON_MESSAGE.items()}
+
+
+class Arrival(NamedTuple):
+    """A message to the agent: mission seconds, type, sender and sequence number.
+
+    `arrived` is true if a capture shows it at the vehicle of the agent. Otherwise its sender sent it at this time, and
+    it may be lost.
+    """
+
+    t: float
+    message: str
+    sender: int
+    sequence: int
+    arrived: bool
+
+
+def crash(trace: Trace, recorded: AgentRecord | None) -> Deviation | None:
+    """Return a deviation if the record of the run says that the agent crashed in a handler. None otherwise."""
+    if recorded is None or recorded.outcome != "crashed":
+        return None
+    named = _NAMED.search(recorded.detail or "")
+    if named is None or named[1] not in HANDLERS:
+        return None
+    ended = next((count.until_s for count in reversed(recorded.handler_runs) if count is not None), None)
+    line, t = last_line(trace)
+    what = f"its record ends here, because the handler did not finish: it {recorded.detail}"
+    return Deviation(trace.header.agent_id, line, t if ended is None else ended, named[1], what)
+
+
+def failure(recorded: AgentRecord | None) -> str | None:
+    """Return the reason why the trace of an agent ends early, if the record of the run has one."""
+    if recorded is None or recorded.outcome not in FAILED:
+        return None
+    return f"its record ends early: it {recorded.detail or recorded.outcome}"
+
+
+def last_line(trace: Trace) -> tuple[int, float]:
+    """Return line number and mission second of the last handler run. Line 1 is the header."""
+    line, t = 1, 0.0
+    for incarnation in trace.incarnations():
+        line, t = max(((number, run.t) for number, run in incarnation), default=(line, t))
+    return line, t
+
+
+def unfinished(
+    follower: Follower, trace: Trace, others_until_s: float, arrivals: Iterator[Arrival] | None
+) -> str | None:
+    """Return a sentence about the end of a trace without an export, if the mission went on after it. None otherwise.
+
+    `others_until_s` is a mission second until which others certainly went on. `arrivals` are the messages to the agent.
+    None if messages prove nothing.
+    """
+    line, t = last_line(trace)
+    if others_until_s <= t:
+        return None
+    ends = f"the record ends at line {line}, t={t:g} s"
+    if follower.state.triggered:
+        event, by = follower.state.triggered[0]
+        name = ON_LOCAL_EVENT[event].name
+        return f"{ends}, in {_title(name)}, which {by} triggered; the handler did not finish"
+    ended = "the handler did not finish, or the agent had ended"
+    running = [timer for timer in follower.state.timers if timer.deadline is not None]
+    due = min(((follower.mission_s(timer.deadline or 0.0), timer.name) for timer in running), default=(math.inf, ""))
+    came = min((each for each in arrivals or () if each.t > t and each.message in _OF_MESSAGE), default=None)
+    if due[0] <= min(others_until_s, came.t if came else math.inf):
+        return f"{ends}, before {_title(ON_TIMER[due[1]].name)}, of the {due[1]} timer due at t={due[0]:g} s; {ended}"
+    if arrivals is None:
+        return None
+    if came is None:
+        return f"{ends}, although others went on until t={others_until_s:g} s; no record shows its next input"
+    named, handler = f"the {came.message} {came.sequence}", _title(_OF_MESSAGE[came.message].name)
+    if came.arrived:
+        of = f"{named} of agent {came.sender}, which reached the vehicle at t={came.t:g} s"
+        return f"{ends}, before {handler}, of {of}; {ended}"
+    return (
+        f"{ends}, before {handler}, of {named} that agent {came.sender} sent at t={came.t:g} s; it was lost, or {ended}"
+    )
+
+
+def sent_to(agent_id: int, traces: Mapping[int, Trace]) -> Iterator[Arrival]:
+    """Yield the messages that other agents sent, by their traces."""
+    for sender, trace in traces.items():
+        if sender != agent_id:
+            for run in trace.runs:
+                for sent in run.sent:
+                    yield Arrival(run.t, sent.message, sender, sent.seq, arrived=False)
+
+
+def _title(handler: str) -> str:
+    return f"Algorithm {HANDLERS[handler].algorithm}, {handler}"

@@ -1,0 +1,85 @@
+"""Find messages that reached the vehicle of an agent, and that its trace does not have.
+
+An agent writes a line for each message that it handles or drops. A capture of its vehicle shows the messages that
+arrived. A few messages without a line prove nothing, because lines may be lost, or the socket of the agent may discard
+messages. Messages without a line at many separate places are a deviation. Only messages that would have had an effect
+count, because the agents of a simulation do not get the others.
+"""
+
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from harness.checker.recorded_inputs import decoded
+from harness.checker.steps.deviation import Deviation
+from harness.field._vehicle_captures import Sighting
+from harness.field.replay._agent_record import Entry, Record
+from ucp.messages import MalformedDatagramError, Message, decode
+from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
+from ucp.trigger import MessageTrigger
+
+if TYPE_CHECKING:
+    from harness.field.replay._player import Player
+
+MAX_PLACES = 3
+"""Number of places at which lines may be lost, or the socket may discard messages."""
+MAX_TRIED = 200
+"""Maximum number of messages whose effect is computed."""
+
+
+def ignored_messages(record: Record, play_to: "Callable[[int], Player]") -> tuple[int, Deviation] | None:
+    """Return the first message that the agent ignored, with its position. None if it ignored at most a few.
+
+    `play_to` plays the entries up to a position.
+    """
+    places: list[tuple[int, Sighting, Message]] = []
+    last = -1
+    for position, sighting in _without_line(record):
+        message = decode(sighting.datagram).message
+        player = play_to(position)
+        if player.lost is not None or player.record.entries[position].gap is not None:
+            continue
+        if position != last and player.has_effect(sighting.sender, message, sighting.at_s):
+            places.append((position, sighting, message))
+            last = position
+    if len(places) <= MAX_PLACES:
+        return None
+    position, sighting, message = places[0]
+    entry = record.entries[position]
+    handler = play_to(position).handler_of(message)
+    what = (
+        f"it did not run for the {message.NAME} {sighting.sequence} of agent {sighting.sender}, which reached its "
+        f"vehicle at t={sighting.at_s:g} s; messages that reached the vehicle are missing at {len(places)} places, so "
+        "the agent ignored them, or its socket discarded them"
+    )
+    return position, Deviation(record.agent_id, entry.line, sighting.at_s, handler, what)
+
+
+def _without_line(record: Record) -> Iterator[tuple[int, Sighting]]:
+    """Yield the messages that arrived between two lines of an incarnation and have no line, with the next position."""
+    known = {(run.sender, run.sequence) for entry in record.entries if (run := _received(entry)) is not None}
+    times = [entry.content.t for entry in record.entries]
+    tried = 0
+    for sighting in record.arrivals or ():
+        if (sighting.sender, sighting.sequence) in known or sighting.sender not in record.header.roster:
+            continue
+        position = bisect_right(times, sighting.at_s)
+        if not 0 < position < len(times) or tried == MAX_TRIED:
+            continue
+        if record.entries[position - 1].incarnation == record.entries[position].incarnation:
+            tried += 1
+            yield position, sighting
+
+
+def _received(entry: Entry) -> MessageTrigger | None:
+    match entry.content:
+        case HandlerRun(trigger=MessageTrigger() as trigger):
+            return trigger
+        case DroppedDatagram() as dropped:
+            with suppress(MalformedDatagramError):
+                sender, sequence, message = decoded(dropped.datagram)
+                return MessageTrigger(message.NAME, sender, sequence)
+        case HandlerRun() | CommandEntry():
+            pass
+    return None
