@@ -1,1 +1,3 @@
-"""Tools for the records of real flights: ingest, import, replay, reconstruction, bisection and the depot."""
+"""Process the records of real flights: read them, replay them, reconstruct the flight, find faulty commits, and merge
+chains.
+"""

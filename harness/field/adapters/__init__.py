@@ -1,4 +1,4 @@
-"""Import records of other implementations, so that the harness can read them like its own.
+"""Convert records of other programs to the formats of the harness.
 
 An adapter reads a source and yields observations: lines of traces, exports, datagrams and logged events. CSV files and
 ROS bags have adapters here, and a user can name an adapter of their own. `imported_records` writes the observations as

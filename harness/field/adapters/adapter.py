@@ -1,4 +1,4 @@
-"""The interface of an adapter, and a function that loads a user's adapter.
+"""Define the interface of an adapter (a reader for another file format), and load adapters that users write.
 
 An adapter reads the records of another implementation, or of a separate recorder, and yields their contents one
 observation after another. It invents nothing. For example, an agent that did not record its handler runs gets no trace,
@@ -61,7 +61,7 @@ class ChainExport:
 
 @dataclass(frozen=True, slots=True)
 class Unusable:
-    """An unusable part of the source. `why` completes a sentence, as in "it has no time".
+    """A part of the source file that cannot be used. `why` completes a sentence, as in "it has no time".
 
     With `of_a_trace`, the part may have been a line of a trace. The trace of `agent_id` then has a gap here. If
     `agent_id` is None, all traces have a gap.
@@ -79,7 +79,7 @@ Observation = TraceLine | Datagram | LoggedEvent | ChainExport | Unusable
 
 
 class Adapter:
-    """The base class of adapters. A subclass recognises its format and reads it.
+    """The base class of adapters. A subclass recognises one file format and reads it.
 
     `counts` is the unit of `where`: "line", "row" or "message".
     """
@@ -87,21 +87,21 @@ class Adapter:
     counts: ClassVar[str] = "line"
 
     def recognises(self, source: Path, beginning: bytes) -> bool:
-        """Return whether a file has this format, judged by its name or its first bytes.
+        """Return true if a file has this format, judged by its name or its first bytes.
 
         The default accepts every file.
         """
         return True
 
     def part_of(self, source: Path) -> Path:
-        """Return the recording that a file belongs to, if a recording may consist of several files.
+        """Return the recording to which a file belongs, if a recording may consist of several files.
 
         The default is the file.
         """
         return source
 
     def observations(self, source: Path) -> Iterator[Observation]:
-        """Yield the contents of a file in order.
+        """Yield the messages, events and trace lines in a file, in their order.
 
         An exception ends the reading of this file. It is reported with the name of the file, and the earlier
         observations are used.
@@ -115,7 +115,7 @@ _USAGE = (
 
 
 def load_adapter(name: str) -> Adapter:
-    """Import and create the adapter `MODULE:CLASS`. Raises FieldError if that is not possible."""
+    """Import a module and create the adapter `MODULE:CLASS`. Raises FieldError if that fails."""
     module_name, separator, class_name = name.rpartition(":")
     if not separator or not module_name or not class_name.isidentifier():
         raise FieldError(f"{name!r} is not an adapter: {_USAGE}")

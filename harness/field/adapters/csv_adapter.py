@@ -1,4 +1,4 @@
-"""Records in a CSV file, one per row. A spreadsheet or a short program can write such a file.
+"""Read records from a CSV file with one record per row. A spreadsheet or a short program can write such a file.
 
 The first row names the columns, in any order:
 
@@ -40,7 +40,7 @@ _BOM = "\ufeff"
 
 
 class CsvAdapter(Adapter):
-    """The adapter for CSV files."""
+    """The adapter that reads CSV files."""
 
     counts = "row"
 
@@ -67,14 +67,16 @@ class CsvAdapter(Adapter):
 
 
 class _Layout:
-    """The positions of the columns, and the separator."""
+    """The positions of the columns in a CSV file, and the separator."""
 
     def __init__(self, separator: str, places: dict[str, int]) -> None:
         self._separator = separator
         self._places = places
 
     def cells(self, row: str) -> dict[str, str] | None:
-        """Return the cells of a row by column name. None if the row does not have the columns of the first row."""
+        """Return the cells of a row by column name, or None if the row has a different number of columns than the first
+        one.
+        """
         last = max(self._places.values())
         try:
             cells = next(csv.reader([row], delimiter=self._separator, strict=True), [])
@@ -96,7 +98,7 @@ def _layout(row: str) -> _Layout | None:
 
 
 def _rows(file: BoundedFile) -> Iterator[tuple[int, str]]:
-    """Yield each row with the number of its first line.
+    """Yield each row together with the number of its first line.
 
     A row may extend over several lines if a quote is open and closes.
     """

@@ -1,4 +1,4 @@
-"""Import records of any kind into one directory: read them with adapters, and write them as files of the harness.
+"""Import records of any format: read them with adapters, and write them as files of the harness into one directory.
 
 The import never invents records. An agent with recorded handler runs gets a trace. An agent of which only datagrams
 were recorded gets a capture.
@@ -54,7 +54,7 @@ FILE = "import.json"
 
 
 class ImportedAgent(BaseModel):
-    """The imported files of one agent, relative to the directory of the flight.
+    """The imported files of one agent. Their names are relative to the directory of the flight.
 
     `trace_from` has the sources of the trace. `handler_runs`, `lives`, `gaps` and `clock_jumps` are counts in the
     trace.
@@ -73,7 +73,7 @@ class ImportedAgent(BaseModel):
 
 
 class ImportedFlight(BaseModel):
-    """One imported flight. `directory` is relative to the directory of the import. `initial_data` is in base64."""
+    """One imported flight. `directory` is relative to the directory of the import, and `initial_data` is in base64."""
 
     directory: str
     initial_data: str | None
@@ -84,8 +84,9 @@ class ImportedFlight(BaseModel):
 
 
 class ImportRemark(BaseModel):
-    """A remark on a source file, or on one of its lines, rows or messages: `counts` names the unit. `why` ends a
-    sentence."""
+    """A remark on a source file, or on a part of it. `counts` is the unit of its position, such as lines. `why` ends a
+    sentence.
+    """
 
     path: str
     line: int | None
@@ -98,7 +99,9 @@ class ImportRemark(BaseModel):
 
 
 class ImportRecord(BaseModel):
-    """The result of an import: the flights, largest first, the files that were left out, and remarks on the others."""
+    """The result of an import: the flights (largest first), the files that were left out, and remarks on the other
+    files.
+    """
 
     model_config = ConfigDict(extra="ignore")
 
@@ -120,7 +123,9 @@ _COPY_BYTES = 1024 * 1024
 
 
 def write_import(result: IngestResult, sources: Sequence[Path], out: Path) -> ImportRecord:
-    """Write the largest flight to `out`, and further flights to directories in `out`. Raises RunDirectoryError."""
+    """Write the largest flight to `out`, and further flights to directories in it. Return the record. Raises
+    RunDirectoryError.
+    """
     claim(out)
     try:
         flights = []
@@ -195,7 +200,7 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
 
 
 def _survived_trace(trace: Trace, export: Export | None) -> bool:
-    """Return whether the agent was alive after the end of its trace, because its export is later."""
+    """Return true if the agent was alive after the end of its trace, because its export is later."""
     if export is None:
         return False
     at_s = mission_s(export.exported_at_us, trace.header)
@@ -203,7 +208,7 @@ def _survived_trace(trace: Trace, export: Export | None) -> bool:
 
 
 def _trace_lines(trace: Trace, *, survived_trace: bool) -> Iterator[str]:
-    """Yield the lines of a trace. Each gap is written as a line that stands for lost lines.
+    """Yield the lines of a trace. Each gap becomes a line that stands for the lost lines.
 
     A trace that ends within a line gets an incomplete last line, because the agent may have been killed there. If it
     survived, a gap is written instead.
@@ -248,7 +253,7 @@ def import_records(
     *,
     by_content: bool = True,
 ) -> ImportRecord:
-    """Read `sources` with `adapters`, and write all flights found in them to `out`, an empty or new directory.
+    """Read `sources` with `adapters`, and write all flights in them to the empty or new directory `out`.
 
     A file that no adapter recognises is read as a file of the harness. With `by_content=False` the first adapter reads
     all files. `report_progress` receives a text at each step. Raises FieldError if a source does not exist or nothing
@@ -377,7 +382,7 @@ class _RecordingReader:
         capture.packet(datagram.time_ns, udp_broadcast(sender, PORT, datagram.data), outbound=datagram.sent)
 
     def end(self, sorter: Sorter) -> None:
-        """Give the records to the sorter after the last file."""
+        """Give the records to the sorter after the last file was read."""
         for agent_id, capture in self._captures.items():
             capture.close()
             seen = summarise_capture(self._scratch / f"{agent_id}.pcapng", self._left_out)

@@ -1,4 +1,4 @@
-"""ROS bags of versions 1 and 2, read without ROS. The package `rosbags` decodes the messages.
+"""Read ROS bags of versions 1 and 2 without an installation of ROS. The package `rosbags` decodes the messages.
 
 The agents of the thesis were ROS nodes. By convention agent 7 has these topics, and any of them may be missing:
 
@@ -39,7 +39,8 @@ _MAX_TOPICS_LISTED = 5
 
 
 class RosBag(Adapter):
-    """The adapter for ROS bags. `topics` maps topic names to their contents, where `{agent}` stands for the agent's ID.
+    """The adapter that reads ROS bags. `topics` states the content of each topic name, in which `{agent}` stands for an
+    ID.
 
     The contents of a topic are `trace`, `sent`, `received`, `event` or `chain`.
     """
@@ -57,7 +58,7 @@ class RosBag(Adapter):
         return beginning.startswith(MAGICS)
 
     def part_of(self, source: Path) -> Path:
-        """Return the directory of a bag of version 2, or the file of a bag of version 1."""
+        """Return the directory of a ROS bag of version 2, or the file of a ROS bag of version 1."""
         if (source.parent / METADATA).is_file():
             return source.parent
         return source.with_name(source.name[:-4]) if source.name.endswith(_JOURNALS) else source
@@ -85,7 +86,7 @@ class RosBag(Adapter):
             yield Unusable(f"{other_topics.total()} messages are on topics of no agent: {names}{more}")
 
     def payload(self, message: BagMessage) -> str | bytes:
-        """Return the text of a String, or the bytes of a UInt8MultiArray.
+        """Return the text of a String message, or the bytes of a UInt8MultiArray message.
 
         Exceptions are reported with the number of the message.
         """
@@ -93,7 +94,7 @@ class RosBag(Adapter):
         return content if isinstance(content, str) else bytes(content)
 
     def decoded(self, message: BagMessage) -> Any:
-        """Return the message that rosbags decoded, an object with the fields of the message type."""
+        """Return the message as an object whose attributes are the fields of its ROS type."""
         data = message_data(message.data)
         if "/msg/" in message.type_name:
             return self._version_2.deserialize_cdr(data, message.type_name)

@@ -1,4 +1,4 @@
-"""Search for the first commit at which the outcome changes."""
+"""Search for the first commit that changes the result."""
 
 import shutil
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from harness.run.code_state import Commit, History, RepositoryError, SuspectComm
 
 @dataclass(frozen=True)
 class Trial:
-    """The result of playing one commit: unchanged (good), changed (bad), or impossible (skip).
+    """The result of testing one commit: unchanged (good), changed (bad), or not testable (skip).
 
     `why` gives the reason.
     """
@@ -27,7 +27,7 @@ class Trial:
 
 @dataclass
 class BisectionResult:
-    """The result of a bisection. `first` is the commit at which the outcome changes.
+    """The result of a search. `first` is the first commit that changes the result.
 
     It has several commits if some of them cannot be played, and none if the outcomes of the good and the bad commit are
     equal.
@@ -56,7 +56,7 @@ class BisectionResult:
 def bisect(
     workshop: Workshop, repository: Path, good: str, bad: str, directory: Path, report_progress: Callable[[str], None]
 ) -> BisectionResult:
-    """Play commits between the revisions `good` and `bad`. The clone is made in `directory`, and the caller removes it.
+    """Test commits between `good` and `bad`. The repository is cloned into `directory`, which the caller removes.
 
     `report_progress` receives a line for each commit. Raises HarnessError.
     """

@@ -1,4 +1,4 @@
-"""Replay the record of one agent with another agent process, datagram by datagram, over UDP.
+"""Send the recorded inputs of one agent to another agent program over UDP, and compare the answers.
 
 The agent runs in a lab with only one other node, which plays all peers. This node sends the datagrams that the peers
 sent according to the record, at the same times.
@@ -59,16 +59,16 @@ HASH_DIGITS = 12
 
 
 class NotStartedError(HarnessError):
-    """The agent process does not start."""
+    """An error: the agent program cannot be started."""
 
 
 class ReplayFailedError(HarnessError):
-    """The agent process ends by itself, or rejects a command."""
+    """An error: the agent program ended by itself, or refused a command."""
 
 
 @dataclass(frozen=True)
 class ExpectedMessage:
-    """A message that the recorded agent sent, and that the replaying agent should send."""
+    """A message that the recorded agent sent, and that the other agent program should also send."""
 
     t: float
     line: int
@@ -78,7 +78,7 @@ class ExpectedMessage:
 
 @dataclass(frozen=True)
 class ScriptedDatagram:
-    """A datagram for the agent.
+    """A datagram to send to the agent program.
 
     `after` is the agent's query that it answers, if any, and `asked_s` the time of the query.
     """
@@ -95,7 +95,9 @@ class ScriptedDatagram:
 
 @dataclass(frozen=True)
 class Script:
-    """The datagrams and commands for the agent by mission second, and its expected messages."""
+    """The datagrams and commands to send at each mission second, and the messages that the agent program should
+    send.
+    """
 
     datagrams: list[ScriptedDatagram]
     questions: list[tuple[float, str]]
@@ -109,11 +111,11 @@ class Script:
     ends_s: float
 
     def line_at(self, at_s: float) -> int:
-        """Return the number of the last line of the record at that time."""
+        """Return the number of the last record line at that time."""
         return self.lines[max(0, bisect_right(self.lines, at_s, key=itemgetter(0)) - 1)][1] if self.lines else 0
 
     def is_near_reconcile_end(self, at_s: float, slack_s: float) -> bool:
-        """Return whether a reconcile ended about that time.
+        """Return true if a reconcile ended at about that time.
 
         A process may then answer queries a little earlier or later.
         """
@@ -122,7 +124,7 @@ class Script:
 
 
 def script_of(record: Record) -> Script:
-    """Return the script of the first incarnation. A later incarnation would need the content of the disk."""
+    """Return the inputs up to the first restart of the agent. Later inputs would need the content of its disk."""
     datagrams: list[ScriptedDatagram] = []
     reconciles: list[float] = []
     expected: list[ExpectedMessage] = []
@@ -164,7 +166,9 @@ def script_of(record: Record) -> Script:
 
 
 def _question_key(message: Message) -> tuple[type, bytes] | None:
-    """Return the type of the response to a query, and its subject. None if the message is no query."""
+    """Return the type of the answer to a query, and the subject of the query. Return None if the message is not a
+    query.
+    """
     match message:
         case ChainContainQuery():
             return ChainContainResponse, message.chain_hash
@@ -204,7 +208,7 @@ def _messages(run: HandlerRun) -> Iterator[tuple[str, Message]]:
 
 
 def play_live(record: Record, command: Sequence[str], directory: Path, *, speedup: float) -> list[RecordDifference]:
-    """Replay the record with an agent process, and return the differences.
+    """Send the recorded inputs to an agent program, and return the differences of its answers.
 
     Raises MachineError, NotStartedError, ReplayFailedError, or FieldError if the record has unknown names.
     """
@@ -332,7 +336,7 @@ class _LiveReplay:
             raise ReplayFailedError(f"the agent does not {command}: {error}") from None
 
     def _wall_s(self, epoch_us: int, mission_s: float) -> float:
-        """Return the wall seconds from now until a mission second."""
+        """Return the number of seconds of wall time from now until a mission second."""
         return max(0.0, epoch_us / MICROSECONDS + mission_s / self._speedup - time.time())
 
 
@@ -388,7 +392,7 @@ def _compare(
 
 
 def _subject(message: Message) -> tuple[type, Any]:
-    """Return the type of a message and the block or chain that it is about."""
+    """Return the type of a message, and the block or chain that it concerns."""
     for name in ("chain_hash", "block_hash"):
         if type(message).__name__ == "BlockAddResponse" and name == "chain_hash":
             continue
@@ -398,7 +402,7 @@ def _subject(message: Message) -> tuple[type, Any]:
 
 
 def _message_text(message: Message) -> str:
-    """Return a text such as "Block Add Response (block hash 5f0c…, approve True)"."""
+    """Return a text about a message, such as "Block Add Response (block hash 5f0c…, approve True)"."""
     parts = []
     for each in fields(message):
         value = getattr(message, each.name)

@@ -1,4 +1,4 @@
-"""Play a subject with another state of the code, or with another agent command."""
+"""Play a scenario or record with the code of another commit, or with another agent program."""
 
 import json
 import shlex
@@ -32,11 +32,12 @@ CODE = "{code}"
 
 
 class UntestableError(HarnessError):
-    """The subject cannot be played with this state of the code, because the code does not start or lacks a feature."""
+    """An error: this commit cannot be tested, because its code cannot be started or lacks a feature."""
 
 
 class Workshop:
-    """A player of one subject. Each play has a new directory in `directory` and at most `limit_s` seconds.
+    """Plays one scenario or record repeatedly. Each play has a new directory in `directory` and at most `limit_s`
+    seconds.
 
     Without `command`, the code under test plays a scenario in virtual time, and its core plays records. With `command`,
     the installed harness plays a scenario with agent processes, and an agent process replays the record of one agent.
@@ -60,13 +61,13 @@ class Workshop:
 
     @property
     def is_deterministic(self) -> bool:
-        """True if the same code always gives the same run, so that the first difference between two runs is
-        meaningful.
+        """True if the same code always gives the same run, so that the first difference between two runs has a
+        meaning.
         """
         return self.subject.scenario is not None and self._command is None
 
     def play(self, code: Path) -> tuple[Outcome, Path]:
-        """Play the subject with the code in this directory. Returns the outcome and the run directory.
+        """Play with the code in this directory. Return the result and the run directory.
 
         Raises UntestableError.
         """
@@ -120,7 +121,7 @@ class Workshop:
         return self._judge(played, run_dir, exact=False), run_dir
 
     def _judge(self, played: ProcessResult, run_dir: Path, *, exact: bool) -> Outcome:
-        """Return the outcome of a run, judged by the installed checker and not by the code under test.
+        """Return the result of a run. The installed checker judges it, and not that of the tested commit.
 
         Raises UntestableError.
         """
@@ -189,13 +190,13 @@ class Workshop:
 
 
 class MachineCannotError(HarnessError):
-    """The subject cannot be played on this machine with any state of the code."""
+    """An error: this machine cannot play the scenario or record with any commit."""
 
     exit_status = CANNOT_HERE
 
 
 def _scenario_file(scenario: Scenario, directory: Path) -> Path:
-    """Write the scenario without `expect` and without default values, which other states of the code may not know."""
+    """Write the scenario without `expect` and without default values, which other commits may not support."""
     document = scenario.model_dump(mode="json", exclude_defaults=True, exclude={"expect"})
     file = directory / "scenario.yaml"
     file.write_text(json.dumps(document), encoding="utf-8")  # JSON is YAML

@@ -1,4 +1,4 @@
-"""Play records with the core of another commit: `python -m harness.field.bisection._record_core PATH [AGENT]`.
+"""Play records with the agent core of another commit: `python -m harness.field.bisection._record_core PATH [AGENT]`.
 
 The caller puts the `ucp` package of that commit first in the module path. The process prints one JSON document with the
 differences between core and record, by agent and in the order of the record.
@@ -20,7 +20,9 @@ MAX_DIFFERENCES = 10_000
 
 
 def differences(path: Path, agent: int | None) -> list[dict[str, Any]]:
-    """Return the differences of one record. Raises HarnessError if it cannot be played."""
+    """Return the differences between the agent core and one record. Raises HarnessError if the record cannot be
+    played.
+    """
     record = open_record(path, agent)
     result, names = Player(record, implementation=IN_USE).to_end(), ReplayNames(record)
     deviations = sorted(result.deviations, key=lambda deviation: deviation.line)
@@ -47,7 +49,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _agents(path: Path) -> list[int]:
-    """Return the agents with a record, in the largest flight."""
+    """Return the agents that have a record in the largest flight."""
     return sorted(ingest_files([path]).largest().traces)
 
 

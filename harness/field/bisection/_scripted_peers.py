@@ -1,4 +1,5 @@
-"""Play all peers of one agent: `python -m harness.field.bisection._scripted_peers SCRIPT HEARD EPOCH_US SPEEDUP`.
+"""Play all other agents for one agent: `python -m harness.field.bisection._scripted_peers SCRIPT HEARD EPOCH_US
+SPEEDUP`.
 
 Each line of SCRIPT is a datagram to send, `{"t": mission seconds, "datagram": base64}`, in order of time. A process is
 some milliseconds later than the record, and during a reconcile the delay grows. Fixed sending times would therefore
@@ -43,7 +44,7 @@ MAX_QUESTION_GAP_S = 6.0
 
 
 class Lateness:
-    """The delay of the agent during a reconcile, in mission seconds.
+    """The number of mission seconds by which the agent is later than in the record during a reconcile.
 
     `margin_s` is the additional delay of its next timer.
     """
@@ -54,18 +55,18 @@ class Lateness:
         self._asked_s = -math.inf
 
     def note_question(self, now: float, in_record: Iterable[float]) -> None:
-        """Note a query of the agent. `in_record` has the times of the same query in the record."""
+        """Process a query that the agent sent. `in_record` contains the times of the same query in the record."""
         nearest = min(in_record, key=lambda at_s: abs(now - at_s), default=None)
         if nearest is not None and abs(now - nearest) < MAX_QUESTION_GAP_S:
             self._late_s, self._asked_s = max(0.0, now - nearest), nearest
 
     def at(self, mission_s: float) -> float:
-        """Return the delay for a datagram with this mission second in the record."""
+        """Return the delay for a datagram that the record contains at this mission second."""
         return self._late_s + self._margin_s if mission_s - self._asked_s < MAX_QUESTION_GAP_S else 0.0
 
 
 def message_key(data: bytes) -> bytes:
-    """Return the type and body of a datagram, without sender and sequence number."""
+    """Return the type and body of a datagram, without its sender and sequence number."""
     return data[3:4] + data[HEADER.size :]
 
 

@@ -1,4 +1,4 @@
-"""A subject of bisection, the outcome of playing it once, and the differences of two outcomes."""
+"""Represent the object of a search for a commit, the result of one play, and the differences between two results."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class _Model(BaseModel):
 
 
 class RecordDifference(_Model):
-    """A difference between a core and a record."""
+    """A difference between an agent core and a record."""
 
     line: int
     handler: str | None
@@ -33,7 +33,7 @@ class RecordDifference(_Model):
 
 
 class AgentResult(_Model):
-    """The result of one agent. None means that this part is not compared.
+    """The result of one agent. A part that is None is not compared.
 
     `chain` has the names of its blocks, oldest first, and `top` its top chain hash. `deviates` is the handler of its
     first deviation, "" if that is no handler of the protocol. `differences` are those from its record.
@@ -46,7 +46,7 @@ class AgentResult(_Model):
 
 
 class Outcome(_Model):
-    """The outcome of playing a subject once.
+    """The result of playing a scenario or record once.
 
     `crashed` is the place of the exception in the code under test that ended it.
     """
@@ -58,13 +58,13 @@ class Outcome(_Model):
     crashed: str | None = None
 
     def as_recorded(self) -> "Outcome":
-        """Return the outcome of a core without any difference from the records."""
+        """Return the result of an agent core that does not differ from the records."""
         agents = {agent: AgentResult(differences=[]) for agent in self.agents}
         return self.model_copy(update={"agents": agents, "crashed": None})
 
     @property
     def sentence(self) -> str:
-        """The outcome in one line."""
+        """Describe the result in one line."""
         if self.crashed:
             return f"it crashes: {self.crashed}"
         bad = [key for key, verdict in self.verdicts.items() if kind_of(verdict) == "bad"]
@@ -91,7 +91,7 @@ def _first(result: AgentResult) -> str:
 
 
 def outcome_of_run(subject: str, result: Result, exports: dict[int, Export], *, exact: bool) -> Outcome:
-    """Return the outcome of a judged run.
+    """Return the result of a run that the checker has judged.
 
     If the run is not `exact`, because its processes depend on timing, chains and timing-dependent judgements are left
     out.
@@ -113,7 +113,7 @@ def outcome_of_run(subject: str, result: Result, exports: dict[int, Export], *, 
 
 
 def differences(before: Outcome, after: Outcome) -> list[str]:
-    """Return a sentence for each difference between two outcomes."""
+    """Return a sentence for each difference between two results."""
     return list(_differences(before, after))
 
 
@@ -163,7 +163,7 @@ def _at(chain: list[str], place: int) -> str:
 
 
 def read(path: Path) -> Outcome:
-    """Read an outcome that was saved before. Raises RunDirectoryError."""
+    """Read a result that was saved in a file. Raises RunDirectoryError."""
     try:
         if path.stat().st_size > MAX_OUTCOME_BYTES:
             raise RunDirectoryError(f"{path}: larger than {MAX_OUTCOME_BYTES} bytes, which is too large for an outcome")
@@ -179,7 +179,9 @@ YAML = (".yaml", ".yml")
 
 @dataclass(frozen=True)
 class Subject:
-    """The subject of a bisection. `scenario` is None for records, which are in `path`. `agent` selects one record."""
+    """The scenario or the records to play. `scenario` is None for the records in `path`. `agent` selects one of
+    them.
+    """
 
     path: Path
     scenario: Scenario | None
@@ -196,7 +198,7 @@ class Subject:
 
 
 def subject_of(path: Path, seed: int | None, agent: int | None) -> Subject:
-    """Return the subject at `path`.
+    """Return the scenario or records at `path`.
 
     A YAML file, a library name, or a run directory of virtual time is a scenario. Every other path is a record. Raises
     HarnessError.
@@ -222,7 +224,7 @@ def _is_scenario(path: Path) -> bool:
 
 
 def _played(path: Path) -> tuple[Scenario, int] | None:
-    """Return scenario and seed of a run, if playing them gives the same run again."""
+    """Return the scenario and the seed of a run, if playing them gives the same run again. Otherwise return None."""
     record = RunArchive(path).record
     if record.backend != "sim" or record.scenario is None or record.seed is None:
         return None

@@ -1,4 +1,4 @@
-"""Calibration: from the records and flight logs of a flight to the radio of a scenario.
+"""Calibrate the radio model of a scenario with the records and flight logs of a real flight.
 
 `_delivery_model.py` has the model and its fit. `_attempts.py` and `_positions.py` read the records. `calibration.py`
 validates the fit and makes the scenario.

@@ -1,4 +1,4 @@
-"""The attempts to deliver a message, from captures or traces, with the distance of the vehicles at that time.
+"""Find out which messages reached which vehicles, and how far apart these were at that time.
 
 A capture shows each frame of its vehicle, so captures are preferred. A trace shows the messages that its agent handled.
 An agent in virtual time is not given messages without effect, so only some types count there, and only while the agent
@@ -30,7 +30,7 @@ _NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, Commit
 
 
 class _Sent(NamedTuple):
-    """A message and its known receivers."""
+    """A message and the vehicles that are known to have received it."""
 
     at_s: float
     sender: int
@@ -40,7 +40,7 @@ class _Sent(NamedTuple):
 
 @dataclass(frozen=True)
 class Observed:
-    """The attempts, their source, and a sentence for each part that cannot be used."""
+    """All transmissions of messages to receivers, their source, and a sentence for each part that cannot be used."""
 
     attempts: list[Attempt]
     source: str
@@ -48,7 +48,7 @@ class Observed:
 
 
 def observe(flight: Flight, positions: Positions, epoch_us: int) -> Observed:
-    """Return all attempts between vehicles with known positions."""
+    """Return all transmissions between vehicles with known positions."""
     problems: list[str] = []
     source, sent = "captures", _from_captures(flight, epoch_us, problems)
     if not any(message.reached or message.lost for message in sent):
@@ -117,7 +117,7 @@ def _from_traces(traces: dict[int, Trace], problems: list[str]) -> Iterator[_Sen
 
 
 class _Receiver:
-    """The messages that an agent handled, and the times at which its trace shows every message."""
+    """The messages that an agent handled, and the intervals in which its trace would show every message."""
 
     def __init__(self, trace: Trace) -> None:
         triggers = (run.trigger for run in trace.runs)
@@ -145,11 +145,11 @@ class _Receiver:
         return message in _NEVER_WITHHELD and not any(around)
 
     def takes(self, key: tuple[int, str, int]) -> bool:
-        """Return whether the message was handled, each time only once."""
+        """Return true if the message was handled. Each handled message is counted once."""
         self._handled[key] -= 1
         return self._handled[key] >= 0
 
 
 def pairs_of(attempts: Iterable[Attempt]) -> list[frozenset[int]]:
-    """Return the links with attempts, in order of their vehicles."""
+    """Return the pairs of vehicles with transmissions, in the order of their IDs."""
     return sorted({attempt.link for attempt in attempts}, key=sorted)

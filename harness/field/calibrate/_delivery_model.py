@@ -1,4 +1,4 @@
-"""The delivery of messages over distance: a model, its maximum likelihood fit, and confidence intervals.
+"""Model the probability that a message arrives over a distance, and fit the model to data by maximum likelihood.
 
 A receiver at d metres gets a message with probability
 
@@ -50,7 +50,7 @@ Vector = list[float]
 
 
 class Attempt(NamedTuple):
-    """A message on its way to one receiver, at mission second `at_s`."""
+    """The transmission of a message to one receiver, at mission second `at_s`."""
 
     at_s: float
     sender: int
@@ -67,7 +67,7 @@ class Attempt(NamedTuple):
 
 @dataclass(frozen=True)
 class DeliveryModel:
-    """The parameters. The docstring of the module explains them."""
+    """The parameters of the model. The docstring of the module explains them."""
 
     range_m: float
     spread: float
@@ -81,12 +81,12 @@ class DeliveryModel:
 
     @property
     def wide(self) -> float:
-        """Return the ratio of the distances with 10 % and 90 % delivery, without `floor`."""
+        """Return the distance at which 10 % arrive divided by the distance at which 90 % arrive, without `floor`."""
         return math.exp(2 * _NORMAL.inv_cdf(0.9) * self.spread)
 
 
 class Interval(NamedTuple):
-    """A confidence interval at `LEVEL`."""
+    """A confidence interval with the confidence level `LEVEL`."""
 
     low: float
     high: float
@@ -97,7 +97,7 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted model. `intervals` has an interval for each parameter that was fitted, by name."""
+    """A fitted model. `intervals` contains a confidence interval for each fitted parameter, by name."""
 
     model: DeliveryModel
     intervals: dict[str, Interval]
@@ -109,7 +109,7 @@ class Fit:
 
 
 class _Row(NamedTuple):
-    """Attempts of one cluster at about the same distance."""
+    """Transmissions of one cluster over about the same distance."""
 
     log_m: float
     others: int
@@ -120,7 +120,7 @@ class _Row(NamedTuple):
 
 
 def fit(attempts: Sequence[Attempt], *, with_load: bool = True) -> Fit | None:
-    """Fit the model. None if the attempts do not determine a range and a spread.
+    """Fit the model to transmissions. Return None if they do not determine a range and a spread.
 
     That is the case if all or no messages arrived, or if the distances hardly differ.
     """
@@ -156,7 +156,7 @@ def _rows(attempts: Iterable[Attempt]) -> list[_Row]:
 
 
 def _cells(rows: Iterable[_Row]) -> list[_Row]:
-    """Return the rows without their clusters, for the likelihood."""
+    """Return the transmissions without their division into clusters, to compute the likelihood."""
     counts: dict[tuple[float, int], list[int]] = defaultdict(lambda: [0, 0])
     for row in rows:
         count = counts[row.log_m, row.others]
@@ -178,7 +178,7 @@ def _starts(rows: Sequence[_Row], free: Sequence[int]) -> list[Vector]:
 
 
 def _terms(row: _Row, values: Vector) -> tuple[float, Vector]:
-    """Return the probability of delivery and its derivatives."""
+    """Return the probability of arrival and its derivatives."""
     spread = math.exp(values[1])
     deviation = (values[0] - row.log_m) / spread
     survives = math.exp(-values[2] - values[3] * row.others)
@@ -204,7 +204,7 @@ def _likelihood(rows: Iterable[_Row], values: Vector) -> float:
 
 
 def _score(rows: Iterable[_Row], values: Vector, free: Sequence[int]) -> tuple[Vector, list[Vector]]:
-    """Return the score and the expected information of the free parameters."""
+    """Return the score vector and the expected information matrix for the free parameters."""
     score = [0.0] * len(free)
     information = [[0.0] * len(free) for _ in free]
     for row in rows:
@@ -222,7 +222,7 @@ def _score(rows: Iterable[_Row], values: Vector, free: Sequence[int]) -> tuple[V
 
 
 def _maximise(rows: Sequence[_Row], start: Vector, free: Sequence[int]) -> tuple[Vector, float]:
-    """Maximise the likelihood over the free parameters, by Fisher scoring within the limits."""
+    """Maximise the likelihood over the free parameters by Fisher scoring within their limits."""
     values = [*start]
     likelihood = _likelihood(rows, values)
     for _ in range(_MOST_ITERATIONS):
@@ -259,7 +259,7 @@ def _maximise(rows: Sequence[_Row], start: Vector, free: Sequence[int]) -> tuple
 def _cluster_scales(
     rows: Sequence[_Row], values: Vector, free: Sequence[int]
 ) -> tuple[dict[int, tuple[float, float]], dict[int, float], int]:
-    """Return for each parameter: standard error with clusters and without, and degrees of freedom; and the number of
+    """Return the standard errors of the parameters with and without clusters, the degrees of freedom, and the number of
     clusters.
     """
     inner = [parameter for parameter in free if values[parameter] > _LOWEST[parameter]]
@@ -367,7 +367,9 @@ def student(freedom: float) -> float:
 
 
 def wilson(delivered: float, attempts: float) -> Interval:
-    """Return the interval of a share of independent draws (Wilson, JASA 22, 1927). It is 0 to 1 without any."""
+    """Return the confidence interval of a share of independent draws (Wilson, JASA 22, 1927). Without draws, it is 0 to
+    1.
+    """
     if not attempts:
         return Interval(0.0, 1.0)
     z = _NORMAL.inv_cdf(0.5 + LEVEL / 2)
@@ -391,7 +393,7 @@ def _phi(deviation: float) -> float:
 
 
 def _solve(matrix: Sequence[Sequence[float]], right: Sequence[float]) -> Vector | None:
-    """Solve linear equations by elimination. None if the matrix is singular."""
+    """Solve linear equations by elimination. Return None if the matrix is singular."""
     size = len(right)
     rows = [[*row, value] for row, value in zip(matrix, right, strict=True)]
     for column in range(size):

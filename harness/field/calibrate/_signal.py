@@ -1,4 +1,4 @@
-"""The path loss exponent, from signal strengths that telemetry radios reported (RADIO_STATUS).
+"""Estimate the path loss exponent from the signal strengths that telemetry radios reported (RADIO_STATUS).
 
 The ground station is taken to be where the vehicle took off. The strength falls by 10 * exponent dB per factor of ten
 in distance. The unit of SiK radios is 1.9 counts per dB (SiK, Firmware/radio/radio.c). The interval is from the
@@ -24,7 +24,7 @@ Sample = tuple[float, float, int]
 
 @dataclass(frozen=True)
 class SignalFit:
-    """The exponent with its interval, from `samples` signal strengths."""
+    """The estimated path loss exponent with its confidence interval, from `samples` signal strengths."""
 
     exponent: float
     interval: Interval
@@ -32,7 +32,7 @@ class SignalFit:
 
 
 def fit_signal(positions: Positions) -> SignalFit | None:
-    """Fit the exponent to the signal strengths of all logs. None if they do not determine it."""
+    """Estimate the exponent from the signal strengths in all logs. Return None if they do not determine it."""
     samples = [sample for number, log in enumerate(positions.logs) for sample in _samples(positions, number)]
     minutes = sorted({minute for _, _, minute in samples})
     if len(samples) < _MIN_SAMPLES or len(minutes) < _MIN_MINUTES:

@@ -1,4 +1,4 @@
-"""The calibration of a flight: fit, validation on the end of the flight, and a scenario with the fitted network."""
+"""Calibrate the radio for a flight: fit a model, test it on the end of the flight, and write a scenario with it."""
 
 import math
 import re
@@ -27,7 +27,8 @@ _MAX_LOSS = 0.9999
 
 @dataclass(frozen=True)
 class Validation:
-    """The predictions of a fit to the beginning of the flight for its end, and those of one loss for all messages.
+    """The test of a model: it is fitted to the beginning of the flight and predicts the end. A constant loss rate is
+    the alternative.
 
     A lower score is better. `bins` has, for each tenth of the predicted probability: number of messages, mean
     prediction and delivered share.
@@ -52,7 +53,7 @@ class Validation:
 
 @dataclass(frozen=True)
 class Share:
-    """The delivery of some messages, with its interval as if they were independent."""
+    """The share of some messages that arrived, with a confidence interval as if they were independent."""
 
     attempts: int
     delivered: int
@@ -66,7 +67,7 @@ class Share:
 
 @dataclass(frozen=True)
 class LinkDelivery:
-    """The delivery over one link: in total, and in blocks of time by their first mission second."""
+    """The share of messages that arrived over one link, in total and in blocks of time."""
 
     one: int
     other: int
@@ -76,7 +77,7 @@ class LinkDelivery:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The result for one flight."""
+    """The result of the calibration for one flight."""
 
     roster: list[int]
     attempts: list[Attempt]
@@ -94,7 +95,7 @@ class Calibration:
         return self.signal.exponent if self.signal else LogDistance.exponent
 
     def sentences(self) -> Iterator[str]:
-        """Yield the result in sentences."""
+        """Yield sentences about the result."""
         delivered = sum(attempt.delivered for attempt in self.attempts)
         yield (
             f"{delivered} of {len(self.attempts)} messages over {len(self.links)} links arrived, from {self.source} "
@@ -172,7 +173,7 @@ class Calibration:
         return document
 
     def to_json(self) -> dict[str, Any]:
-        """Return the result as JSON."""
+        """Return the result as a JSON object."""
         return {
             "messages": len(self.attempts),
             "delivered": sum(attempt.delivered for attempt in self.attempts),
@@ -215,7 +216,7 @@ def _between(interval: Interval, form: str) -> str:
 
 
 def calibrate(paths: Sequence[Path]) -> Calibration:
-    """Fit the radio of the largest flight in these files.
+    """Fit the radio model to the largest flight in these files.
 
     Raises FieldError if the files have no message whose receivers are known.
     """
@@ -259,7 +260,9 @@ def calibrate(paths: Sequence[Path]) -> Calibration:
 
 
 def validate(attempts: Sequence[Attempt]) -> Validation | None:
-    """Fit the beginning of the flight and predict its end. None if the beginning does not determine a fit."""
+    """Fit the model to the beginning of the flight and predict the end. Return None if the beginning does not determine
+    it.
+    """
     first_s, last_s = min(each.at_s for each in attempts), max(each.at_s for each in attempts)
     until_s = first_s + TRAINING_SHARE * (last_s - first_s)
     training = [attempt for attempt in attempts if attempt.at_s <= until_s]
@@ -292,7 +295,7 @@ def _brier(predicted: Sequence[float], outcomes: Sequence[bool]) -> float:
 
 
 def _log_score(predicted: Sequence[float], outcomes: Sequence[bool]) -> float:
-    """Return the mean of -ln(predicted probability of the outcome). No prediction counts as certain beyond 0.1 %."""
+    """Return the mean of -ln(predicted probability of each outcome). Probabilities are limited to 0.001 to 0.999."""
     bounded = [min(max(p, 0.001), 0.999) for p in predicted]
     return -sum(math.log(p if d else 1 - p) for p, d in zip(bounded, outcomes, strict=True)) / len(outcomes)
 
@@ -313,13 +316,13 @@ def _links(attempts: Sequence[Attempt]) -> list[LinkDelivery]:
 
 
 def share_of(attempts: Sequence[Attempt]) -> Share:
-    """Return the delivery of these messages. There is at least one."""
+    """Return the share of these messages that arrived. There must be at least one message."""
     delivered = sum(attempt.delivered for attempt in attempts)
     mean_m = sum(attempt.distance_m for attempt in attempts) / len(attempts)
     return Share(len(attempts), delivered, mean_m, wilson(delivered, len(attempts)))
 
 
 def model_of(radio: LogDistance, loss: float = 0.0) -> DeliveryModel:
-    """Return the model with the same delivery as this radio and an additional loss."""
+    """Return a model with the same probability of arrival as this radio with an additional loss rate."""
     range_m = 10 ** (radio.margin_db(1.0) / (10 * radio.exponent))
     return DeliveryModel(range_m, radio.shadowing_db * math.log(10) / (10 * radio.exponent), loss)

@@ -1,4 +1,6 @@
-"""The page of a calibration: delivery over distance, residuals, validation, delivery over time, and a map."""
+"""Write the page of a calibration: arrivals over distance, residuals, the test of the model, arrivals over time, and a
+map.
+"""
 
 import math
 from collections import defaultdict
@@ -92,7 +94,9 @@ def _delivery(calibration: Calibration) -> Markup:
 
 
 def _residuals(calibration: Calibration) -> Markup:
-    """Draw the delivered share minus the expected one. Without a fit, one share is expected at all distances."""
+    """Draw the share of messages that arrived minus the expected share. Without a model, a constant share is
+    expected.
+    """
     area = _areas(2)[1]
     across, up = _distance_axis(calibration, area), svg.linear_axis(-0.5, 0.5, area.up)
     texts = [f"{tick:+.0%}" for tick in up.ticks]
@@ -150,7 +154,7 @@ def _over_time(calibration: Calibration) -> Markup:
 
 
 def _map(calibration: Calibration) -> Markup:
-    """Draw the tracks, and a dot for each lost message."""
+    """Draw the paths of the vehicles, and a dot for each lost message."""
     tracks = calibration.positions.tracks
     ink = inks(calibration.roster)
     projection = Projection(extent([fix for track in tracks.values() for fix in track]), 62, 14, 800, 460)

@@ -1,1 +1,3 @@
-"""Before and after a mission: the mission files of all vehicles, and their exports merged into one record."""
+"""Prepare a mission and process its results: write the mission files of all vehicles, and merge their exports into one
+record.
+"""

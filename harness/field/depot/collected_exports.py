@@ -1,4 +1,4 @@
-"""Read the chain exports of a mission in any condition, and use every undamaged part.
+"""Read the chain exports of a mission, even if they are damaged, and use every undamaged part.
 
 A truncated export is read up to its end, and an edited or damaged one without its damaged parts. The hash of a block is
 computed from its content (eq. 3.1). If the file has another hash, the difference is reported. Vehicles that hold the
@@ -55,7 +55,7 @@ EXPORT_AGAIN = "export it again if you can"
 
 @dataclass(frozen=True)
 class ReadExport:
-    """An export with correct hashes, and its file.
+    """An export whose hashes are correct, and its file.
 
     `problems` has a sentence for each error. `claims` maps the true hash of each wrong block to the hash in the file.
     """
@@ -72,7 +72,7 @@ class ReadExport:
 
 @dataclass
 class CollectedExports:
-    """The exports of one mission: the latest of each agent, and the earlier ones.
+    """The exports of one mission: the latest one of each agent, and earlier ones.
 
     `left_out` has a sentence for each unused file, and `remarks` has further facts about the used ones.
     """
@@ -113,7 +113,7 @@ class CollectedExports:
 
     @property
     def claims(self) -> dict[str, str]:
-        """The true hash of each wrong block, with the hash in the file.
+        """The correct hash of each block with a wrong hash in its file, with that wrong hash.
 
         A block is not wrong if another export has it under its true hash, or if its agent completed it.
         """
@@ -126,7 +126,7 @@ class CollectedExports:
 
 @gc_paused()
 def collect_exports(paths: Iterable[Path], keys: "PublicKeys | None" = None) -> CollectedExports:
-    """Return the exports of the largest mission in files and directories.
+    """Return the exports of the largest mission in these files and directories.
 
     `keys` are public keys that the user trusts. Without them, signatures are verified with the keys in the directories.
     Raises FieldError if a path does not exist, and ExportError if no export is usable.
@@ -187,7 +187,7 @@ def _is_flight_log(path: Path) -> bool:
 
 
 def _add_context(collected: CollectedExports, compared_files: Iterable[ComparedFile]) -> None:
-    """Add the roster, and the kind of events, from other files of the mission."""
+    """Add the roster, and the kind of events, that other files of the mission contain."""
     for each in compared_files:
         if each.kind == "trace" and each.agent_id is not None and each.agent_id not in collected.latest:
             trace = read_trace(each.path, skim=True)
@@ -213,11 +213,11 @@ def _add_context(collected: CollectedExports, compared_files: Iterable[ComparedF
 
 
 class NotAnExportError(ExportError):
-    """The file has another format."""
+    """An error: the file has a different format."""
 
 
 def _largest_mission(read_exports: Iterable[ReadExport]) -> str:
-    """Return the inception block of the mission with the most agents, then the most blocks."""
+    """Return the inception block of the mission with the most agents, or with the most blocks in a tie."""
     agents: dict[str, set[int]] = {}
     blocks: Counter[str] = Counter()
     for each in read_exports:
@@ -243,7 +243,9 @@ def _other_missions(read_exports: Iterable[ReadExport], mission: str) -> Iterato
 
 
 def _by_agent(read_exports: Iterable[ReadExport], left_out: list[str]) -> CollectedExports:
-    """Group the exports by agent. The latest export has the current state. Earlier ones may contain further blocks."""
+    """Group the exports by agent. The latest export has the current state, but earlier ones may contain further
+    blocks.
+    """
     collected = CollectedExports({}, [], left_out, [])
     for each in read_exports:
         agent_id = each.export.agent_id
@@ -270,7 +272,7 @@ def _by_agent(read_exports: Iterable[ReadExport], left_out: list[str]) -> Collec
 
 
 class _PartialExport(Export):
-    """An export in which every key has a default."""
+    """An export in which every key has a default value."""
 
     agent_id: AgentId | None = None  # type: ignore[assignment]
     exported_at_us: Annotated[int, Field(ge=0, strict=True)] = 0
@@ -285,14 +287,14 @@ class _PartialExport(Export):
 
 
 class _Reader:
-    """A reader of exports. Equal blocks share one object."""
+    """A reader of exports that stores equal blocks once."""
 
     def __init__(self) -> None:
         self._hashes: dict[tuple[int, int, str], str] = {}
         self._blocks: dict[tuple[str, str | None], ExportedBlock] = {}
 
     def read(self, path: Path, *, named_by_user: bool) -> ReadExport:
-        """Read an export.
+        """Read a chain export, and return its undamaged part.
 
         Raises NotAnExportError for a file of another format, and ExportError if no part is usable.
         """
@@ -392,7 +394,7 @@ def _content(path: Path, named_by_user: bool) -> bytes:
 
 
 def _recover(path: Path, data: bytes, problems: list[str]) -> Export:
-    """Return the undamaged parts of an export. `problems` gets a sentence for each error."""
+    """Return the undamaged parts of an export. A sentence about each error is added to `problems`."""
     if _FORMAT not in data:
         raise NotAnExportError(f"{path}: not a chain export")
     text = data.decode("utf-8", errors="replace")
@@ -434,7 +436,7 @@ _FLAT_OBJECT = re.compile(r"\{[^{}]*\}")
 
 
 def _parse_prefix(text: str) -> Any:
-    """Return the complete parts of a truncated JSON value. None if there are none."""
+    """Return the complete parts of a truncated JSON value, or None if there are none."""
     closing: list[str] = []
     complete_end, after = 0, ""
     for token in _TOKEN.finditer(text):
@@ -453,7 +455,7 @@ def _parse_prefix(text: str) -> Any:
 
 
 def _intact_blocks(text: str) -> Iterator[Any]:
-    """Yield each block in a text whose hash is correct, whatever surrounds it."""
+    """Yield each block in a text whose hash is correct, regardless of the surrounding text."""
     for candidate in _FLAT_OBJECT.finditer(text):
         try:
             block = ExportedBlock.model_validate_json(candidate[0])

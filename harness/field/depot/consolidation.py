@@ -1,4 +1,4 @@
-"""Merge the exports of a mission into one ordered record: each block once, its holders, and the missing blocks.
+"""Merge the exports of a mission into one ordered record, with each block once, its holders, and the missing blocks.
 
 Blocks are in the order of `harness.field.depot.record_lines`. The current block of an agent at its export comes after
 them, unless a completed block begins with the same events. In that case both are the same block at different times.
@@ -40,7 +40,7 @@ _HEADER = struct_of(EVENT_FIELDS)
 
 @dataclass(frozen=True)
 class RecordedBlock:
-    """A block of the record, with the event data from which its events are decoded on demand."""
+    """A block of the merged record. Its events are decoded when they are needed."""
 
     line: Block
     event_data: bytes
@@ -55,7 +55,7 @@ class RecordedBlock:
 
 @dataclass
 class Consolidation:
-    """The merged record. `names` has the names of all blocks by hash."""
+    """The merged record of a mission. `names` contains the names of all blocks by hash."""
 
     collected: CollectedExports
     header: Header
@@ -70,18 +70,18 @@ class Consolidation:
 
     @property
     def missing(self) -> list[MissingItem]:
-        """The vehicles without an export."""
+        """The vehicles from which no export was collected."""
         return [lost for lost in self.lost if lost.block is None]
 
     @property
     def unfinished(self) -> list[RecordedBlock]:
-        """The blocks that agents had not completed at their export."""
+        """The blocks that agents had not completed when they exported their chains."""
         return [block for block in self.blocks if block.line.block_hash is None]
 
 
 @gc_paused()
 def consolidate(collected: CollectedExports, depot: "Depot | None" = None) -> Consolidation:
-    """Merge exports into one record.
+    """Merge exports into one record, and return it.
 
     `depot` decrypts event data. Raises ExportError if its key does not fit the mission.
     """
@@ -163,12 +163,12 @@ def _header(
 
 
 def _without_surrogates(text: str) -> str:
-    """Return a text in which bytes of a file name that are no text are question marks."""
+    """Return the text with question marks in place of bytes of a file name that are not valid text."""
     return text.encode(errors="replace").decode()
 
 
 def _event_data(block: ExportedBlock, event_data: EventData) -> tuple[bytes, bool]:
-    """Return the event data of a block, and whether it is still sealed."""
+    """Return the event data of a block, and true if they are still encrypted."""
     try:
         return event_data.of_block(block), False
     except SealedError:
@@ -176,8 +176,8 @@ def _event_data(block: ExportedBlock, event_data: EventData) -> tuple[bytes, boo
 
 
 def events_in(event_data: bytes) -> list[tuple[int, int, int, int]]:
-    """Return the events at the beginning of the data: timestamp, event ID, and the start and end of each event's
-    data.
+    """Return the readable events at the beginning of the data: timestamp, event ID, and the start and end of each
+    event's data.
     """
     events, offset = [], 0
     last_header = len(event_data) - EVENT_HEADER_BYTES
@@ -196,7 +196,7 @@ def _unreadable(event_data: bytes, events: Sequence[tuple[int, int, int, int]]) 
 
 
 def _names(collected: CollectedExports) -> dict[str, str]:
-    """Return the names of the blocks. An edited block has no ordinal."""
+    """Return the names of the blocks by hash. A modified block has no number."""
     claims = collected.claims
     exports: dict[int, Export] = {}
     for agent_id, export in collected.exports.items():
@@ -221,7 +221,7 @@ def _names(collected: CollectedExports) -> dict[str, str]:
 
 
 def _holdings(collected: CollectedExports) -> dict[str, list[Holding]]:
-    """Return the holders of each block, by hash."""
+    """Return, for each block hash, the agents that hold the block."""
     where: dict[str, dict[tuple[Place, int | None, str | None], list[int]]] = defaultdict(lambda: defaultdict(list))
     for agent_id, export in collected.exports.items():
         for position, block in enumerate(export.chain, 1):
@@ -245,9 +245,7 @@ def _holdings(collected: CollectedExports) -> dict[str, list[Holding]]:
 
 
 def _add_unfinished(recorded_blocks: list[RecordedBlock], collected: CollectedExports) -> None:
-    """Add the current blocks of agents: as separate blocks, or as holders of a block that begins with the same
-    events.
-    """
+    """Add the blocks under construction, either as separate blocks or to a block that begins with the same events."""
     building = [
         (base64.b64decode(export.current_block.event_data), export)
         for export in (read_export.export for read_export in collected.read_exports)
@@ -282,7 +280,7 @@ def _add_unfinished(recorded_blocks: list[RecordedBlock], collected: CollectedEx
 
 
 def _forks(chains: Mapping[int, Sequence[str]], names: Mapping[str, str]) -> list[Fork]:
-    """Return the places at which chains fork, the lowest first."""
+    """Return the places at which chains diverge. The lowest is first."""
     forks = []
     to_split = [(0, sorted(chains))]
     while to_split:
@@ -318,7 +316,7 @@ def _lost_blocks(
     names: Mapping[str, str],
     without_export: Sequence[int],
 ) -> list[MissingItem]:
-    """Return the blocks that their agents completed, but no export contains."""
+    """Return the blocks that their agents completed, but that no export contains."""
     lost: dict[str, MissingItem] = {}
     edited = {*collected.claims.values()}
     for read_export in collected.read_exports:

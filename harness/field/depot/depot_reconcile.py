@@ -1,4 +1,4 @@
-"""Reconcile the exports of a mission by the protocol, without vehicles (Section 5.1).
+"""Reconcile the exports of a mission by running the protocol without vehicles (Section 5.1).
 
 Each export is put into an agent, as after a brown-out (`Agent.boot`). The agents run in virtual time on a network
 without loss. One agent after another reconciles, until a round changes no chain, as at the end of a run. Then each
@@ -36,14 +36,14 @@ LIMIT_S = 1e7
 
 @dataclass(frozen=True)
 class Reconciliation:
-    """The exports after the reconcile, by agent, and the line for the record."""
+    """The exports after the reconcile, by agent, and the line for the merged record."""
 
     exports: dict[int, Export]
     line: ReconcileResult
 
 
 def reconcile(record: Consolidation, report_progress: Callable[[str], None] = lambda words: None) -> Reconciliation:
-    """Reconcile the exports of a record with each other. `report_progress` receives texts on the progress."""
+    """Reconcile the exports of a record with each other. `report_progress` is called with texts about the progress."""
     collected = record.collected
     stored = _stored(collected)
 
@@ -71,7 +71,7 @@ def reconcile(record: Consolidation, report_progress: Callable[[str], None] = la
 
 
 async def _play(swarm: RestoredSwarm, agents_with_deque: Iterable[int]) -> int:
-    """Play the reconcile. Returns the number of rounds, in each of which every agent reconciles once."""
+    """Simulate the reconcile. Return the number of rounds, in each of which every agent reconciles once."""
     first, *_ = timeline_of(swarm.scenario)
     await swarm.begin(first)
     await swarm.until_idle(LIMIT_S)
@@ -91,7 +91,7 @@ async def _reconcile(swarm: RestoredSwarm) -> int:
 
 
 def write(reconciliation: Reconciliation, directory: Path) -> None:
-    """Write the exports. Raises MachineError if that is not possible."""
+    """Write the exports after the reconcile. Raises MachineError if that fails."""
     try:
         for agent_id, export in reconciliation.exports.items():
             write_json_atomically(directory / f"{agent_id}{SUFFIX}", export.model_dump(mode="json", by_alias=True))
@@ -100,7 +100,7 @@ def write(reconciliation: Reconciliation, directory: Path) -> None:
 
 
 def _scenario(record: Consolidation) -> Scenario:
-    """Return a mission without events and faults."""
+    """Return a scenario without events and faults."""
     document: dict[str, Any] = {
         "name": "final reconcile",
         "agents": list(record.header.roster),
@@ -122,7 +122,7 @@ def _signatures(collected: CollectedExports) -> dict[bytes, bytes]:
 
 
 def _stored(collected: CollectedExports) -> dict[int, StoredState]:
-    """Return the state that each agent boots with: every block once, without edited blocks."""
+    """Return the initial state of each agent. Every block occurs once, and modified blocks are left out."""
     claims, shared_blocks = collected.claims, dict[str, Block]()
     stored = {}
     held_anywhere = {block.block_hash for export in collected.exports.values() for block in export.blocks()}

@@ -1,4 +1,4 @@
-"""Compare the files of all vehicles, key by key, to find out whether they belong to one mission.
+"""Compare the files of all vehicles key by key, to find out whether they belong to the same mission.
 
 Mission files must agree in all values that a swarm shares, and must differ in the values that are unique per vehicle. A
 manifest has the expected values. Without one, the most frequent values are expected. Chain exports and traces in the
@@ -37,12 +37,12 @@ _EXPECTED = (MISSION_SUFFIX, EXPORT_SUFFIX, TRACE_SUFFIX)
 
 
 class UnreadableFileError(HarnessError):
-    """The file has no comparable format, or is damaged."""
+    """An error: the file cannot be compared, because its format is unknown or it is damaged."""
 
 
 @dataclass(frozen=True)
 class SharedValue:
-    """A value that all files must share. `key` is its key in this file."""
+    """A value that must be the same in all files. `key` is its key in this file."""
 
     key: str
     value: Hashable
@@ -51,7 +51,7 @@ class SharedValue:
 
 @dataclass
 class ComparedFile:
-    """A file of a vehicle, or of the mission."""
+    """A file of a vehicle or of the mission, with the values that are compared."""
 
     path: Path
     kind: Kind
@@ -62,7 +62,7 @@ class ComparedFile:
 
 @dataclass(frozen=True)
 class MissionDifference:
-    """A difference. `file` is None if a file is missing. `key` is None if the whole file is wrong."""
+    """A difference between files. `file` is None if a file is missing, and `key` is None if the whole file is wrong."""
 
     file: Path | None
     key: str | None
@@ -116,7 +116,7 @@ class Comparison:
 
 
 def compare(paths: Iterable[Path]) -> Comparison:
-    """Compare files, and the files in directories.
+    """Compare these files, and the files in these directories.
 
     Raises RunDirectoryError if a path does not exist, or a directory has no files to compare.
     """
@@ -133,7 +133,7 @@ def compare(paths: Iterable[Path]) -> Comparison:
 
 
 def differences(files: Sequence[ComparedFile]) -> list[MissionDifference]:
-    """Return all differences that show that the files do not belong to one mission."""
+    """Return all differences which show that the files do not belong to one mission."""
     found = [*_deviating_values(files), *_duplicate_values(files), *_roster_differences(files)]
     for file in files:
         if file.mission is not None:
@@ -150,7 +150,7 @@ def differences(files: Sequence[ComparedFile]) -> list[MissionDifference]:
 
 
 def read(path: Path) -> ComparedFile:
-    """Read a file. Raises UnreadableFileError with the reason, without the name of the file."""
+    """Read a file. Raises UnreadableFileError with the reason but without the name of the file."""
     document = _beginning(path)
     schema = document.get("schema")
     try:
@@ -277,7 +277,7 @@ def _shown(value: Any) -> str:
 
 
 def _deviating_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
-    """Yield the values that differ from those of the manifest, or of most files."""
+    """Yield the values that differ from those in the manifest, or from those in most files."""
     names = dict.fromkeys(name for file in files for name in file.shared)
     for name in names:
         files_with_value = [file for file in files if name in file.shared]
@@ -304,12 +304,14 @@ def _deviating_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifferen
 
 
 def _has_settings_to_compare(file: ComparedFile, others: Sequence[ComparedFile]) -> bool:
-    """Return whether the single settings are compared, too, so that the fingerprint needs no sentence of its own."""
+    """Return true if single settings can be compared, so that the difference of their hashes needs no separate
+    sentence.
+    """
     return file.mission is not None and any(other.mission is not None for other in others)
 
 
 def _duplicate_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
-    """Yield the values that several mission files share, but that must be unique per vehicle."""
+    """Yield the values that several mission files share although they must be unique for each vehicle."""
     for key in ("agent_id", "network.address", "seed"):
         first: dict[Hashable, ComparedFile] = {}
         for file in files:
@@ -327,7 +329,7 @@ def _duplicate_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifferen
 
 
 def _roster_differences(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
-    """Yield the agents on the roster without a mission file, and the files of agents that are not on it."""
+    """Yield the agents on the roster without a mission file, and the files of agents that are not on the roster."""
     rosters = [file for file in files if ROSTER in file.shared and file.kind in ("manifest", "mission file")]
     if not rosters:
         return
@@ -358,7 +360,7 @@ def _roster_differences(files: Sequence[ComparedFile]) -> Iterator[MissionDiffer
 
 
 def _files(paths: Iterable[Path]) -> list[tuple[Path, bool]]:
-    """Return the files, each once, and whether the user named the file itself."""
+    """Return the files, each once, and for each true if the user named the file itself."""
     files: dict[Path, tuple[Path, bool]] = {}
     for path in paths:
         if path.is_dir():

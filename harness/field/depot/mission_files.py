@@ -1,4 +1,4 @@
-"""The mission files of a roster, and their manifest (`ucp-mission-manifest/1`).
+"""Write the mission files of all agents, and a manifest that describes them (`ucp-mission-manifest/1`).
 
 They equal the files that a run gives to its agents (`harness.play.process.agent_mission`), with some differences for
 real flights. Time has no speedup, and there are no quirks. Each vehicle has an address of the user's network. Each
@@ -69,9 +69,7 @@ class Manifest(BaseModel):
 
 
 def fingerprint(settings: Settings) -> str:
-    """Return the SHA-256 hash of the settings as JSON, with sorted keys, without spaces, and with integers as
-    floats.
-    """
+    """Return the SHA-256 hash of the settings as JSON with sorted keys, without spaces, and with integers as floats."""
     values = {
         name: float(value) if type(value) is int and value < EXACT else value
         for name, value in settings.to_json().items()
@@ -83,12 +81,12 @@ SUFFIX = ".mission.json"
 
 
 class MissionFileError(HarnessError):
-    """The requested mission is not one that an agent accepts."""
+    """An error: no agent would accept the requested mission."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The plan of a mission before it is written. `settings` and `events` override the scenario's values, key by key.
+    """The plan of a mission before it is written. `settings` and `events` override values of the scenario.
 
     The address of a vehicle is given in `addresses`, or is the address in `subnet` with its ID as the number. Without a
     subnet, the address is that of a run (`netem.addresses`). The broadcast address follows from the subnet unless it is
@@ -166,7 +164,7 @@ class Plan:
 
 
 def write(plan: Plan, directory: Path, *, overwrite: bool = False) -> list[Path]:
-    """Write the mission files and the manifest. Returns their paths, the manifest last.
+    """Write the mission files and the manifest. Return their paths. The manifest is last.
 
     Raises MissionFileError, or MachineError on a disk error. Raises RunDirectoryError if a file exists and `overwrite`
     is false, or if the directory has other mission files.
@@ -185,7 +183,7 @@ def write(plan: Plan, directory: Path, *, overwrite: bool = False) -> list[Path]
 
 
 def manifest(name: str, missions: Mapping[str, Mission]) -> Manifest:
-    """Return the manifest of these mission files, at least one, by file name."""
+    """Return the manifest of these mission files, which are given by file name. There must be at least one."""
     first = next(iter(missions.values()))
     return Manifest(
         name=name,

@@ -1,4 +1,4 @@
-"""The lines of a consolidated record (`ucp-consolidated/1`), and the order of its blocks.
+"""Define the lines of a merged record (`ucp-consolidated/1`), and the order of its blocks.
 
     header      first, once: the mission, its exports, and totals
     fork        a place at which chains fork, the lowest first
@@ -192,7 +192,7 @@ class ConsolidatedLine(
 
 
 def mutual_chain(chains: Iterable[Sequence[str]]) -> Sequence[str]:
-    """Return the longest common prefix of the chains."""
+    """Return the longest common beginning of the chains."""
     first, *others = chains
     length = len(first)
     for other in others:
@@ -203,7 +203,7 @@ def mutual_chain(chains: Iterable[Sequence[str]]) -> Sequence[str]:
 
 
 def ordered(blocks: Mapping[str, ExportedBlock], chains: Sequence[Sequence[str]]) -> list[str]:
-    """Return the hashes of `blocks` in the order of the record.
+    """Return the hashes of `blocks` in the order of the merged record.
 
     `blocks` includes all blocks of the chains. There is at least one chain.
     """
@@ -248,7 +248,7 @@ def ordered(blocks: Mapping[str, ExportedBlock], chains: Sequence[Sequence[str]]
 
 
 def _components(after: Mapping[str, set[str]]) -> dict[str, int]:
-    """Return the strongly connected component of each block (Tarjan, 1972).
+    """Return the number of each block's strongly connected component (Tarjan, 1972).
 
     Long chains would exceed the recursion limit, so the function is iterative.
     """

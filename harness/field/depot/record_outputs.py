@@ -1,4 +1,4 @@
-"""The consolidated record as files, and its summary in sentences.
+"""Write a merged record as files, and summarise it in sentences.
 
 The files are JSON Lines (`harness.field.depot.record_lines`), a CSV table, and tracks for maps.
 """
@@ -26,7 +26,7 @@ COLUMNS = (
 
 
 def lines(record: Consolidation, reconciled: ReconcileResult | None = None) -> Iterator[str]:
-    """Yield the lines of the record, each with its line end."""
+    """Yield the lines of the merged record, including line ends."""
     yield _line(record.header)
     yield from map(_line, record.forks)
     for block in record.blocks:
@@ -42,7 +42,7 @@ def _line(line: RecordLine) -> str:
 
 
 def _event_lines(block: RecordedBlock) -> str:
-    """Return the lines of a block's events, as the model `Event` writes them.
+    """Return the lines for a block's events, in the format of the model `Event`.
 
     The model is too slow for a million events.
     """
@@ -83,7 +83,7 @@ def table(record: Consolidation) -> str:
 
 
 def flight_logs(record: Consolidation) -> list[MatchedLog]:
-    """Return the flight logs of vehicles, with their agents."""
+    """Return the flight logs of vehicles, with the agents that flew on them."""
     if not record.collected.flight_logs:
         return []  # the events of all blocks need not be decoded
     logged = {track.agent_id: track.fixes for track in tracks(record)}
@@ -91,7 +91,7 @@ def flight_logs(record: Consolidation) -> list[MatchedLog]:
 
 
 def flown_tracks(matches: Iterable[MatchedLog]) -> list[Track]:
-    """Return the track of each flight log that has an agent, by the clock of the log."""
+    """Return the path in each flight log that belongs to an agent, by the clock of the log."""
     return [
         Track(match.agent_id, [], [_fix(position) for position in match.vehicle.positions])
         for match in matches
@@ -106,7 +106,9 @@ def _fix(position: Position) -> tuple[int, RoundedPosition]:
 
 
 def tracks(record: Consolidation) -> list[Track]:
-    """Return the track of each agent that logged positions, by agent ID. Empty if events are no telemetry."""
+    """Return the path of each agent that logged positions, by agent ID. There is none if the events are not
+    telemetry.
+    """
     logged: dict[int, list[tuple[LoggableEvent, str]]] = {}
     for block in record.blocks if record.collected.telemetry else ():
         name = block.line.name
@@ -122,7 +124,7 @@ MAX_NAMES = 8
 def in_words(
     record: Consolidation, reconciled: ReconcileResult | None = None, *, opened: bool = False
 ) -> Iterator[str]:
-    """Yield the summary: exports, forks, blocks on one vehicle only, lost blocks, and the result of a reconcile.
+    """Yield sentences about the exports, diverged chains, blocks on one vehicle only, lost blocks, and the reconcile.
 
     `opened` is true if the depot's key was given.
     """
@@ -177,7 +179,7 @@ def branch_in_words(branch: ForkBranch) -> str:
 
 
 def missing_in_words(lost: Sequence[MissingItem]) -> Iterator[str]:
-    """Yield a sentence for each agent whose blocks were lost for the same reason."""
+    """Yield a sentence for each group of lost blocks of one agent with the same reason."""
     by_reason: dict[str, list[MissingItem]] = {}
     for each in lost:
         by_reason.setdefault(each.why, []).append(each)

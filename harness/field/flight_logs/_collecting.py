@@ -1,4 +1,4 @@
-"""Collect the records of a log: detect jumps of its clock, and convert times to UTC.
+"""Collect the records in a flight log, detect jumps of its clock, and convert its times to UTC.
 
 A clock segment is the part of a log between two jumps of its clock. In each segment, a time is converted by straight
 lines through the medians of GPS time in each ten seconds. Medians ignore single late or damaged records. The lines
@@ -26,7 +26,9 @@ Kind = TypeVar("Kind", bound=FlightRecord)
 
 
 class LogClock:
-    """The clock of a log. A single record with a wrong time is dropped; consistent new times are a jump."""
+    """The clock of a flight log. A single record with a wrong time is dropped, but several consistent new times are a
+    jump.
+    """
 
     def __init__(self) -> None:
         self.jumps: list[ClockJump] = []
@@ -39,7 +41,7 @@ class LogClock:
         return self._last_us is not None
 
     def accepts(self, at_us: int) -> bool:
-        """Return whether a record with this time may be used. The caller compares `jumps` to detect a new segment."""
+        """Return true if a record with this time may be used. After a jump, `jumps` has increased."""
         if not 0 <= at_us <= MAX_TIME_US:
             self.dropped += 1
             return False
@@ -58,7 +60,7 @@ def _consistent(before_us: int, after_us: int) -> bool:
 
 
 class Budget:
-    """The number of records that may still be kept from a file."""
+    """The number of records that may still be stored from a file."""
 
     def __init__(self) -> None:
         self.left = MAX_RECORDS
@@ -69,7 +71,7 @@ class Budget:
 
 
 class Collector:
-    """The records of one source, such as a vehicle."""
+    """A collector for the records of one source, such as a vehicle."""
 
     def __init__(self, budget: Budget) -> None:
         self._budget = budget
@@ -80,30 +82,30 @@ class Collector:
         self._last_state: dict[type[Any], Hashable] = {}
 
     def add(self, record: FlightRecord) -> bool:
-        """Keep a record. Its UTC follows at the end of the segment. Return False if the limit is reached."""
+        """Store a record. Its time is converted later. Return False if the limit is reached."""
         kept = self._budget.take()
         if kept:
             self._records.setdefault(type(record), []).append(record)
         return kept
 
     def add_gps_time(self, time: GpsTime) -> bool:
-        """Keep the time, at most once per second. Return whether it was kept."""
+        """Store a GPS time, at most one per second. Return true if it was stored."""
         if not self._is_due(GpsTime, time.at_us, None) or not self.add(time):
             return False
         self.use_gps_time(time)
         return True
 
     def use_gps_time(self, time: GpsTime) -> None:
-        """Use the time to convert the records of this collector, without keeping it as a record."""
+        """Use a GPS time to convert the times of this collector's records, without storing it as a record."""
         self._times.setdefault(time.at_us // _BIN_US, []).append((time.at_us, time.utc_us))
 
     def add_sample(self, record: FlightRecord, source: Hashable, state: Hashable = None) -> None:
-        """Keep a record if the last one of this source is a second old or has another state."""
+        """Store a record if the previous one from this source is a second old or has a different state."""
         if self._is_due((type(record), source), record.at_us, state):
             self.add(record)
 
     def add_change(self, record: FlightRecord, state: Hashable) -> None:
-        """Keep a record if its state differs from that of the last one of its type."""
+        """Store a record if its state differs from that of the previous record of its type."""
         if self._last_state.get(type(record), _UNKNOWN) != state:
             self._last_state[type(record)] = state
             self.add(record)
@@ -137,12 +139,14 @@ class Collector:
                 records[index] = records[index]._replace(utc_us=to_utc(records[index].at_us))
 
     def records_of(self, kind: type[Kind]) -> list[Kind]:
-        """Return the records of a type in the order of the file."""
+        """Return the records of one type in the order of the file."""
         return self._records.get(kind, [])
 
 
 class _Line:
-    """Straight lines through points (time on the log's clock, UTC), continued before the first and after the last."""
+    """Straight lines through points (time on the log's clock, UTC). They continue before the first and after the last
+    point.
+    """
 
     def __init__(self, points: list[tuple[int, int]]) -> None:
         self._points = points

@@ -1,4 +1,4 @@
-"""DataFlash, the binary log that ArduPilot writes on the vehicle.
+"""Read DataFlash, the binary log that ArduPilot writes on the vehicle.
 
 Each message begins with A3 95 and the number of its type. Messages of type FMT define the other types: name, length,
 types and names of the columns. A message has no checksum. So a message counts only if another one, or the end of the
@@ -64,7 +64,7 @@ class _Definition(NamedTuple):
 
 
 class DataFlashReader:
-    """A reader of one file. `read` fills the collectors."""
+    """A reader of one DataFlash file. Its method `read` stores the records in collectors."""
 
     def __init__(self) -> None:
         budget = Budget()
@@ -102,7 +102,7 @@ class DataFlashReader:
         self.gps_positions.end_segment()
 
     def _messages(self, stream: BinaryIO) -> Iterator[tuple[_Definition, bytes, int]]:
-        """Yield the messages to decode: definition, buffer and the position of the first column."""
+        """Yield the messages to decode, each as its definition, the buffer, and the position of its first column."""
         lengths = [0] * 256
         lengths[FMT] = _FMT_BYTES
         definitions: dict[int, _Definition] = {}

@@ -1,4 +1,4 @@
-"""Damaged parts of a log, and plausible values."""
+"""Count damaged parts of a flight log, and check whether values are plausible."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ _ALTITUDES_M = (-1000.0, 100_000.0)
 
 @dataclass
 class Damage:
-    """The bytes of a file that are no message."""
+    """The bytes of a flight log that do not belong to a message."""
 
     searches: int = 0
     skipped_bytes: int = 0
@@ -50,7 +50,7 @@ class Damage:
 
 
 def is_place(lat_deg: float, lon_deg: float, alt_m: float) -> bool:
-    """Return whether these are a position on Earth.
+    """Return true if these values are a position on Earth.
 
     A vehicle that does not know its position yet reports a place near 0° N, 0° E.
     """

@@ -1,4 +1,4 @@
-"""Recognise the format of a flight log and read it."""
+"""Recognise the format of a flight log and read the file."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,7 +33,7 @@ _SUFFIXES: dict[str, LogKind] = {".bin": "DataFlash", ".tlog": "telemetry"}
 
 
 def flight_log_kind(path: Path, beginning: bytes) -> LogKind | None:
-    """Return the format of a file with this content at its beginning. None if it is no flight log.
+    """Return the format of the flight log that begins with these bytes, or None if it is not a flight log.
 
     A damaged beginning is recognised by the suffix of the file, together with a mark of the format.
     """
@@ -50,7 +50,7 @@ def flight_log_kind(path: Path, beginning: bytes) -> LogKind | None:
 
 @gc_paused()
 def read_flight_log(path: Path) -> FlightLog:
-    """Read a flight log, which may be packed with gzip.
+    """Read a flight log. The file may be compressed with gzip.
 
     Raises FieldError if the file cannot be read, or is no flight log. Every other problem is a sentence in the result.
     """

@@ -1,4 +1,4 @@
-"""The records of a flight log. The times of a record are explained in the docstring of the package."""
+"""Define the records in a flight log. The docstring of the package explains their times."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ class Position(NamedTuple):
 
 
 class ModeChange(NamedTuple):
-    """A flight mode that begins, and the mode at the beginning of the log."""
+    """A new flight mode, or the mode at the beginning of the log."""
 
     at_us: int
     utc_us: int | None
@@ -31,7 +31,7 @@ class ModeChange(NamedTuple):
 
 
 class Arming(NamedTuple):
-    """The vehicle is armed or disarmed. The state at the beginning of the log is included."""
+    """The arming or disarming of the vehicle, or its state at the beginning of the log."""
 
     at_us: int
     utc_us: int | None
@@ -39,7 +39,7 @@ class Arming(NamedTuple):
 
 
 class Battery(NamedTuple):
-    """The state of a battery, at most one record per second for each battery."""
+    """The state of a battery. There is at most one record per second for each battery."""
 
     at_us: int
     utc_us: int | None
@@ -50,7 +50,7 @@ class Battery(NamedTuple):
 
 
 class GpsStatus(NamedTuple):
-    """The state of a GPS receiver, at most one record per second for each receiver and fix type."""
+    """The state of a GPS receiver. There is at most one record per second for each receiver and fix type."""
 
     at_us: int
     utc_us: int | None
@@ -62,7 +62,7 @@ class GpsStatus(NamedTuple):
 
 
 class EkfStatus(NamedTuple):
-    """The state of the EKF in use, at most one record per second for the same flags.
+    """The state of the active position filter (EKF). There is at most one record per second for the same flags.
 
     A variance is the square root of the normalised innovation test ratio. Above 1 the EKF rejects the measurement.
     """
@@ -78,7 +78,7 @@ class EkfStatus(NamedTuple):
 
 
 class GpsTime(NamedTuple):
-    """GPS time at a moment of the log's clock, at most one record per second."""
+    """The GPS time at a time on the log's clock. There is at most one record per second."""
 
     at_us: int
     utc_us: int
@@ -115,7 +115,7 @@ class Parameter(NamedTuple):
 
 
 class ClockJump(NamedTuple):
-    """A jump of the log's clock: two records with consistent new times follow a record with the old time.
+    """A jump of the log's clock. Two records with consistent new times follow a record with the old time.
 
     A restart of the autopilot, a corrected clock of the computer, and a pause of the log look the same. Only a clock
     that goes back is certainly wrong.
@@ -133,7 +133,7 @@ FlightRecord: TypeAlias = (
 
 @dataclass(frozen=True)
 class VehicleLog:
-    """The records of one vehicle in a log."""
+    """The records of one vehicle in a flight log."""
 
     vehicle: int | None
     """The MAVLink system ID. None if a DataFlash log does not have the parameter."""
@@ -160,7 +160,7 @@ class VehicleLog:
 
 @dataclass(frozen=True)
 class FlightLog:
-    """The content of one file."""
+    """The content of one flight log file."""
 
     path: Path
     kind: LogKind

@@ -1,4 +1,4 @@
-"""Summarise a flight log: one sentence, and a list of changes along time."""
+"""Summarise a flight log in one sentence, and list the changes over time."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ MAX_NAMED_MODES = 8
 
 @dataclass(frozen=True)
 class LoggedChange:
-    """A change of a vehicle. `at_us` is UTC by GPS, or the time on the clock of the log without GPS time."""
+    """A change of a vehicle. `at_us` is UTC by GPS, or the time on the log's own clock without GPS time."""
 
     at_us: int
     agent_id: int | None
@@ -24,7 +24,7 @@ class LoggedChange:
 
 
 def in_words(match: MatchedLog) -> str:
-    """Return a sentence on a log: its agent, its clock, and its records."""
+    """Return a sentence about a flight log: its agent, its clock, and its records."""
     log, vehicle = match.log, match.vehicle
     owner = (
         f"is of agent {match.agent_id} by {match.evidence}" if match.agent_id else f"matches no agent: {match.evidence}"
@@ -60,7 +60,9 @@ def _contents(match: MatchedLog) -> Iterator[str]:
 
 
 def changes(match: MatchedLog) -> list[LoggedChange]:
-    """Return the modes, the arming, and the beginnings and ends of GPS and EKF problems, in time order."""
+    """Return the changes in order of time: flight modes, arming, and the beginnings and ends of GPS and filter
+    problems.
+    """
     vehicle, agent_id = match.vehicle, match.agent_id
     found = [LoggedChange(_time(mode), agent_id, f"mode {mode.name}") for mode in vehicle.modes]
     found += [LoggedChange(_time(arm), agent_id, "armed" if arm.armed else "disarmed") for arm in vehicle.arming]

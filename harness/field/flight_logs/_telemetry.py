@@ -1,4 +1,4 @@
-"""Telemetry logs: MAVLink frames of version 1 or 2, each after the time of its arrival.
+"""Read telemetry logs: MAVLink frames of version 1 or 2, each after the time of its arrival.
 
 The time is a big-endian u64 in microseconds since the Unix epoch. A frame of a known message counts only with the right
 checksum. A frame of another message counts if a frame or the end of the file follows it.
@@ -41,7 +41,7 @@ Values = dict[str, Any]
 
 
 class SystemLog:
-    """The records of one MAVLink system."""
+    """The records of one sender (MAVLink system) in a telemetry log."""
 
     def __init__(self, budget: Budget) -> None:
         self.collector = Collector(budget)
@@ -50,7 +50,7 @@ class SystemLog:
 
 
 class TelemetryReader:
-    """A reader of one file. `read` fills the collectors."""
+    """A reader of one telemetry log. Its method `read` stores the records in collectors."""
 
     def __init__(self) -> None:
         self.budget = Budget()
@@ -86,7 +86,7 @@ class TelemetryReader:
             system.collector.end_segment()
 
     def _frames(self, stream: BinaryIO) -> Iterator[tuple[int, int, int, int, bytes]]:
-        """Yield time, system ID, component ID, message ID and payload of each frame."""
+        """Yield the time, system ID, component ID, message ID and payload of each frame."""
         buffer, at, offset, at_end, messages = b"", 0, 0, False, 0
         while True:
             if len(buffer) - at < 2 * _MAX_FRAME_BYTES and not at_end:
@@ -203,7 +203,7 @@ _HANDLERS: dict[int, Callable[[TelemetryReader, SystemLog, int, Values], None]] 
 
 
 def begins_with_frame(beginning: bytes) -> bool:
-    """Return whether a time and a known frame with the right checksum begin the bytes."""
+    """Return true if the bytes begin with a time and a known frame with the right checksum."""
     return (frame := _frame_at(beginning, _STAMP_BYTES)) is not None and frame[3] in mavlink.mavlink_map
 
 
@@ -217,7 +217,9 @@ def _values(message: int, payload: bytes) -> Values:
 
 
 def _frame_at(buffer: bytes, at: int) -> tuple[int, int, int, int, bytes] | None:
-    """Return the frame at a position, if there is one: its end, system ID, component ID, message ID and payload."""
+    """Return the end, system ID, component ID, message ID and payload of the frame at a position, or None if there is
+    none.
+    """
     if len(buffer) < at + _STAMP_BYTES:
         return None
     length = buffer[at + 1]

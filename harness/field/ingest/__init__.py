@@ -1,4 +1,4 @@
-"""Ingest the files of a flight: find out the agent, the flight and the usable part of each file.
+"""Read all files of a flight, and find out the agent, the flight and the usable part of each file.
 
 Field data is often broken. Lines are truncated, two flights are in one file, a file exists twice, and unrelated files
 lie in the same directory. Ingesting uses everything usable, and reports everything that it leaves out.

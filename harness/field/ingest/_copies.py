@@ -1,4 +1,4 @@
-"""Combine several files of the same incarnation of an agent. One copy may contain the lines that another has lost."""
+"""Combine several copies of the same trace. One copy may contain the lines that another one has lost."""
 
 from collections.abc import Iterator
 
@@ -11,7 +11,7 @@ from ucp.trace import HandlerRun
 def split_into_flights(
     incarnations: list[TraceIncarnation], left_out: list[Omission]
 ) -> Iterator[list[TraceIncarnation]]:
-    """Yield groups of incarnations of one agent with the same header. Each group belongs to one flight.
+    """Yield groups of traces of one agent with the same header. Each group belongs to one flight.
 
     Successive incarnations belong to the same flight, overlapping ones to different flights. Copies are combined into
     one.
@@ -52,7 +52,7 @@ def split_into_flights(
 
 
 def _quality(incarnation: TraceIncarnation) -> tuple[bool, int, int]:
-    """Return a sort key for copies.
+    """Return a sort key that puts the best copy of a trace first.
 
     Copies without clock jumps are best, then longer ones, then those with fewer gaps.
     """
@@ -60,12 +60,12 @@ def _quality(incarnation: TraceIncarnation) -> tuple[bool, int, int]:
 
 
 def _key(run: HandlerRun) -> tuple[object, ...]:
-    """Return a key that identifies a handler run within an incarnation."""
+    """Return a key that identifies a handler run within a trace."""
     return round(run.t, 3), run.handler, run.trigger, run.branch, run.state.chain, run.state.top
 
 
 def _is_copy(incarnation: TraceIncarnation, other: TraceIncarnation) -> bool:
-    """Return whether most handler runs of `incarnation` are also in `other`."""
+    """Return true if most handler runs of one trace are also in the other."""
     if not incarnation.runs:
         return not other.runs and incarnation.path != other.path
     if incarnation.runs == other.runs[: len(incarnation.runs)]:
@@ -77,7 +77,7 @@ def _is_copy(incarnation: TraceIncarnation, other: TraceIncarnation) -> bool:
 
 
 def _overlap(incarnation: TraceIncarnation, other: TraceIncarnation, *, anywhere: bool = False) -> bool:
-    """Return whether the times of two incarnations overlap, so that they cannot belong to the same flight.
+    """Return true if the times of two traces overlap, so that they cannot belong to the same flight.
 
     Incarnations in the same file follow each other, whatever their times are. With `anywhere` this does not count.
     """
@@ -87,7 +87,7 @@ def _overlap(incarnation: TraceIncarnation, other: TraceIncarnation, *, anywhere
 
 
 def _fill_gaps(incarnation: TraceIncarnation, copy: TraceIncarnation) -> int:
-    """Insert the handler runs that `incarnation` lacks and `copy` has. Returns the number of inserted runs."""
+    """Insert the handler runs that one trace lacks and its copy contains. Return their number."""
     where = {_key(run): position for position, run in enumerate(copy.runs)}
     broken = {gap.position for gap in copy.gaps}
     added_runs = 0

@@ -1,4 +1,4 @@
-"""Find the owner of files that do not name it: the mission of a capture, and the flight of public keys."""
+"""Find the mission of a packet capture, and the flight of a file with public keys. Neither file names it."""
 
 import base64
 from collections.abc import Iterator, Sequence
@@ -20,7 +20,7 @@ MAX_FRAMES_READ = 5000
 
 @dataclass(frozen=True)
 class CaptureSummary:
-    """The facts about a capture that identify its flight.
+    """The facts about a packet capture that identify its flight.
 
     `hashes` are the block and chain hashes in its datagrams, in hex.
     """
@@ -34,7 +34,7 @@ class CaptureSummary:
 
 
 def summarise_capture(path: Path, left_out: list[Omission], opener: "Opener | None" = None) -> CaptureSummary | None:
-    """Read the beginning of a capture. Returns None if it contains no UCP datagram. `opener` decrypts sealed datagrams.
+    """Read the beginning of a capture. Return None if it contains no UCP datagram. `opener` decrypts secured datagrams.
 
     Raises CaptureError if the file cannot be read.
     """
@@ -55,7 +55,9 @@ PUBLIC_SCHEMA = '"ucp-keys/1"'
 
 
 def read_public_keys(path: Path, left_out: list[Omission]) -> "PublicKeys | None":
-    """Return the public keys in a file. None if they are unusable. `left_out` then has the reason. Raises OSError."""
+    """Return the public keys in a file, or None if they cannot be used. Then `left_out` has the reason. Raises
+    OSError.
+    """
     try:
         from ucp.secure.bundle import load_public
         from ucp.secure.keyfile import KeyFileError
@@ -72,7 +74,7 @@ def read_public_keys(path: Path, left_out: list[Omission]) -> "PublicKeys | None
 def assign_keys(
     flights: Sequence[Flight], found: Sequence[tuple[Path, "PublicKeys"]], left_out: list[Omission]
 ) -> None:
-    """Assign to each flight the public keys that verify a signature in its exports.
+    """Assign to each flight the public keys with which a signature in its exports is valid.
 
     If any block is signed, unused keys belong to another mission and are left out.
     """
@@ -94,7 +96,7 @@ def _signed(flight: Flight) -> Iterator[ExportedBlock]:
 
 
 def _has_signed(keys: "PublicKeys", block: ExportedBlock) -> bool:
-    """Return whether the signature of a block is valid under these keys."""
+    """Return true if the signature of a block is valid with these keys."""
     from ucp.secure.block_signature import block_claim
     from ucp.secure.crypto_suite import verify
 

@@ -1,4 +1,4 @@
-"""Find the files to ingest: the given files, and the files in given directories, each once.
+"""Find the files to read: the given files, and the files in the given directories, each once.
 
 FIFOs, devices and loops of links are left out.
 """
@@ -63,7 +63,7 @@ def files_of(paths: Iterable[Path], left_out: list[Omission]) -> list[Path]:
 
 
 def is_incarnation_copy(path: Path) -> bool:
-    """Return whether a run kept this file for one incarnation.
+    """Return true if a run wrote this file for one start of an agent, in addition to the whole file.
 
     The files of the agent usually contain the same records.
     """
@@ -98,5 +98,5 @@ def _walk(
 
 
 def _files_first(path: Path) -> tuple[bool, int, str]:
-    """Return a sort key: files before directories, and 9 before 10."""
+    """Return a sort key that puts files before directories, and 9 before 10."""
     return path.is_dir(), len(path.name), path.name

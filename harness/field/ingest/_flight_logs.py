@@ -36,7 +36,7 @@ def assign_flight_logs(
 
 
 def _logged_positions(flight: Flight) -> dict[int, list[tuple[int, Position]]]:
-    """Return the positions that each agent logged, in time order, from all known blocks."""
+    """Return the positions that each agent logged, in order of time, from all known blocks."""
     found: dict[int, dict[int, Position]] = {agent_id: {} for agent_id in {*flight.agents, *flight.roster}}
     data = {(block.agent_id, block.event_bytes) for export in flight.exports.values() for block in export.blocks()}
     data |= {(agent_id, b64decode(export.current_block.event_data)) for agent_id, export in flight.exports.items()}

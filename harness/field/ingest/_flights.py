@@ -27,7 +27,7 @@ from ucp.trigger import TimerTrigger
 
 
 class _Mission(NamedTuple):
-    """The mission in a header: BD_0 in base64 if present, the roster, and mission second 0."""
+    """The mission in a trace header: the inception data in base64 if present, the roster, and the start time."""
 
     initial_data: str | None
     roster: tuple[int, ...]
@@ -36,7 +36,7 @@ class _Mission(NamedTuple):
 
 @dataclass
 class _FlightRecords:
-    """The records of one flight so far. `hashes` are the hashes of its blocks and chains, in hex."""
+    """The records of one flight so far. `hashes` contains the hashes of its blocks and chains in hexadecimal."""
 
     mission: _Mission
     incarnations: dict[int, list[TraceIncarnation]] = field(default_factory=lambda: defaultdict(list))
@@ -62,7 +62,7 @@ class _FlightRecords:
 
     @cached_property
     def time_span(self) -> tuple[float, float]:
-        """The times of the first and the last handler run, in seconds of the blocks' timestamps."""
+        """The times of the first and the last handler run, in seconds since the Unix epoch by the agents' clocks."""
         times = [
             run.t
             for incarnations in self.incarnations.values()
@@ -81,7 +81,7 @@ def group_by_flight(
     left_out: list[Omission],
     remarks: list[Remark],
 ) -> list[Flight]:
-    """Return the flights, the one with the most records first."""
+    """Return the flights. The one with the most records is first."""
     groups, without_header = _by_mission(incarnations, left_out)
     for path, export in exports:
         _add_export(groups, path, export, left_out)
@@ -101,7 +101,7 @@ def group_by_flight(
 def _by_mission(
     incarnations: Iterable[TraceIncarnation], left_out: list[Omission]
 ) -> tuple[list[_FlightRecords], list[TraceIncarnation]]:
-    """Return the records of each mission and mission second 0, and the incarnations without a header."""
+    """Return the records of each mission with the same start time, and the traces without a header."""
     by_header: dict[tuple[_Mission, int], list[TraceIncarnation]] = defaultdict(list)
     without_header: list[TraceIncarnation] = []
     last: TraceIncarnation | None = None
@@ -214,7 +214,9 @@ def _hashes_of(incarnation: TraceIncarnation) -> set[str]:
 def _add_without_header(
     groups: list[_FlightRecords], incarnation: TraceIncarnation, left_out: list[Omission], remarks: list[Remark]
 ) -> None:
-    """Add an incarnation without a header. It gets the header of the flight with the most shared hashes."""
+    """Add a trace without a header to the flight with which it shares the most hashes, and give it that flight's
+    header.
+    """
     agent_id, hashes = incarnation.agent_id, _hashes_of(incarnation)
     if agent_id is None or not incarnation.runs:
         left_out.append(Omission(incarnation.path, "its header is lost, so its agent is unknown"))
@@ -256,7 +258,9 @@ MAX_DRIFT = 0.05
 
 
 def _drift(incarnation: TraceIncarnation) -> float:
-    """Return the drift of an agent's clock, by the timer that expired soonest for its duration. 0 without timers."""
+    """Return the drift of an agent's clock, from the timer that expired earliest relative to its duration. It is 0
+    without timers.
+    """
     started: dict[str, tuple[float, float]] = {}
     drifts = []
     for run in incarnation.runs:
@@ -320,7 +324,7 @@ def _inception(records: _FlightRecords) -> str:
 
 
 def _inception_chain_hash(records: _FlightRecords) -> str | None:
-    """Return CH_0 (eq. 3.4), which all flights of the mission share."""
+    """Return the chain hash CH_0 (eq. 3.4) of the mission, which is the same for all its flights, or None."""
     data = _decoded(records.mission.initial_data)
     return None if data is None else InceptionBlock(data).chain_hash.hex()
 
@@ -362,7 +366,7 @@ def _add_capture(groups: list[_FlightRecords], capture: CaptureSummary) -> None:
 
 
 def _add_logged(groups: list[_FlightRecords], path: Path, agent_id: int, event: LoggableEvent) -> None:
-    """Assign an event to the flight in progress at its time, else to the flight with files in the same directory."""
+    """Assign an event to the flight in progress at its time, or else to the flight with files in the same directory."""
 
     def under_way(records: _FlightRecords) -> bool:
         start_s, end_s = records.time_span

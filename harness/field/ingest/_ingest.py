@@ -1,4 +1,4 @@
-"""The result of ingesting files: flights, and remarks on the files."""
+"""Represent the result of reading many files: flights, and remarks on files."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Remark:
-    """A remark on a file, or on a line of it. `why` completes a sentence, as in "it is not of this mission"."""
+    """A remark on a file or one of its lines. `why` completes a sentence, as in "it is not of this mission"."""
 
     path: Path
     why: str
@@ -34,7 +34,7 @@ class Remark:
 
 @dataclass(frozen=True)
 class Omission(Remark):
-    """A file, or a part of it, that is not used, with the reason."""
+    """A file, or a part of a file, that is not used, with the reason."""
 
 
 @dataclass
@@ -64,7 +64,7 @@ class Flight:
 
     @property
     def agents(self) -> list[int]:
-        """The IDs of all agents with any record, ascending."""
+        """The IDs of all agents with any record, in ascending order."""
         return sorted({*self.traces, *self.exports, *self.captures, *self.logged})
 
     @property
@@ -74,7 +74,7 @@ class Flight:
 
 @dataclass
 class IngestResult:
-    """The flights in some files, the one with the most records first, and the omitted files.
+    """The flights in the files (the one with the most records first), and the omitted files.
 
     `remarks` concern files that are used, for example a changed clock or a header taken from another agent's trace.
     """
@@ -84,7 +84,7 @@ class IngestResult:
     remarks: list[Remark] = field(default_factory=list)
 
     def largest(self) -> Flight:
-        """Return the flight with the most records. Raises FieldError if nothing is usable."""
+        """Return the flight with the most records. Raises FieldError if no file is usable."""
         if not self.flights:
             why = f": {self.left_out[0].sentence}" if self.left_out else ""
             error = FieldError(f"none of these files is a usable trace, chain export or capture{why}")
@@ -93,7 +93,7 @@ class IngestResult:
         return self.flights[0]
 
     def sentences(self) -> Iterator[str]:
-        """Yield sentences for the user: omissions, remarks, and the further flights."""
+        """Yield sentences for the user about omitted files, remarks, and further flights."""
         yield from (left_out.sentence for left_out in self.left_out)
         yield from (remark.sentence for remark in self.remarks)
         for flight in self.flights[1:]:

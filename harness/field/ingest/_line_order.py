@@ -1,4 +1,4 @@
-"""Put the lines of a damaged trace back into order: lines that were swapped, and lines that are there twice.
+"""Repair the order of lines in a damaged trace, in which lines were swapped or occur twice.
 
 Only lines that cannot be right where they are count: the time goes back for one line, a handler comes before the one
 that triggered it, or an effect on record happens twice.
@@ -16,7 +16,7 @@ MAX_REPEATED = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Reordered:
-    """A place that was put in order: the first and the last position of its runs, as they were, and the reason."""
+    """A part of a trace that was repaired: its first and last position before the repair, and the reason."""
 
     first: int
     last: int
@@ -24,7 +24,7 @@ class Reordered:
 
 
 def in_order(runs: Sequence[HandlerRun]) -> tuple[list[int], list[Reordered]]:
-    """Return the positions of the runs to keep, in the right order, and the places that were put in order."""
+    """Return the positions of the handler runs to keep, in the right order, and the parts that were repaired."""
     places = [*_repeated(runs)]
     repeated = {position for place in places for position in range(place.first, place.last + 1)}
     order = [position for position in range(len(runs)) if position not in repeated]
@@ -64,7 +64,7 @@ def _repeated(runs: Sequence[HandlerRun]) -> Iterator[Reordered]:
 
 
 def _happens_once(part: Sequence[HandlerRun]) -> bool:
-    """Return whether the runs have an effect that no agent has twice at the same time."""
+    """Return true if the runs have an effect that no agent can have twice at the same time."""
     return any(
         run.changes or run.sent or run.tally or run.started or not isinstance(run.trigger, MessageTrigger)
         for run in part
@@ -72,7 +72,7 @@ def _happens_once(part: Sequence[HandlerRun]) -> bool:
 
 
 def _triggers_next(runs: Sequence[HandlerRun], position: int) -> bool:
-    """Return whether the run at this position was triggered by the one before it."""
+    """Return true if the run at this position was triggered by the run before it."""
     if position >= len(runs):
         return False
     trigger = runs[position].trigger
@@ -80,7 +80,7 @@ def _triggers_next(runs: Sequence[HandlerRun], position: int) -> bool:
 
 
 def _are_swapped(runs: Sequence[HandlerRun], order: Sequence[int], number: int) -> bool:
-    """Return whether the run at `number` belongs after the next one."""
+    """Return true if the run at `number` belongs after the next one."""
     first, second = runs[order[number]], runs[order[number + 1]]
     before_s = runs[order[number - 1]].t if number else 0.0
     if second.t < first.t:
@@ -94,7 +94,7 @@ def _are_swapped(runs: Sequence[HandlerRun], order: Sequence[int], number: int) 
 
 
 def _is_triggered_later(runs: Sequence[HandlerRun], order: Sequence[int], number: int) -> bool:
-    """Return whether the handler that triggered this run ran next, and not before."""
+    """Return true if the handler that triggered this run appears after it, and not before it."""
     trigger = runs[order[number]].trigger
     assert isinstance(trigger, LocalTrigger)
     for position in reversed(order[:number]):

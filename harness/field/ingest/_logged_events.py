@@ -1,4 +1,4 @@
-"""Events for agents to log, recorded by a separate recorder: `ucp-events/1`, one JSON object per line.
+"""Read events that a separate recorder wrote (`ucp-events/1`, one JSON object per line).
 
 {"schema": "ucp-events/1", "agent_id": 7, "time_us": 1790000000000000, "event_id": 3, "data": "<base64>"}
 """
@@ -45,7 +45,7 @@ class EventLine(BaseModel):
 
 
 def read_logged(path: Path, left_out: list[Omission]) -> list[tuple[int, LoggableEvent]]:
-    """Return the events in a file, each with its agent. Empty if the file has another format. Raises OSError."""
+    """Return the events in a file, each with its agent. The list is empty for another format. Raises OSError."""
     events: list[tuple[int, LoggableEvent]] = []
     damaged: list[int] = []
     with BoundedFile(path) as file:

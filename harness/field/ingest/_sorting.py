@@ -42,7 +42,7 @@ _BLANK = " \t\r\n\0\ufeff"
 
 @gc_paused()
 def ingest_files(paths: Iterable[Path], opener: "Opener | None" = None) -> IngestResult:
-    """Return the records in files and directories, by flight. File names and damage do not matter.
+    """Return the records in files and directories, grouped by flight. File names and damage do not matter.
 
     `opener` decrypts captures of a secured mission. Raises FieldError if a path does not exist. Every other problem is
     reported in `left_out` of the result.
@@ -55,7 +55,7 @@ def ingest_files(paths: Iterable[Path], opener: "Opener | None" = None) -> Inges
 
 
 class Sorter:
-    """A collector of records.
+    """Collects records from files, and sorts them by flight.
 
     It reads files of the harness, and accepts the records that adapters read from other files.
     """
@@ -71,7 +71,7 @@ class Sorter:
         self._left_out = left_out
 
     def result(self) -> IngestResult:
-        """Return the flights of all records so far."""
+        """Return the flights in all files so far."""
         remarks: list[Remark] = []
         flights = group_by_flight(self.incarnations, self.exports, self.captures, self.logged, self._left_out, remarks)
         assign_flight_logs(flights, self.flight_logs, self._left_out, remarks)
@@ -79,7 +79,7 @@ class Sorter:
         return IngestResult(flights, [*_summarise(self._left_out)], remarks)
 
     def add_file(self, path: Path) -> None:
-        """Recognise a file and read it."""
+        """Recognise the format of a file, and read it."""
         try:
             with BoundedFile(path) as file:
                 beginning = file.peek(4096)[:4096]
@@ -121,7 +121,7 @@ class Sorter:
         self.add_exports(path, text)
 
     def add_exports(self, path: Path, text: str, line: int | None = None, counts: str = "line") -> None:
-        """Add the exports in a text. `line` is the position of the text in its file, if it is only a part."""
+        """Add the exports in a text. If the text is only a part of its file, `line` is its position there."""
         try:
             for document in _documents(text.strip(_BLANK)):
                 self.exports.append((path, parse_export(path, document)))
@@ -160,7 +160,7 @@ def _describe_content(data: bytes) -> str:
 
 
 def _summarise(left_out: list[Omission]) -> Iterator[Omission]:
-    """Yield the omissions. Many files of one directory with the same reason are combined into one omission."""
+    """Yield the omitted files. Many files of one directory with the same reason are combined."""
     alike: dict[tuple[Path, str], list[Omission]] = {}
     for each in left_out:
         alike.setdefault((each.path.parent, each.why) if each.line is None else (each.path, str(each.line)), []).append(

@@ -1,4 +1,4 @@
-"""Read traces from the field, incarnation by incarnation. The lines between damaged lines are used.
+"""Read damaged traces from the field, divided at restarts of the agent. Undamaged lines between damaged ones are used.
 
 A header line begins an incarnation. A file may contain incarnations of several agents and missions, and may begin
 within one.
@@ -46,7 +46,7 @@ _BOM = b"\xef\xbb\xbf"
 
 @dataclass
 class TraceIncarnation:
-    """One incarnation of an agent, as far as its file contains it. `header` is None if the header line is lost."""
+    """The part of a trace between two restarts of its agent. `header` is None if the header line is lost."""
 
     path: Path
     header: Header | None
@@ -65,7 +65,7 @@ class TraceIncarnation:
 
     @property
     def agent_id(self) -> int | None:
-        """The agent ID in the header, else that in its sent datagrams, else that in the file name. None if unknown."""
+        """The agent ID from the header, the sent datagrams or the file name, in this order. None if unknown."""
         if self.header is not None:
             return self.header.agent_id
         if self.agent is not None:
@@ -91,7 +91,7 @@ class TraceIncarnation:
         return zip(self.asides, self.aside_lines, strict=True)
 
     def add_gap(self, lines: int, lost_bytes: int) -> None:
-        """Note lost or damaged lines. Consecutive ones form one gap."""
+        """Record lost or damaged lines. Consecutive ones form one gap."""
         position = len(self.runs)
         if self.gaps and self.gaps[-1].position == position:
             last = self.gaps.pop()
@@ -99,7 +99,7 @@ class TraceIncarnation:
         self.gaps.append(Gap(position, lines, lost_bytes))
 
     def put_in_order(self) -> Iterator[Omission]:
-        """Put swapped lines in order, and drop repeated ones. Yields a sentence for each place."""
+        """Repair the order of lines, and drop repeated ones. Yield a sentence for each place."""
         order, places = in_order(self.runs)
         if not places:
             return
@@ -124,7 +124,9 @@ def jumps_in(runs: list[HandlerRun]) -> list[int]:
 
 
 def read_incarnations(path: Path, left_out: list[Omission]) -> list[TraceIncarnation]:
-    """Return the incarnations in a file, in order. Empty if the file is no trace. Raises OSError."""
+    """Return the parts of a trace between restarts, in order. The list is empty if the file is not a trace. Raises
+    OSError.
+    """
     reader = TraceReader(path)
     with BoundedFile(path, MAX_TRACE_BYTES) as file:
         for number, line, finish in _lines(file):
@@ -148,13 +150,13 @@ class _Damage:
 
 
 class TraceReader:
-    """A reader of the lines of a trace, in any condition. `incarnations` has the result so far.
+    """Reads the lines of a trace in any condition. `incarnations` contains the parts between restarts so far.
 
     `gave_up` is true if further lines are not needed, because a limit is exceeded.
     """
 
     def __init__(self, path: Path, agent_id: int | None = None, counts: str = "line") -> None:
-        """Create a reader.
+        """Create a reader for one trace.
 
         `agent_id` is the agent, if the source determines it. `counts` is the unit of line numbers.
         """
@@ -167,7 +169,7 @@ class TraceReader:
         self._cut_off: int | None = None
 
     def add_line(self, number: int, line: bytes, finish: bool = True) -> None:
-        """Read a line. A line without a line end may be truncated."""
+        """Read one line. A line without a line end may be truncated."""
         self._read_bytes += len(line)
         self._lines += 1
         self.gave_up = not self.incarnations and (
@@ -232,19 +234,19 @@ class TraceReader:
             self._damaged.append(_Damage(number, number, why))
 
     def add_unknown_gap(self) -> None:
-        """Note that lines may be lost here."""
+        """Record that lines may be lost at this place."""
         if self.incarnations:
             self.incarnations[-1].add_gap(0, 0)
 
     def _add_earlier_gap(self, number: int, lines: int, lost_bytes: int) -> None:
-        """Note lines that were lost before this file was written, as an import recorded it."""
+        """Record lines that an earlier import reported as lost."""
         if self.incarnations:
             self.incarnations[-1].add_gap(lines, lost_bytes)
         what = "the part before this" if not lines else "1 line" if lines == 1 else f"{lines} lines"
         self._report(number, f"{what} {'were' if lines > 1 else 'was'} lost before this file was written")
 
     def finish(self, left_out: list[Omission]) -> list[TraceIncarnation]:
-        """Return the incarnations. If there are any, the damage is added to `left_out`."""
+        """Return the parts of the trace. If there are any, descriptions of damage are added to `left_out`."""
         incarnations = [life for life in self.incarnations if life.runs or life.asides or life.header]
         left_out += self._left_out() if incarnations else ()
         places = [place for incarnation in incarnations for place in incarnation.put_in_order()]
@@ -271,7 +273,7 @@ class TraceReader:
 
 
 def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield (number, line, whether it has a line end). Of a line that is too long, only the last part is kept."""
+    """Yield (number, line, true if it has a line end). Of a line that is too long, only the last part is returned."""
     number, kept = 1, b""
     while text := file.readline(MAX_LINE_BYTES):
         if not text.endswith(b"\n") and len(text) == MAX_LINE_BYTES:
@@ -284,13 +286,13 @@ def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:
 
 
 def _entry(line: bytes) -> Header | Entry | None:
-    """Return the entry in a line, if it is complete and has a possible time."""
+    """Return the entry in a line, or None if it is incomplete or has an impossible time."""
     entry = _parse(line)
     return entry if entry is None or isinstance(entry, Header) or 0 <= entry.t <= LATEST_S else None
 
 
 def _parse(line: bytes) -> Header | Entry | None:
-    """Return the entry in a line, if it is complete. Its time is not checked."""
+    """Return the entry in a line, or None if it is incomplete. Its time is not checked."""
     if not any(word in line for word in _MARKERS):
         return None
     try:
@@ -311,7 +313,7 @@ def _texts_in_base64(entry: Header | Entry) -> Iterator[str]:
 
 
 def _recover_tail(text: bytes) -> tuple[int, Header | Entry] | None:
-    """Return the position and the entry of a complete line at the end of a damaged line."""
+    """Return the position and content of a complete entry at the end of a damaged line, or None."""
     start = max(text.rfind(beginning) for beginning in _BEGINNINGS)
     entry = _entry(text[start:]) if start > 0 else None
     return None if entry is None else (start, entry)

@@ -1,4 +1,4 @@
-"""Split a trace into inputs: the causes of handler runs in order, each with the handler runs that it caused."""
+"""Divide a trace into the inputs of the agent, each with the handler runs that it caused."""
 
 import base64
 import math
@@ -17,38 +17,38 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 
 
 class UnusableInputError(Exception):
-    """An input is not recorded, or is impossible. The message is a sentence."""
+    """An error: an input is not recorded, or is impossible. The message is a sentence."""
 
 
 @dataclass(frozen=True, slots=True)
 class EventLogged:
-    """The vehicle logged an event."""
+    """An input: the vehicle logged an event."""
 
     event: LoggableEvent
 
 
 @dataclass(frozen=True, slots=True)
 class DatagramReceived:
-    """The agent received a datagram."""
+    """An input: the agent received a datagram."""
 
     datagram: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class TimerExpired:
-    """The timer `name` expired."""
+    """An input: the timer `name` expired."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class ReconcileRequested:
-    """The operator requested a reconcile."""
+    """An input: the operator requested a reconcile."""
 
 
 @dataclass(frozen=True, slots=True)
 class BootedFromDisk:
-    """The agent restarted with the data on its disk."""
+    """An input: the agent restarted with the data on its disk."""
 
 
 Cause = EventLogged | DatagramReceived | TimerExpired | ReconcileRequested | BootedFromDisk
@@ -56,7 +56,7 @@ Cause = EventLogged | DatagramReceived | TimerExpired | ReconcileRequested | Boo
 
 @dataclass(slots=True)
 class Input:
-    """An input of an agent. `at_s` is the time on the agent's own clock. `line` is the line of its trace, from 1.
+    """One input of an agent. `at_s` is the time on the agent's clock, and `line` the line of its trace (from 1).
 
     `runs` are the handler runs that it caused, including those of local events. If the record `is_partial`, some of
     them may be lost.
@@ -70,7 +70,7 @@ class Input:
 
 
 class MissingInputs(Protocol):
-    """The records that may contain inputs which a trace of version 1 lacks."""
+    """The other records that may contain inputs which a trace of version 1 lacks."""
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]: ...
 
@@ -80,7 +80,7 @@ class MissingInputs(Protocol):
 def inputs_by_incarnation(
     trace: Trace, header: CheckedHeader, missing: MissingInputs
 ) -> tuple[list[list[Input]], str | None]:
-    """Return the inputs of each incarnation, and the reason why the rest is unusable, or None.
+    """Return the inputs between restarts, and the reason why later inputs are unusable, or None.
 
     The reason names the line.
     """

@@ -1,4 +1,4 @@
-"""Lead an agent over lost lines: infer inputs after which it is in the next state that its record shows.
+"""Lead an agent over lost trace lines: guess inputs that lead to the next recorded state.
 
 The lost inputs are unknown, but their result is not: a chain, and the events in the current block. The inference plays
 the other agents of a swarm that already holds this chain. They answer each question of the agent, approve its blocks in
@@ -42,7 +42,7 @@ STEPS_PER_BLOCK = 200
 
 @dataclass(frozen=True)
 class KnownState:
-    """The state of an idle agent after lost lines. `why` is the reason why the lines before are not on record.
+    """The state of an idle agent after lost lines. `why` is the reason why earlier lines are missing.
 
     `current_block` is None if it is empty, or its content has no later effect.
     """
@@ -53,7 +53,7 @@ class KnownState:
 
 
 class Bridge:
-    """The inputs that lead an agent to a known state, one after another. `reached` is true at the end of success."""
+    """The guessed inputs that lead an agent to a known state, one after another. `reached` is true after success."""
 
     def __init__(self, agent: Agent, known: KnownState) -> None:
         self.reached = False
@@ -71,7 +71,7 @@ class Bridge:
             self._chain_hashes.append(top)
 
     def next(self, sent: Iterable[Message]) -> Cause | None:
-        """Return the next input, after the agent has sent these messages. None at the end."""
+        """Return the next input, after the agent has sent these messages. Return None at the end."""
         self._left -= 1
         if self._left < 0 or not self._peers:
             return None
@@ -106,7 +106,9 @@ class Bridge:
         return self._datagram(owner, CommitBlock(block, self._chain_hashes[held + 1]))
 
     def _log(self, event_data: bytes) -> Cause | None:
-        """Return the first of the events that the current block lacks. None if there is none, or it has others."""
+        """Return the next event that the block under construction lacks, or None if it lacks none or has different
+        ones.
+        """
         logged = bytes(self._agent.state.current_block)
         if not event_data.startswith(logged):
             return None
@@ -121,7 +123,7 @@ class Bridge:
         return DatagramReceived(encode(sender, self._sequence, message))
 
     def _answer(self, message: Message) -> None:
-        """Answer a question as agents that hold the known chain do."""
+        """Answer a query in the way of agents that hold the known chain."""
         answer: Message
         known = {chain_hash: height for height, chain_hash in enumerate(self._chain_hashes)}
         chain = self._known.chain

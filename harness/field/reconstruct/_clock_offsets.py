@@ -1,4 +1,4 @@
-"""Estimate the offsets and drifts of the agents' clocks from messages alone.
+"""Estimate the offsets and drifts of the agents' clocks from the times of messages alone.
 
 Each message was received after it was sent. Let t be the time on the clock of agent A, and u that on the clock of B.
 Then the messages from A to B are points (t sent, u received) above the line that converts t to u. The messages from B
@@ -26,7 +26,7 @@ OFFSET_DIGITS, DRIFT_DIGITS = 6, 9
 
 @dataclass(frozen=True)
 class ClockLine:
-    """A clock relative to another one: it shows offset_s + rate * t when the other shows t."""
+    """A clock relative to a reference clock: it shows offset_s + rate * t when the reference shows t."""
 
     offset_s: float = 0.0
     rate: float = 1.0
@@ -35,11 +35,11 @@ class ClockLine:
         return self.offset_s + self.rate * t
 
     def at(self, shown: float) -> float:
-        """Return the time on the other clock at which this clock shows `shown`."""
+        """Return the time on the reference clock at which this clock shows `shown`."""
         return (shown - self.offset_s) / self.rate
 
     def after(self, first: "ClockLine") -> "ClockLine":
-        """Return this clock relative to the base of `first`. So far it is relative to the clock of `first`."""
+        """Combine two relations of clocks. The result relates this clock to the reference clock of `first`."""
         return ClockLine(self.shows(first.offset_s), self.rate * first.rate)
 
     def inverse(self) -> "ClockLine":
@@ -54,7 +54,7 @@ def estimate(
     deliveries: Iterable[Delivery],
     ahead_s: Mapping[int, float] = {},
 ) -> dict[int, ClockLine]:
-    """Return each agent's clock relative to the reference.
+    """Return each agent's clock relative to a common reference clock.
 
     `ahead_s` has clocks relative to GPS time. It places the clocks of agents that exchanged no messages with the
     reference. Without it, these clocks are assumed to equal the reference.
@@ -98,12 +98,12 @@ def estimate(
 
 
 def _height(hull: list[Point], rate: float, of: Callable[[Iterator[float]], float]) -> float:
-    """Return the value at t = 0 of the line with this rate that touches the hull."""
+    """Return the value at t = 0 of the line with slope `rate` that touches the convex hull."""
     return of(u - rate * t for t, u in hull)
 
 
 def _hull(points: list[Point], side: int) -> list[Point]:
-    """Return the points that a line can touch from below (side 1), or from above (-1): the convex hull of that side."""
+    """Return the convex hull of the points on their lower (side 1) or upper (side -1) side."""
     hull: list[Point] = []
     for t, u in sorted(points, key=lambda point: (point[0], side * point[1])):
         if hull and hull[-1][0] == t:
@@ -119,9 +119,7 @@ def _turn(a: Point, b: Point, c: Point) -> float:
 
 
 def fit_line(above: list[Point], below: list[Point]) -> ClockLine:
-    """Return the line with the points `above` above it, the points `below` below it, and the greatest distance to
-    both.
-    """
+    """Return the line between two sets of points that has the greatest distance to both."""
     lower, upper = _hull(above, 1), _hull(below, -1)
 
     def room(rate: float) -> float:

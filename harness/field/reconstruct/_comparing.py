@@ -1,4 +1,4 @@
-"""Compare played agents with their records: each agent alone, and the whole flight."""
+"""Compare simulated agents with the records: first each agent alone, and then the whole flight."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ PlayedStep = tuple[float, int | None, HandlerRun]
 def first_difference(
     table: Timetable, rehearsals: Mapping[int, Rehearsal], simulated: Simulated
 ) -> FirstDifference | None:
-    """Return the first difference in mission time. None if all steps with an effect are equal."""
+    """Return the earliest difference in mission time, or None if all steps with an effect are equal."""
     differences = []
     for agent_id in rehearsals:
         recorded = [*_effective(_recorded(table, agent_id))]
@@ -81,7 +81,7 @@ def _played(trace: Trace | None) -> Iterator[PlayedStep]:
 
 
 def _effective(steps: Iterable[PlayedStep]) -> Iterator[PlayedStep]:
-    """Yield the steps without messages that only changed a tally."""
+    """Yield the steps, except messages that only changed a vote count."""
     return (
         step for step in steps if step[2].changes or step[2].sent or not isinstance(step[2].trigger, MessageTrigger)
     )
@@ -119,7 +119,7 @@ RecordedInputs = Sequence[Sequence[Input]]
 
 
 class SoloRehearsals:
-    """Rehearsals of each agent alone.
+    """Simulates each agent alone with its recorded inputs.
 
     `rehearsals` has each agent that can be played, and `why` the reasons for incomplete ones.
     """
@@ -134,7 +134,7 @@ class SoloRehearsals:
 
     @property
     def remarks(self) -> list[str]:
-        """Sentences on assumptions and findings."""
+        """Sentences about assumptions and findings."""
         if not self._by_captures:
             return self._remarks
         which = agents(self._by_captures)
@@ -142,7 +142,7 @@ class SoloRehearsals:
         return [*self._remarks, inferred]
 
     def rehearse(self, header: CheckedHeader) -> None:
-        """Rehearse an agent by its trace.
+        """Simulate an agent with the inputs in its trace.
 
         If that does not lead to its export, use its capture if that explains more inputs.
         """
@@ -182,7 +182,9 @@ class SoloRehearsals:
     def _explain_deviations(
         self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: Rehearsal
     ) -> Rehearsal:
-        """Explain the deviations of an agent by a known mistake, if possible. Otherwise play up to the first one."""
+        """Explain the deviations of an agent by a known error, if possible. Otherwise simulate it up to the first
+        deviation.
+        """
         agent_id, finding = header.agent_id, judged.first_finding
         parts: Incarnations = judged.with_known_states(incarnations) if judged.lost else incarnations
         in_parts = rehearse(header, parts) if judged.lost else whole
@@ -203,7 +205,7 @@ class SoloRehearsals:
     def _play_around_lost_lines(
         self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: Rehearsal
     ) -> Rehearsal:
-        """Play the trace of an agent without deviations. Lost lines are replaced by inferred inputs if possible."""
+        """Simulate an agent without deviations. Inputs on lost lines are replaced by guessed inputs if possible."""
         agent_id = header.agent_id
         early = rehearse(header, incarnations, tolerance=Tolerance(early_timers=True)) if whole.deviation else whole
         if early.deviation is None and self._leads_to_export(early):
@@ -231,7 +233,9 @@ class SoloRehearsals:
             )
 
     def _by_capture(self, header: CheckedHeader, by_trace: Rehearsal | None) -> Rehearsal | None:
-        """Return the rehearsal that explains more inputs: `by_trace`, or one by the capture if it is needed."""
+        """Return the simulation that explains more inputs: the one by the trace, or one by the packet capture if
+        needed.
+        """
         agent_id = header.agent_id
         export, capture = self._flight.exports.get(agent_id), self._other_records.captures.get(agent_id)
         if capture is None or export is None or (by_trace and by_trace.chain == list(export.chain_of_block_hashes)):
@@ -250,8 +254,7 @@ class SoloRehearsals:
     def _explain_by_quirk(
         self, header: CheckedHeader, incarnations: Incarnations, at: ProtocolDeviation
     ) -> Rehearsal | None:
-        """Return a rehearsal with a known quirk that explains the whole record, with equal branches and tallies if
-        possible.
+        """Return a simulation with a known error that explains the whole record, or None.
 
         Quirks of the handlers that ran at the deviation are tried first.
         """
@@ -279,7 +282,9 @@ class SoloRehearsals:
         return explaining[names[0]]
 
     def _explain_by_tolerance(self, header: CheckedHeader, incarnations: Incarnations) -> Rehearsal | None:
-        """Return a rehearsal that tolerates ignored messages or early timers, if the chain is then as recorded."""
+        """Return a simulation that allows ignored messages or early timers, if it gives the recorded chain. Otherwise
+        None.
+        """
         agent = f"agent {header.agent_id}"
         ignoring = rehearse(header, incarnations, tolerance=Tolerance(ignoring=True))
         if ignoring.deviation is None:

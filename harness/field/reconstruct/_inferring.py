@@ -1,4 +1,4 @@
-"""Infer the inputs of an agent without a complete trace, from its capture and the events in its blocks.
+"""Guess the inputs of an agent without a complete trace, from its packet capture and the events in its blocks.
 
 The capture contains the received and sent datagrams with their times. The blocks contain the logged events. The expiry
 of timers is not recorded. Usually a timer expires on time, but a process is sometimes late, and another input may then
@@ -61,20 +61,22 @@ SENT_ON_TIMER_EXPIRY = (BlockAddRequest, CommitBlock, ChainContainQuery, ChainHa
 
 @dataclass
 class InferredInputs:
-    """The inputs of each incarnation that explain the sent datagrams. `problem` names the first unexplained one."""
+    """The guessed inputs that explain the sent datagrams, by restart. `problem` names the first unexplained
+    datagram.
+    """
 
     incarnations: list[list[Input]] = field(default_factory=list)
     problem: str | None = None
 
     @property
     def explained(self) -> int:
-        """The number of inputs."""
+        """The number of guessed inputs."""
         return sum(map(len, self.incarnations))
 
 
 @dataclass(frozen=True)
 class _IncarnationRecord:
-    """The records of one incarnation: received datagrams, sent datagrams, and logged events with their times."""
+    """The received datagrams, sent datagrams, and logged events of an agent between two restarts."""
 
     received: Sequence[Sighting]
     sent: Sequence[Sighting]
@@ -82,7 +84,7 @@ class _IncarnationRecord:
     is_last: bool
 
     def since(self, at_s: float) -> "_IncarnationRecord":
-        """Return the records of an incarnation that began at `at_s`."""
+        """Return the records after a restart at `at_s`."""
         received = [sighting for sighting in self.received if sighting.at_s >= at_s]
         logged_events = [timed for timed in self.logged_events if timed[0] >= at_s]
         return _IncarnationRecord(received, self.sent, logged_events, self.is_last)
@@ -91,7 +93,7 @@ class _IncarnationRecord:
 def infer(
     header: CheckedHeader, capture: AgentCapture, events: Sequence[LoggableEvent], tries: int = MAX_TRIES
 ) -> InferredInputs:
-    """Infer the inputs of an agent. `header` has its mission and settings."""
+    """Guess the inputs of an agent. `header` contains its mission and settings."""
     late_s = MAX_LATE_WALL_S * capture.speedup + ROUNDING_S
     inferred = InferredInputs()
     stored: StoredState | None = None
@@ -109,7 +111,7 @@ def infer(
 
 
 def _incarnation_records(capture: AgentCapture, events: Sequence[LoggableEvent]) -> Iterator[_IncarnationRecord]:
-    """Yield the records of each incarnation. A restarted agent numbers its datagrams from 0 again."""
+    """Yield the records between restarts. After a restart, an agent numbers its datagrams from 0 again."""
     received = [sighting for sighting in capture.sightings if not sighting.outbound and sighting.at_s >= 0]
     sent = [sighting for sighting in capture.sightings if sighting.outbound]
     logged_events = [(seconds_of(event, capture), event) for event in events]
@@ -126,7 +128,7 @@ def _incarnation_records(capture: AgentCapture, events: Sequence[LoggableEvent])
 
 
 def _last_seen(received: Sequence[Sighting], last_s: float, restart_s: float) -> float:
-    """Return a time until which the incarnation certainly existed. It would have answered the next query."""
+    """Return a time until which the agent certainly ran. It would have answered the next query."""
     later = (sighting for sighting in received if last_s < sighting.at_s)
     questions = (sighting.at_s for sighting in later if isinstance(decode(sighting.datagram).message, ANSWERED_QUERIES))
     return min(next(questions, restart_s), restart_s)
@@ -135,8 +137,8 @@ def _last_seen(received: Sequence[Sighting], last_s: float, restart_s: float) ->
 def _infer_restarted(
     header: CheckedHeader, record: _IncarnationRecord, late_s: float, stored: StoredState, tries: int
 ) -> "_Attempt":
-    """Infer an incarnation that began some time before its first datagram, with the data on its disk or with
-    nothing.
+    """Guess the inputs after a restart that happened some time before the first datagram, with or without data on the
+    disk.
     """
     first_s = record.sent[0].at_s if record.sent else NEVER
     times = sorted(
@@ -165,7 +167,7 @@ def _infer_incarnation(
     tries: int,
     start_s: float = 0.0,
 ) -> "_Attempt":
-    """Return the attempt whose order of inputs explains the most datagrams."""
+    """Return the order of inputs that explains the most datagrams."""
     deferred: dict[int, int] = {}
     pauses: list[Pause] = []
     best: _Attempt | None = None
@@ -186,7 +188,7 @@ def _infer_incarnation(
 
 
 def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
-    """Choose the next untried order, by changing the last timer that has one. Returns False if there is none."""
+    """Choose the next order to try, by changing the last timer that allows it. Return False if there is none."""
     for place in range(len(choices) - 1, -1, -1):
         if deferred.get(place, 0) < choices[place]:
             deferred[place] = deferred.get(place, 0) + 1
@@ -197,7 +199,7 @@ def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
 
 
 class _Attempt:
-    """One possible course of an incarnation.
+    """One possible order of an agent's inputs between two restarts.
 
     `deferred` maps timers, by number, to their deviation from the likely order.
     """
@@ -268,7 +270,7 @@ class _Attempt:
             self._fail(self._sent[self._explained])
 
     def _end_of_pause(self, at_s: float, after_s: float = 0.0) -> float:
-        """Return the time at which an input is handled, if the process was paused when it arrived.
+        """Return the time at which an input is handled, if the agent was paused when the input arrived.
 
         After a pause, the process first reads its socket, then it handles timers, then events.
         """
@@ -279,7 +281,7 @@ class _Attempt:
         return None if deadline is None else self._end_of_pause(deadline, JUST_AFTER_S)
 
     def _begin_requested_reconcile(self, next_s: float) -> bool:
-        """Return whether a reconcile begins before the next input. The operator must have requested it."""
+        """Return true if a reconcile begins before the next input. The operator must have requested it."""
         if self._explained == len(self._sent) or self._agent.state.reconcile_in_progress:
             return False
         sighting = self._sent[self._explained]
@@ -289,7 +291,7 @@ class _Attempt:
         return True
 
     def _expire_timer(self, deadline: float, position: int) -> int:
-        """Expire the timer, after the inputs that came before. Returns the position of the next input."""
+        """Let the timer expire after the inputs that precede it. Return the position of the next input."""
         count, fewest, most = self._inputs_before_timer(deadline, position)
         place = len(self.choices)
         self.choices.append(most - fewest)
@@ -306,7 +308,7 @@ class _Attempt:
         return position
 
     def _inputs_before_timer(self, deadline: float, position: int) -> tuple[int, int, int]:
-        """Return the likely number of inputs before the expiry of the timer, and the fewest and most possible ones.
+        """Return the likely, the smallest and the largest number of inputs before the expiry of the timer.
 
         The datagrams that the expiry caused show its time. Datagrams that arrived directly before may have waited in
         the socket.
@@ -352,7 +354,7 @@ class _Attempt:
             self.inputs.append(Input(now, 0, cause, runs))
 
     def _detect_pause(self, since_s: float) -> None:
-        """Note a pause if the agent sent nothing for a long time although it should have."""
+        """Record a pause if the agent sent nothing for a long time although it should have."""
         until_s = self._sent[self._explained].at_s if self._explained < len(self._sent) else NEVER
         if since_s + self._late_s < until_s < NEVER:
             self.pause = since_s, until_s

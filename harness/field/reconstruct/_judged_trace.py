@@ -1,4 +1,4 @@
-"""Judge a trace as `replay` does, and find the parts whose inputs can be played."""
+"""Compare a trace with the reference implementation, and find the parts whose inputs can be simulated."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,13 +16,13 @@ from ucp.trace import HandlerRun
 
 
 class JudgedTrace:
-    """The trace of an agent as the reference judges it.
+    """The trace of an agent, compared with the reference implementation.
 
     `deviations` are the accusations. `lost` has the reasons why parts of the trace could not be judged.
     """
 
     def __init__(self, flight: Flight, agent_id: int) -> None:
-        """Judge the trace. Raises FieldError if the trace does not record inputs."""
+        """Compare the trace. Raises FieldError if the trace does not contain inputs."""
         trace = flight.traces[agent_id]
         record = Record(Path(f"agent {agent_id}"), "", trace, IngestedRecords(flight), [])
         player = Player(record)
@@ -53,7 +53,7 @@ class JudgedTrace:
         return self.deviations[0].sentence(self._names.of) if self.deviations else None
 
     def with_known_states(self, incarnations: Sequence[Sequence[Input]]) -> list[list[Input | KnownState]]:
-        """Return the inputs that can be played, with a known state in the place of lost ones."""
+        """Return the inputs that can be simulated, with a known state in place of lost inputs."""
         parts = [[*self._parts(inputs)] for inputs in incarnations]
         for before, after in zip(parts, incarnations[1:], strict=False):
             if after and isinstance(after[0].cause, BootedFromDisk) and (disk := _disk(after[0])) is not None:
@@ -72,7 +72,7 @@ class JudgedTrace:
             yield from (self._known[id(run)] for run in recorded.runs if id(run) in self._known)
 
     def _state_at_export(self) -> KnownState | None:
-        """Return the state in the export, if the agent was idle then and its last lines are lost."""
+        """Return the state in the export, if the agent was idle then and its last trace lines are lost."""
         export = self._export
         if export is None or not export.idle or export.blocks_to_be_committed or export.reconcile_stack:
             return None
@@ -82,7 +82,7 @@ class JudgedTrace:
 
 
 def _disk(boot: Input) -> KnownState | None:
-    """Return the recorded content of the disk at a boot. None if blocks on it were not committed yet."""
+    """Return the recorded content of the disk at a restart, or None if some of its blocks were not committed yet."""
     run = boot.runs[0]
     try:
         blocks = [*stored_blocks(run.input)]

@@ -1,4 +1,4 @@
-"""The mission and settings of a flight: recorded, or inferred from the sent messages.
+"""Find the mission and the settings of a flight. They are recorded, or guessed from the sent messages.
 
 Some settings are visible in messages and blocks: whether votes name a chain, and the size of a full block. For the
 others, each value is tried alone, and the one that explains the most messages is assumed.
@@ -30,7 +30,7 @@ TRIES = 10
 def likely_settings(
     other_records: OtherRecords, captures: dict[int, AgentCapture], header_of: Callable[[int, Settings], CheckedHeader]
 ) -> Settings:
-    """Return the settings that explain the most datagrams of the captured agents."""
+    """Return the settings that explain the most datagrams of the agents with packet captures."""
     events = {agent_id: other_records.events(agent_id) for agent_id in captures}
 
     def explained(settings: Settings) -> tuple[int, int]:
@@ -64,7 +64,7 @@ def _alternatives(visible: Settings) -> Iterator[Settings]:
 
 
 def _visible_settings(other_records: OtherRecords) -> Settings:
-    """Return the settings that are visible in messages and blocks."""
+    """Return the settings that can be seen in messages and blocks."""
     votes = (decode(datagram).message for datagram in other_records.all_datagrams())
     names_chain = any(isinstance(vote, BlockAddResponse) and vote.chain_hash is not None for vote in votes)
     default = Settings()
@@ -76,7 +76,7 @@ def _visible_settings(other_records: OtherRecords) -> Settings:
 
 
 def _max_block_bytes(blocks: Iterable[bytes], largest: int) -> int:
-    """Return the setting max_block_bytes. A block is full as soon as another event of maximum size might not fit."""
+    """Return the setting max_block_bytes. A block is full when another event of the largest size might not fit."""
     least, most = largest, MAX_EVENT_DATA_BYTES
     for event_data in blocks:
         last = _last_event_bytes(event_data)
@@ -100,7 +100,7 @@ NO_INPUTS = "the records hold no inputs of agents: add traces (*.trace.jsonl), o
 
 @dataclass(frozen=True)
 class Mission:
-    """The configuration that all agents of a flight shared."""
+    """The configuration that all agents of a flight share."""
 
     name: str
     roster: tuple[int, ...]
@@ -111,7 +111,7 @@ class Mission:
 def known_mission(
     flight: Flight, other_records: OtherRecords, name: str, remarks: list[str]
 ) -> tuple[Mission, dict[int, CheckedHeader]]:
-    """Return the mission, and the header of each agent with enough records.
+    """Return the mission, and the trace header of each agent with enough records.
 
     Raises FieldError if no agent has enough.
     """
@@ -151,7 +151,7 @@ def _in_words(settings: Settings) -> str:
 
 
 def _initial_data(flight: Flight) -> str | None:
-    """Return the initial data in base64."""
+    """Return the data of the inception block in base64, or None if they are unknown."""
     if flight.initial_data is not None:
         return base64.b64encode(flight.initial_data).decode("ascii")
     return next((export.inception.block_data for export in flight.exports.values()), None)

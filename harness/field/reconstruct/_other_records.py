@@ -1,4 +1,4 @@
-"""Datagrams and events that other records contain: captures, other agents' traces, and exported blocks."""
+"""Find datagrams and events in other records: packet captures, traces of other agents, and exported blocks."""
 
 import base64
 from collections import defaultdict
@@ -30,7 +30,7 @@ class OtherRecords:
     """All datagrams and blocks in the files of a flight."""
 
     def __init__(self, flight: Flight, opener: "Opener | None" = None, depot: "Depot | None" = None) -> None:
-        """Read the files. In a secured mission, `opener` decrypts captures, and `depot` decrypts event data."""
+        """Read the files. In a secured mission, `opener` decrypts datagrams, and `depot` decrypts event data."""
         self.sealed: dict[int, dict[bytes, bytes]] = defaultdict(dict)
         """The sealed data of each agent's blocks. The key is the encoded event that filled the block."""
         self._depot = depot
@@ -82,7 +82,7 @@ class OtherRecords:
         return [*self._event_data.values()]
 
     def with_seal(self, header: CheckedHeader) -> CheckedHeader:
-        """Return the header with the sealed data of the agent, if its mission seals event data."""
+        """Return the header with the encrypted event data of the agent, if its mission encrypts them."""
         if sealed_to(header.initial_data) is None:
             return header
         max_block_bytes = min(header.settings.max_block_bytes, MAX_EVENT_DATA_BYTES - SEAL_BYTES)
@@ -94,7 +94,7 @@ class OtherRecords:
         return replace(header, settings=settings, seal=RecordedSeals(self.sealed[header.agent_id]))
 
     def events(self, agent_id: int) -> list[LoggableEvent]:
-        """Return the known events of an agent in order: those of its blocks, and those of its current block."""
+        """Return the known events of an agent in order, including those of its block under construction."""
         export = self._exports.get(agent_id)
         own = [block for block in self._blocks.values() if block.agent_id == agent_id]
         data = [self._event_data[block.block_hash.hex()] for block in sorted(own, key=lambda block: block.timestamp_us)]
@@ -126,7 +126,7 @@ class OtherRecords:
 
     @property
     def _reason_unreadable(self) -> str:
-        """The reason why sealed event data cannot be split into events. "" if the mission does not seal."""
+        """The reason why encrypted event data cannot be divided into events. It is "" if they are not encrypted."""
         exports = self._exports.values()
         if not any(sealed_to(base64.b64decode(export.inception.block_data)) for export in exports):
             return ""
@@ -145,7 +145,7 @@ class OtherRecords:
 
 
 def _seals(trace: Trace) -> Iterator[tuple[bytes, bytes]]:
-    """Yield each event that filled a block, with the sealed data of the block."""
+    """Yield each event that completed a block, with the encrypted data of the block."""
     for run in trace.runs:
         if (sealed := sealed_of(run.sealed)) is not None and run.input is not None:
             with suppress(ValueError, MalformedEventsError):

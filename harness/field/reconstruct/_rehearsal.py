@@ -1,4 +1,4 @@
-"""Rehearse one agent alone, to find how far its record follows the protocol.
+"""Simulate one agent alone with its recorded inputs, to find how far its record follows the protocol.
 
 The agent core, or a core with a known quirk, plays each recorded input at its recorded time. The resulting handler
 runs must equal the recorded ones. The reference cannot play: the scenario needs agents, and known quirks exist only
@@ -65,7 +65,7 @@ class ProtocolDeviation:
 
 @dataclass(slots=True)
 class PlayedInput:
-    """An input that a simulated agent can receive again. `sent` are the datagrams that it caused.
+    """An input that can be simulated again. `sent` contains the datagrams that it caused.
 
     `matters` is false for a message that no handler uses. `expired` is the timer that expired, if the input is that.
     `stopped` are timers that were stopped before their expiry.
@@ -81,8 +81,8 @@ class PlayedInput:
 
 @dataclass
 class Rehearsal:
-    """The rehearsal of one agent. `played` are the inputs of all incarnations up to the deviation. `deviation` is None
-    without one.
+    """The simulation of one agent with its recorded inputs. `played` contains the inputs up to `deviation`, if there is
+    one.
 
     `chain` has the block hashes of the agent's chain at that point. `running_at_end` has the timers that ran at the end
     of each incarnation.
@@ -108,7 +108,7 @@ class Rehearsal:
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """Deviations that are accepted: timers that expire early, and ignored messages."""
+    """The kinds of deviations to ignore: timers that expire early, and ignored messages."""
 
     early_timers: bool = False
     ignoring: bool = False
@@ -124,7 +124,7 @@ def rehearse(
     quirks: Quirks | None = None,
     tolerance: Tolerance | None = None,
 ) -> Rehearsal:
-    """Play all recorded inputs up to the first deviation."""
+    """Simulate all recorded inputs up to the first deviation, and return the result."""
     tolerance = tolerance or Tolerance()
     rehearsal = Rehearsal(header.agent_id, quirks or {})
     stored: StoredState | None = None
@@ -174,11 +174,11 @@ class _IncarnationRehearsal:
         timers.update(self.agent.state)
 
     def running_at_end(self) -> list[TimerStart]:
-        """Return the running timers."""
+        """Return the timers that are still running."""
         return [*self._running_timers.values()]
 
     def bridge(self, known: KnownState) -> bool:
-        """Infer and play inputs until the agent is in this state. Returns whether it is."""
+        """Guess and simulate inputs that lead the agent to this state. Return true on success."""
         bridge = Bridge(self.agent, known)
         sent: list[Message] = []
         while (cause := bridge.next(sent)) is not None:
@@ -202,7 +202,7 @@ class _IncarnationRehearsal:
     def play(
         self, index: int, recorded_input: Input, stored: StoredState | None, *, is_last: bool
     ) -> ProtocolDeviation | None:
-        """Play an input. Returns the deviation if the result differs from the record, else None."""
+        """Simulate an input. Return the deviation if the result differs from the record, otherwise None."""
         expired = (
             self._timers.running.get(recorded_input.cause.name)
             if isinstance(recorded_input.cause, TimerExpired)
@@ -238,14 +238,14 @@ class _IncarnationRehearsal:
         return None
 
     def _sent(self, recorded_input: Input) -> list[bytes]:
-        """Return the sent datagrams as recorded. Datagrams that are not recorded come from the reference core."""
+        """Return the sent datagrams as recorded. If the record lacks them, return those of the simulated agent."""
         encoded = [encode(self.agent.agent_id, *numbered) for numbered in self.agent.messages_to_send()]
         recorded = [sent.datagram for run in recorded_input.runs for sent in run.sent]
         both = zip(encoded, recorded, strict=False)
         return [our if their is None else base64.b64decode(their.text) for our, their in both]
 
     def _follow_timers(self, played: PlayedInput, ended: RunningTimer | None) -> None:
-        """Note the timers that the input started, and those that no longer run."""
+        """Record the timers that the input started, and those that no longer run."""
         place, before = len(self._rehearsal.played), self._running_timers
         self._timers.update(self.agent.state)
         self._running_timers = {}
@@ -257,7 +257,7 @@ class _IncarnationRehearsal:
         played.stopped = [started for number, started in before.items() if number not in self._running_timers]
 
     def _feed(self, recorded_input: Input, stored: StoredState | None) -> str | None:
-        """Give an input to the core. Returns the reason if the input is impossible, else None."""
+        """Give an input to the simulated agent. Return the reason if the input is impossible, otherwise None."""
         agent, now = self.agent, recorded_input.at_s
         match recorded_input.cause:
             case EventLogged(event):
@@ -283,7 +283,7 @@ class _IncarnationRehearsal:
         return None
 
     def _matters(self, datagram: bytes) -> bool:
-        """Return whether a correct agent uses the datagram."""
+        """Return true if a correct agent uses the datagram."""
         try:
             sender, _, message = decode(datagram)
         except MalformedDatagramError:
@@ -294,7 +294,7 @@ class _IncarnationRehearsal:
         return MATTERS[type(message)](agent.state, sender, message)
 
     def _ignores(self, recorded_input: Input) -> bool:
-        """Return whether a message had no effect although it should have had one."""
+        """Return true if a message had no effect although it should have had one."""
         if not isinstance(recorded_input.cause, DatagramReceived) or any(
             run.changes or run.sent for run in recorded_input.runs
         ):
@@ -316,7 +316,7 @@ def _matches_exactly(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -
 
 
 def _difference(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str | None:
-    """Return a description of the first difference with an effect. None if there is none."""
+    """Return a description of the first difference that has an effect, or None."""
     runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
     for ours, theirs in zip_longest(runs, recorded):
         if ours is None:
@@ -332,7 +332,7 @@ def _difference(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str
 
 
 def same_sent(ours: Sequence[SentMessage], theirs: Sequence[SentMessage]) -> bool:
-    """Return whether the messages are equal. Sequence numbers are ignored, because the protocol does not use them."""
+    """Return true if the messages are equal. Sequence numbers are ignored, because the protocol does not use them."""
     if len(ours) != len(theirs):
         return False
     return all(_same_message(our, their) for our, their in zip(ours, theirs, strict=True))

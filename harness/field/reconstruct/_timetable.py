@@ -1,4 +1,4 @@
-"""Put the inputs of all agents on one time axis.
+"""Put the inputs of all agents on one common time axis.
 
 Three rules hold. The inputs of each agent keep their order. A message arrives after it was sent. A timer expires no
 sooner than its duration after its start. Each input happens as early as these rules allow, but not before its recorded
@@ -32,7 +32,8 @@ MAX_CLOCK_ERROR_S = 1.0
 
 @dataclass(slots=True)
 class TimedInput:
-    """An input of an agent at mission second `at_s`. `number` is that of the sender's datagram, None for a stray.
+    """An input of an agent at mission second `at_s`. `number` counts the sender's datagrams, or is None for another
+    input.
 
     `late_s` is the delay of an expired timer.
     """
@@ -46,8 +47,8 @@ class TimedInput:
 
 @dataclass
 class IncarnationTimes:
-    """The mission seconds of the first and the last input of an incarnation. `boots` is true if it began with data on
-    its disk.
+    """The mission seconds of the first and last input between two restarts. `boots` is true if the agent began with
+    data on its disk.
 
     The incarnation existed at `present_s`: the first message that it received was sent then, or another input came.
     """
@@ -61,7 +62,7 @@ class IncarnationTimes:
 
 @dataclass
 class Timetable:
-    """The inputs of all agents in mission time. `clocks` are relative to mission time.
+    """The inputs of all agents in mission time. `clocks` relates each agent's clock to mission time.
 
     `contradictions` has a sentence for each record that no order of inputs explains.
     """
@@ -94,7 +95,7 @@ class Timetable:
 
 
 def timetable(rehearsals: Mapping[int, Rehearsal], ahead_s: Mapping[int, float] = {}) -> Timetable:
-    """Return the timetable of the rehearsed inputs. `ahead_s` has the clocks of agents relative to GPS time."""
+    """Return the inputs on one time axis. `ahead_s` relates the clocks of agents to GPS time."""
     senders = _Senders(rehearsals)
     clocks = estimate(rehearsals, senders.deliveries(), ahead_s)
     clocks = _from_zero(clocks, rehearsals)
@@ -120,7 +121,7 @@ def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, Rehears
 
 
 class _Senders:
-    """The datagrams that each played agent sent, and their receivers among the played agents."""
+    """The datagrams that each simulated agent sent, and their receivers among the simulated agents."""
 
     def __init__(self, rehearsals: Mapping[int, Rehearsal]) -> None:
         self._rehearsals = rehearsals
@@ -144,7 +145,7 @@ class _Senders:
         return self._rehearsals[agent].played[self._sent_by[agent][number]].input.at_s
 
     def deliveries(self) -> list[Delivery]:
-        """Return the datagrams that were sent once, with each reception."""
+        """Return the datagrams that were sent exactly once, with each of their receptions."""
         found = []
         for receiver, rehearsal in self._rehearsals.items():
             for played in rehearsal.played:
@@ -188,7 +189,7 @@ class _Planner:
         return self._table
 
     def _queue(self, agent: int) -> None:
-        """Mark the next input of the agent that matters as ready, or as waiting for the sending of a message."""
+        """Mark the next relevant input of the agent as ready, or as waiting until a message is sent."""
         played = self._played[agent]
         place = self._next[agent]
         while place < len(played) and not played[place].matters:
@@ -206,7 +207,9 @@ class _Planner:
         return self._table.clocks[agent].at(self._played[agent][place].input.at_s)
 
     def _sent(self, agent: int, place: int) -> tuple[int, int] | None:
-        """Return (sender, number) of the arriving datagram. None for other inputs and for strays."""
+        """Return (sender, number) of the arriving datagram, or None for other inputs and for datagrams of unknown
+        origin.
+        """
         cause = self._played[agent][place].input.cause
         if not isinstance(cause, DatagramReceived) or (agent, place) in self._as_strays:
             return None
@@ -218,7 +221,7 @@ class _Planner:
         return before[-1] if before else candidates[0]
 
     def _break_cycle(self) -> None:
-        """Resolve a deadlock, in which each agent waits for a later message.
+        """Resolve a deadlock in which each agent waits for a later message of another one.
 
         The earliest waiting input becomes a stray.
         """
@@ -276,12 +279,12 @@ class _Planner:
         self._queue(agent)
 
     def _expiry(self, agent: int, timer: TimerStart) -> tuple[float, float]:
-        """Return the expiry of a timer without delay, on the agent's clock and in mission seconds."""
+        """Return the time at which a timer expires without delay, on the agent's clock and in mission seconds."""
         expiry_local = self._at[agent][timer.place] + timer.duration_s
         return expiry_local, self._table.clocks[agent].at(expiry_local)
 
     def _keep_running(self, agent: int, timer: TimerStart, until_s: float) -> None:
-        """Delay the timer so that it does not expire until then."""
+        """Delay the timer so that it does not expire before `until_s`."""
         _, expiry_s = self._expiry(agent, timer)
         if expiry_s < until_s + MIN_GAP_S:
             self._delay(agent, timer, _rounded_up(until_s + 2 * MIN_GAP_S - expiry_s))

@@ -1,4 +1,4 @@
-"""Write a timetable as a scenario with exact events, datagrams, timer delays and faults."""
+"""Write the inputs of all agents as a scenario with exact events, datagrams, timer delays and faults."""
 
 import base64
 import dataclasses
@@ -27,7 +27,7 @@ MIN_PAUSE_S = 0.5
 def scenario_document(
     mission: Mission, table: Timetable, rehearsals: Mapping[int, Rehearsal], lost: Collection[int], sealed: Sealed
 ) -> Document:
-    """Return the scenario as a document. An agent of the roster without a rehearsal takes no part in it.
+    """Return the scenario as a document. An agent without simulated inputs does not take part in it.
 
     `lost` agents, and agents whose record ends early, are switched off after their last input. `sealed` has the sealed
     data of agents.
@@ -60,7 +60,7 @@ def scenario_document(
 
 
 def _all_incarnations(known: Sequence[IncarnationTimes], count: int) -> list[IncarnationTimes]:
-    """Return all incarnations of an agent, including those without inputs."""
+    """Return the times between all restarts of an agent, including those without inputs."""
     incarnations: list[IncarnationTimes] = []
     by_number = {incarnation.number: incarnation for incarnation in known}
     for number in range(count):
@@ -70,8 +70,8 @@ def _all_incarnations(known: Sequence[IncarnationTimes], count: int) -> list[Inc
 
 
 def _start_times(incarnations: Sequence[IncarnationTimes]) -> list[float]:
-    """Return the start of each incarnation: 0 for the first, the boot for one with data on its disk, else before its
-    first reception.
+    """Return the start times of an agent: 0 at first, then each restart, or just before the first reception after
+    it.
     """
     start_times = [0.0]
     for before, incarnation in pairwise(incarnations):
@@ -121,7 +121,7 @@ def _events(table: Timetable, sealed: Sealed) -> list[Document]:
 
 
 class _Strays:
-    """Datagrams that the scenario sends separately."""
+    """The datagrams that the scenario must deliver itself, because no agent in it sends them."""
 
     def __init__(self) -> None:
         self._reached: dict[bytes, list[dict[int, float]]] = defaultdict(list)
@@ -181,7 +181,7 @@ def _fates(
 
 
 def _can_be_sent(timed_input: TimedInput, table: Timetable, start_times: Sequence[float]) -> bool:
-    """Return whether the receiver existed when the datagram was sent."""
+    """Return true if the receiver was already running when the datagram was sent."""
     if timed_input.sender is None or timed_input.number is None:
         return False
     return table.sent_at_s[timed_input.sender][timed_input.number] >= start_times[timed_input.played.incarnation]

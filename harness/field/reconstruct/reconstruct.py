@@ -1,4 +1,4 @@
-"""Reconstruct a flight as a scenario, write the scenario, and verify that it replays the flight."""
+"""Reconstruct a flight as a scenario, write the scenario, and verify that it reproduces the flight."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,8 +34,8 @@ SEED = 1
 
 @dataclass(frozen=True)
 class AgentOutcome:
-    """The result of one agent: number of blocks in its simulated chain, and `why` the chain is not as recorded, else
-    None.
+    """The result for one agent: the number of blocks in its simulated chain, and the reason `why` it differs from the
+    recorded chain, or None.
     """
 
     agent_id: int
@@ -62,13 +62,15 @@ class Reconstruction:
 
     @property
     def problems(self) -> list[str]:
-        """Sentences on the parts that are not reproduced, the first difference first. Empty if all is reproduced."""
+        """Sentences about the parts that are not reproduced. The first difference is first, and there is none if all is
+        reproduced.
+        """
         first = [self.difference.sentence] if self.difference else []
         return first + [f"agent {agent.agent_id} {agent.why}" for agent in self.agents if agent.why]
 
     @property
     def blocks(self) -> int:
-        """Number of distinct blocks in the reproduced chains."""
+        """The number of different blocks in the reproduced chains."""
         exports = self.simulated.evidence.exports
         chains = (exports[agent].chain_of_block_hashes for agent in self.reproduced if agent in exports)
         return len({block for chain in chains for block in chain})
@@ -125,7 +127,8 @@ def reconstruct(
     depot: "Depot | None" = None,
     keys: "PublicKeys | None" = None,
 ) -> Reconstruction:
-    """Reconstruct a flight. `report_progress` receives a text at each step. Raises FieldError without usable records.
+    """Reconstruct a flight. `report_progress` is called with a text at each step. Raises FieldError without usable
+    records.
 
     In a secured mission, `opener` decrypts captures, `depot` decrypts blocks, and `keys` are public keys that the user
     trusts.
@@ -184,7 +187,7 @@ def reconstruct(
 
 
 def _check_signatures(flight: Flight, keys: "PublicKeys | None", remarks: list[str]) -> list[str]:
-    """Return a sentence on each wrong signature, and add a remark if nothing vouches for the exports."""
+    """Return a sentence about each wrong signature. Add a remark if no signature confirms the exports."""
     trusted = TrustedKeys(keys, "--keys") if keys is not None else None
     if trusted is None and flight.public_keys is not None:
         trusted = TrustedKeys(flight.public_keys, None)
@@ -233,7 +236,7 @@ def _blocks(simulated: Simulated, agent_id: int) -> int:
 
 
 def _expected(simulated: Simulated, rehearsals: Mapping[int, Rehearsal]) -> Document:
-    """Return the expected results: the chains, and the bad verdicts, because they occurred in the flight."""
+    """Return the expected results of the scenario: the chains, and the bad verdicts that occurred in the flight."""
     exports = simulated.evidence.exports
     chains = {str(agent): exports[agent].top_chain_hash for agent in sorted(rehearsals) if agent in exports}
     bad = {key: simulated.result.judgements[key].verdict for key in simulated.result.bad}
@@ -246,7 +249,7 @@ WIDTH = 116
 
 
 def write(reconstruction: Reconstruction, path: Path, sources: Sequence[Path], left_out: Sequence[str]) -> None:
-    """Write the scenario. Raises MachineError if that is not possible."""
+    """Write the scenario to a file. Raises MachineError if that fails."""
     sentences = _sentences(reconstruction, path, sources, left_out)
     comment = [line for sentence in sentences for line in wrap(sentence, WIDTH)]
     try:

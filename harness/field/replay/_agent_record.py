@@ -1,4 +1,4 @@
-"""The record of one agent for a replay: its lines in order, and the other records of the flight."""
+"""Read the record of one agent for a replay: its trace lines in order, and the other records of the flight."""
 
 import base64
 from bisect import bisect_right
@@ -28,7 +28,7 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A line of the record. Line numbers and incarnations count from 1.
+    """A line of the record. Line numbers and restarts count from 1.
 
     `gap` describes missing lines directly before it, such as "2 lines are damaged", else None.
     """
@@ -40,7 +40,7 @@ class Entry:
 
 
 class FlightRecords(Protocol):
-    """The records of a flight. Each is read at its first use."""
+    """The records of a flight. Each is read when it is first used."""
 
     @property
     def exports(self) -> Mapping[int, Export]: ...
@@ -50,7 +50,7 @@ class FlightRecords(Protocol):
 
     @property
     def record(self) -> JudgedRecord | None:
-        """The record of the run. None for a flight in the field."""
+        """Return run.json of the run, or None for a real flight."""
 
     def capture(self, agent_id: int) -> AgentCapture | None:
         """Return the capture of the agent's vehicle. None without one, or if it is not needed."""
@@ -94,14 +94,16 @@ class Record:
 
     @cached_property
     def unrecorded(self) -> dict[int, str]:
-        """Positions of entries that lost lines may explain, with the reason, such as "lines are missing ..."."""
+        """The positions of entries whose errors lost lines may explain, with reasons such as "lines are missing
+        ...".
+        """
         lost = {} if self.is_counted else lost_lines(self.trace)
         of_runs = [position for position, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
         return {of_runs[position]: why for position, why in lost.items()}
 
     @property
     def is_counted(self) -> bool:
-        """True if the record of the run proves that no line is missing: the agent had counted its handler runs."""
+        """True if run.json proves that no line is missing, because the agent counted its handler runs."""
         run = self.flight.record
         recorded = run.agents.get(str(self.agent_id)) if run is not None else None
         counts = recorded.handler_runs if recorded is not None else []
@@ -109,7 +111,7 @@ class Record:
         return bool(counted) and len(counted) == self.incarnations and sum(counted) <= len(self.trace.runs)
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
-        """Return the datagrams of a sender with this number, as the traces of other agents sent or received them."""
+        """Return the datagrams of a sender with this number, from the traces of other agents."""
         return self._datagrams.get((sender, sequence), [])
 
     @cached_property
@@ -139,7 +141,7 @@ class Record:
 
     @cached_property
     def present_until_s(self) -> float | None:
-        """A mission second at which the agent certainly still ran, after its last line. None if unknown.
+        """A mission second after the last line at which the agent certainly still ran, or None if it is unknown.
 
         Steps that were due before this time, but have no line, are missing.
         """
@@ -182,7 +184,7 @@ class Record:
             yield Arrival(seen.at_s, decode(seen.datagram).message.NAME, seen.sender, seen.sequence, arrived=True)
 
     def was_paused(self, since: float, until: float) -> bool:
-        """Return whether the agent was paused, or may have been, at any time between two mission seconds.
+        """Return true if the agent was paused, or may have been paused, between two mission seconds.
 
         The record of a run contains the pauses. Without it, an agent may have been paused if it wrote no line while a
         timer was overdue, and caught up with its next line.

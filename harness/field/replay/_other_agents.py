@@ -1,4 +1,4 @@
-"""The steps of the other agents at the current moment of a replay, if their records are available."""
+"""Show the steps of the other agents at the current moment of a replay, if their records exist."""
 
 from bisect import bisect_right
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ STEPS_SHOWN = 2
 
 
 class OtherAgents:
-    """The records of the other agents. They are read at their first use.
+    """The records of the other agents. They are read when they are first used.
 
     The agents of a run share one clock. Agents in the field have separate clocks, whose offsets follow from the
     messages between two agents.
@@ -40,7 +40,7 @@ class OtherAgents:
         return {agent_id: _OtherAgent(record, trace) for agent_id, trace in others.items()}
 
     def at(self, player: Player) -> Iterator[Text]:
-        """Yield for each agent its steps at this moment, its state, and its relation to the current step."""
+        """Yield the steps of each agent at this moment, its state, and its relation to the current step."""
         entry = player.entry
         now = entry.content.t if entry else 0.0
         top = player.state.chain.top_chain_hash.hex()
@@ -64,7 +64,7 @@ class OtherAgents:
 
 
 class _OtherAgent:
-    """Another agent. `clock` is its clock relative to that of the replayed agent."""
+    """Another agent. `clock` relates its clock to that of the replayed agent."""
 
     def __init__(self, record: Record, trace: Trace) -> None:
         self._messages = PeerMessages(record, trace)
@@ -87,7 +87,7 @@ class _OtherAgent:
         return range(max(first, middle - STEPS_SHOWN), min(until, middle + STEPS_SHOWN))
 
     def state_text(self, now: float, top: str) -> str:
-        """Return its state at this moment."""
+        """Return a text about its state at this moment."""
         number = bisect_right(self._times, now) - 1
         if number < 0:
             return "nothing yet"
@@ -117,13 +117,13 @@ class _OtherAgent:
                 yield shown(f"    has no line for {message.message[:60]} {message.seq}", style="yellow")
 
     def _nearest(self, numbers: list[int], at_s: float) -> list[tuple[int, HandlerRun]]:
-        """Return the run nearest in time. Sequence numbers repeat in each incarnation, so several runs may match."""
+        """Return the run that is nearest in time. Sequence numbers repeat after restarts, so several runs may match."""
         runs = (self.runs[number] for number in numbers)
         return sorted(runs, key=lambda numbered: abs(self.clock.at(numbered[1].t) - at_s))[:1]
 
 
 def _ahead_s(our_trace: Trace, their_run: Trace) -> float:
-    """Return the offset of the other mission clock from ours, from the start times of both."""
+    """Return the difference between two agents' mission clocks, from the start times in both traces."""
     own, other = (trace.header.clock.get("epoch_us") for trace in (our_trace, their_run))
     speedup = our_trace.header.clock.get("speedup", 1.0)
     if not (isinstance(own, int) and isinstance(other, int) and isinstance(speedup, int | float)):

@@ -1,4 +1,4 @@
-"""The messages between the agent of a record and one other agent, as both records contain them."""
+"""Find the messages between the agent of a record and one other agent in both of their records."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """A message with its times of sending and reception, each on the clock of the agent there."""
+    """A message with the times at which it was sent and received, each on the clock of the agent there."""
 
     sender: int
     receiver: int
@@ -21,14 +21,14 @@ class Delivery:
 
 
 class PeerMessage(NamedTuple):
-    """A message, with the position of the entry that sent or received it."""
+    """A message, and the position of the trace entry that sent or received it."""
 
     position: int
     delivery: Delivery
 
 
 class PeerMessages:
-    """The messages between both agents. `runs` are the handler runs of the other agent, with line numbers."""
+    """The messages between two agents. `runs` contains the handler runs of the other agent with line numbers."""
 
     def __init__(self, record: Record, other_trace: Trace) -> None:
         self.runs = [numbered for numbered_runs in other_trace.incarnations() for numbered in numbered_runs]
@@ -44,7 +44,9 @@ class PeerMessages:
                 self._received.setdefault((trigger.message, trigger.sequence), []).append(number)
 
     def runs_that_sent(self, message: object, sequence: object) -> list[int]:
-        """Return the positions of runs that sent a message of this type and number: at most one per incarnation."""
+        """Return the positions of runs that sent a message of this type and number. There is at most one between
+        restarts.
+        """
         return self._sent.get((message, sequence), [])
 
     def runs_that_received(self, message: object, sequence: object) -> list[int]:

@@ -1,4 +1,4 @@
-"""Play a record: the reference core receives the recorded inputs, forward and back, with the same result each time.
+"""Play a record: the agent core gets the recorded inputs, forward or back, with the same result each time.
 
 To go back, the player restores a checkpoint and plays forward from there. Reversing single steps instead would need an
 inverse of each handler.
@@ -38,7 +38,7 @@ _OF_TIMERS = frozenset(handler.name for handler in ON_TIMER.values())
 
 @dataclass
 class ReplayResult:
-    """The result of the played entries."""
+    """The result of the replay up to the current entry."""
 
     steps: int = 0
     """Number of handler runs that were compared with the reference."""
@@ -109,12 +109,12 @@ class Player:
 
     @property
     def lost(self) -> str | None:
-        """The reason why the state of the agent is currently unknown, else None."""
+        """The reason why the state of the agent is unknown at this position, or None."""
         return self._follower.lost
 
     @property
     def entry(self) -> Entry | None:
-        """The entry played last."""
+        """The entry that was played last, or None."""
         return self.entries[self.position - 1] if self.position else None
 
     @property
@@ -122,7 +122,7 @@ class Player:
         return self.position == len(self.entries)
 
     def deviations_here(self) -> list[Deviation]:
-        """Return the deviations of the last entry, including those that the next entry will reveal."""
+        """Return the deviations of the last entry, including those that only the next entry shows."""
         result = self.result
         here = result.deviations[bisect_left(result.positions, self.position) :]
         upcoming = None if self.at_end else self.entries[self.position]
@@ -138,7 +138,7 @@ class Player:
         return here + self._follower.foresee(upcoming.line, upcoming.content)
 
     def forward(self, *, into_debugger: bool = False) -> Entry:
-        """Play the next entry. `into_debugger` calls `breakpoint()` directly before its handler runs."""
+        """Play the next entry. With `into_debugger`, call `breakpoint()` directly before its handler runs."""
         entry = self.entries[self.position]
         if isinstance(entry.content, HandlerRun):
             if entry.incarnation != self._incarnation:
@@ -156,7 +156,7 @@ class Player:
         return entry
 
     def to(self, position: int, *, replay: bool = False) -> None:
-        """Go to a position, forward or back. With `replay`, entries are played again even at the same position."""
+        """Go to a position, forward or back. With `replay`, play the entry there again."""
         position = max(0, min(position, len(self.entries)))
         if position < self.position or replay:
             nearest = max(known for known in self._checkpoints if known <= position)
@@ -256,7 +256,9 @@ class Player:
             result.lost.append(follower.lost)
 
     def _excuse(self, deviations: list[Deviation]) -> str | None:
-        """Return a reason for the deviations other than the agent, such as missing lines. None if there is none."""
+        """Return a reason for the deviations other than an error of the agent, such as missing lines. None if there is
+        none.
+        """
         if (why := self.record.unrecorded.get(self.position)) is not None:
             return f"{why},"
         of_timers = any(deviation.run is None and deviation.handler in _OF_TIMERS for deviation in deviations)
@@ -264,7 +266,7 @@ class Player:
         return shift or self._doubt(deviations)
 
     def _doubt(self, deviations: list[Deviation]) -> str | None:
-        """Return the damage to a single line that explains the deviations as well as a mistake. None if there is none.
+        """Return damage to a single line that would also explain the deviations, or None.
 
         It is a coincidence at most a few times in a record. If it explains more places, the deviations count.
         """
@@ -282,7 +284,7 @@ class Player:
 
 
 class _DoubtingPlayer(Player):
-    """A player that tries at each deviation whether damage to a single line explains it."""
+    """A player that tries to explain each deviation by damage to a single line."""
 
     def __init__(self, record: Record) -> None:
         super().__init__(record)
@@ -316,7 +318,7 @@ def _short(block_hash: str) -> str:
 
 
 def _later_than(entries: Iterable[Entry], until_s: float) -> int:
-    """Return the number of entries before the first one after `until_s`."""
+    """Return the number of entries before the first entry that is later than `until_s`."""
     count = 0
     for entry in entries:
         if entry.content.t > until_s:

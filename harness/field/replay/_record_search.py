@@ -1,4 +1,4 @@
-"""Find the records in a path: a trace, the directory of a run, or a directory of any files.
+"""Find the records at a path: a trace, the directory of a run, or a directory with any files.
 
 In the directory of a run, the files have known names, and only the needed ones are read. In every other directory all
 files are ingested first.
@@ -83,7 +83,7 @@ class _DirectoryRecords:
 
 
 class IngestedRecords:
-    """The records of a flight that was ingested before."""
+    """The records of a flight that was already read."""
 
     record = None
 
@@ -105,7 +105,7 @@ def _capture(flight: Flight, agent_id: int) -> AgentCapture | None:
 
 
 def open_record(path: Path, agent_id: int | None = None) -> Record:
-    """Return the record in a trace, or that of an agent in a directory. Raises FieldError if none can be played."""
+    """Return the record in a trace, or of an agent in a directory. Raises FieldError if none can be played."""
     records = open_records(path, agent_id)
     if len(records) > 1:
         names = ", ".join(str(record.agent_id) for record in records)
@@ -114,7 +114,7 @@ def open_record(path: Path, agent_id: int | None = None) -> Record:
 
 
 def open_records(path: Path, agent_id: int | None = None) -> list[Record]:
-    """Return all records in a trace or a directory, or that of one agent. Raises FieldError if none can be played."""
+    """Return all records in a trace or a directory, or those of one agent. Raises FieldError if none can be played."""
     files = _files_in(path, agent_id) if path.is_dir() else [path]
     directory = path if path.is_dir() else _directory_of(path)
     traces = [trace for file in files if (trace := _read(file)) and not trace.problem and not trace.cut_off]
@@ -161,13 +161,13 @@ def _read(file: Path) -> Trace | None:
 
 
 def _directory_of(file: Path) -> Path:
-    """Return the directory of the run that wrote the file, else the directory of the file."""
+    """Return the directory of the run that wrote the file, or else the directory of the file."""
     run_records = file.parent.parent
     return run_records if file.parent.name == AGENTS and (run_records / RUN_FILE).is_file() else file.parent
 
 
 def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
-    """Return the traces of all agents, or of one, if their names identify them and no other file can belong to them.
+    """Return the traces of all agents, or of one, if their file names identify them without doubt.
 
     Otherwise return nothing. Then all files must be ingested, which takes longer.
     """
@@ -182,7 +182,7 @@ def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
 
 
 def _belongs_to_another(path: Path, agent_id: int) -> bool:
-    """Return whether a file certainly contains no record of the agent, judged by its name or first line."""
+    """Return true if a file certainly has no record of the agent, judged by its name or its first line."""
     if path.name.endswith((".chain.json", ".mission.json", ".log", ".store")):
         return True
     try:
@@ -194,7 +194,7 @@ def _belongs_to_another(path: Path, agent_id: int) -> bool:
 
 
 def _open_ingested(path: Path, agent_id: int | None, sources: Sequence[Path]) -> list[Record]:
-    """Return the records in files of any kind. Empty if only a part of `path` was read, and it has too few records."""
+    """Return the records in files of any kind. If too few were found in the part that was read, return none."""
     ingested = ingest_files(sources)
     flights = [flight for flight in ingested.flights if flight.traces]
     if path not in sources and len({agent for flight in flights for agent in flight.traces}) < len(sources):

@@ -1,4 +1,4 @@
-"""Find the place after a gap at which an agent can be followed again, and detect changes of its clock.
+"""Find a place after a gap at which the state of an agent is known again, and detect changes of its clock.
 
 The state of an idle agent consists of its chain and its current block. The top chain hash identifies the chain, if the
 records of the flight contain each step from the inception block to it. The current block follows from the block that
@@ -29,7 +29,7 @@ _ChainSteps = dict[bytes, tuple[bytes, str]]
 
 
 class Resumption:
-    """The chains in all records of the flight, and the states that follow from them."""
+    """The chains in all records of the flight, and the agent states that follow from them."""
 
     def __init__(self, record: Record, blocks: RecordedBlocks) -> None:
         self._record = record
@@ -37,7 +37,7 @@ class Resumption:
         self._inception = InceptionBlock(record.header.initial_data).chain_hash
 
     def resume(self, follower: Follower, position: int) -> bool:
-        """Put a new follower into the state after the entry at `position`. Returns whether that state is known."""
+        """Set a new follower to the agent's state after the entry at `position`. Return true if that state is known."""
         entry = self._record.entries[position]
         run = entry.content
         if not isinstance(run, HandlerRun):
@@ -63,7 +63,7 @@ class Resumption:
         return True
 
     def _chain(self, top: str, predecessors: _ChainSteps) -> list[Block] | None:
-        """Return the blocks of the chain with this top chain hash, oldest first. Raises NotOnRecordError."""
+        """Return the blocks of the chain with this top chain hash. The oldest is first. Raises NotOnRecordError."""
         blocks: list[Block] = []
         chain_hash = bytes.fromhex(top) if len(top) == 2 * HASH_BYTES and _is_hex(top) else b""
         while chain_hash != self._inception:
@@ -75,7 +75,7 @@ class Resumption:
 
     @cached_property
     def _own_steps(self) -> _ChainSteps:
-        """The chain steps in the record itself, and in exports."""
+        """Return the extensions of chains that the record itself and exports contain."""
         steps: _ChainSteps = {}
         for export in self._record.flight.exports.values():
             predecessors = self._inception
@@ -88,7 +88,7 @@ class Resumption:
 
     @cached_property
     def _all_steps(self) -> _ChainSteps:
-        """The chain steps in all records. Reading them takes some time."""
+        """Return the extensions of chains in all records. Reading them takes some time."""
         steps = self._own_steps.copy()
         for trace in self._record.flight.traces.values():
             self._add_steps(trace, steps)
@@ -110,7 +110,7 @@ class Resumption:
                 top = bytes.fromhex(run.state.top) if _is_hex(run.state.top) else None
 
     def _block_in_progress(self, position: int) -> bytes | None:
-        """Return the current block after an entry, from the events that follow. None if unknown."""
+        """Return the block under construction after an entry, from the events that follow, or None if it is unknown."""
         logged = bytearray()
         for _, run in self._following_runs(position):
             if run.handler != "build_data_block" or not isinstance(run.trigger, EventTrigger):
@@ -123,11 +123,11 @@ class Resumption:
         return b""  # The block is never completed, so its content has no effect.
 
     def _sequence(self, position: int) -> int:
-        """Return the sequence number of the next message after an entry. 0 if there is none."""
+        """Return the sequence number of the next message after an entry, or 0 if there is none."""
         return next((run.sent[0].seq for _, run in self._following_runs(position) if run.sent), 0)
 
     def _following_runs(self, position: int) -> Iterator[tuple[Entry, HandlerRun]]:
-        """Yield the following entries of the same incarnation, up to a gap."""
+        """Yield the following entries up to a gap or a restart."""
         incarnation = self._record.entries[position].incarnation
         for entry in islice(self._record.entries, position + 1, None):
             if isinstance(entry.content, HandlerRun):
@@ -153,16 +153,13 @@ MIN_SHIFT_S = 1.0
 
 
 class ClockSet:
-    """A detector of changes of the agent's clock. It reads the records of the other agents at its first use."""
+    """A detector of changes of the agent's clock. It reads the records of the other agents when it is first used."""
 
     def __init__(self, record: Record) -> None:
         self._record = record
 
     def shift_near(self, position: int) -> str | None:
-        """Return a text such as "its clock was set by +30.0 s" for a change around this entry.
-
-        None if none is visible.
-        """
+        """Return a text such as "its clock was set by +30.0 s" if the clock changed around this entry, otherwise None."""
         if self._record.flight.record is not None:
             return None  # The agents of a run share one clock.
         jumps = [_largest_jump(differences, position) for differences in self._differences]
@@ -176,8 +173,8 @@ class ClockSet:
 
     @cached_property
     def _differences(self) -> list[list[tuple[int, float]]]:
-        """Message positions for each other agent, each with the time by which our clock is ahead according to the
-        message.
+        """Return, for each other agent, the positions of its messages, with the difference between both clocks at
+        each.
         """
         own = self._record.agent_id
         differences = []
@@ -193,7 +190,7 @@ class ClockSet:
 
 
 def _largest_jump(differences: list[tuple[int, float]], position: int) -> float | None:
-    """Return the largest change of the clock difference around an entry. None if there are too few messages."""
+    """Return the largest change of the clock difference around an entry, or None if there are too few messages."""
     shift_near = [offset_s for at, offset_s in differences if abs(at - position) <= WITHIN]
     jumps = (
         median(shift_near[number : number + MESSAGES]) - median(shift_near[number - MESSAGES : number])

@@ -1,4 +1,4 @@
-"""The text of a step, a state and a difference, mostly one line of at most 100 columns each."""
+"""Print a step, a state or a difference, mostly in one line of at most 100 columns."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import zip_longest
@@ -24,7 +24,7 @@ BLOCKS_SHOWN = 8
 
 
 class StepText:
-    """The texts of a player's record. `names` has the names of its blocks."""
+    """The texts for the record of a player. `names` contains the names of its blocks."""
 
     def __init__(self, player: Player, names: ReplayNames) -> None:
         self._player = player
@@ -33,7 +33,7 @@ class StepText:
     # A step
 
     def line(self, number: int, entry: Entry) -> Text:
-        """Return the line of the entry with this number, from 1: " 212 604.278 s A18
+        """Return the line for entry number `number` (from 1), such as "212 604.278 s A18
         receive_response_block_for_hash: committed".
         """
         where = f"{entry.line:>7} {entry.content.t:>10.3f} s  "
@@ -48,9 +48,7 @@ class StepText:
         return shown(f"{'✘' if differs else ' '}{where}{text}", style="red" if differs else "")
 
     def step(self) -> Iterator[Text]:
-        """Yield the lines of the step played last: its cause, the rule of its Algorithm, its effects and its
-        deviations.
-        """
+        """Yield the lines about the last step: its cause, the rule of its Algorithm, its effects and its deviations."""
         player = self._player
         entry = player.entry
         if entry is None:
@@ -94,7 +92,7 @@ class StepText:
             yield _row("counted", ", ".join(self._counted(key, count) for key, count in run.tally.items()))
 
     def deviation(self, deviation: Deviation) -> Text:
-        """Return the line of a deviation. It names the step if that is not the one played last."""
+        """Return the line about a deviation. It names the step if that is not the last one."""
         entry = self._player.entry
         own = entry is not None and entry.line == deviation.line and isinstance(entry.content, HandlerRun)
         whose = "" if own else f"of line {deviation.line}, {deviation.handler}: "
@@ -163,7 +161,7 @@ class StepText:
         return ", ".join(text)
 
     def chain(self, chain_hash: bytes) -> str:
-        """Return a chain hash, and whether it belongs to the agent's own chain."""
+        """Return a text about a chain hash, which states whether it belongs to the agent's own chain."""
         chain = self._player.state.chain
         if chain_hash == chain.top_chain_hash:
             own = "our top"
@@ -185,7 +183,7 @@ class StepText:
     # The state
 
     def in_short(self) -> Text:
-        """Return the state in one line."""
+        """Return the state of the agent in one line."""
         if self._player.lost is not None:
             return shown("  the state of the agent is not known", style="yellow")
         state = self._player.state
@@ -197,7 +195,7 @@ class StepText:
         return shown(f"  {held}, {doing}{timers}", style="cyan")
 
     def state(self) -> Iterator[Text]:
-        """Yield the lines of the complete state after the step."""
+        """Yield lines about the complete state of the agent after the step."""
         if self._player.lost is not None:
             yield self.in_short()
             return

@@ -1,4 +1,4 @@
-"""Breakpoints in a record, and the source lines of handlers."""
+"""Handle breakpoints in a record, and find the source lines of handlers."""
 
 import inspect
 from collections.abc import Callable, Iterator
@@ -24,8 +24,7 @@ _BY_ALGORITHM = {str(handler.algorithm): name for name, handler in HANDLERS.item
 
 
 def parse_breakpoint(text: str, names: ReplayNames) -> Breakpoint:
-    """Return the breakpoint for a line ("812"), a handler (its name, or "A13"), or a block ("4.11", or the start of its
-    hash).
+    """Return the breakpoint that a text describes: a line ("812"), a handler (its name, or "A13"), or a block ("4.11").
 
     Raises FieldError for any other text.
     """
@@ -47,7 +46,9 @@ def parse_breakpoint(text: str, names: ReplayNames) -> Breakpoint:
 
 
 def next_stop(player: Player, stops_at: Breakpoint, backward: bool = False) -> int | None:
-    """Return the position after the next entry that meets the condition, or the previous one. None if there is none."""
+    """Return the position after the next entry that matches, or after the previous one with `backward`. None if none
+    matches.
+    """
     numbers = range(player.position - 2, -1, -1) if backward else range(player.position, len(player.entries))
     return next((number + 1 for number in numbers if stops_at(player.entries[number])), None)
 
@@ -80,8 +81,7 @@ def blocks_of(entry: Entry) -> set[str]:
 
 @cache
 def source_of(handler: str) -> str:
-    """Return the place of the first statement of a handler, such as "ucp/reconcile.py:187". A breakpoint there always
-    stops.
+    """Return the place of a handler's first statement, such as "ucp/reconcile.py:187". A breakpoint there always stops.
 
     The path is relative to the working directory, if the code is in it.
     """

@@ -1,4 +1,4 @@
-"""Judge the records of a flight without the record of a run: lines of a trace may be missing.
+"""Prepare the records of a real flight for the checker. Without run.json, trace lines may be missing.
 
 Each trace is judged as `replay` judges it. The other checks read a trace only up to the first place at which lines are
 missing.
@@ -21,7 +21,7 @@ from harness.field.replay._record_search import IngestedRecords
 
 
 def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
-    """Return the evidence with the traces of a flight in place of its own."""
+    """Return the evidence with the traces of a flight in place of its own traces."""
     traces = {agent_id: _up_to_loss(trace) for agent_id, trace in flight.traces.items()}
     for agent_id, why in lacking_traces(traces):
         traces[agent_id].problem = traces[agent_id].problem or why
@@ -34,7 +34,7 @@ def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
 
 
 def _up_to_loss(trace: Trace) -> Trace:
-    """Return the part of a trace before the first place at which lines are missing, with the reason as its problem."""
+    """Return the part of a trace before the first missing line. The reason becomes its problem."""
     lost = lost_lines(trace)
     lost |= {gap.position: "lines are damaged" for gap in trace.gaps}
     lost |= dict.fromkeys(trace.jumps, "the clock of the agent was set")

@@ -1,4 +1,4 @@
-"""The interactive command line of a replay: go forward and back by step, handler, block, line and second."""
+"""Provide the command line of a replay: go forward and back by step, handler, block, line and second."""
 
 import cmd
 import sys
@@ -36,7 +36,7 @@ SHORT_FORMS = {
 
 
 class Prompt(cmd.Cmd):
-    """A prompt that reads commands from standard input until its end or `quit`. `quit` is true after the latter.
+    """A command line that reads commands until the input ends or the user enters `quit`. Then `quit` is true.
 
     `breaks` are the places at which `continue` stops, in addition to differences.
     """
@@ -68,7 +68,7 @@ class Prompt(cmd.Cmd):
         return f"(replay {self._player.position}/{len(self._player.entries)}) " if self._terminal else ""
 
     def onecmd(self, line: str) -> bool:
-        """Run a command.
+        """Execute a command. Return true if the replay must end.
 
         Short forms and unique beginnings of names are accepted. An empty line repeats the last command.
         """
@@ -250,7 +250,7 @@ class Prompt(cmd.Cmd):
         self._show()
 
     def _stops_at(self, entry: Entry) -> bool:
-        """Return whether `continue` stops at the entry played last."""
+        """Return true if `continue` must stop at the last entry."""
         positions = self._player.result.positions
         return positions[-1:] == [self._player.position] or self._breaks_at(entry)
 

@@ -1,4 +1,4 @@
-"""The result of a replay: the document `ucp-replay/1`, and a summary for users."""
+"""Represent the result of a replay: the JSON document `ucp-replay/1`, and a summary for users."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -66,7 +66,7 @@ def document(records: Iterable[ReplayedRecord]) -> dict[str, Any]:
 
 
 def verdict(result: ReplayResult) -> Verdict:
-    """Return the verdict. A record without compared steps is "not judged", never "as specified"."""
+    """Return the verdict on a replay. A record without compared steps is "not judged", never "as specified"."""
     if result.deviations:
         return "deviates"
     return "as specified" if result.steps else "not judged"
@@ -105,7 +105,7 @@ LOST_SHOWN = 5
 
 
 def header_text(record: Record) -> Text:
-    """Return the line with the agent and the length of its record."""
+    """Return a line with the agent and the length of its record."""
     incarnations = f", {record.incarnations} lives" if record.incarnations > 1 else ""
     return shown(
         f"agent {record.agent_id}, one of {len(record.header.roster)}: {len(record.entries):,} lines, "
@@ -115,7 +115,9 @@ def header_text(record: Record) -> Text:
 
 
 def summary(record: Record, result: ReplayResult, names: ReplayNames) -> Iterator[Text]:
-    """Yield the first difference in detail, the others by handler, and the reasons for steps that were not compared."""
+    """Yield text about the first difference in detail, the others by handler, and the reasons why steps were not
+    compared.
+    """
     steps = f"{result.steps:,} handler run{'s' if result.steps != 1 else ''}"
     match verdict(result):
         case "as specified":
@@ -150,7 +152,9 @@ def _differences(record: Record, result: ReplayResult, steps: str, names: Replay
 
 
 def title(deviation: Deviation) -> str:
-    """Return a text such as "Algorithm 13, receive_request_next_in_sequence (ucp/reconcile.py:130)"."""
+    """Return the title of a deviation, such as "Algorithm 13, receive_request_next_in_sequence
+    (ucp/reconcile.py:130)".
+    """
     handler = HANDLERS.get(deviation.handler or "")
     if handler is None:
         return "an unknown handler"

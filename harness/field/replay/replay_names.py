@@ -1,4 +1,4 @@
-"""Names of blocks in a replay, and blocks by hash from any record of the flight."""
+"""Name the blocks in a replay, and find blocks by hash in any record of the flight."""
 
 import re
 from collections.abc import Iterator
@@ -18,12 +18,12 @@ _NAME = re.compile(r"\d+\.\d+")
 
 
 def is_block(text: str) -> bool:
-    """Return whether a text may be the name of a block, or the beginning of its hash."""
+    """Return true if a text may be the name of a block, or the beginning of its hash."""
     return bool(_NAME.fullmatch(text) or (_HASH.fullmatch(text) and not text.isdigit()))
 
 
 class ReplayNames:
-    """Names of blocks by hash, and hashes by name. They come from exports, or from traces if there are none."""
+    """The names of blocks by hash, and the hashes by name. They come from exports, or from traces if there are none."""
 
     def __init__(self, record: Record) -> None:
         self._record = record
@@ -54,7 +54,7 @@ class ReplayNames:
 
 
 class RecordedBlocks(Blocks):
-    """All blocks in the records of the flight, whether or not they were played already."""
+    """All blocks in the records of the flight, including those that the replay has not reached yet."""
 
     def __init__(self, record: Record) -> None:
         super().__init__(())
@@ -73,7 +73,7 @@ class RecordedBlocks(Blocks):
                 self.add(block)
 
     def _sources(self) -> Iterator[Iterator[Block]]:
-        """Yield the sources of blocks, the fastest first."""
+        """Yield the sources of blocks. The fastest one is first."""
         yield _blocks_of(self._record.trace)
         yield self._of_exports()
         yield from map(_blocks_of, self._record.flight.traces.values())

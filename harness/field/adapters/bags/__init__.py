@@ -1,4 +1,4 @@
-"""Read ROS bags message by message, in the order of recording: version 1, and version 2 in MCAP or SQLite.
+"""Read ROS bags (recordings of ROS messages) in order of time: version 1, and version 2 in MCAP or SQLite files.
 
 The readers need neither an index nor `metadata.yaml`, because a bag has neither if its recorder was killed or its
 vehicle lost power. They skip a damaged place and continue behind it. A size that a file claims is trusted up to a
@@ -28,7 +28,7 @@ MAGICS = (_version_1.MAGIC, _mcap_bag.MAGIC, _sqlite.MAGIC, ZSTD_MAGIC)
 
 
 class BagMessage(NamedTuple):
-    """A message in a bag.
+    """A message in a ROS bag.
 
     `number` counts the messages of the file from 1. `time_ns` is the recording time since the epoch.
     """
@@ -41,7 +41,7 @@ class BagMessage(NamedTuple):
 
 
 def messages(path: Path) -> Iterator[BagMessage | Damage]:
-    """Yield all messages, and a Damage for each unreadable place between them. Raises OSError."""
+    """Yield all messages in a ROS bag, and a Damage for each unreadable place between them. Raises OSError."""
     number = 0
     with TemporaryDirectory(prefix="ucp-bag-") as directory:
         for item in _items(path, Path(directory)):

@@ -1,4 +1,4 @@
-"""Messages in a bag, and the bounded decompression of chunks and files."""
+"""Represent messages in a ROS bag, and decompress data without exceeding a size limit."""
 
 import bz2
 from collections.abc import Hashable, Iterator
@@ -22,7 +22,7 @@ MAX_TRIES = 2_000_000
 
 
 class RawMessage(NamedTuple):
-    """A message as stored. `time_ns` is the recording time in nanoseconds since the Unix epoch."""
+    """A message as it is stored in the ROS bag. `time_ns` is the recording time in nanoseconds since the Unix epoch."""
 
     topic: str
     type_name: str
@@ -31,7 +31,7 @@ class RawMessage(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """A place that cannot be read. `why` completes a sentence."""
+    """A place in a file that cannot be read. `why` completes a sentence."""
 
     why: str
 
@@ -40,7 +40,7 @@ Item = RawMessage | Damage
 
 
 class Topics:
-    """The topics of the channels in a bag.
+    """The topics of the channels in a ROS bag.
 
     A message on a channel without a known topic is kept until the end, because an index at the end of the file may
     declare the topic. Messages of one channel stay in order.
@@ -53,7 +53,7 @@ class Topics:
         self._waiting_bytes = 0
 
     def message(self, channel: Hashable, time_ns: int, data: bytes) -> Iterator[Item]:
-        """Yield the message, or keep it if the topic of its channel is unknown."""
+        """Yield the message, or store it for later if the topic of its channel is still unknown."""
         if channel in self.known and channel not in self._waiting_channels:
             yield RawMessage(*self.known[channel], time_ns, data)
         elif self._waiting_bytes < MAX_CHUNK_BYTES:
@@ -62,7 +62,7 @@ class Topics:
             self._waiting_bytes += len(data)
 
     def pending(self) -> Iterator[Item]:
-        """Yield the messages that were kept."""
+        """Yield the messages that were stored because their topic was unknown."""
         unknown = 0
         for channel, time_ns, data in self._waiting:
             if channel in self.known:
@@ -100,7 +100,7 @@ def decompress(compression: str, data: bytes, max_bytes: int = MAX_CHUNK_BYTES) 
 
 
 def message_data(data: bytes) -> bytes:
-    """Return the message. In version 2, each message may be compressed. Raises ValueError."""
+    """Return the message data. In version 2, each message may be compressed. Raises ValueError."""
     if not data.startswith(ZSTD_MAGIC):
         return data
     content, problem = decompress("zstd", data, MAX_MESSAGE_BYTES)
@@ -110,7 +110,7 @@ def message_data(data: bytes) -> bytes:
 
 
 def decompress_file(path: Path, copy: Path) -> str:
-    """Decompress a zstd file to `copy`. Returns the reason why the content is incomplete, or ""."""
+    """Decompress a zstd file to `copy`. Return the reason why the content is incomplete, or ""."""
     decompressor: Any = _decompressor("zstd")
     written = 0
     with BoundedFile(path, MAX_FILE_BYTES) as file, copy.open("wb") as unpacked_copy:

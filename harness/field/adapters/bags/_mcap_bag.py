@@ -1,4 +1,4 @@
-"""Bags of version 2 in MCAP files, read record by record (mcap.dev/spec). Damaged records are skipped."""
+"""Read ROS bags of version 2 in MCAP files (mcap.dev/spec). Damaged records are skipped."""
 
 import re
 import struct
@@ -46,7 +46,7 @@ class _Reader:
         self.closed = False
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
-        """Yield the messages of the bag or of a chunk.
+        """Yield the messages in the whole file, or in a compressed part of it (chunk).
 
         If the chunk is not `whole`, an incomplete last record is no damage.
         """
@@ -92,7 +92,7 @@ class _Reader:
             yield from self._topics.message(number, log_time, record[_MESSAGE_HEAD.size :])
 
     def _next(self, buffer: Buffer, start: int) -> int | None:
-        """Return the position of the next record that another record or the end of the buffer follows."""
+        """Return the position of the next record that is followed by another record or by the end of the buffer."""
         for match in _BEGINNING.finditer(buffer, start):
             if next(self._tries, None) is None:
                 return None
@@ -103,7 +103,9 @@ class _Reader:
 
 
 def _record_at(buffer: Buffer, position: int) -> tuple[int, int, int]:
-    """Return (operation, start, end) of the record at a position, or zeros if there is none. A chunk may be cut off."""
+    """Return (operation, start, end) of the record at a position, or zeros if there is none. A chunk may be cut off at
+    its end.
+    """
     if position + _RECORD.size > len(buffer):
         return 0, 0, 0
     operation, length = _RECORD.unpack_from(buffer, position)

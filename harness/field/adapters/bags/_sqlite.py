@@ -1,4 +1,4 @@
-"""Bags of version 2 in SQLite files (rosbag2_storage_sqlite3), read in the order of recording."""
+"""Read ROS bags of version 2 in SQLite files (rosbag2_storage_sqlite3), in order of time."""
 
 import shutil
 import sqlite3
@@ -28,7 +28,7 @@ _FIRST = -(2**63)
 
 
 def items(path: Path, scratch: Path) -> Iterator[Item]:
-    """Yield the messages.
+    """Yield the messages in the database.
 
     A database that was not closed has messages in its journal. SQLite then repairs a copy of both files.
     """
@@ -51,7 +51,7 @@ def items(path: Path, scratch: Path) -> Iterator[Item]:
 
 
 def _pages_of_truncated(path: Path) -> SqlitePages | None:
-    """Return the pages of a file that is shorter than its header says. None for any other file."""
+    """Return the pages of a file that is shorter than its header states. Return None for any other file."""
     with path.open("rb") as file:
         header = file.read(FILE_HEADER_BYTES)
         if len(header) < FILE_HEADER_BYTES:
@@ -63,7 +63,7 @@ def _pages_of_truncated(path: Path) -> SqlitePages | None:
 
 
 def _rows_in_pages(pages: SqlitePages) -> Iterator[Item]:
-    """Yield the messages in the pages, in the order of recording, and the damage at the end."""
+    """Yield the messages in the pages in order of time, and finally the damage."""
     topics: dict[Any, tuple[str, str]] = {}
     messages: dict[int, list[Any]] = {}
     for number, values in pages.rows():
@@ -115,7 +115,7 @@ def _rows(database: sqlite3.Connection) -> Iterator[Item]:
 
 
 def _item(topics: dict[Any, tuple[str, str]], topic: Any, time_ns: Any, data: Any) -> Item:
-    """Return the message in a row. In a damaged file, values may have any type."""
+    """Return the message in a database row. In a damaged file, values may have any type."""
     if topic not in topics or not isinstance(time_ns, int) or not isinstance(data, bytes):
         return Damage("a message is damaged")
     return RawMessage(*topics[topic], time_ns, data)

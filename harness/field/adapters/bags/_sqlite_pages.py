@@ -1,4 +1,4 @@
-"""Read the rows of a truncated SQLite file from its pages, without the tree that leads to them.
+"""Read the rows of a truncated SQLite file directly from its pages, because the index that leads to them is lost.
 
 SQLite finds a row by inner pages of a tree. In a file that grew while it was recorded, an inner page often lies behind
 the rows that it leads to. If the end of the file is lost, SQLite then finds no row at all. Each leaf page, however,
@@ -19,7 +19,7 @@ Row = tuple[int, list[Value]]
 
 
 class SqlitePages:
-    """The pages of a file."""
+    """The pages of an SQLite file."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -44,7 +44,7 @@ class SqlitePages:
                     continue
 
     def _row(self, offset: int) -> Row:
-        """Return the row in a cell. Raises IndexError or ValueError if it is damaged."""
+        """Return the row that begins at `offset` of a page. Raises IndexError or ValueError if it is damaged."""
         payload_bytes, offset = self._varint(self._data, offset)
         number, offset = self._varint(self._data, offset)
         payload = self._payload(offset, payload_bytes)

@@ -1,4 +1,4 @@
-"""Bags of version 1, read record by record (wiki.ros.org/Bags/Format/2.0). Damaged records are skipped."""
+"""Read ROS bags of version 1 (wiki.ros.org/Bags/Format/2.0). Damaged records are skipped."""
 
 import re
 import struct
@@ -45,7 +45,7 @@ class _Reader:
         self.records = iter(range(MAX_RECORDS))
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
-        """Yield the messages of the bag or of a chunk.
+        """Yield the messages in the whole file, or in a compressed part of it (chunk).
 
         If the chunk is not `whole`, an incomplete last record is no damage.
         """
@@ -81,7 +81,7 @@ class _Reader:
         self._topics.known.setdefault(fields.get("conn", b""), topic_and_type)
 
     def _next(self, buffer: Buffer, start: int) -> int | None:
-        """Return the position of the next intact record."""
+        """Return the position of the next undamaged record."""
         for match in _OPERATION.finditer(buffer, start):
             for candidate in range(match.start() - _U32.size, max(start, match.start() - _HEAD_BEFORE) - 1, -1):
                 if next(self._tries, None) is None:
@@ -92,12 +92,12 @@ class _Reader:
 
 
 def _declared_length(buffer: Buffer, end: int, data: bytes) -> int:
-    """Return the length that the record declares for the data ending at `end`."""
+    """Return the length that the record declares for the data that end at `end`."""
     return int(_U32.unpack_from(buffer, end - len(data) - _U32.size)[0])
 
 
 def _record_at(buffer: Buffer, position: int) -> _Record | None:
-    """Return the record at a position, or None. A chunk may be cut off by the end of the buffer."""
+    """Return the record at a position, or None. The end of the buffer may cut off a chunk."""
     if position + _U32.size > len(buffer):
         return None
     (length,) = _U32.unpack_from(buffer, position)
@@ -115,7 +115,7 @@ def _record_at(buffer: Buffer, position: int) -> _Record | None:
 
 
 def _fields(head: bytes) -> dict[str, bytes] | None:
-    """Return the header fields in `head`. None if they are damaged."""
+    """Return the header fields in `head`, or None if they are damaged."""
     fields: dict[str, bytes] = {}
     position = 0
     while position < len(head):

@@ -1,4 +1,4 @@
-"""The page of a consolidated record: one file that loads nothing and runs no script.
+"""Write the page of a merged record: one HTML file that loads no other files and runs no script.
 
 `_depot_page` lays it out. It shows a map of the events, a chart over time, and the blocks that each vehicle holds.
 """

@@ -1,4 +1,4 @@
-"""The layout of the page. The template escapes all data from vehicles."""
+"""Lay out the page of a merged record. The template escapes all data from vehicles."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ MAX_TITLE = 100
 
 
 def draw(record: Consolidation, reconciliation: Reconciliation | None = None) -> str:
-    """Return the page as HTML."""
+    """Return the page of a merged record as HTML."""
     header = record.header
     ink = inks(header.roster)
     when = _time_chart.time_span_of(record)
@@ -84,7 +84,9 @@ def draw(record: Consolidation, reconciliation: Reconciliation | None = None) ->
 
 
 def _title(record: Consolidation) -> str:
-    """Return the inception data if it is readable text, else a title with the hash of the inception block."""
+    """Return the data of the inception block if they are readable text, otherwise a title with the hash of that
+    block.
+    """
     text = base64.b64decode(record.header.inception.block_data).decode("utf-8", errors="replace")
     if text and text.isprintable() and "\ufffd" not in text:
         return text if len(text) <= MAX_TITLE else f"{text[: MAX_TITLE - 1]}…"
@@ -92,7 +94,7 @@ def _title(record: Consolidation) -> str:
 
 
 def _headline(record: Consolidation) -> tuple[str, str]:
-    """Return a short headline, and its class in the style sheet."""
+    """Return a short headline, and the name of its style."""
     losses = []
     if record.missing:
         losses.append("1 vehicle" if len(record.missing) == 1 else f"{len(record.missing)} vehicles")
@@ -133,7 +135,9 @@ def _figures(record: Consolidation, single_copies: list[str]) -> list[tuple[str,
 def _trees(
     record: Consolidation, reconciliation: Reconciliation | None, ink: Mapping[int, Ink]
 ) -> list[tuple[str, Markup]] | None:
-    """Return the chain trees of the exports and of the reconcile. None if there are too many blocks for a drawing."""
+    """Return pictures of the chains before and after the reconcile, or None if there are too many blocks for a
+    picture.
+    """
     exports = record.collected.exports
     if len(record.blocks) > MAX_TREE_BLOCKS:
         return None
@@ -168,7 +172,7 @@ def _vehicles(record: Consolidation, ink: Mapping[int, Ink]) -> list[dict[str, A
 
 
 def _changes(matches: Sequence[MatchedLog], ink: Mapping[int, Ink]) -> list[dict[str, Any]]:
-    """Return the changes of all vehicles with a flight log and an agent, in time order."""
+    """Return the changes (such as flight modes) of all vehicles with a flight log and an agent, in order of time."""
     found = [change for match in matches if match.agent_id is not None for change in changes(match)]
     return [
         {

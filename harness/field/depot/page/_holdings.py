@@ -1,5 +1,5 @@
-"""A chart of the holders: a row for each vehicle, a column for each block in the order of the record, and lost
-blocks.
+"""Draw which vehicle holds which block: a row for each vehicle, and a column for each block in the order of the
+record.
 """
 
 import math
@@ -112,7 +112,7 @@ def _group_of(block: RecordedBlock) -> str:
 
 
 def _places(block: RecordedBlock) -> dict[int, str]:
-    """Return the place of the block by agent. If an agent holds it in two places, the first counts."""
+    """Return the place of the block on each agent. If an agent holds it in two places, the first one counts."""
     places: dict[int, str] = {}
     for held in block.line.held:
         for agent_id in held.agents:
@@ -153,7 +153,7 @@ def _group(
 
 
 def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Iterator[_Range]:
-    """Yield consecutive blocks that the agent holds in the same place.
+    """Yield ranges of consecutive blocks that the agent holds in the same place.
 
     Columns narrower than a pixel are combined into cells. A cell shows the place at which the agent holds most of its
     blocks, and whether it holds all of them.

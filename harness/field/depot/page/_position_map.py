@@ -1,5 +1,4 @@
-"""A map of the logged events: the positions of each vehicle as a line in its colour, and its other events at its last
-position.
+"""Draw a map of logged events: the path of each vehicle as a line, and its other events at its last position.
 
 A ring marks blocks that only one vehicle holds, which the next loss would have destroyed. If blocks of a vehicle were
 lost, its line is dotted between the positions before and after them.
@@ -33,7 +32,7 @@ _WIDTH, _HEIGHT = 900, 560
 
 @dataclass(frozen=True)
 class Map:
-    """The drawing, and sentences on omitted events."""
+    """A map, and sentences about events that it omits."""
 
     drawing: Markup
     notes: list[str]
@@ -46,8 +45,8 @@ def draw(
     ink: Mapping[int, Ink],
     flown: Sequence[Track] = (),
 ) -> Map:
-    """Draw the map. `rare` has the names of blocks that only one vehicle holds, and `lost` the ordinals of an agent's
-    lost blocks. `flown` has the tracks in flight logs, which are thin lines.
+    """Draw the map. `rare` names blocks on one vehicle only, `lost` numbers each agent's lost blocks, and `flown` are
+    paths from flight logs.
 
     There is at least one position.
     """
@@ -89,7 +88,7 @@ def draw(
 
 
 class _Field:
-    """A conversion of positions to metres north and east of the median of all positions."""
+    """Converts positions to metres north and east of the median of all positions."""
 
     def __init__(self, tracks: Sequence[Track]) -> None:
         positions = [position for track in tracks for _, position in track.fixes]
@@ -146,7 +145,7 @@ def _paths(
 def _pieces(
     track: Track, path: Sequence[Fix], lost: Mapping[int, Sequence[int]]
 ) -> Iterable[tuple[bool, Sequence[Fix]]]:
-    """Yield the pieces of a path, and whether the piece is a gap.
+    """Yield the pieces of a path, each with true if the piece is a gap.
 
     A gap is where blocks between two positions were lost.
     """
@@ -167,7 +166,7 @@ def _ordinal(name: str) -> int | None:
 
 
 def _logged(track: Track, single_copies: set[str]) -> Iterable[tuple[bool, int, LogEntry]]:
-    """Yield (whether only one vehicle holds it, agent ID, entry) for each event that the map marks."""
+    """Yield each event to mark on the map, as (true if only one vehicle holds it, agent ID, event)."""
     for entry in track.entries:
         rare = entry.block in single_copies
         if entry.position is not None and (rare or not entry.is_position):

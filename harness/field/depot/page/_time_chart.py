@@ -1,4 +1,4 @@
-"""A chart over time with a lane for each vehicle: its events above, and its blocks below, shaded by number of
+"""Draw a chart over time with a row for each vehicle: its events, and below them its blocks, shaded by the number of
 holders.
 """
 
@@ -26,7 +26,7 @@ SHADES = 4
 
 @dataclass(frozen=True)
 class TimeSpan:
-    """A time span in microseconds. `outside` counts the events of clocks that show a different time."""
+    """An interval of time in microseconds. `outside` counts the events whose clocks show a different time."""
 
     first_us: int
     last_us: int
@@ -34,7 +34,7 @@ class TimeSpan:
 
 
 def time_span_of(record: Consolidation) -> TimeSpan | None:
-    """Return the time span of nearly all events. None without events."""
+    """Return the interval of nearly all events, or None if there are no events."""
     times = sorted(timestamp_us for block in record.blocks for timestamp_us, *_ in events_in(block.event_data))
     if not times:
         return None
@@ -47,7 +47,7 @@ def time_span_of(record: Consolidation) -> TimeSpan | None:
 
 
 def draw(record: Consolidation, time_span: TimeSpan, ink: Mapping[int, Ink]) -> Markup:
-    """Draw the lanes of all vehicles."""
+    """Draw the rows of all vehicles."""
     length_s = max(1.0, (time_span.last_us - time_span.first_us) / 1e6)
     axis = svg.linear_axis(0.0, length_s, (LEFT, WIDTH - RIGHT))
     of_agent: dict[int, list[RecordedBlock]] = defaultdict(list)
@@ -129,7 +129,7 @@ def _bars(blocks: Sequence[RecordedBlock], time_span: TimeSpan, axis: svg.Axis, 
 
 
 def shade(holders: int, vehicles: int) -> int:
-    """Return the shade for a number of holders: 0 for one, and the last for all vehicles."""
+    """Return the number of the shade for a number of holders: 0 for one holder, and the last one for all vehicles."""
     if holders <= 1:
         return 0
     return SHADES - 1 if holders >= vehicles else 1 if 2 * holders <= vehicles else 2
@@ -138,7 +138,7 @@ def shade(holders: int, vehicles: int) -> int:
 def _boxes(
     blocks: Sequence[RecordedBlock], record: Consolidation, time_span: TimeSpan, axis: svg.Axis, top: float
 ) -> Markup:
-    """Draw the blocks. Adjacent blocks with equal shades are one box."""
+    """Draw the blocks. Neighbouring blocks with the same shade are drawn as one box."""
     vehicles = len(record.collected.latest)
     merged: list[tuple[float, float, str, list[str]]] = []
     for block in sorted(blocks, key=lambda block: block.line.timestamp_us):
@@ -181,9 +181,7 @@ def _losses(
     axis: svg.Axis,
     top: float,
 ) -> Iterable[Markup]:
-    """Draw hatched areas: for lost blocks from the block before to the block after them, for a missing vehicle to
-    the end.
-    """
+    """Draw hatched areas for lost blocks, and for the missing end of a vehicle's record."""
     extents = {block.line.name: _extent(block, time_span, axis) for block in blocks}
     ordinals = sorted(int(name.partition(".")[2]) for name in extents if name.partition(".")[2].isdecimal())
     gaps: dict[tuple[float, float], list[str]] = {}
