@@ -159,7 +159,7 @@ class ClockSet:
         self._record = record
 
     def shift_near(self, position: int) -> str | None:
-        """Return a text such as "its clock was set by +30.0 s" if the clock changed around this entry, otherwise None."""
+        """Return a text such as "its clock was set by +30.0 s" if the clock changed near this entry, otherwise None."""
         if self._record.flight.record is not None:
             return None  # The agents of a run share one clock.
         jumps = [_largest_jump(differences, position) for differences in self._differences]
