@@ -9,7 +9,7 @@ count, because the agents of a simulation do not get the others.
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.deviation import Deviation
@@ -19,16 +19,24 @@ from ucp.messages import MalformedDatagramError, Message, decode
 from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
 
-if TYPE_CHECKING:
-    from harness.field.replay._player import Player
-
 MAX_PLACES = 3
 """Number of places at which lines may be lost, or the socket may discard messages."""
 MAX_TRIED = 200
 """Maximum number of messages whose effect is computed."""
 
 
-def ignored_messages(record: Record, play_to: "Callable[[int], Player]") -> tuple[int, Deviation] | None:
+class PlayedAgent(Protocol):
+    """A player of the record at some position."""
+
+    @property
+    def lost(self) -> str | None: ...
+
+    def has_effect(self, sender: int, message: Message, at_s: float) -> bool: ...
+
+    def handler_of(self, message: Message) -> str: ...
+
+
+def ignored_messages(record: Record, play_to: Callable[[int], PlayedAgent]) -> tuple[int, Deviation] | None:
     """Return the first message that the agent ignored, with its position. None if it ignored at most a few.
 
     `play_to` plays the entries up to a position.
@@ -38,7 +46,7 @@ def ignored_messages(record: Record, play_to: "Callable[[int], Player]") -> tupl
     for position, sighting in _without_line(record):
         message = decode(sighting.datagram).message
         player = play_to(position)
-        if player.lost is not None or player.record.entries[position].gap is not None:
+        if player.lost is not None or record.entries[position].gap is not None:
             continue
         if position != last and player.has_effect(sighting.sender, message, sighting.at_s):
             places.append((position, sighting, message))
