@@ -1,1 +1,1 @@
-"""Many runs: matrices with their fits of growth, and exploration of seeds."""
+"""Play many runs of a scenario: in a matrix of conditions, or with many seeds to search for violations."""

@@ -1,4 +1,4 @@
-"""Explore seeds until a run violates a characteristic, and shrink that run to a small scenario.
+"""Play seeds until a run violates a characteristic, and reduce that run to a small scenario.
 
 `_exploring` plays seed after seed in the simulation. `_recording` turns the random parts of a run into a document: the
 logged events and the lost messages. `_shrink` removes parts of the document (delta debugging) as long as the violation

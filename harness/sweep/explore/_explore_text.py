@@ -1,4 +1,4 @@
-"""The output of the command `explore`, during an exploration and at its end."""
+"""Print the output of the command `explore`."""
 
 import contextlib
 import time
@@ -21,7 +21,7 @@ CLEAR_LINE = "\r\x1b[2K"
 
 @contextlib.contextmanager
 def watching(console: Console) -> Iterator[Watcher]:
-    """Yield functions that print violations and the progress of shrinking.
+    """Yield functions that print violations and the progress of the reduction.
 
     On a terminal, the progress is one line that is redrawn. Elsewhere it is a line every ten seconds.
     """

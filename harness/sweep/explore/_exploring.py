@@ -1,4 +1,4 @@
-"""Explore seeds until a run violates a characteristic, then record, shrink and write it."""
+"""Play seeds until a run violates a characteristic. Then record this run, reduce it, and write it as a scenario."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from harness.sweep.explore._smaller import replays, scenario_of, shrink, size
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """A run with bad verdicts: its seed, and the numbers or keys of the checks."""
+    """A run with bad verdicts: its seed, and the numbers or keys of the failed checks."""
 
     seed: int
     keys: tuple[str, ...]
@@ -25,7 +25,7 @@ class Violation:
 
 @dataclass
 class Searched:
-    """The result of the search.
+    """The result of a search for a violation.
 
     `failed` maps a seed to the reason why its run has no verdict. `unfinished` has the seeds of the runs that only
     needed more time.
@@ -39,7 +39,7 @@ class Searched:
 
 
 def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> Searched:
-    """Play `seeds` in order until a run violates something. A swarm that only needs more time does not count.
+    """Play the seeds in order until a run violates a check. A swarm that only needs more time does not count.
 
     The result is the first such seed, for any number of `jobs`. Ctrl-C ends the search early. Raises HarnessError if
     the scenario cannot be played.
@@ -75,7 +75,7 @@ SEEDS = 1000
 
 @dataclass(frozen=True)
 class Shrunk:
-    """The smallest scenario found: its file, and the steps that led to it."""
+    """The smallest scenario that still violates: its file, and the number of steps that led to it."""
 
     path: Path
     seed: int
@@ -86,7 +86,7 @@ class Shrunk:
 
 @dataclass
 class Explored:
-    """The result of an exploration.
+    """The result of the command `explore`.
 
     `shrunk` is the smallest scenario found; it is None if no run violated anything. `interrupted` says whether Ctrl-C
     ended the search or the shrinking.
@@ -107,7 +107,9 @@ class Explored:
 
 @dataclass(frozen=True)
 class Watcher:
-    """Functions that report progress. `on_step` receives the number of runs so far, and the size as text."""
+    """Functions that report progress. `on_step` is called with the number of runs so far, and the size of the scenario
+    as text.
+    """
 
     on_violation: Callable[[Violation], None] = field(default=lambda violation: None)
     on_step: Callable[[int, str], None] = field(default=lambda runs, words: None)
@@ -125,7 +127,7 @@ def explore(
     max_runs: int = MAX_RUNS,
     watcher: Watcher | None = None,
 ) -> Explored:
-    """Play a scenario in virtual time with one seed after another, and shrink the first run that violates.
+    """Play a scenario in virtual time with one seed after another, and reduce the first run that violates a check.
 
     - `out`: the new file of the smallest scenario. Without it, a new file under `runs/`.
     - `source`: the name of the scenario in that file. Without it, the scenario's `name`.
@@ -170,8 +172,8 @@ def smallest_of(
     max_runs: int,
     on_step: Callable[[int, str], None],
 ) -> tuple[Document, str, bool]:
-    """Return the smallest document for which `still` is true, a description of the shrinking, and whether Ctrl-C ended
-    it.
+    """Return the smallest document for which `still` is true, a description of the steps, and true if the user
+    interrupted the search.
     """
     interrupted = False
     shrinker = Shrinker(

@@ -26,7 +26,7 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True, slots=True)
 class Logged:
-    """A logged event of an agent. `completes` is true if it filled a block."""
+    """A logged event of an agent. `completes` is true if it completed a block."""
 
     at_s: float
     agent: int
@@ -36,7 +36,7 @@ class Logged:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """A message that `receiver` did not receive: message number `count` of its type from `sender`, sent at `at_s`.
+    """A message that `receiver` did not receive. It was number `count` of its type from `sender`, sent at `at_s`.
 
     `by_quirk` is true if the message arrived and the receiver ignored it.
     """
@@ -52,7 +52,7 @@ class Lost:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recorded run with its verdict. Events and lost messages are in time order."""
+    """A recorded run with its verdict. Events and lost messages are in order of time."""
 
     result: Result
     logged: list[Logged]
@@ -60,7 +60,7 @@ class Recording:
 
 
 def record(scenario: Scenario, seed: int) -> Recording:
-    """Play and record a run. If an agent crashes or hangs, the recording ends there."""
+    """Play a run and record it. If an agent crashes or hangs, the recording ends there."""
     tape = _Recorder()
     try:
         result = simulate_in_memory(tape, scenario, seed, fate_script=partial(_RecordingScript, tape=tape)).result
@@ -105,7 +105,7 @@ class _Recorder(MemoryRecorder):
 
 
 class _RecordingScript(FateScript):
-    """A fate script that also records the messages that are lost by script or by chance."""
+    """Delivery rules that also record the messages that are lost by a rule or by chance."""
 
     def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _Recorder) -> None:
         super().__init__(fates, roster, name_of)

@@ -1,4 +1,4 @@
-"""A scenario as a document that can be reduced: its YAML keys without defaults.
+"""Represent a scenario as a document that can be reduced: its YAML keys without default values.
 
 Each function returns a new document, and leaves the old one unchanged. The result may be an invalid scenario. The
 caller finds out by playing it.
@@ -32,7 +32,7 @@ def document_of(scenario: Scenario) -> Document:
 
 
 def with_key(document: Document, key: str, value: Any) -> Document:
-    """Set the value at a path with dots. An empty value or None removes the key."""
+    """Return the document with a new value for the key, which is a path with dots. An empty value removes the key."""
     first, _, rest = key.partition(".")
     if rest:
         value = with_key(document.get(first, {}), rest, value)
@@ -41,7 +41,7 @@ def with_key(document: Document, key: str, value: Any) -> Document:
 
 
 def at(document: Document, key: str) -> Any:
-    """Return the value at the path, or None."""
+    """Return the value of the key, which is a path with dots, or None."""
     value: Any = document
     for part in key.split("."):
         value = value.get(part) if isinstance(value, dict) else None
@@ -49,7 +49,9 @@ def at(document: Document, key: str) -> Any:
 
 
 def with_script(document: Document, logged: list[Logged], drops: list[Document]) -> Document:
-    """Replace all random parts: exactly these events are logged, and exactly these drops lose messages."""
+    """Replace all random parts of the document: exactly these events are logged, and exactly these messages are
+    lost.
+    """
     script = [event_of(event) for event in logged]
     document = _without_flight(document)
     network = _without_loss(document.get("network", {}))
@@ -63,7 +65,7 @@ def with_script(document: Document, logged: list[Logged], drops: list[Document])
 
 
 def with_drops(document: Document, drops: list[Document]) -> Document:
-    """Replace the drops of the document. Its other fates stay."""
+    """Replace the rules of the document that lose messages. Its other delivery rules stay."""
     others = [fate for fate in document.get("fates", []) if "drop" not in fate]
     return with_key(document, "fates", [*drops, *others])
 
@@ -84,7 +86,7 @@ def fate_by_count(lost: Lost) -> Document:
 
 
 def fate_by_time(lost: Lost, slack_s: float) -> Document:
-    """Return a drop of all messages of this type from this sender at about this time.
+    """Return a rule that loses all messages of this type from this sender at about this time.
 
     It stays valid when other messages disappear from the run.
     """
@@ -116,7 +118,7 @@ def _silent(layer: Document) -> Document:
 
 
 def _silent_change(change: Document) -> Document:
-    """Remove the loss from a timeline entry or from the repeated part of a schedule."""
+    """Return a timeline entry, or the repeated part of a schedule, without its loss."""
     silent = {**change, **_silent(change)}
     return {**silent, "network": _without_loss(change["network"])} if "network" in change else silent
 
@@ -135,7 +137,7 @@ def _with_networks(ramp: Document, change: Callable[[Document], Document]) -> Do
 
 
 def keep_agents(document: Document, kept: Collection[int]) -> Document:
-    """Keep only these agents, and remove everything that refers to others."""
+    """Return the document with only these agents. Everything that refers to other agents is removed."""
     document = {**document, "agents": sorted(kept)}
     document = with_key(document, "events.script", [event for event in script(document) if event["agent"] in kept])
     document = with_key(document, "fates", [fate for fate in document.get("fates", []) if _agents_in(fate) <= {*kept}])
@@ -157,7 +159,7 @@ def keep_agents(document: Document, kept: Collection[int]) -> Document:
 
 
 def _network(network: Document, kept: Collection[int]) -> Document:
-    """Keep what applies to all agents or to the kept ones."""
+    """Return the network section with the conditions of all agents or of the kept ones."""
     receivers = {name: value for name, value in network.get("receivers", {}).items() if int(name) in kept}
     links = [_filter_lists(link, ("from", "to"), kept) for link in network.get("links", [])]
     network = with_key(network, "receivers", receivers)
@@ -165,7 +167,7 @@ def _network(network: Document, kept: Collection[int]) -> Document:
 
 
 def _schedule(schedule: Document, kept: Collection[int]) -> Document | None:
-    """Reduce a schedule to the kept agents. Return None if nothing is left."""
+    """Reduce a schedule to the kept agents. Return None if nothing remains."""
     if "repeat" in schedule:
         repeat = _keep_network_change(schedule["repeat"], kept)
         return {**schedule, "repeat": repeat} if repeat else None
@@ -177,7 +179,7 @@ def _schedule(schedule: Document, kept: Collection[int]) -> Document | None:
 
 
 def _keep_network_change(change: Document, kept: Collection[int]) -> Document:
-    """Reduce a network change of a timeline entry or schedule to the kept agents."""
+    """Reduce a network change in a timeline entry or schedule to the kept agents."""
     groups = [[agent for agent in group if agent in kept] for group in change.get("partition", [])]
     change = with_key(change, "partition", [group for group in groups if group])
     return with_key(change, "network", _network(change.get("network", {}), kept))
@@ -189,7 +191,7 @@ def _agents_in(fate: Document) -> set[int]:
 
 
 def _entry(entry: Document, kept: Collection[int]) -> Document | None:
-    """Reduce a timeline entry to the kept agents. Return None if nothing is left."""
+    """Reduce a timeline entry to the kept agents. Return None if nothing remains."""
     if "partition" in entry or "network" in entry:
         entry = _keep_network_change(entry, kept)
         return entry if "partition" in entry or "network" in entry else None
@@ -202,14 +204,14 @@ def _entry(entry: Document, kept: Collection[int]) -> Document | None:
 
 
 def _datagram(datagram: Document, kept: Collection[int]) -> Document:
-    """Keep only receivers that remain, or no receivers if the source is removed."""
+    """Return the datagram with the remaining receivers, or without receivers if its source is removed."""
     from_kept = datagram["source"] in kept
     reaches = {agent: at_s for agent, at_s in datagram["reaches"].items() if from_kept and int(agent) in kept}
     return {**datagram, "reaches": reaches}
 
 
 def _of_kept(quirk: Any, kept: Collection[int]) -> Any:
-    """Reduce a quirk to the kept agents. Return None if none is left."""
+    """Reduce a deliberate error (quirk) to the kept agents. Return None if none remains."""
     if not isinstance(quirk, dict):
         return quirk
     quirk = _filter_lists(quirk, ("agents",), kept)
@@ -238,7 +240,7 @@ def event_times(document: Document) -> list[float]:
 
 
 def cut_after(document: Document, last_s: float) -> Document:
-    """End the mission at `last_s`, and remove everything later."""
+    """Return the document with a mission that ends at `last_s`. Everything later is removed."""
     document = {**document, "duration_s": max(1.0, last_s)}
     for key in ("events.script", "timeline"):
         before = [entry for entry in at(document, key) or [] if entry["at_s"] <= last_s]
@@ -252,13 +254,13 @@ def cut_after(document: Document, last_s: float) -> Document:
 
 
 def _limit_duration(entry: Document, last_s: float) -> Document:
-    """Make a change permanent if it would end after `last_s`."""
+    """Make a temporary change permanent if it would end after `last_s`."""
     lasts = "for_s" in entry and entry["at_s"] + entry["for_s"] > last_s
     return with_key(entry, "for_s", None) if lasts else entry
 
 
 def move_times(document: Document, to: Callable[[float], float]) -> Document:
-    """Move all times of the document with the function `to`."""
+    """Return the document with all times changed by the function `to`."""
     for key in ("events.script", "timeline"):
         document = with_key(document, key, [_move_entry_times(entry, to) for entry in at(document, key) or []])
     document = with_key(document, "fates", [_move_fate_times(fate, to) for fate in document.get("fates", [])])
@@ -269,7 +271,7 @@ def move_times(document: Document, to: Callable[[float], float]) -> Document:
 
 
 def _move_fate_times(fate: Document, to: Callable[[float], float]) -> Document:
-    """Move the arrival times of a fate. Fates without arrival times keep their time windows."""
+    """Change the arrival times in a delivery rule. Rules without arrival times keep their time limits."""
     if "arrivals" not in fate:
         return fate
     return {

@@ -1,4 +1,4 @@
-"""Shrink a document by delta debugging, and write the smallest scenario that still fails.
+"""Reduce a document step by step (delta debugging), and write the smallest scenario that still violates a check.
 
 The result does not depend on the number of processes. Candidates count in their order: results for candidates after the
 first success are discarded.
@@ -25,11 +25,11 @@ WORTH_FORKING_S = 0.03
 
 
 class BudgetSpentError(Exception):
-    """The maximum number of runs has been played."""
+    """An error: the maximum number of runs has been played."""
 
 
 class Shrinker:
-    """Searches for smaller documents.
+    """Searches for smaller documents that still violate a check.
 
     `best` is the smallest document so far for which `violates` is true. `adopted` is called for each new one.
     """
@@ -53,7 +53,7 @@ class Shrinker:
         self._pace_s = 1.0
 
     def first(self, candidates: Iterable[Document]) -> int | None:
-        """Adopt the first candidate that violates. Return its index, or None. Raises BudgetSpentError."""
+        """Use the first candidate that still violates. Return its index, or None. Raises BudgetSpentError."""
         if self.runs >= self._max_runs:
             raise BudgetSpentError
         jobs = self._jobs if self._pace_s > WORTH_FORKING_S else 1
@@ -75,7 +75,7 @@ class Shrinker:
         return None
 
     def _new(self, candidates: Iterable[Document]) -> Iterator[tuple[int, Scenario, Document]]:
-        """Yield candidates that are valid scenarios and were not tried before."""
+        """Yield the candidates that are valid scenarios and were not tried before."""
         seen = {_key(self.best)}
         for index, document in enumerate(candidates):
             key = _key(document)
@@ -88,7 +88,7 @@ class Shrinker:
                 continue
 
     def fewest(self, items: Sequence[T], with_items: Callable[[Sequence[T]], Document]) -> None:
-        """Leave out ever smaller parts of `items` until no part can be left out (ddmin, Zeller 2002)."""
+        """Remove ever smaller parts of `items` until no part can be removed (ddmin, Zeller 2002)."""
         kept = list(items)
         if not kept or self.first([with_items([])]) is not None:
             return
@@ -105,7 +105,7 @@ class Shrinker:
 
 
 def _leaving_out(items: Sequence[T], parts: int) -> Iterator[list[T]]:
-    """Yield `items` without one part, for each of `parts` parts.
+    """Yield `items` without one of `parts` parts, for each part.
 
     The last part comes first, because least depends on it.
     """

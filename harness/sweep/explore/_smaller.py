@@ -1,4 +1,5 @@
-"""The steps of shrinking, in order of benefit: first steps that shorten runs, then steps that simplify the scenario.
+"""Define the steps that reduce a scenario. Steps that shorten runs come first, and then steps that simplify the
+scenario.
 
 Fates have two forms. A fate by time still hits the same message when other messages disappear. A fate by count still
 hits the same message when everything happens earlier. After each change of form, all steps are tried again.
@@ -43,7 +44,7 @@ Record = Callable[[Document], Recording]
 
 
 def shrink(shrinker: Shrinker, record: Record) -> None:
-    """Shrink until nothing can be left out. Raises BudgetSpentError."""
+    """Reduce the scenario until nothing more can be removed. Raises BudgetSpentError."""
     for _ in range(MAX_ROUNDS):
         before = shrinker.best
         for express in (_fates_by_time, _fates_by_count):
@@ -58,7 +59,9 @@ def shrink(shrinker: Shrinker, record: Record) -> None:
 
 
 def replays(document: Document, recording: Recording) -> Iterator[Document]:
-    """Yield candidates that may reproduce the recorded run without chance. The last one is `document` itself."""
+    """Yield candidates that may reproduce the recorded run without random numbers. The last one is `document`
+    itself.
+    """
     lost = [loss for loss in recording.lost if not loss.by_quirk]
     everything = with_script(document, recording.logged, [fate_by_count(loss) for loss in recording.lost])
     ignored = at(document, "quirks.ignore_commit")
@@ -84,7 +87,7 @@ def _fates_by_count(shrinker: Shrinker, record: Record) -> None:
 
 
 def _shorten_mission(shrinker: Shrinker) -> None:
-    """End the mission as early as possible, then close to the last event."""
+    """End the mission as early as possible, and soon after the last event."""
     moments = event_times(shrinker.best)
     low, high = -1, len(moments) - 1  # a violation is known up to `high`, none up to `low`
     while high - low > 1:
@@ -115,7 +118,7 @@ def _fewer_agents(shrinker: Shrinker) -> None:
 
 
 def _two_agents_fewer(shrinker: Shrinker, delay: Any) -> bool:
-    """Remove two agents at once, so that an even number of voters stays even."""
+    """Remove two agents at once, so that an even number of voters stays even. Return true on success."""
     base = with_key(shrinker.best, "network.delay", delay)
     agents = set(base["agents"])
     if len(agents) > MAX_PAIRED:
@@ -137,7 +140,7 @@ def _fewer_of_each(shrinker: Shrinker) -> None:
 
 
 def _use_defaults(shrinker: Shrinker) -> None:
-    """Replace keys by defaults, or at least use one latency for all messages."""
+    """Replace values by their defaults, or at least use the same latency for all messages."""
     for key in (
         "initial_data",
         "lateness",
@@ -158,7 +161,7 @@ def _use_defaults(shrinker: Shrinker) -> None:
 
 
 def _blocks_of_one_event(shrinker: Shrinker, record: Record) -> None:
-    """Build the same blocks at the same times from one event each, namely the event that completed the block."""
+    """Build the same blocks at the same times from one event each."""
     document = shrinker.best
     largest = at(document, "settings.max_event_bytes") or Settings().max_event_bytes
     if at(document, "settings.max_block_bytes") == largest or not script(document):
@@ -197,7 +200,7 @@ def _time_shift(moment: float, earlier: float) -> Callable[[float], float]:
 
 
 def size(document: Document) -> str:
-    """Return the size as text: "5 agents, 203 events, 61 fates"."""
+    """Return the size of a scenario as text, such as "5 agents, 203 events, 61 fates"."""
     counts = {
         "agent": len(document["agents"]),
         "event": len(script(document)),

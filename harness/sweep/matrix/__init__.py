@@ -1,4 +1,4 @@
-"""The matrix: one scenario over loss rates, numbers of agents, mission lengths, backends and seeds.
+"""Play a scenario with all combinations (a matrix) of loss rate, number of agents, mission length, backend and seed.
 
 `_matrix_file` is the file that a user writes. `matrix_run` plays all runs on all cores, or on a Dask cluster
 (`_cluster`), and adds each result to `results.jsonl`, so that an interrupted matrix can continue. `_cell` sums up the

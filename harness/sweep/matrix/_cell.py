@@ -1,4 +1,4 @@
-"""The result of one run, and the summary of all runs at one point of the matrix."""
+"""Represent the result of one run, and the summary (cell) of all runs that differ only by their seed."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from harness.sweep.matrix._matrix_file import Point, Task
 
 
 class AtPoint(BaseModel):
-    """Base class of everything that belongs to one point of the matrix."""
+    """The base class of all records that belong to one combination of values in the matrix."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -29,7 +29,7 @@ class AtPoint(BaseModel):
 
 
 class Run(AtPoint):
-    """The result of one run: figures, and verdicts by number or key.
+    """The result of one run: its figures, and its verdicts by number or key.
 
     A run without a verdict has a reason: in `failed` for an error, or in `unsupported` if an agent lacks a feature.
     """
@@ -52,7 +52,7 @@ class Run(AtPoint):
 
 
 class Cell(AtPoint):
-    """The runs at one point of a matrix. `failed` and `unsupported` count the runs without figures.
+    """The summary of the runs with one combination of values. `failed` and `unsupported` count runs without figures.
 
     `estimates` has an estimate for each metric. `verdicts` counts the verdicts of each check. `violated` has the seeds
     of the runs with a bad verdict, by check. `unfinished` has the seeds of the runs that only needed more time.
@@ -68,19 +68,19 @@ class Cell(AtPoint):
 
     @property
     def finished(self) -> Estimate:
-        """The share of runs whose swarm became idle, among runs with a verdict about it."""
+        """The share of runs in which the swarm became idle, among the runs with a verdict about it."""
         counts = self.verdicts.get("liveness", {})
         finished = counts.get("finished", 0)
         return estimate_share(finished, finished + counts.get("not finished", 0) + counts.get("never finishes", 0))
 
 
 def is_wrong(verdict: Verdict) -> bool:
-    """Return true for a bad verdict other than that of a swarm that only needs more time."""
+    """Return true for a bad verdict, unless the swarm only needs more time."""
     return kind_of(verdict) == "bad" and verdict != UNFINISHED
 
 
 def sum_up(point: Point, runs: Sequence[Run], *, grows: bool = False) -> Cell:
-    """Sum up the runs of a cell. `grows`: also estimate the metrics of growth."""
+    """Return the summary of these runs. With `grows`, also estimate the figures for laws of growth."""
     failed = sum(run.failed is not None for run in runs)
     unsupported = sum(run.unsupported is not None for run in runs)
     judged = [run for run in runs if run.judged]

@@ -1,4 +1,4 @@
-"""Play one run of a matrix in the simulation, or as processes or containers in its own run directory."""
+"""Play one run of a matrix, either as a simulation or with real programs in its own run directory."""
 
 import shutil
 from collections.abc import Callable, Iterable
@@ -25,14 +25,14 @@ Judge = Callable[[Scenario, int], tuple[RunOutcome, Result]]
 
 
 class RunFailedError(HarnessError):
-    """A run did not complete, or one of its agents crashed or hung."""
+    """An error: a run was not completed, or one of its agents crashed or hung."""
 
     exit_status = VIOLATED
 
 
 @gc_paused()
 def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> tuple[RunOutcome, Result]:
-    """Play in virtual time. Every step is judged if `tracing` is true."""
+    """Simulate a run in virtual time, and judge it. Every step is judged if `tracing` is true."""
     from harness.run.simulate import simulate
 
     run = simulate(scenario, seed, tracing=tracing)
@@ -41,7 +41,7 @@ def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> tuple[R
 
 @gc_paused()
 def play_with_coverage(scenario: Scenario, seed: int, reached: Reached) -> tuple[RunOutcome, Result]:
-    """Play in virtual time with traces, and add the coverage of the run to `reached`."""
+    """Simulate a run with traces, and add its coverage to `reached`."""
     watcher = Watcher()
     run = simulate_watched(scenario, seed, watcher.step)
     reached.add(watcher.reached)
@@ -56,7 +56,9 @@ def _same_twice(scenario: Scenario, seed: int) -> None:
 
 @dataclass(frozen=True)
 class Player:
-    """Plays any run of `matrix`. Processes leave run directories in `directory`. `judge` plays runs in virtual time."""
+    """Plays any run of `matrix`. Runs with real programs leave directories in `directory`. `judge` plays simulated
+    runs.
+    """
 
     matrix: Matrix
     directory: Path
@@ -86,7 +88,7 @@ class Player:
         return Run(**task.point._asdict(), seed=task.seed, figures=figures, verdicts=verdicts, reached=reached)
 
     def refuse(self, points: Iterable[Point]) -> None:
-        """Check all points before the first run.
+        """Check before the first run that all combinations of values can be played.
 
         Raises HarnessError if a backend or this machine cannot play one of them.
         """
@@ -96,7 +98,7 @@ class Player:
     def _play_with_processes(
         self, scenario: Scenario, task: Task, reached: Reached | None
     ) -> tuple[RunOutcome, Result]:
-        """Play as processes or containers. Raises UnsupportedError, or RunFailedError with the run directory."""
+        """Play a run with real programs. Raises UnsupportedError, or RunFailedError that names the run directory."""
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # remains of an interrupted run
         try:

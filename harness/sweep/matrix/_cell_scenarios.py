@@ -1,4 +1,4 @@
-"""Write cells/*.yaml, the scenario of each cell. `ucp-harness run` can play each run again with them."""
+"""Write the scenarios of a matrix as files, with which `ucp-harness run` can play each run again."""
 
 from pathlib import Path
 
@@ -11,12 +11,12 @@ DIRECTORY = "cells"
 
 
 def scenario_file(point: Point) -> str:
-    """Return the path of the point's scenario, relative to the matrix's directory."""
+    """Return the path of the scenario file, relative to the matrix's directory."""
     return f"{DIRECTORY}/{point.file_name}.yaml"
 
 
 def write_scenarios(matrix: Matrix, directory: Path) -> None:
-    """Write the scenarios of all points. Raises OSError if a file cannot be written."""
+    """Write the scenarios for all combinations of values. Raises OSError if a file cannot be written."""
     (directory / DIRECTORY).mkdir(exist_ok=True)
     for path, point in {scenario_file(point): point for point in matrix.points}.items():
         scenario = matrix.scenario_at(point).model_dump(mode="json", exclude_defaults=True)

@@ -1,4 +1,4 @@
-"""Play many tasks on a Dask cluster. The interface equals that of `harness.run.parallel` for one machine.
+"""Run many tasks on a Dask cluster, with the same interface as `harness.run.parallel` for one machine.
 
 Dask gives the tasks of a lost worker to other workers. Each task is one future, so it has exactly one outcome, even if
 it was started several times.
@@ -28,7 +28,7 @@ SAME_VERSIONS = ("dask", "distributed", "ucp-harness")
 def cluster(
     tasks: Sequence[T], work: Callable[[T], R], address: str, *, what: str | None = None
 ) -> Iterator[Iterator[tuple[T, R | FailedTask]]]:
-    """Yield each task with its outcome, in order of completion, from the scheduler at `address` (tcp://host:port).
+    """Yield each task with its result in order of completion. `address` is the Dask scheduler (tcp://host:port).
 
     Outcomes, errors and interrupts are as in `harness.run.parallel.sweep`. The workers must be able to import `work`.
     At the end of the block, unfinished tasks are cancelled.

@@ -1,4 +1,4 @@
-"""Compare the cells of a matrix with those of an earlier night, the baseline.
+"""Compare the results of a matrix with those of an earlier night.
 
 In virtual time, equal code gives equal runs, so two nights differ only where the code differs. The runs of a cell are
 therefore compared in pairs with the same seed. A figure changed if the interval of the mean difference of the pairs
@@ -22,7 +22,7 @@ from harness.sweep.matrix._matrix_file import Point
 
 
 class Change(AtPoint):
-    """A changed figure: `metric` was `before` and is `now`.
+    """A changed figure. `metric` was `before` and is `now`.
 
     `difference` is the mean difference of the runs with the same seed, with its corrected interval. It is null if the
     runs are not compared in pairs.
@@ -36,14 +36,15 @@ class Change(AtPoint):
 
 
 class ChangedRuns(AtPoint):
-    """The seeds of the runs of a cell in virtual time that differ from the baseline, of `pairs` compared runs."""
+    """The seeds of the simulated runs that differ from the earlier night, among `pairs` compared runs."""
 
     pairs: int
     seeds: list[int]
 
 
 class Comparison(BaseModel):
-    """The comparison with an earlier matrix. `baseline` is its matrix.json, and `cells` the number of compared cells.
+    """The comparison with an earlier night. `baseline` is the file of that night, and `cells` the number of compared
+    summaries.
 
     `started_at` is its start, and null if this version of the harness cannot read the file.
     """
@@ -62,7 +63,7 @@ class Comparison(BaseModel):
 
 
 def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
-    """Yield the changes in the order of `now`. Cells that exist in only one of the matrices are left out."""
+    """Yield the changes in the order of `now`. Combinations that only one of the matrices has are left out."""
     earlier = {cell.point: cell for cell in before}
     for cell in now:
         if cell.point not in earlier:
@@ -77,7 +78,7 @@ def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
 def compare_pairs(
     before: Sequence[Cell], now: Sequence[Cell], runs_before: Sequence[Run], runs_now: Sequence[Run]
 ) -> tuple[list[Change], list[ChangedRuns]]:
-    """Compare the runs of equal seeds in the cells that both matrices have."""
+    """Compare the runs of equal seeds, for all combinations of values that both matrices have."""
     earlier = {cell.point: cell for cell in before}
     runs = {run.task: run for run in runs_before}
     pairs: dict[Point, list[tuple[Run, Run]]] = {}
@@ -113,7 +114,7 @@ def compare_pairs(
 
 
 def is_paired(point: Point) -> bool:
-    """Return true if equal code gives equal runs at this point."""
+    """Return true if equal code always gives equal runs here, so that single runs can be compared."""
     return BACKENDS[point.backend].plays_in_memory
 
 
@@ -129,7 +130,7 @@ def _differences(metric: Metric, pairs: Sequence[tuple[Run, Run]]) -> list[float
 
 
 def _moved(before: Estimate, now: Estimate) -> str | None:
-    """Return the direction of the change if the intervals do not overlap. Without both intervals, return None."""
+    """Return the direction of a change if the confidence intervals do not overlap. Otherwise return None."""
     if before.low is None or before.high is None or now.low is None or now.high is None:
         return None
     if now.high < before.low:

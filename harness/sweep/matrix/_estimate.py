@@ -1,4 +1,4 @@
-"""The metrics of a run, and their means and shares with 95 % intervals.
+"""Estimate the means and shares of figures over several runs, with 95 % confidence intervals.
 
 A share of runs has Wilson's interval, which is also valid near 0 and 100 %. A mean has Student's interval. A single run
 has no interval, because it contains no information about the spread.
@@ -17,7 +17,7 @@ CONFIDENCE = 0.95
 
 
 class Estimate(BaseModel):
-    """The mean of `n` runs.
+    """The mean of a figure over `n` runs, with its confidence interval.
 
     `low` and `high` are the limits of its 95 % interval, null for a single run. Without runs, all are null.
     """
@@ -40,7 +40,7 @@ def estimate_mean(values: Sequence[float], confidence: float = CONFIDENCE) -> Es
 
 
 def estimate_share(count: int, n: int) -> Estimate:
-    """Return the share `count` / `n` with its interval (E. B. Wilson, 1927)."""
+    """Return the share `count` / `n` with its confidence interval (E. B. Wilson, 1927)."""
     if n < 2:
         return Estimate(n=n, mean=float(count) if n else None)
     z = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
@@ -53,7 +53,7 @@ def estimate_share(count: int, n: int) -> Estimate:
 
 @lru_cache
 def student_quantile(probability: float, degrees: int) -> float:
-    """Return the quantile of Student's t distribution with `degrees` degrees of freedom; `probability` is above 0.5.
+    """Return a quantile of Student's t distribution with `degrees` degrees of freedom. `probability` is above 0.5.
 
     The method is bisection in angle = atan(t / sqrt(degrees)), in which the distribution is a finite sum.
     """
@@ -67,7 +67,7 @@ def student_quantile(probability: float, degrees: int) -> float:
 
 
 def _within(angle: float, degrees: int) -> float:
-    """Return the probability of Student's distribution between -t and t (Abramowitz and Stegun, 26.7.3 and 26.7.4)."""
+    """Return the probability that Student's t lies between -t and t (Abramowitz and Stegun, 26.7.3 and 26.7.4)."""
     cosine = math.cos(angle)
     first = degrees % 2
     term, total = (cosine if first else 1.0), 0.0
@@ -84,7 +84,7 @@ Figures = Mapping[str, float | int | None]
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A metric of a run. `of` returns its value, or None if the run does not determine it.
+    """A figure of a run. `of` returns its value, or None if the run does not determine it.
 
     `unit` is a share of the runs, a share in each run, or a number. `worse` is the worse direction, None if neither is.
     """

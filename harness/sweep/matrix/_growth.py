@@ -1,4 +1,4 @@
-"""Fit laws of growth of the figures with the number of agents and the number of blocks.
+"""Fit laws for the growth of figures with the number of agents and the number of blocks.
 
 The mission's length is no variable of its own, because a longer mission costs more only through its larger number of
 blocks. The laws "over blocks" therefore compare missions of several lengths.
@@ -19,7 +19,7 @@ Load = Literal["any", "below 1", "from 1"]
 
 
 class Growth(BaseModel):
-    """A law of how `metric` grows. Each run is a point.
+    """A law for the growth of `metric`. It is fitted to single runs.
 
     The runs have this `backend` and `loss`. They also have this `duration_s`, this number of `agents`, and a cell with
     this `load`; null stands for all of them.
@@ -36,13 +36,13 @@ class Growth(BaseModel):
 
 
 def overloaded(cell: Cell) -> bool:
-    """Return whether agents complete blocks faster than they can commit them."""
+    """Return true if agents complete blocks faster than they can commit them."""
     load = cell.estimates["load"].mean if "load" in cell.estimates else None
     return load is not None and load >= 1
 
 
 def growths(matrix: Matrix, cells: Sequence[Cell], runs: Sequence[Run]) -> list[Growth]:
-    """Fit laws for each backend and loss.
+    """Fit laws of growth for each backend and loss rate.
 
     Laws over agents hold for one mission length, laws over blocks for one number of agents. Laws over both use all
     sizes. If some cells have a load below 1 and others have not, laws over agents are also fitted to each side alone.
@@ -78,7 +78,7 @@ def growths(matrix: Matrix, cells: Sequence[Cell], runs: Sequence[Run]) -> list[
 
 
 def _points(over: tuple[Variable, ...], metric: str, runs: Iterable[Run]) -> Iterable[tuple[list[float], float]]:
-    """Yield a point for each run. An unknown value is 0, so that `fit` leaves the run out and counts it."""
+    """Yield a point for each run. An unknown value becomes 0, so that `fit` excludes and counts the run."""
     for run in runs:
         values = {"agents": run.agents, "blocks": run.figures.get("blocks") or 0.0}
         yield [values[name] for name in over], BY_NAME[metric].of(run.figures) or 0.0

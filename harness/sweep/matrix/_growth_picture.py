@@ -1,4 +1,4 @@
-"""Draw growth.svg: small panels on logarithmic axes, where a power law is a straight line.
+"""Draw growth.svg: small charts with logarithmic axes, on which a power law is a straight line.
 
 A dot is the mean of a cell. A line is the law fitted to the cells' runs, with its exponent beside it. Lines differ by
 colour and dashes. The legend names the lines over agents, and each exponent over blocks names its line.
@@ -56,7 +56,7 @@ ALSO_OVER_BLOCKS = ("messages", "bytes")
 
 @dataclass(frozen=True, slots=True)
 class LineKey:
-    """The axes that are the same along a line; None for the axis along which the line runs."""
+    """The values that are the same along a line of a chart. The value that varies along the line is None."""
 
     backend: BackendName
     loss: float
@@ -66,7 +66,7 @@ class LineKey:
 
 @dataclass(frozen=True, slots=True)
 class PanelLine:
-    """A line of a panel, with the number of its colour."""
+    """A line of a chart, with the number of its colour."""
 
     number: int
     name: str
@@ -75,7 +75,7 @@ class PanelLine:
 
 
 def draw_growth(record: MatrixRecord) -> str:
-    """Draw the picture as a file of its own."""
+    """Return the picture as an SVG file."""
     panels = panels_of(record.matrix)
     areas = svg.grid(len(panels), COLUMNS, HEAD, PANEL_HEIGHT)
     drawn = [_panel(record, panel, area) for panel, area in zip(panels, areas, strict=True)]
@@ -97,7 +97,7 @@ def panels_of(matrix: Matrix) -> list[Panel]:
 
 
 def description(record: MatrixRecord) -> str:
-    """Describe the picture in words."""
+    """Return a text that describes the picture."""
     if not record.cells:
         return "No run has ended."
     parts = []
@@ -138,7 +138,7 @@ def _title(record: MatrixRecord, panel: Panel) -> str:
 
 
 def _legend(record: MatrixRecord) -> Markup:
-    """Name the lines over agents, or the lines over blocks if these are all."""
+    """Draw the legend with the names of all lines."""
     parts = []
     x = svg.MARGIN + 4.0
     for line in _lines(record, panels_of(record.matrix)[0]):
@@ -155,7 +155,7 @@ def _legend(record: MatrixRecord) -> Markup:
 
 
 def _lines(record: MatrixRecord, panel: Panel) -> list[PanelLine]:
-    """Return the lines of a panel.
+    """Return the lines of a chart.
 
     A line over agents has one mission length. A line over blocks has one number of agents; beside lines over agents,
     lines over blocks are drawn at the highest loss alone.
@@ -190,7 +190,7 @@ def _place_of(item: Cell | Growth, panel: Panel) -> LineKey:
 
 
 def _name(matrix: Matrix, losses: Sequence[float], place: LineKey) -> str:
-    """Name the values in which lines differ."""
+    """Return the values in which a line differs from the others, as text."""
     return ", ".join(
         [
             *([f"{words.percent(place.loss)} loss"] if len(losses) > 1 else []),
@@ -221,7 +221,7 @@ def _panel(record: MatrixRecord, panel: Panel, area: Area) -> Markup:
 
 
 def _line(panel: Panel, line: PanelLine, across: Axis, up: Axis) -> Markup:
-    """Draw the law, or straight lines between the dots if there is none; and the dots with tooltips."""
+    """Draw the dots with tooltips, and the fitted law. Without a law, draw straight lines between the dots."""
     points = [(x, y, cell) for cell in line.cells if (x := _x(panel, cell)) and (y := _y(panel, cell)) is not None]
     ends = _ends(panel, line) or [(x, y) for x, y, _ in points]
     parts = [svg.line([(across(x), up(y)) for x, y in ends], line.number)] if ends else []
@@ -232,7 +232,7 @@ def _line(panel: Panel, line: PanelLine, across: Axis, up: Axis) -> Markup:
 
 
 def _power(panel: Panel, line: PanelLine, law: Law, prefix: str, x: float, y: float) -> Markup:
-    """Write the exponent of a law into the corner that growth leaves empty."""
+    """Write the exponent of a law into an empty corner of the chart."""
     value, margin = say_exponent(law.exponents[panel.over]).split("\u00b1")
     text = Markup('{}{}<tspan dy="-4" font-size="10">{}</tspan><tspan dy="4" font-size="10"> \u00b1{}</tspan>').format(
         prefix, SYMBOLS[panel.over], value, margin
@@ -243,7 +243,7 @@ def _power(panel: Panel, line: PanelLine, law: Law, prefix: str, x: float, y: fl
 
 
 def _ends(panel: Panel, line: PanelLine) -> list[tuple[float, float]]:
-    """The ends of a law's line: its values at the first and the last dot."""
+    """Return the ends of the law's line, at the first and the last dot."""
     xs = [x for cell in line.cells if (x := _x(panel, cell)) and _y(panel, cell)]
     if not line.law or not xs:
         return []
@@ -252,7 +252,7 @@ def _ends(panel: Panel, line: PanelLine) -> list[tuple[float, float]]:
 
 
 def _across(panel: Panel, lines: Sequence[PanelLine], area: Area) -> Axis:
-    """Return the horizontal axis. Over agents, the ticks are their numbers as far as there is room."""
+    """Return the horizontal axis. For numbers of agents, its ticks are these numbers if there is enough space."""
     xs = sorted({x for line in lines for cell in line.cells if (x := _x(panel, cell))}) or [1.0, 10.0]
     if panel.over == "blocks":
         return svg.log_axis(xs[0], xs[-1], area.across)
@@ -273,7 +273,7 @@ def _up(panel: Panel, lines: Sequence[PanelLine], area: Area) -> Axis:
 
 
 def _x(panel: Panel, cell: Cell) -> float | None:
-    """The place of a cell on the horizontal axis, or None if a logarithmic axis cannot show it."""
+    """Return the horizontal position of a summary, or None if a logarithmic axis cannot show it."""
     return float(cell.agents) if panel.over == "agents" else _mean("blocks", cell) or None
 
 

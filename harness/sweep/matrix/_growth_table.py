@@ -1,4 +1,4 @@
-"""Tables of growth for the terminal, the page and Markdown: means of each size, and exponents of laws."""
+"""Write tables of growth for the terminal, the page and Markdown: means for each size, and exponents of the laws."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -32,7 +32,7 @@ EXPLANATION = (
 
 @dataclass(frozen=True, slots=True)
 class GrowthTables:
-    """The growth at one loss and backend: cells, and a row of laws by metric for each group of runs and variable."""
+    """The tables for one loss rate and backend: means, and a row of laws for each group of runs and variable."""
 
     name: str
     cells: list[Cell]
@@ -40,7 +40,9 @@ class GrowthTables:
 
 
 def growth_tables(record: MatrixRecord) -> Iterator[GrowthTables]:
-    """Yield growth at each backend and loss at which a run has ended; nothing if the matrix does not grow."""
+    """Yield the tables for each backend and loss rate with a finished run. There are none if the matrix has only one
+    size.
+    """
     for backend in record.matrix.backend if record.matrix.grows else ():
         for loss in record.matrix.loss:
             cells = [cell for cell in record.cells if (cell.backend, cell.loss) == (backend, loss)]
@@ -51,7 +53,7 @@ def growth_tables(record: MatrixRecord) -> Iterator[GrowthTables]:
 
 
 def _rows(growths: Iterable[Growth]) -> list[tuple[str, Variable, dict[str, Law]]]:
-    """Group laws by the runs that they are fitted to: over agents, then over blocks, then over both."""
+    """Group the laws by the runs to which they are fitted: over agents, then over blocks, then over both."""
     by_row: dict[tuple[float, str, Variable], dict[str, Law]] = {}
     for growth in growths:
         for variable in growth.over:
@@ -61,7 +63,7 @@ def _rows(growths: Iterable[Growth]) -> list[tuple[str, Variable, dict[str, Law]
 
 
 def runs_of(growth: Growth) -> str:
-    """Name the runs that a law is fitted to, apart from their backend and loss: "600 s, load < 1", "both"."""
+    """Return a name for the runs to which a law is fitted, such as "600 s, load < 1" or "both"."""
     names = []
     if growth.over == ("agents", "blocks"):
         names.append("both")
@@ -75,7 +77,7 @@ def runs_of(growth: Growth) -> str:
 
 
 def label(name: str) -> str:
-    """A column's header, with a hyphen where a narrow column may break it."""
+    """Return the title of a column, with a hyphen where a narrow column may break it."""
     return "idle at end" if name == "finished" else BY_NAME[name].label
 
 
@@ -84,7 +86,7 @@ def in_one_line(label: str) -> str:
 
 
 def size_row(cell: Cell) -> list[str]:
-    """Return the means of a cell, in the order of `SIZE_METRICS`."""
+    """Return the means in a summary, in the order of `SIZE_METRICS`."""
     share = Metric("finished", "", lambda _: None, "share of runs")
     return [
         say(share, cell.finished) if name == "finished" else say(BY_NAME[name], cell.estimates.get(name, Estimate(n=0)))
@@ -121,18 +123,18 @@ def render(record: MatrixRecord) -> Iterator[RenderableType]:
 
 
 def place(record: MatrixRecord, cell: Cell) -> list[str]:
-    """Return a cell's mission length in seconds and its number of agents."""
+    """Return the mission length in seconds and the number of agents of a summary, as text."""
     return [f"{record.matrix.scenario_at(cell.point).duration_s:g}", str(cell.agents)]
 
 
 def say_exponent(exponent: Exponent) -> str:
-    """Format an exponent with half the width of its interval."""
+    """Return an exponent with half the width of its confidence interval, as text."""
     margin = (exponent.high - exponent.low) / 2
     return f"{exponent.value:.2f}\u00b1" + (f"{margin:.2f}".lstrip("0") if margin < 0.995 else f"{margin:.2g}")
 
 
 def say_quality(law: Law) -> str:
-    """Format the explained share of the variance, and the number of points if runs were left out."""
+    """Return the explained share of the variance as text, with the number of points if runs were left out."""
     explained = "" if law.r_squared is None else f"R\u00b2\u00a0{law.r_squared:.2f}".replace("0.", ".")
     return explained + (f" n\u00a0{law.n}" if law.left_out else "")
 
@@ -144,7 +146,7 @@ def say(metric: Metric, estimate: Estimate) -> str:
 
 
 def say_number(value: float) -> str:
-    """Format with three significant digits: 0.012, 7.3, 482, 40.4k, 225M."""
+    """Return a number with three significant digits as text: 0.012, 7.3, 482, 40.4k, 225M."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     for factor, unit in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):

@@ -1,4 +1,4 @@
-"""The coverage of the protocol by the runs of a matrix: in total, and in each cell. It is measured on request."""
+"""Measure how much of the protocol the runs of a matrix reach, in total and for each combination of values."""
 
 from collections import defaultdict
 from typing import Any
@@ -16,7 +16,7 @@ MOST_AGENTS, MOST_BLOCKS = 3, 3
 
 
 class CellCoverage(AtPoint):
-    """Coverage by the runs of one cell that this command played."""
+    """The coverage by the runs with one combination of values, as far as this command played them."""
 
     local_states: int
     pairs: int
@@ -24,7 +24,7 @@ class CellCoverage(AtPoint):
 
 
 class MatrixCoverage(BaseModel):
-    """Coverage by all examined runs. `all_cells` is a `ucp-coverage/1` document."""
+    """The coverage by all examined runs. `all_cells` is a `ucp-coverage/1` document."""
 
     runs: int
     all_cells: dict[str, Any]
@@ -45,7 +45,7 @@ class CoverageTally:
         self._by_point[point].add(reached)
 
     def tried(self, matrix: Matrix, runs: int) -> MatrixCoverage:
-        """Return the coverage.
+        """Return the coverage so far.
 
         `runs` counts all runs, including those of earlier commands, whose coverage is unknown.
         """

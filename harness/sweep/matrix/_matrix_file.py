@@ -1,4 +1,4 @@
-"""The matrix file: a scenario and its axes (loss rates, numbers of agents, mission lengths, backends) and seeds."""
+"""Read a matrix file: a scenario with lists of loss rates, numbers of agents, mission lengths, backends and seeds."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -22,7 +22,7 @@ SIZES_FOR_GROWTH = 3
 
 
 class Point(NamedTuple):
-    """The place of a cell in the matrix. `duration_s` is None if the matrix has no axis of mission lengths."""
+    """A combination of values in the matrix. `duration_s` is None if the mission length is not varied."""
 
     loss: float
     agents: int
@@ -31,13 +31,13 @@ class Point(NamedTuple):
 
     @property
     def file_name(self) -> str:
-        """The name of the cell's files and directories, which is the same for all backends."""
+        """The name for files and directories of this combination. It is the same for all backends."""
         length = "" if self.duration_s is None else f"-duration-{self.duration_s}"
         return f"loss-{self.loss}-agents-{self.agents}{length}"
 
 
 class Task(NamedTuple):
-    """One run of the matrix: the place of its cell, and its seed."""
+    """One run of the matrix: its combination of values, and its seed."""
 
     point: Point
     seed: int
@@ -107,12 +107,12 @@ class Matrix(Model):
 
     @property
     def duration_axis(self) -> Sequence[float | None]:
-        """The values of `duration_s` of the cells: None alone if the matrix has no such axis."""
+        """The mission lengths of the combinations. It contains only None if the mission length is not varied."""
         return self.duration_s or [None]
 
     @property
     def lengths(self) -> list[float]:
-        """The mission lengths, in seconds."""
+        """The mission lengths in seconds."""
         return self.duration_s or [self.scenario.duration_s]
 
     @property
@@ -132,7 +132,7 @@ class Matrix(Model):
     @model_validator(mode="before")
     @classmethod
     def _scenario_takes_from_the_matrix(cls, document: Any) -> Any:
-        """Give the scenario the matrix's name, first number of agents and first mission length.
+        """Set the scenario's name, number of agents and mission length to the first values of the matrix.
 
         The keys of the scenario that name single agents or times are checked with these values.
         """
@@ -201,7 +201,7 @@ class Matrix(Model):
 
 
 def load_matrix(path: Path | str, backend: BackendName | None = None) -> Matrix:
-    """Load a matrix from a YAML file. `backend`, if given, replaces that of the file.
+    """Load a matrix from a YAML file. If `backend` is given, it replaces the one in the file.
 
     Raises ScenarioError. Its message names the file, the key, the value and the allowed values.
     """

@@ -1,4 +1,4 @@
-"""Draw matrix.svg: six panels side by side, with the loss as horizontal axis.
+"""Draw matrix.svg: six charts side by side, with the loss rate as horizontal axis.
 
 Each number of agents, mission length and backend has six panels, one series below the other. Lines are means, bands are
 95 % intervals, and dots are the measured losses. Two lines in one panel also have different dashes, and their names
@@ -25,7 +25,7 @@ HEAD, SERIES_HEAD, PANEL_HEIGHT, FOOT = 74, 26, 218, 26
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """The contents of a panel: metrics with the names of their lines."""
+    """The contents of a chart: its figures, with the names of their lines."""
 
     title: str
     lines: tuple[tuple[str, str], ...]
@@ -47,7 +47,7 @@ PANELS = (
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """An estimate at a position on a line, and its tooltip."""
+    """A point of a line: an estimate with its horizontal position and its tooltip."""
 
     x: float
     estimate: Estimate
@@ -56,7 +56,7 @@ class Dot:
 
 @dataclass(frozen=True, slots=True)
 class PlacedPanel:
-    """A panel with the `id` of its drawing and its area in the picture."""
+    """A chart, with its ID in the SVG file and its area in the picture."""
 
     id: str
     panel: Panel
@@ -65,7 +65,7 @@ class PlacedPanel:
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """The panels of one series. `name` is empty if there is only one series. It stands at `top`, above the panels."""
+    """A row of charts below its name. `name` is empty if there is only one row."""
 
     name: str
     cells: list[Cell]
@@ -74,7 +74,7 @@ class Series:
 
 
 def series_of(record: MatrixRecord) -> list[Series]:
-    """Return the series of the picture from top to bottom."""
+    """Return the rows of the picture from top to bottom."""
     top: float = HEAD
     made = []
     for number, cells in enumerate(_series(record)):
@@ -106,17 +106,17 @@ def _heading(name: str, top: float) -> Markup:
 
 
 def _series(record: MatrixRecord) -> list[list[Cell]]:
-    """Return the series, each sorted by loss. If no run has ended, return one series without cells."""
+    """Return the rows of results, each sorted by loss rate. If no run has ended, return one empty row."""
     return [sorted(cells, key=lambda cell: cell.loss) for cells in series(record)] or [[]]
 
 
 def _name(record: MatrixRecord, cells: Sequence[Cell]) -> str:
-    """Return the values in which this series differs from others, or an empty text."""
+    """Return the values in which this row differs from others, as text."""
     return ", ".join(series_name(record.matrix, cells[0].point)) if cells else ""
 
 
 def description(record: MatrixRecord) -> str:
-    """Return a text alternative for the picture."""
+    """Return a text that describes the picture."""
     if not record.cells:
         return "No run has ended."
     parts = []
@@ -178,7 +178,7 @@ def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axi
 
 
 def curve(number: int, dots: Sequence[Dot], across: Axis, up: Axis) -> tuple[Markup, list[tuple[float, float]]]:
-    """Draw line `number` of a panel with its band of intervals, and return it with its points.
+    """Draw line `number` of a chart with its band of confidence intervals. Return the drawing and the points.
 
     Unknown means are left out.
     """
@@ -208,7 +208,7 @@ def _loss_axis(losses: Sequence[float], area: Area) -> Axis:
 
 
 def _value_axis(panel: Panel, cells: Sequence[Cell], area: Area) -> Axis:
-    """Return an axis from 0 to the first tick above all means and (up to 2 %) all intervals. Shares end at 100 %."""
+    """Return a vertical axis from 0 to the first tick above all means and nearly all confidence intervals."""
     if panel.shares:
         return svg.share_axis(area.up)
     estimates = [cell.estimates[name] for name, _ in panel.lines for cell in cells]

@@ -1,4 +1,4 @@
-"""How one quantity grows with others: power laws y = a * x^b, fitted by least squares in logarithms.
+"""Fit power laws y = a * x^b by least squares of the logarithms, to describe how one quantity grows with others.
 
 Only a value above 0 has a logarithm. Other points are left out and counted. The interval of an exponent is Student's,
 which assumes that the points scatter around the line independently and equally. Where the growth is no power law, the
@@ -21,7 +21,7 @@ variables cannot be separated."""
 
 
 class Exponent(BaseModel):
-    """An exponent with its 95 % interval."""
+    """An exponent with its 95 % confidence interval."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -31,7 +31,7 @@ class Exponent(BaseModel):
 
 
 class Law(BaseModel):
-    """y = factor * product of the variables, each raised to its exponent.
+    """A power law: y = factor * product of the variables, each raised to its exponent.
 
     The law is fitted to `n` points. `left_out` more points have a value that is not above 0. `r_squared` is the share
     of the variance of log y that the law explains, or null if y does not vary.
@@ -96,7 +96,7 @@ def _centred(values: Sequence[float]) -> list[float]:
 
 
 def _unexplained(values: Sequence[float], by: Sequence[float]) -> list[float]:
-    """Return the residuals of the regression of `values` on another variable, which need not vary."""
+    """Return the residuals of the regression of `values` on another variable, which may be constant."""
     if max(by) - min(by) < 1e-12:
         return _centred(values)
     slope, intercept = linear_regression(by, values)
@@ -104,5 +104,5 @@ def _unexplained(values: Sequence[float], by: Sequence[float]) -> list[float]:
 
 
 def _rounded(number: float) -> float:
-    """Round to six digits. Further digits mean nothing, and the last bits differ between machines."""
+    """Round to six digits, because further digits mean nothing and differ between machines."""
     return float(f"{number:.6g}")

@@ -1,5 +1,4 @@
-"""Read and write results.jsonl, which holds each finished run of a matrix. An interrupted matrix can therefore
-continue.
+"""Read and write results.jsonl, the list of finished runs, so that an interrupted matrix can continue.
 
 The first line is the resolved matrix. Each further line is one run. Lines are only appended.
 """
@@ -25,14 +24,14 @@ SCHEMA = "ucp-matrix-results/1"
 
 
 class Results:
-    """The finished runs, at most one for each task."""
+    """The finished runs of a matrix, at most one for each task."""
 
     def __init__(self, directory: Path, started_at: str, runs: dict[Task, Run], file: BinaryIO) -> None:
         self.directory, self.started_at, self.runs = directory, started_at, runs
         self._file = file
 
     def add(self, run: Run) -> None:
-        """Append a run. Raises MachineError if the file cannot be written."""
+        """Append a run to the file. Raises MachineError if it cannot be written."""
         line = _line(run.model_dump(mode="json"))
         try:
             if self._file.write(line) < len(line):
@@ -47,7 +46,7 @@ class Results:
 
 @contextlib.contextmanager
 def opened(directory: Path, matrix: Matrix) -> Iterator[Results]:
-    """Open the results of `matrix` in `directory`. A new or empty directory has no results yet.
+    """Open the results of `matrix` in `directory`, which may be new or empty.
 
     Raises RunDirectoryError if the directory holds other files, or if another command uses it.
     """
@@ -80,7 +79,7 @@ def _header(matrix: Matrix) -> dict[str, Any]:
 
 
 def _start_time(line: bytes, matrix: Matrix, directory: Path) -> str:
-    """Return the start time of the matrix in `directory`. Raises RunDirectoryError if it is another matrix."""
+    """Return the start time of the matrix in `directory`. Raises RunDirectoryError if it is a different matrix."""
     try:
         header = json.loads(line)
     except (ValueError, RecursionError):

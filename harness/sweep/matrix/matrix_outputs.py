@@ -38,7 +38,7 @@ from ucp.agent_files import write_atomically, write_json_atomically
 
 
 def to_junit(record: MatrixRecord) -> str:
-    """Return the matrix as JUnit XML.
+    """Return the results of a matrix as JUnit XML.
 
     A cell fails if one of its runs failed or has a bad verdict, or if it is worse than the baseline. A cell with
     missing or unsupported runs is skipped.
@@ -62,7 +62,7 @@ def _cases(record: MatrixRecord) -> Iterator[Case]:
 
 
 def write(finished: Finished, directory: Path, nights: Nights | None = None) -> None:
-    """Write all files. `nights` are drawn as a trend. Raises MachineError if a file cannot be written."""
+    """Write all output files. `nights` are drawn as a trend. Raises MachineError if a file cannot be written."""
     record = finished.record
     try:
         write_json_atomically(directory / "matrix.json", record.to_json())
@@ -93,12 +93,14 @@ def _cell_row(cell: Cell) -> dict[str, Any]:
 
 
 def _place(point: Point) -> dict[str, Any]:
-    """Return the columns that name a cell. A matrix without an axis of mission lengths has no column for them."""
+    """Return the table columns that name a combination of values. A constant mission length has no column."""
     return {axis: value for axis, value in point._asdict().items() if value is not None}
 
 
 def run_rows(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
-    """Yield a row of `runs.csv` for each run: point, seed, figures and verdicts, or the reason for their absence."""
+    """Yield a row of `runs.csv` for each run: its values and seed, and its figures and verdicts or the reason why they
+    are missing.
+    """
     figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
     for run in runs:
         yield {

@@ -1,4 +1,4 @@
-"""The record of a matrix: matrix.json, schema `ucp-matrix/1`.
+"""Define the file matrix.json, the results of a matrix (schema `ucp-matrix/1`).
 
 Later versions may add keys, but never remove or rename one.
 """
@@ -19,7 +19,7 @@ SCHEMA = "ucp-matrix/1"
 
 
 class RunWithoutResult(AtPoint):
-    """A run without a result, with the reason."""
+    """A run without a result, and the reason."""
 
     seed: int
     reason: str

@@ -1,4 +1,4 @@
-"""Play all runs of a matrix on the cores of this machine or on a cluster, and summarize each cell."""
+"""Play all runs of a matrix on this machine or on a cluster, and summarise them."""
 
 import time
 from collections import defaultdict
@@ -31,21 +31,21 @@ Spread = Callable[[Sequence[Task], Callable[[Task], Run]], AbstractContextManage
 
 @dataclass(frozen=True)
 class Finished:
-    """A finished or interrupted matrix: its record, and the runs that ended, by point and then by seed."""
+    """A finished or interrupted matrix: its results, and its runs sorted by their values and seeds."""
 
     record: MatrixRecord
     runs: list[Run]
 
 
 def on_cores(matrix: Matrix, jobs: int, *, shown: bool = False) -> Spread:
-    """Distribute the runs over `jobs` processes of this machine; runs of processes over at most one for each core."""
+    """Return a function that distributes the runs over `jobs` processes of this machine."""
     if matrix.needs_processes:
         jobs = min(jobs, cores())
     return partial(sweep, jobs=jobs, what="runs" if shown else None, in_order=False)
 
 
 def on_cluster(matrix: Matrix, address: str, *, shown: bool = False) -> Spread:
-    """Distribute the runs over the workers of the Dask scheduler at `address`.
+    """Return a function that distributes the runs over the workers of the Dask scheduler at `address`.
 
     Raises ScenarioError for runs of processes.
     """
@@ -65,7 +65,7 @@ def run_matrix(
     *,
     covers: bool = False,
 ) -> Finished:
-    """Play every run of a matrix and sum up each point.
+    """Play every run of a matrix, and summarise the runs for each combination of values.
 
     - `out`: the directory of `results.jsonl`. It is new or empty, or holds earlier results of the same matrix; runs in
       it are not played again. Without it, a new directory under `runs/`.
@@ -119,7 +119,7 @@ def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge,
 
 
 def compare_with(finished: Finished, baseline: Baseline) -> Finished:
-    """Add the changes since `baseline`."""
+    """Return the results together with their changes since an earlier night."""
     if baseline.record is None:
         comparison = Comparison(baseline=str(baseline.path), changes=[], not_compared=baseline.not_compared)
         return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
@@ -145,7 +145,9 @@ def compare_with(finished: Finished, baseline: Baseline) -> Finished:
 
 
 def _effort(scenario: Scenario) -> float:
-    """Estimate the relative cost of a run. All agents receive each other's messages, and large swarms settle slowly."""
+    """Estimate the relative cost of a run. It grows with the number of messages, and large swarms take long to become
+    idle.
+    """
     agents = len(scenario.roster)
     return agents**2 * (scenario.duration_s + min(scenario.settle.limit_s, 30 * agents))
 

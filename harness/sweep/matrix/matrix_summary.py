@@ -1,4 +1,4 @@
-"""Write summary.md, the matrix in Markdown, for the summary of a CI job or a message to a team."""
+"""Write summary.md, the results of a matrix in Markdown, for a CI job or a message to a team."""
 
 from collections.abc import Iterator
 
@@ -40,7 +40,7 @@ def to_markdown(record: MatrixRecord) -> str:
 
 
 def describe_coverage(tried: MatrixCoverage) -> Iterator[str]:
-    """Yield sentences on how much of the protocol the runs reached."""
+    """Yield sentences about the share of the protocol that the runs reached."""
     every, branches = tried.all_cells, tried.all_cells["branches"]
     yield (
         f"Coverage of {text.value(tried.runs)} runs: {text.value(every['local_states'])} local states, "
@@ -58,7 +58,7 @@ def describe_coverage(tried: MatrixCoverage) -> Iterator[str]:
 
 
 def verdict(record: MatrixRecord) -> str:
-    """Return the headline: runs, violations, failures and worse figures."""
+    """Return the headline: numbers of runs, violations, failures and worse figures."""
     runs = sum(cell.runs for cell in record.cells)
     parts = [f"{text.value(runs)} runs"]
     if record.outcome == "interrupted":

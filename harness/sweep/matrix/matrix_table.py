@@ -1,4 +1,4 @@
-"""The matrix on the terminal: means and 95 % intervals of each cell, then growth, then failures."""
+"""Print the results of a matrix on the terminal: means with 95 % confidence intervals, laws of growth, and failures."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -49,7 +49,7 @@ def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
 
 
 def series(record: MatrixRecord) -> list[list[Cell]]:
-    """Return groups of cells that differ by their loss alone."""
+    """Return groups of summaries that differ only by their loss rate."""
     groups: dict[tuple[object, ...], list[Cell]] = {}
     for cell in record.cells:
         groups.setdefault((cell.backend, cell.duration_s, cell.agents), []).append(cell)
@@ -57,7 +57,7 @@ def series(record: MatrixRecord) -> list[list[Cell]]:
 
 
 def axes(matrix: Matrix) -> dict[str, Callable[[Point], str]]:
-    """Return the loss and all other axes with several values.
+    """Return the loss rate and all other values that vary, each with a function that formats it.
 
     Each axis comes with a function that formats the value of a point.
     """
@@ -72,12 +72,12 @@ def axes(matrix: Matrix) -> dict[str, Callable[[Point], str]]:
 
 
 def name_of(matrix: Matrix, point: Point) -> str:
-    """Return a cell's name: "15 % loss" or "15 % loss, 10 agents, process"."""
+    """Return the name of a combination of values, such as "15 % loss" or "15 % loss, 10 agents, process"."""
     return ", ".join([f"{words.percent(point.loss)} loss", *series_name(matrix, point)])
 
 
 def series_name(matrix: Matrix, point: Point) -> list[str]:
-    """Return the values other than the loss that identify a cell."""
+    """Return the values, apart from the loss rate, that identify a combination."""
     named = axes(matrix)
     return [
         *([f"{point.agents} agents"] if "agents" in named else []),
@@ -86,12 +86,12 @@ def series_name(matrix: Matrix, point: Point) -> list[str]:
 
 
 def say_lengths(matrix: Matrix) -> str:
-    """Format the mission lengths: "600 s, 1200 s"."""
+    """Return the mission lengths as text, such as "600 s, 1200 s"."""
     return ", ".join(map(words.duration, matrix.lengths))
 
 
 def say(metric: Metric, estimate: Estimate) -> str:
-    """Format mean and interval on one line."""
+    """Return a mean and its confidence interval as one line of text."""
     interval = say_interval(metric, estimate)
     return f"{say_mean(metric, estimate)} ({interval})" if interval else say_mean(metric, estimate)
 
@@ -103,7 +103,7 @@ def say_mean(metric: Metric, estimate: Estimate) -> str:
 
 
 def say_interval(metric: Metric, estimate: Estimate) -> str:
-    """Format the interval: both limits for a share of runs, whose interval is asymmetric; otherwise the margin."""
+    """Return a confidence interval as text: both limits for a share, otherwise half its width."""
     if estimate.low is None or estimate.high is None:
         return ""
     if metric.unit == "share of runs":
@@ -113,7 +113,7 @@ def say_interval(metric: Metric, estimate: Estimate) -> str:
 
 
 def explanation(record: MatrixRecord) -> str:
-    """Return a sentence that explains the numbers."""
+    """Return a sentence that explains the numbers in the table."""
     seeds = len(record.matrix.seed_list)
     if seeds == 1:
         return "Each cell has one run, so there are no intervals."
@@ -137,7 +137,7 @@ def violated(cell: Cell) -> int:
 
 
 def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
-    """Yield a sentence for each failure, bad verdict, unfinished run or regression of a cell."""
+    """Yield a sentence for each failure, bad verdict, unfinished run or worse figure of a summary."""
     by_words = {BAD_IN_WORDS[key]: seeds for key, seeds in cell.violated.items()}
     for trouble, seeds in {**by_words, "more time needed": cell.unfinished}.items():
         if seeds:
@@ -155,7 +155,7 @@ def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
 
 
 def unsupported(record: MatrixRecord, cell: Cell) -> Iterable[str]:
-    """Return the features that agents lack for runs of this cell, without repetitions."""
+    """Return the features that agents lack for these runs, without repetitions."""
     return dict.fromkeys(run.reason for run in record.unsupported if run.point == cell.point)
 
 
@@ -178,7 +178,9 @@ def improvements(record: MatrixRecord) -> Iterable[str]:
 
 
 def changed_runs(record: MatrixRecord) -> Iterable[str]:
-    """Yield a sentence for each cell with runs that differ from the baseline, and for each reason not to compare."""
+    """Yield a sentence for each group of runs that differ from the earlier night, and for each group that cannot be
+    compared.
+    """
     if record.against is None:
         return
     for changed in record.against.changed_runs:
@@ -201,7 +203,7 @@ def _say_change(change: Change) -> str:
 
 
 def _say_difference(change: Change) -> str:
-    """Format the mean difference of the pairs with its interval, in percent of the value before if it has one."""
+    """Return the mean difference of paired runs with its confidence interval as text, in percent if possible."""
     metric, difference, before = BY_NAME[change.metric], change.difference, change.before.mean
     assert difference is not None, "the change is one of pairs"
     factor, unit = (1.0, "") if metric.unit == "number" else (100.0, "\u00a0points")
@@ -212,7 +214,7 @@ def _say_difference(change: Change) -> str:
 
 
 def say_finished(cell: Cell) -> str:
-    """Format the share of runs whose swarm became idle."""
+    """Return the share of runs in which the swarm became idle, as text."""
     share = cell.finished.mean
     return "\u2013" if share is None else f"{round(100 * share)}\u00a0%"
 
@@ -231,7 +233,7 @@ def _violated(cell: Cell) -> Text:
 
 
 def _number(number: float) -> str:
-    """Format with about three significant digits."""
+    """Return a number with about three significant digits as text."""
     digits = 2 if abs(number) < 10 else 1 if abs(number) < 100 else 0
     text = f"{number:.{digits}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text

@@ -1,4 +1,4 @@
-"""The results of earlier nights: where they are stored, and which one a matrix is compared with."""
+"""Store the results of a matrix for every night, and choose the night with which a matrix is compared."""
 
 import json
 import re
@@ -21,12 +21,12 @@ _IRRELEVANT_KEYS: Any = {"name": True, "about": True, "keep": True, "scenario": 
 
 
 class OtherVersionError(ScenarioError):
-    """A matrix.json that this version of the harness cannot read."""
+    """An error: this version of the harness cannot read the file matrix.json."""
 
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """An earlier night, for a comparison with the cells at `points`. `not_compared` says why others are left out.
+    """An earlier night for a comparison. `not_compared` is the reason why some combinations of values are left out.
 
     `record` is None if another version of the harness wrote the file and this version cannot read it.
     """
@@ -38,7 +38,7 @@ class Baseline:
 
 
 def load_baseline(path: Path, matrix: Matrix) -> Baseline:
-    """Load a night for a comparison. It may be of another matrix, and then some cells are not compared.
+    """Load a night for a comparison. If its matrix differs, some combinations of values are not compared.
 
     Raises ScenarioError if the file is no finished record of a matrix, or if the matrix has only one seed.
     """
@@ -70,7 +70,7 @@ def _scenario_at(matrix: Matrix, point: Point) -> Any:
 
 
 def _differing(before: Any, now: Any, key: str) -> Iterator[str]:
-    """Yield a clause for each key whose value differs."""
+    """Yield a phrase for each key whose value differs."""
     if isinstance(before, dict) and isinstance(now, dict):
         for name in dict.fromkeys((*before, *now)):
             yield from _differing(before.get(name), now.get(name), f"{key}.{name}")
@@ -79,7 +79,7 @@ def _differing(before: Any, now: Any, key: str) -> Iterator[str]:
 
 
 def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
-    """Load matrix.json. Raises ScenarioError if it is not the finished record of the same matrix."""
+    """Load matrix.json. Raises ScenarioError unless it contains finished results of the same matrix."""
     record = _load(path)
     before, now = (side.model_dump(mode="json", exclude=_IRRELEVANT_KEYS) for side in (record.matrix, matrix))
     differing = [f"`{key}`" for key in now if before[key] != now[key]]
@@ -90,7 +90,7 @@ def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
 
 
 def _load(path: Path) -> MatrixRecord:
-    """Load matrix.json. Raises ScenarioError if it is not the finished record of a matrix.
+    """Load matrix.json. Raises ScenarioError unless it contains finished results of a matrix.
 
     Raises OtherVersionError if it has the schema, but not its keys.
     """
@@ -120,7 +120,7 @@ LAST = 60
 
 @dataclass(frozen=True, slots=True)
 class Nights:
-    """The nights in `directory` of one matrix, sorted by start. `left_out` holds a sentence for each other file."""
+    """The stored nights of one matrix, sorted by start time. `left_out` contains a sentence for each unusable file."""
 
     directory: Path
     records: list[MatrixRecord]
@@ -128,7 +128,7 @@ class Nights:
 
     @property
     def said_left_out(self) -> str:
-        """Return a clause with the number of files that are not in the trend, or an empty text."""
+        """Return a phrase with the number of unusable files, or an empty text."""
         if not self.left_out:
             return ""
         number = len(self.left_out)
@@ -137,7 +137,7 @@ class Nights:
 
 
 def opened(directory: Path) -> Path:
-    """Create the directory if it is missing. Raises RunDirectoryError if that is impossible."""
+    """Create the directory if it does not exist. Raises RunDirectoryError if that is impossible."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -157,7 +157,7 @@ def keep(record: MatrixRecord, directory: Path) -> None:
 
 
 def read(directory: Path, matrix: Matrix) -> Nights:
-    """Read the nights of `matrix` in `directory`."""
+    """Return the stored nights of `matrix` in `directory`."""
     records, left_out = [], []
     for path in sorted(directory.glob("*.json"))[-LAST:]:
         try:

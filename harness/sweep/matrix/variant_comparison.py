@@ -1,4 +1,5 @@
-"""A protocol variant beside the original: the same matrix with the same seeds, and one page of paired differences.
+"""Compare a protocol variant with the original: play the same matrix with the same seeds, and write a page of
+differences.
 
 A run of the variant and a run of the original with the same seed have the same blocks, losses and faults. The page
 therefore shows means of differences between pairs, whose intervals are narrower than those of two independent means.
@@ -23,7 +24,7 @@ SIGNIFICANT_DIGITS = 4
 
 @dataclass(frozen=True)
 class Compared:
-    """A value that is compared in each pair of runs. `of` returns None for a run that does not know it."""
+    """A value that is compared for each pair of runs. `of` returns None if a run does not determine it."""
 
     label: str
     of: Callable[[Run], float | None]
@@ -69,7 +70,7 @@ COMPARED = (
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the page: means of original and variant over the pairs, and the mean difference of the pairs."""
+    """One line of the page: the means of the original and the variant, and the mean difference of the pairs."""
 
     compared: Compared
     original: float | None
@@ -90,7 +91,7 @@ class Row:
 
 @dataclass(frozen=True)
 class VariantComparison:
-    """The rows of each cell of the matrix."""
+    """The lines of the comparison for each combination of values."""
 
     variant: Variant
     matrix: Matrix
@@ -124,7 +125,7 @@ class VariantComparison:
 
 
 def compare_runs(variant: Variant, matrix: Matrix, original: Finished, changed: Finished) -> VariantComparison:
-    """Compare all pairs of runs that have ended."""
+    """Compare all pairs of runs that have ended, and return the result."""
     before = {run.task: run for run in original.runs if run.judged}
     pairs: dict[Point, list[tuple[Run, Run]]] = {}
     for run in changed.runs:

@@ -1,4 +1,4 @@
-"""Exploration guided by coverage, continued from night to night. See docs/how-to/explore-every-night.md.
+"""Explore scenarios for hours, guided by coverage, and continue every night. See docs/how-to/explore-every-night.md.
 
 `_hunt` changes a kept scenario (`_mutation`), plays it (`_hunt_trial`) and keeps it if it reaches a new state, branch
 or livelock. `_corpus` stores scenarios and findings in a directory. `_finding_identity` decides whether two runs show

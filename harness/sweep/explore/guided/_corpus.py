@@ -1,4 +1,4 @@
-"""The corpus: a directory that stores scenarios and findings from night to night.
+"""Store scenarios and findings in a directory (corpus), so that the next night can continue with them.
 
 corpus.json    the scenario of the corpus
 runs/          a scenario for each kept run; its file name ends with the seed
@@ -66,7 +66,9 @@ NightName = Annotated[str, Field(max_length=40)]
 
 
 class Finding(BaseModel):
-    """A bad verdict that runs showed. `first` and `last` are the start times of the nights that showed it."""
+    """A kind of bad verdict. `first` and `last` are the start times of the first and the last night in which runs
+    showed it.
+    """
 
     model_config = ConfigDict(extra="ignore")
 
@@ -86,7 +88,7 @@ class Finding(BaseModel):
 
     @property
     def file(self) -> str:
-        """File name of its scenario."""
+        """The name of the file with its scenario."""
         digest = sha256(repr((self.key, self.verdict, self.handler, self.shape)).encode()).hexdigest()[:8]
         slug = re.sub(r"[^a-z0-9]+", "_", f"{self.key} {self.verdict} {self.handler}".lower()).strip("_")[:60]
         return f"{slug}_{digest}.yaml"
@@ -101,7 +103,9 @@ class _Findings(BaseModel):
 
 @dataclass
 class Corpus:
-    """An open directory, locked against other commands. `left_out` holds a sentence for each unused file."""
+    """An open corpus directory, locked against other commands. `left_out` contains a sentence about each unused
+    file.
+    """
 
     directory: Path
     base: Document
@@ -114,7 +118,7 @@ class Corpus:
             self._lock.close()
 
     def runs(self) -> list[Candidate]:
-        """Return the kept runs without duplicates, in the order of their names."""
+        """Return the stored runs without duplicates, in the order of their names."""
         paths = sorted((self.directory / "runs").iterdir())
         if len(paths) > 2 * MOST_KEPT:
             self.left_out.append(f"{len(paths) - 2 * MOST_KEPT} of {len(paths)} files in {self.directory / 'runs'}")
@@ -142,7 +146,7 @@ class Corpus:
         self._write(self.directory / "runs" / _name_of(candidate), text + "\n")
 
     def drop(self, candidate: Candidate) -> None:
-        """Delete a run that reaches nothing that other runs do not reach."""
+        """Delete a run whose states and inputs are all reached by other runs."""
         (self.directory / "runs" / _name_of(candidate)).unlink(missing_ok=True)
 
     def findings(self) -> list[Finding]:
@@ -171,7 +175,7 @@ class Corpus:
         return path
 
     def write_night(self, began: str, document: dict[str, Any], page: Callable[[list[dict[str, Any]]], str]) -> Path:
-        """Store the results of a night, and write the page of all nights."""
+        """Store the results of a night, and write the page about all nights."""
         name = re.sub("[^0-9TZ]", "", began)
         path = self.directory / "nights" / f"{name}.json"
         self._checked_write(lambda path: write_json_atomically(path, document), path)
@@ -223,7 +227,7 @@ class Corpus:
 
 
 def opened(directory: Path, scenario: Scenario, limits: Limits) -> Corpus:
-    """Create the directory, or open an existing corpus.
+    """Open a corpus directory, and create it if it does not exist.
 
     Raises RunDirectoryError if it is no corpus, is the corpus of another scenario, or is used by another command.
     """
@@ -253,7 +257,7 @@ def opened(directory: Path, scenario: Scenario, limits: Limits) -> Corpus:
 
 
 def check_fits(document: Any, base: Document, limits: Limits) -> Document:
-    """Return the document if changes of the base can produce it. Raises ScenarioError otherwise."""
+    """Return the document if it can result from changes of the base scenario. Raises ScenarioError otherwise."""
     if not isinstance(document, dict):
         raise ScenarioError("it is no scenario")
     document = {"agents": base["agents"], **document}
@@ -272,7 +276,7 @@ def check_fits(document: Any, base: Document, limits: Limits) -> Document:
 
 
 def _is_part(value: Any, whole: Any) -> bool:
-    """Return whether the value equals the whole or a part of it. A run with fewer agents has fewer entries."""
+    """Return true if a value equals the whole or a part of it. A scenario with fewer agents has fewer entries."""
     if isinstance(value, dict) and isinstance(whole, dict):
         return all(_is_part(part, whole.get(key)) for key, part in value.items())
     return bool(value == whole)

@@ -1,4 +1,4 @@
-"""The identity of a finding, independent of the run: verdict, handler and shape. The seed is not part of it."""
+"""Identify a finding independently of the run: by verdict, handler, and form of the endless cycle."""
 
 import dataclasses
 from collections import Counter, defaultdict
@@ -26,7 +26,7 @@ SIZE_SETTINGS = frozenset(("max_block_bytes", "max_event_bytes"))
 
 @dataclass(frozen=True, order=True)
 class Identity:
-    """`key` is the key of a judgement. `handler` is empty if the evidence names no handler."""
+    """The identity of a finding. `key` is the key of a check. `handler` is empty if the evidence names no handler."""
 
     key: str
     verdict: str
@@ -39,7 +39,7 @@ class Identity:
 
 
 def identities(result: Result, cycle: Cycle | None, scenario: Scenario) -> tuple[Identity, ...]:
-    """Return the identity of the finding of each bad verdict.
+    """Return the identity of the finding behind each bad verdict.
 
     Settings that differ from the thesis are part of the shape.
     """
@@ -79,7 +79,7 @@ def _shape(key: str, judgement: Judgement, result: Result, cycle: Cycle | None) 
 
 
 def _form(cycle: Cycle) -> list[str]:
-    """Return the cycles of timers of the agents, each distinct cycle once.
+    """Return the timers that agents repeat in the endless cycle, each different sequence once.
 
     `prove` compares livelocks in the same way.
     """
@@ -91,7 +91,7 @@ def _form(cycle: Cycle) -> list[str]:
 
 
 def _one_repetition(pattern: Sequence[str]) -> Sequence[str]:
-    """Return one repetition of the cycle, rotated to a fixed start: the vote, if there is one."""
+    """Return one repetition of a sequence of timers. It starts with the vote if there is one."""
     length = len(pattern)
     divisors = (part for part in range(1, length + 1) if length % part == 0)
     once = next(part for part in divisors if [*pattern[:part]] * (length // part) == pattern)

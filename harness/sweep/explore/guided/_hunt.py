@@ -1,4 +1,4 @@
-"""The hunt: change documents, play them, and keep those that reach something new.
+"""Search for new behaviour (hunt): change scenarios at random, play them, and keep those that reach something new.
 
 The hunt proceeds in rounds. A round depends only on the documents that were kept before it and on the random draws. It
 does not depend on speed, so any number of processes gives the same result.
@@ -28,7 +28,7 @@ BITS = 1 << 28
 
 
 class DigestSet:
-    """A set of digests of local states or pairs, as a bit field. `count` is a lower limit of its size."""
+    """A set of numbers as a bit field. `count` is a lower limit for the number of its members."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -39,7 +39,7 @@ class DigestSet:
         return bool(self._bits[place >> 3] >> (place & 7) & 1)
 
     def add(self, number: int) -> None:
-        """Add a number that is not in the set."""
+        """Add a number that is not yet in the set."""
         place = number % BITS
         self._bits[place >> 3] |= 1 << (place & 7)
         self.count += 1
@@ -60,7 +60,7 @@ SEEDS = 1 << 16
 
 
 class Candidate(NamedTuple):
-    """A document to play with a seed. It does not contain the liveness phase, which every run gets."""
+    """A scenario document to play with a seed. It lacks the phase at the end that every run gets to become idle."""
 
     document: Document
     seed: int
@@ -72,7 +72,9 @@ class Candidate(NamedTuple):
 
 @dataclass
 class Kept:
-    """A kept candidate. It reached `new_states` new local states, or their equivalent, in `steps` handler runs."""
+    """A stored document. It reached `new_states` new agent states, or something of similar value, in `steps` handler
+    runs.
+    """
 
     candidate: Candidate
     new_states: int
@@ -84,18 +86,20 @@ class Kept:
 
     @property
     def worth(self) -> float:
-        """Expected benefit of changing this document."""
+        """The expected benefit of changing this document."""
         return (1 + self.new_states) / (1 + self.picked) / (100 + self.steps)
 
     @property
     def nearness(self) -> float:
-        """Expected benefit of this document in the search for a livelock; 0 if no votes failed in a new pattern."""
+        """The expected benefit of this document in the search for an endless cycle. It is 0 without a new sequence of
+        failed votes.
+        """
         return self.failed**2 / (1 + self.picked) / (100 + self.steps)
 
 
 @dataclass(frozen=True)
 class NewCoverage:
-    """The parts of a run's coverage that are new in its round, and the findings of the run."""
+    """The parts of a run's coverage that are new, and the findings of the run."""
 
     reached: Reached
     found: tuple[Identity, ...]
@@ -117,7 +121,7 @@ class NewCoverage:
 
 @dataclass
 class Hunt:
-    """The state of a hunt: coverage, findings and kept documents."""
+    """The state of a search: its coverage, its findings and its stored documents."""
 
     limits: Limits
     rng: Random
@@ -142,17 +146,17 @@ class Hunt:
     _to_reconcile: list[Candidate] = field(default_factory=list)
 
     def begin(self, candidates: Iterable[Candidate], jobs: int) -> Iterator[tuple[Candidate, bool]]:
-        """Play these candidates unchanged. Yield each played run, and whether it is kept."""
+        """Play these candidates unchanged. Yield each played run, and true if it is stored."""
         yield from self._play(list(candidates), jobs)
 
     def round(self, jobs: int) -> Iterator[tuple[Candidate, bool]]:
-        """Change kept documents and play them. Yield each played run, and whether it is kept."""
+        """Change stored documents and play them. Yield each played run, and true if it is stored."""
         to_reconcile, self._to_reconcile = self._to_reconcile, []
         worth = list(accumulate(kept.worth for kept in self.kept))
         yield from self._play([*to_reconcile, *(self._next(worth) for _ in range(ROUND))], jobs)
 
     def dropped(self) -> list[Candidate]:
-        """Return the documents that were dropped since the last call."""
+        """Return the documents that were removed since the last call."""
         dropped, self._dropped = self._dropped, []
         return dropped
 
@@ -179,7 +183,7 @@ class Hunt:
                     yield candidate, self._learn(candidate, outcome)
 
     def _learn(self, candidate: Candidate, news: NewCoverage) -> bool:
-        """Add a run to the state. Return whether it reached something new."""
+        """Add the results of a run. Return true if it reached something new."""
         for identity in news.found:
             self.shown[identity] += 1
             self.found.setdefault(identity, candidate)
@@ -211,12 +215,12 @@ class Hunt:
 
     @property
     def local_states(self) -> int:
-        """Number of local states that were reached."""
+        """The number of different agent states that runs have reached."""
         return len(self.reached.states) + self.states_overflow.count
 
     @property
     def pairs(self) -> int:
-        """Number of pairs of a local state and an input that were reached."""
+        """The number of different pairs of agent state and input that runs have reached."""
         return len(self.reached.pairs) + self.pairs_overflow.count
 
     def _next(self, worth: Sequence[float]) -> Candidate:
@@ -228,7 +232,7 @@ class Hunt:
         return Candidate(document, kept.candidate.seed if rng.random() < 0.8 else rng.randrange(SEEDS))
 
     def _pick(self, worth: Sequence[float]) -> Kept:
-        """Choose a document: in half of all cases one of the newest, otherwise by nearness to a livelock or by worth.
+        """Choose a stored document: in half of all cases a new one, otherwise one of high expected benefit.
 
         `worth` holds cumulative sums.
         """

@@ -1,4 +1,4 @@
-"""One run of a hunt: its document, its verdict, and the timers that ended in it.
+"""Play one run of a search, and return its coverage, its findings and the timers that expired in it.
 
 The liveness phase clears all conditions and logs no more events. The swarm must then become idle. If it has several
 chains at that time, the run may be played again with a final reconcile, after which there must be one chain.
@@ -42,7 +42,7 @@ TimerPatterns = tuple[tuple[str, ...], ...]
 
 
 class TimerEnd(NamedTuple):
-    """The end of a timer, and the branch that its handler took."""
+    """The expiry of a timer, and the branch that its handler took."""
 
     at_s: float
     agent_id: int
@@ -52,7 +52,7 @@ class TimerEnd(NamedTuple):
 
 
 def timers_ended(evidence: Evidence) -> list[TimerEnd]:
-    """Return the ends of timers of all agents in time order."""
+    """Return the timer expiries of all agents in order of time."""
     return sorted(
         TimerEnd(run.t, agent_id, run.trigger.timer, run.handler, run.branch)
         for agent_id, trace in evidence.traces.items()
@@ -62,7 +62,7 @@ def timers_ended(evidence: Evidence) -> list[TimerEnd]:
 
 
 def failed_votes(timer_ends: Iterable[TimerEnd]) -> TimerPatterns:
-    """Return the longest pattern of timers without an approved vote, or no pattern if fewer than two votes failed."""
+    """Return the longest sequence of timers without an approved vote, or none if fewer than two votes failed."""
     longest: Sequence[TimerEnd] = ()
     for approved, stretch in groupby(timer_ends, lambda each: (each.handler, each.branch) == APPROVED):
         if not approved:
@@ -105,7 +105,7 @@ class Trial:
 
 @gc_paused()
 def play_trial(scenario: Scenario, seed: int) -> Trial:
-    """Play a scenario. Raises HarnessError if it cannot be played."""
+    """Play a scenario, and return the result. Raises HarnessError if it cannot be played."""
     watcher = Watcher()
     result, evidence = _played(scenario, seed, watcher.step)
     divergence = None if scenario.final_reconcile or result.bad else _known_divergences(result)
@@ -141,7 +141,9 @@ def _played(scenario: Scenario, seed: int, watch: Watch) -> tuple[Result, Eviden
 
 
 def with_liveness_phase(document: Document) -> Document:
-    """Add entries that clear all conditions at the end of the mission."""
+    """Return the document with entries that remove all network conditions at the end of the mission, so that the swarm
+    can become idle.
+    """
     ends_s = float(document.get("duration_s", 1200.0))
     fates = [_until(fate, ends_s) for fate in document.get("fates", []) if fate.get("from_s", 0.0) < ends_s]
     entries = [entry for entry in timeline(document) if entry["at_s"] < ends_s - 3 * CLEARED_S]
@@ -157,7 +159,7 @@ def with_liveness_phase(document: Document) -> Document:
 
 
 def without_liveness_phase(document: Document) -> Document:
-    """Remove the entries that `with_liveness_phase` added."""
+    """Return the document without the entries that `with_liveness_phase` added."""
     last_s = float(document.get("duration_s", 1200.0)) - 3 * CLEARED_S
     return with_key(document, "timeline", [entry for entry in timeline(document) if entry["at_s"] < last_s])
 
@@ -179,7 +181,7 @@ def _until(fate: Document, ends_s: float) -> Document:
 
 
 def initial_documents(scenario: Scenario, seeds: Iterable[int]) -> tuple[Limits, list[tuple[Document, int]]]:
-    """Return the limits of changes, and short documents to start with."""
+    """Return the limits for changes, and short documents with which the search can begin."""
     initial, last_s = [], LAST_S
     for seed in seeds:
         completing = [event for event in record(scenario, seed).logged if event.completes]
@@ -190,13 +192,13 @@ def initial_documents(scenario: Scenario, seeds: Iterable[int]) -> tuple[Limits,
 
 
 def _as_json(document: Document) -> Document:
-    """Return the document as it is after writing and reading. Keys that are numbers become text."""
+    """Return the document as it is after writing and reading a JSON file. Keys that are numbers become text."""
     copy: Document = json.loads(json.dumps(document))
     return copy
 
 
 def _initial_document(scenario: Scenario, completing: Sequence[Logged]) -> Document:
-    """Return a document with these blocks, each completed by one event.
+    """Return a document in which one event completes each of these blocks.
 
     Everything else is as in the scenario up to then. Losses and latencies are still random.
     """

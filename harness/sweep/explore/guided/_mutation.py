@@ -1,4 +1,4 @@
-"""Random changes of a scenario: times, agents, network, single messages and settings.
+"""Change a scenario at random: times, agents, network, single messages and settings.
 
 A change takes a document and returns another, which may be an invalid scenario. The caller finds out by playing it. All
 random draws come from `rng`, so equal generators make equal changes.
@@ -37,7 +37,7 @@ Change = Callable[[Document, Random], Document]
 
 
 class Limits(NamedTuple):
-    """The agents that may take part, the maximum number of blocks, and the time of the last one."""
+    """The agents that may take part, the maximum number of blocks, and the latest time of a block."""
 
     roster: Sequence[int]
     blocks: int
@@ -47,7 +47,7 @@ class Limits(NamedTuple):
 def mutate(
     document: Document, other: Document, limits: Limits, rng: Random, timers_ended_s: Sequence[float] = ()
 ) -> Document:
-    """Return a document with one to eight random changes, sometimes combined with parts of `other` or other agents.
+    """Return a document with one to eight random changes, sometimes combined with parts of `other`.
 
     `timers_ended_s` are times at which timers ended in the document's run.
     """
@@ -64,7 +64,7 @@ def mutate(
 
 
 def _limited(document: Document, limits: Limits) -> Document:
-    """Apply the limits, and end the mission soon after the last event."""
+    """Return the document within the limits, with a mission that ends soon after the last event."""
     events = [event for event in script(document) if event["at_s"] <= limits.last_s][: limits.blocks]
     last_s = max((event["at_s"] for event in events), default=0.0)
     document = with_events(document, events)
@@ -107,7 +107,7 @@ def _reassign_event(document: Document, rng: Random) -> Document:
 
 
 def _align_two_events(document: Document, rng: Random) -> Document:
-    """Let two agents complete a block at the same instant."""
+    """Let two agents complete a block at the same time."""
     events = list(script(document))
     if len(events) < 2:
         return _add_event(document, rng)
@@ -120,7 +120,7 @@ def _align_two_events(document: Document, rng: Random) -> Document:
 
 
 def _align_with_timer(document: Document, timers_ended_s: Sequence[float], rng: Random) -> Document:
-    """Move events to the end of a timer: new events of some agents, one event, or all events from one on."""
+    """Move events to the expiry of a timer: new events of some agents, one event, or all later events."""
     moment = rng.choice(timers_ended_s)
 
     def near() -> float:
@@ -138,7 +138,7 @@ def _align_with_timer(document: Document, timers_ended_s: Sequence[float], rng: 
 
 
 def with_events(document: Document, events: Sequence[Document]) -> Document:
-    """Return the document with these events in time order, extended to their duration."""
+    """Return the document with these events in order of time, and with a mission that is long enough for them."""
     ordered = sorted(events, key=lambda event: (event["at_s"], event["agent"]))
     document = {**document, "events": {"source": "scripted", **({"script": ordered} if ordered else {})}}
     last = max((event["at_s"] for event in ordered), default=0.0)
@@ -181,7 +181,7 @@ def _retarget_fate(document: Document, rng: Random) -> Document:
 
 
 def _with_target(fate: Document, which: Document) -> Document:
-    """Return a fate with the effect of `fate` on other messages."""
+    """Return a delivery rule with the effect of `fate` on other messages."""
     return {**which, **{key: fate[key] for key in ("drop", "delay_s") if key in fate}}
 
 
@@ -194,7 +194,7 @@ def _with_fate(document: Document, fate: Document, rng: Random) -> Document:
 
 
 def _choose_messages(document: Document, rng: Random) -> Document:
-    """Choose a message, for one receiver or for all."""
+    """Choose a message at random, for one receiver or for all."""
     which: Document = {
         "message": rng.choice(MESSAGES),
         "sender": rng.choice(document["agents"]),
@@ -246,7 +246,7 @@ def _add_temporary_loss(document: Document, rng: Random) -> Document:
 
 
 def _add_agent_fault(document: Document, rng: Random) -> Document:
-    """Kill, reboot or pause an agent."""
+    """Add a fault that kills, reboots or pauses an agent."""
     agent = rng.choice(document["agents"])
     what = rng.randrange(4)
     if what == 0:
@@ -297,7 +297,7 @@ def _change_duplication(document: Document, rng: Random) -> Document:
 
 
 def _change_clock(document: Document, rng: Random) -> Document:
-    """Set an agent's clock apart from the others, so that its blocks look older or younger than they are."""
+    """Set an agent's clock to a different time than the others, so that its blocks look older or younger."""
     clocks = dict(document.get("clocks", {}))
     agent = str(rng.choice(document["agents"]))
     clocks.pop(agent, None)
@@ -321,7 +321,7 @@ def _change_agents(document: Document, roster: Sequence[int], rng: Random) -> Do
 
 
 def _splice(document: Document, other: Document, rng: Random) -> Document:
-    """Combine the events of one document with conditions of the other."""
+    """Combine the events of one document with the conditions of another."""
     if document["agents"] != other["agents"]:
         return document
     for key in ("fates", "timeline", "lateness", "network", "clocks", "settings"):
@@ -331,7 +331,7 @@ def _splice(document: Document, other: Document, rng: Random) -> Document:
 
 
 def _moment(document: Document, rng: Random) -> float:
-    """Choose a time: at or between known times, or when a timer that started then would end."""
+    """Choose a time: at or between known times, or at the expiry of a timer that starts then."""
     known = [event["at_s"] for event in script(document)]
     known += [entry["at_s"] for entry in timeline(document)]
     last = max(known, default=20.0)

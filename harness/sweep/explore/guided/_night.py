@@ -1,4 +1,4 @@
-"""A night: known findings are played first, then the hunt continues from the kept runs until its time is over.
+"""Spend a night on the search: play known findings again, and then continue from the stored runs until time is over.
 
 An interruption loses only the runs in progress, because new coverage and findings are written at once.
 """
@@ -49,7 +49,9 @@ SAMPLES = 200
 
 @dataclass(frozen=True)
 class Watcher:
-    """Functions that report progress: `on_progress` receives runs, local states and findings, `on_event` a text."""
+    """Functions that report progress. `on_progress` gets the numbers of runs, agent states and findings, and `on_event`
+    a text.
+    """
 
     on_progress: Callable[[int, int, int], None] = lambda runs, states, findings: None
     on_event: Callable[[str], None] = lambda words: None
@@ -57,7 +59,7 @@ class Watcher:
 
 @dataclass
 class NightFinding:
-    """A finding with its status of this night. It appeared with `shown` of `of` seeds."""
+    """A finding and its status in this night. It appeared with `shown` of `of` seeds."""
 
     finding: Finding
     status: Status
@@ -67,7 +69,7 @@ class NightFinding:
 
     @property
     def replay(self) -> str | None:
-        """The command that plays it again."""
+        """The command that plays the finding again, or None."""
         return None if self.path is None else f"ucp-harness run {self.path} --backend sim --seed {self.finding.seed}"
 
     def to_json(self) -> dict[str, Any]:
@@ -84,7 +86,9 @@ class NightFinding:
 
 @dataclass
 class Night:
-    """The results of a night. `growth` holds pairs of a number of runs and the local states known after them."""
+    """The results of a night. `growth` contains pairs of a number of runs and the number of agent states known after
+    them.
+    """
 
     scenario: Scenario
     directory: Path
@@ -100,7 +104,7 @@ class Night:
     report: Path | None = None
 
     def grow(self) -> None:
-        """Add a sample to `growth`. In a long night, only every second, fourth or eighth run is kept."""
+        """Add a pair to `growth`. In a long night, only every second, fourth or eighth run is stored."""
         self.growth.append((self.hunt.runs, self.hunt.local_states))
         if len(self.growth) > 2 * SAMPLES:
             del self.growth[1::2]
@@ -144,7 +148,8 @@ def spend(
     jobs: int = 1,
     watcher: Watcher = Watcher(),
 ) -> Night:
-    """Hunt for `for_s` seconds or `most_runs` runs, and store results in `directory`. Ctrl-C ends the night early.
+    """Search for `for_s` seconds or `most_runs` runs, and store the results in `directory`. Ctrl-C ends the night
+    early.
 
     Raises HarnessError if the scenario cannot be played, or if the directory cannot be used.
     """
@@ -161,7 +166,7 @@ def spend(
 
 
 class _NightRun:
-    """Carries out one night."""
+    """Carries out the search of one night."""
 
     def __init__(
         self,
@@ -217,7 +222,7 @@ class _NightRun:
             return sum(outcome is True for _, outcome in outcomes), len(seeds)
 
     def _hunt(self, initial: list[Candidate]) -> None:
-        """Hunt from the kept runs.
+        """Continue the search from the stored runs.
 
         Runs that reach nothing new any more are dropped, if there was time to play all of them.
         """
@@ -240,7 +245,7 @@ class _NightRun:
         return time.monotonic() >= self._ends_s or self._night.hunt.runs >= self._most_runs
 
     def _kept_runs(self, runs: Iterator[tuple[Candidate, bool]]) -> Iterator[Candidate]:
-        """Yield the runs that are kept. Kept runs and findings are written at once."""
+        """Yield the runs to store. They and new findings are written at once."""
         night, hunt = self._night, self._night.hunt
         for candidate, is_kept in runs:
             night.grow()
@@ -276,7 +281,7 @@ class _NightRun:
         assert path.exists()
 
     def _shrink(self) -> None:
-        """Shrink the new findings."""
+        """Reduce the scenarios of new findings."""
         for identity, finding in self._new.items():
             document = with_liveness_phase(self._night.hunt.found[identity].document)
             self._watcher.on_event(f"shrinking: {identity}")

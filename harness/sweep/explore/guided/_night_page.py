@@ -1,4 +1,4 @@
-"""The page of a night: findings, coverage, and earlier nights. The template escapes all text."""
+"""Write the page about a night: findings, coverage, and earlier nights. The template escapes all text."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ MOST_BRANCHES = 100
 
 
 def to_html(night: dict[str, Any], nights: Sequence[dict[str, Any]]) -> str:
-    """Return the page.
+    """Return the page about a night as HTML.
 
     `night` is the night's JSON, and `nights` holds that of all stored nights, including this one.
     """
@@ -43,7 +43,7 @@ def to_html(night: dict[str, Any], nights: Sequence[dict[str, Any]]) -> str:
 
 
 def headline(night: dict[str, Any]) -> str:
-    """Return the headline: findings by status, runs and local states."""
+    """Return the headline: numbers of findings by status, of runs, and of agent states."""
     counts = dict.fromkeys(("new", "ongoing", "rare", "resolved"), 0)
     for finding in night["findings"]:
         counts[finding["status"]] += 1

@@ -1,4 +1,4 @@
-"""The output of the command `explore --for`, during a night and at its end."""
+"""Print the output of the command `explore --for`."""
 
 import contextlib
 import time

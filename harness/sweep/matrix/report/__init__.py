@@ -1,4 +1,4 @@
-"""The report of a matrix: one file that loads nothing and runs no script.
+"""Write the report of a matrix: one HTML file that loads no other files and runs no script.
 
 `_matrix_page` lays it out. It shows a heatmap of a figure, the trend over the nights, and the runs of each cell with
 the command that plays one of them again.

@@ -1,4 +1,4 @@
-"""The runs of each cell, failures first, with the command that plays one of them again."""
+"""List the runs behind each summary, failures first, with a command that plays one of them again."""
 
 import shlex
 from collections.abc import Sequence
@@ -22,7 +22,9 @@ MAX_ROWS = 12_000
 
 @dataclass(frozen=True, slots=True)
 class RunRow:
-    """One run. `href` is its report if it was kept. `failed` or `unsupported` is the reason for missing verdicts."""
+    """A table row about one run. `href` links to its report if it was kept. `failed` or `unsupported` explains missing
+    verdicts.
+    """
 
     seed: int
     href: str | None
@@ -34,7 +36,7 @@ class RunRow:
 
 @dataclass(frozen=True, slots=True)
 class CellRuns:
-    """The runs of one cell. `left_out` is the number of runs without a row."""
+    """The runs behind one summary. `left_out` is the number of runs without a table row."""
 
     anchor: str
     name: str
@@ -46,7 +48,7 @@ class CellRuns:
 
 
 def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
-    """Return the runs of all cells. `directory` is the directory of the matrix, in which the page will be."""
+    """Return the runs behind all summaries. `directory` is the place of the page, for links."""
     by_point = [(point, list(runs)) for point, runs in groupby(finished.runs, key=lambda run: run.point)]
     room = MAX_ROWS // max(1, len(by_point))
     cells = []

@@ -1,4 +1,4 @@
-"""Heatmaps of figures over the points of a matrix, and the menu of figures.
+"""Draw heatmaps of figures over the values of a matrix, and the menu from which a reader chooses a figure.
 
 The shade grows with the figure. All shades have one hue, so they can be distinguished with any colour vision. Each cell
 also shows its number. Violations, failures and changes have a sign and a text.
@@ -51,7 +51,7 @@ class Figure:
 
 
 def known_figures(cells: Iterable[Cell]) -> list[Figure]:
-    """Return the figures that runs determined, those before the final reconcile first.
+    """Return the figures that runs determined. Those before the final reconcile come first.
 
     "violated" is always included.
     """
@@ -81,7 +81,7 @@ STYLE = (
 
 @dataclass(frozen=True, slots=True)
 class TileMark:
-    """A note in a tile. `kind` is "bad" or "good", for the style sheet."""
+    """A note in a tile of the heatmap. `kind` is "bad" or "good", and selects the style."""
 
     sign: str
     text: str
@@ -90,7 +90,7 @@ class TileMark:
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """A cell of the heatmap. `shade` is None for an unknown figure, and `href` is None without runs."""
+    """A tile of the heatmap. `shade` is None for an unknown figure, and `href` is None without runs."""
 
     shade: int | None
     mean: str
@@ -102,7 +102,9 @@ class Tile:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """The cells of one backend and mission length: a row for each number of agents, a column for each loss."""
+    """The tiles for one backend and mission length, with a row for each number of agents and a column for each loss
+    rate.
+    """
 
     name: str
     losses: list[str]
@@ -120,7 +122,7 @@ class Heatmap:
 
 
 def anchor(point: Point) -> str:
-    """Return the ID of the page section with the point's runs."""
+    """Return the HTML ID of the section with the runs for a combination of values."""
     return f"{point.file_name}-{point.backend}"
 
 
@@ -143,7 +145,9 @@ def heatmap(record: MatrixRecord, figure: Figure) -> Heatmap:
 
 
 def _scale(figure: Figure, record: MatrixRecord) -> tuple[float, float]:
-    """Return the values of the first and the last shade: 0 and 1 for shares, otherwise the extreme means."""
+    """Return the values of the first and the last shade: 0 and 1 for shares, otherwise the smallest and largest
+    mean.
+    """
     if figure.metric.unit != "number":
         return 0.0, 1.0
     means = [mean for cell in record.cells if (mean := figure.of(cell).mean) is not None]

@@ -1,4 +1,4 @@
-"""The page of a matrix. The template escapes all text from scenarios, runs and earlier nights."""
+"""Write the page about a matrix. The template escapes all text from scenarios, runs and earlier nights."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ _STYLE, _GROWTH_STYLE = (_TEMPLATE.with_name(f"{name}.css").read_text(encoding="
 
 
 def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -> str:
-    """Return the page.
+    """Return the page as HTML.
 
     `directory` will contain the page and the kept runs. `nights` includes this one, if it is finished.
     """
@@ -79,7 +79,7 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
 
 
 def _choosing(shown: list[_heatmap.Figure]) -> str:
-    """Return CSS that shows only the parts of the chosen figure. On paper, all heatmaps are shown."""
+    """Return CSS that shows only the parts for the chosen figure. On paper, all heatmaps are shown."""
     others = [
         f"main:has(#show-{figure.metric.name}:checked) {{}} .figure:not(.of-{figure.metric.name})" for figure in shown
     ]
@@ -88,7 +88,7 @@ def _choosing(shown: list[_heatmap.Figure]) -> str:
 
 
 def _kind(record: MatrixRecord) -> str:
-    """Return the kind of result for the style sheet. An interrupted matrix is never "holds"."""
+    """Return the kind of the result, which selects a style. The kind of an interrupted matrix is never "holds"."""
     if record.outcome == "interrupted":
         return "violated" if record.failed or any(cell.violated for cell in record.cells) else "unknown"
     return {0: "holds", CANNOT_HERE: "unknown"}.get(record.exit_status, "violated")

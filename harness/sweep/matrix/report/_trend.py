@@ -1,4 +1,4 @@
-"""A figure over the nights: a row of small panels, one for each loss, for each number of agents and backend.
+"""Draw a figure over several nights, in a small chart for each loss rate, number of agents and backend.
 
 Dots and lines are means, and bands are 95 % intervals. Each panel has its own scale, because only changes matter here.
 Each step to the right is one night.
@@ -26,12 +26,12 @@ LARGEST = 1e12
 
 
 def nights_drawn(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figures: int) -> Sequence[MatrixRecord]:
-    """Return the last nights, at least two, within `MAX_DOTS`."""
+    """Return the latest nights, at least two, with at most `MAX_DOTS` dots in all."""
     return nights[-max(2, MAX_DOTS // max(1, len(tonight.cells) * figures)) :]
 
 
 def trend(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figure: Figure) -> list[tuple[str, Markup]]:
-    """Return a drawing for each number of agents and backend, with its name if there are several."""
+    """Return a drawing for each number of agents and backend, with a name if there are several."""
     of_night = [{cell.point: figure.of(cell) for cell in night.cells} for night in nights]
     begun = [text.started(night.started_at)[:16] for night in nights]
     drawings = []
@@ -76,7 +76,7 @@ def _panel(figure: Figure, cell: Cell, dots: Sequence[Dot], dates: Sequence[str]
 
 
 def _value_axis(figure: Figure, estimates: Sequence[Estimate], area: Area) -> Axis:
-    """Return an axis around all intervals. It has a minimum span, so that small changes look small."""
+    """Return a vertical axis for all confidence intervals. Its minimum length makes small changes look small."""
     bounds = [
         bound for estimate in estimates for bound in (estimate.low, estimate.mean, estimate.high) if bound is not None
     ]
