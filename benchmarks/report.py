@@ -15,7 +15,7 @@ from typing import Any
 from benchmarks.rounds import Spread, show
 from benchmarks.simulation import scenario, seconds
 from harness.archive.archive import RunArchive
-from harness.archive.traces import SUFFIX
+from harness.archive.trace_files import SUFFIX
 from harness.play.progress import Silent
 from harness.report import write_report
 from harness.run.run import run

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
 import selectors
 import signal
 import socket
@@ -21,6 +22,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from errno import EINPROGRESS, ETIMEDOUT
+from functools import partial
 from typing import Any
 
 from netem import _choice, _namespaces
@@ -41,6 +43,12 @@ class _Connection:
     request: int
     socket: socket.socket
     deadline: float
+
+
+def _limit_files(most_bytes: int) -> None:
+    """Limit the files of this process. SIGXFSZ is ignored, so that a write beyond the limit fails with EFBIG."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
 
 class Server:
@@ -164,6 +172,7 @@ class Server:
     def _spawn(self, message: dict[str, Any]) -> dict[str, Any]:
         mode = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
         files: list[int] = []
+        most = message["max_file_bytes"]
         try:
             for name in ("stdout", "stderr"):
                 files.append(os.open(message[name], mode, 0o644))
@@ -177,6 +186,7 @@ class Server:
                     stdout=files[0],
                     stderr=files[1],
                     start_new_session=True,
+                    preexec_fn=None if most is None else partial(_limit_files, most),
                 )
         except PermissionError as error:
             raise PermissionError(error.errno, f"{error.strerror} to {_namespaces.user()}", error.filename) from None

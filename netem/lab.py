@@ -230,16 +230,18 @@ class Lab:
         stdout: Path,
         stderr: Path,
         role: str = "program",
+        max_file_bytes: int | None = None,
     ) -> LabProcess:
         """Start a program in the network of a vehicle.
 
         With `vehicle` None, the program runs in the lab's own network, which no vehicle reaches.
 
         `env` is its whole environment. Its output is appended to the files `stdout` and `stderr`. Its input is empty.
-        `role` names the program in errors. Raises SpawnError with the message of the operating system.
+        `role` names the program in errors. A file of the program that reaches `max_file_bytes` takes no further bytes:
+        the call that writes them fails with EFBIG. Raises SpawnError with the message of the operating system.
         """
         self._check_vehicle(vehicle)
-        where = {"cwd": str(cwd), "stdout": str(stdout), "stderr": str(stderr)}
+        where = {"cwd": str(cwd), "stdout": str(stdout), "stderr": str(stderr), "max_file_bytes": max_file_bytes}
         try:
             result, _ = await self._channel.ask("spawn", vehicle=vehicle, argv=[*argv], env={**env}, **where)
         except SpawnError as error:

@@ -70,9 +70,9 @@ class TraceFile:
         data = lines.encode("ascii")
         end = self._file.tell()
         try:
-            if self._file.write(data) == len(data):
-                return
-            self.problem = "No space left on device"
+            while data:
+                data = data[self._file.write(data) :]  # the call after a partial one raises the reason
+            return
         except OSError as error:
             self.problem = error.strerror or str(error)
         with contextlib.suppress(OSError):

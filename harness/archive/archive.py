@@ -31,9 +31,9 @@ from harness.archive.exports import (
 from harness.archive.history import has_possible_time
 from harness.archive.lag import LAG_FILE, LagLine, MeasuredLag
 from harness.archive.record_file import RecordFile, read_record
-from harness.archive.run_record import JudgedRecord, RunRecord
+from harness.archive.run_record import AgentRecord, JudgedRecord, RunRecord
+from harness.archive.trace_files import MAX_TRACE_BYTES, is_packed, trace_file, trace_files
 from harness.archive.traces import (
-    SUFFIX,
     HandlerRunLine,
     Trace,
     read_clock,
@@ -51,8 +51,6 @@ if TYPE_CHECKING:
 LARGE_BYTES = 16 * 1024 * 1024
 """If the traces together are larger, they are read without handler runs that only received a message, if the caller
 allows it."""
-MAX_TRACE_BYTES = 256 * 1024 * 1024
-"""Maximum size of a trace. In a swarm of 50 agents without loss, a trace grows to a tenth of it in 20 minutes."""
 _AGENT_ID = re.compile("[1-9][0-9]{0,4}")
 
 ReportProgress = Callable[[str], None]
@@ -190,7 +188,7 @@ class RunArchive:
     def trace_lines(self, agent_id: int) -> Iterator[HandlerRunLine]:
         """Yield the lines of an agent's handler runs. Raises RunDirectoryError at a damaged line."""
         assert self.directory is not None
-        return read_trace_lines(agents_directory(self.directory) / f"{agent_id}{SUFFIX}")
+        return read_trace_lines(trace_file(agents_directory(self.directory), agent_id))
 
     def handler_runs(self) -> Iterator[RecordedRun]:
         """Yield every handler run, trace by trace, agents in order of their IDs.
@@ -224,11 +222,12 @@ class RunArchive:
     @cached_property
     def large(self) -> bool:
         """True if the traces together are larger than LARGE_BYTES."""
-        return sum(path.stat().st_size for path in self._trace_files if path.is_file()) > LARGE_BYTES
+        files = [path for path in self._trace_files if path.is_file()]
+        return any(map(is_packed, files)) or sum(path.stat().st_size for path in files) > LARGE_BYTES
 
     @cached_property
     def _trace_files(self) -> list[Path]:
-        paths = [path for directory in self._agents for path in directory.glob(f"*{SUFFIX}")]
+        paths = [path for directory in self._agents for path in trace_files(directory)]
         return sorted(paths, key=lambda path: (len(path.name), path.name))
 
     @property
@@ -262,7 +261,7 @@ class RunArchive:
                 continue
             recorded = self.record.agents.get(str(agent_id))
             if recorded is not None and recorded.trace_problem:
-                trace.problem = f"it ends early: {recorded.trace_problem}"
+                trace.problem = _early_end(trace, recorded)
             if trace.problem:
                 problems.append(f"{path}: {trace.problem}; the part before is read")
             elif trace.cut_off:
@@ -392,3 +391,13 @@ class RunArchive:
 
     def _in_directory(self, name: str) -> Path | None:
         return None if self.directory is None else self.directory / name
+
+
+def _early_end(trace: Trace, recorded: AgentRecord) -> str:
+    """Return the problem of a trace that its agent could not write to the end."""
+    why = f"it ends early: {recorded.trace_problem}"
+    counted = [life.counted if life else None for life in recorded.handler_runs]
+    if not trace.runs or None in counted:
+        return why
+    missing = sum(number or 0 for number in counted) - len(trace.runs)
+    return f"{why}; {missing} handler runs after {trace.runs[-1].t:.0f} s are not recorded" if missing > 0 else why

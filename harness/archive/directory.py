@@ -22,13 +22,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.archive import traces
 from harness.archive.channel_journal import CHANNEL_FILE
 from harness.archive.connectivity import NETWORK_FILE
 from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE, SUFFIX, export_paths
 from harness.archive.lag import LAG_FILE
 from harness.archive.run_listing import RUNS
 from harness.archive.run_record import RunRecord
+from harness.archive.trace_files import SUFFIX as TRACE_SUFFIX
 from harness.archive.tracks import TRACKS_FILE
 from harness.errors import MachineError, RunDirectoryError
 from netem.radio import Place
@@ -99,7 +99,7 @@ class RunDirectory:
         `copied_bytes` is the size of the part that was appended before. An incomplete last line is left out: the agent
         was killed while it wrote the line, or is still writing it.
         """
-        later = directory / f"{agent_id}{traces.SUFFIX}"
+        later = directory / f"{agent_id}{TRACE_SUFFIX}"
         if not later.exists():
             return 0
         with later.open("rb") as file:

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from harness.archive.traces import SUFFIX as TRACE_SUFFIX
+from harness.archive.trace_files import trace_files
 from harness.errors import ExportError, RunDirectoryError
 from ucp.block import HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
 from ucp.export import SCHEMA
@@ -331,7 +331,7 @@ def export_files(paths: Iterable[Path]) -> list[Path]:
 
 
 def _holds_traces(directory: Path) -> bool:
-    return any(agents_directory(directory).glob(f"*{TRACE_SUFFIX}"))
+    return bool(trace_files(agents_directory(directory)))
 
 
 def _first_problem(error: ValidationError) -> str:

@@ -16,10 +16,10 @@ from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
+from harness.archive.trace_files import open_trace
 from harness.errors import RunDirectoryError
 from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun
 
-SUFFIX = ".trace.jsonl"
 MAX_LINE_BYTES = 16 * 1024 * 1024
 LARGEST = 2**64
 """Limit of integers in a header. A larger one cannot be a setting, because it does not fit into 64 bits."""
@@ -99,7 +99,7 @@ ASIDE = TypeAdapter(DroppedDatagram | CommandEntry)
 def read_clock(path: Path) -> dict[str, Any]:
     """Return the clock in the header of a trace. Empty if the header cannot be read."""
     try:
-        with path.open("rb") as file:
+        with open_trace(path) as file:
             return HEADER.validate_json(file.readline(MAX_LINE_BYTES)).clock
     except (OSError, ValueError):
         return {}
@@ -294,7 +294,7 @@ def only_receives(run: HandlerRun) -> bool:
 def why_not_a_trace(path: Path) -> str:
     """Return the reason why the file does not begin like a trace."""
     try:
-        with path.open("rb") as file:
+        with open_trace(path) as file:
             header = json.loads(file.readline(MAX_LINE_BYTES))
     except OSError as error:
         return f"cannot be read: {error.strerror}"
@@ -314,7 +314,7 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
     """
     trace: Trace | None = None
     try:
-        with path.open("rb") as file:
+        with open_trace(path) as file:
             number = 0
             while line := file.readline(MAX_LINE_BYTES):
                 number += 1
@@ -343,6 +343,8 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
                         lost = parse_gap(line)
                         trace.problem = f"line {number} is damaged" if lost is None else f"lines are lost at {number}"
                     break
+            if trace is not None and file.problem:
+                trace.problem, trace.cut_off = file.problem, False
     except OSError:
         return None
     return trace
@@ -372,7 +374,7 @@ def read_trace_lines(path: Path) -> Iterator[HandlerRunLine]:
     """
     incarnation = number = agent_id = 0
     try:
-        with path.open("rb") as file:
+        with open_trace(path) as file:
             while text := file.readline(MAX_LINE_BYTES):
                 number += 1
                 if not text.endswith(b"\n") and len(text) < MAX_LINE_BYTES:

@@ -22,6 +22,7 @@ from harness.play import progress
 from harness.play.backends import BACKENDS
 from harness.play.interventions import Interventions
 from harness.play.machine.uml_kernel import OUT, Kernel, run_inside
+from harness.play.trace_space import space_sentence
 from harness.report.facts import gaps
 from harness.report.live.server_process import live_page
 from harness.run.run import Run, run
@@ -147,6 +148,11 @@ def run_command(
     if remark := BACKENDS[backend].remark(request):
         console.print(remark, style="dim")
     virtual = BACKENDS[backend].virtual_time
+    remark, warning = space_sentence(request, directory, all_delivered=watch or not virtual)
+    if remark:
+        console.print(remark, style="dim", highlight=False, soft_wrap=True)
+    if warning:
+        complain(warning)
     takes_events = watch or by_hand
     interventions = None
     if takes_events:
@@ -273,5 +279,12 @@ def _show_end(console: Console, finished: Run) -> None:
     if late is not None and not late.tolerable:
         lateness = f"one in twenty vote timers expired {late.late_s:.1f} or more mission seconds late"
         complain(f"this machine was too slow: {lateness} (set to {late.asked_s:g} s): choose a smaller --speedup")
+    early = [agent for agent, each in finished.record.agents.items() if each.trace_problem]
+    if early:
+        why = finished.record.agents[early[0]].trace_problem
+        complain(
+            f"the traces of agents {', '.join(early)} end early ({why}), so some checks could not judge the run: free "
+            "disk space or raise `trace_quota_mb`"
+        )
     wall = f"{finished.wall_s:.0f}" if finished.wall_s >= 10 else f"{finished.wall_s:.1f}"
     console.print(f"{wall} s; report: {finished.report}", highlight=False, soft_wrap=True)

@@ -16,6 +16,7 @@ from harness import checker, report
 from harness.archive.archive import ReportProgress, RunArchive
 from harness.archive.directory import RunDirectory, default_path
 from harness.archive.run_record import RogueInjection, RunRecord, Survival
+from harness.archive.trace_files import pack_traces
 from harness.backend_names import BackendName
 from harness.checker.injections import account
 from harness.checker.recurring_cycles import cycle_of
@@ -219,6 +220,7 @@ class RunRecording:
             page = report.write_report(archive)
         except RunDirectoryError as error:
             raise MachineError(f"{error}; run.json has the verdict") from None
+        pack_traces(self.directory.agents, report_progress)
         status = played.exit_status or result.exit_status or (WRONG_REQUEST if played.unmatched_fates else 0)
         late = None if in_virtual_time(self._record.backend) else timer_lag(evidence.traces.values(), evidence.lag)
         return Run(self.directory.path, played, self._record, result, survived, rogue, status, wall_s, page, late)

@@ -129,6 +129,9 @@ class Scenario(Model):
     """True if the run ends with perfect network conditions, under which one agent after another reconciles."""
     capture: bool = False
     """True if the run writes every frame that a vehicle sent or received to capture/<ID>.pcapng."""
+    trace_quota_mb: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    """Maximum size of all traces together, in megabytes, but at least 8 for each agent. A trace ends early at its share
+    of it. Default: half of the free disk space."""
     gcs: Annotated[str, Field(max_length=300)] | None = None
     """HOST:PORT of a ground station, usually 127.0.0.1:14550. It receives the telemetry of all vehicles by UDP, and may
     command them."""

@@ -42,6 +42,19 @@ async def output(lab: Lab, folder: Path, vehicle: int | None, *argv: str) -> str
     return (folder / "out").read_text()
 
 
+def test_file_of_a_program_ends_at_its_limit(tmp_path: Path) -> None:
+    async def story(lab: Lab) -> None:
+        argv = ("/bin/sh", "-c", "head -c 5000 /dev/zero > big; echo $? after")
+        output, errors, env = tmp_path / "out", tmp_path / "err", {"PATH": os.environ["PATH"]}
+        process = await lab.spawn(1, argv, cwd=tmp_path, env=env, stdout=output, stderr=errors, max_file_bytes=1000)
+        assert await asyncio.wait_for(process.wait(), DEADLINE_S) == 0
+
+    in_lab(tmp_path, story, (1,))
+    assert (tmp_path / "big").stat().st_size == 1000
+    assert (tmp_path / "out").read_text() == "1 after\n"
+    assert "File too large" in (tmp_path / "err").read_text()
+
+
 def test_a_vehicle_has_its_address_a_broadcast_address_and_a_default_route(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         said = await output(lab, tmp_path, 258, "/bin/sh", "-c", "ip -4 -o addr; ip route; ip link show lo")

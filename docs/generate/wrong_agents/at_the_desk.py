@@ -16,7 +16,7 @@ from docs.generate.matrix_thesis import put_between_markers
 from docs.generate.wrong_agents.quirky import PROBABILITY
 from docs.generate.wrong_agents.trials_page import rows_of
 from harness.archive.exports import agents_directory
-from harness.archive.traces import SUFFIX
+from harness.archive.trace_files import SUFFIX
 from harness.field.replay import Player, open_record
 from harness.field.replay.replay_names import ReplayNames
 from harness.play.progress import Silent

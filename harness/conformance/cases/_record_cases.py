@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.archive.exports import Export, read_export
-from harness.archive.traces import SUFFIX, Trace, read_trace
+from harness.archive.trace_files import SUFFIX
+from harness.archive.traces import Trace, read_trace
 from harness.checker import records, steps
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Judgement

@@ -22,7 +22,7 @@ from harness.archive.exports import SUFFIX as EXPORT_SUFFIX
 from harness.archive.exports import Export
 from harness.archive.packets.capture_files import DIRECTORY as CAPTURES
 from harness.archive.packets.pcap import PCAPNG_MAGIC
-from harness.archive.traces import SUFFIX as TRACE_SUFFIX
+from harness.archive.trace_files import SUFFIX as TRACE_SUFFIX
 from harness.archive.traces import Gap, Trace, gap_line
 from harness.checker.records.contradiction import ROUNDED_S, mission_s
 from harness.errors import MachineError, RunDirectoryError

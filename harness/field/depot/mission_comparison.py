@@ -19,8 +19,9 @@ from pydantic import ValidationError
 
 from harness.archive.exports import MAX_EXPORT_BYTES, agents_directory, read_export
 from harness.archive.exports import SUFFIX as EXPORT_SUFFIX
+from harness.archive.trace_files import PACKED_SUFFIX, open_trace
+from harness.archive.trace_files import SUFFIX as TRACE_SUFFIX
 from harness.archive.traces import HEADER, MAX_LINE_BYTES
-from harness.archive.traces import SUFFIX as TRACE_SUFFIX
 from harness.errors import ExportError, HarnessError, RunDirectoryError
 from harness.field.depot.mission_files import FILE, Manifest, fingerprint
 from harness.field.depot.mission_files import SUFFIX as MISSION_SUFFIX
@@ -33,7 +34,8 @@ Kind = Literal["mission file", "manifest", "chain export", "trace"]
 INCEPTION, ROSTER, FINGERPRINT = "inception block", "roster", "settings fingerprint"
 HASH_DIGITS = 12
 MAX_VALUE = 60
-_EXPECTED = (MISSION_SUFFIX, EXPORT_SUFFIX, TRACE_SUFFIX)
+_EXPECTED = (MISSION_SUFFIX, EXPORT_SUFFIX, TRACE_SUFFIX, PACKED_SUFFIX)
+_READ = (".json", ".jsonl", PACKED_SUFFIX)
 
 
 class UnreadableFileError(HarnessError):
@@ -175,7 +177,7 @@ def read(path: Path) -> ComparedFile:
 def _beginning(path: Path) -> dict[str, Any]:
     """Return the JSON object in the file, or in its first line."""
     try:
-        with path.open("rb") as file:
+        with open_trace(path) as file:
             first = file.readline(MAX_LINE_BYTES)
             with contextlib.suppress(ValueError, RecursionError):
                 if isinstance(document := json.loads(first), dict):
@@ -380,7 +382,7 @@ def _in_directory(directory: Path) -> list[Path]:
     """Return the JSON files in a directory. If there are none, return those in its subdirectories, one per vehicle."""
     agents_folder = agents_directory(directory)
     for pattern in ("*.json*", "*/*.json*"):
-        files = [path for path in agents_folder.glob(pattern) if path.is_file() and path.suffix in (".json", ".jsonl")]
+        files = [path for path in agents_folder.glob(pattern) if path.is_file() and path.name.endswith(_READ)]
         if files:
             return sorted(files, key=lambda path: (path.parent, len(path.name), path.name))
     return []

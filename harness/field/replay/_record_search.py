@@ -12,7 +12,8 @@ from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE, Export, agents_directory
 from harness.archive.packets.pcap import MAGICS
 from harness.archive.run_record import JudgedRecord
-from harness.archive.traces import HEADER, MAX_LINE_BYTES, SUFFIX, Trace, read_trace
+from harness.archive.trace_files import SUFFIX, trace_file, trace_files
+from harness.archive.traces import HEADER, MAX_LINE_BYTES, Trace, read_trace
 from harness.checker.evidence import check_variant
 from harness.errors import CaptureError, FieldError, RunDirectoryError
 from harness.field._vehicle_captures import AgentCapture, read_capture
@@ -173,8 +174,8 @@ def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
     """
     agents = agents_directory(directory)
     if (directory / RUN_FILE).is_file():
-        files = [agents / f"{agent_id}{SUFFIX}"] if agent_id is not None else agents.glob(f"*{SUFFIX}")
-        return sorted((file for file in files if file.is_file()), key=lambda file: (len(file.name), file.name))
+        files = [trace_file(agents, agent_id)] if agent_id is not None else trace_files(agents)
+        return [file for file in files if file.is_file()]
     file = agents / f"{agent_id}{SUFFIX}"
     if agent_id is None or not file.is_file():
         return []

@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 import docker
 import docker.errors
-from docker.types import LogConfig, Mount
+from docker.types import LogConfig, Mount, Ulimit
 
 from harness.play.containers._images import Image
 from harness.play.containers.docker_engine import Engine
@@ -185,6 +185,7 @@ def recipe(
     kept: Sequence[Path],
     network_mode: str,
     limits: DockerOptions,
+    max_file_bytes: int | None = None,
 ) -> dict[str, Any]:
     """Return the keyword arguments with which the Docker SDK creates the container.
 
@@ -202,7 +203,7 @@ def recipe(
         cap_drop=["ALL"],
         security_opt=["no-new-privileges"],
         log_config=LogConfig(type=LogConfig.types.NONE),
-        **_limits(limits),
+        **_limits(limits, max_file_bytes),
     )
     return {
         "image": image.name,
@@ -213,8 +214,10 @@ def recipe(
     }
 
 
-def _limits(limits_asked: DockerOptions) -> dict[str, Any]:
+def _limits(limits_asked: DockerOptions, max_file_bytes: int | None) -> dict[str, Any]:
     limits: dict[str, Any] = {}
+    if max_file_bytes is not None:
+        limits["ulimits"] = [Ulimit(name="fsize", soft=max_file_bytes, hard=max_file_bytes)]
     if limits_asked.memory_mib is not None:
         limits["mem_limit"] = limits["memswap_limit"] = limits_asked.memory_mib * MEBIBYTE
     if limits_asked.cpus is not None:

@@ -161,8 +161,13 @@ class ContainerLab:
         stdout: Path,
         stderr: Path,
         role: Role,
+        max_file_bytes: int | None = None,
     ) -> Container:
-        """Start a program in its own container, in the network of a vehicle."""
+        """Start a program in its own container, in the network of a vehicle.
+
+        `max_file_bytes` limits the files of a program in an image of the harness. Another program might not survive the
+        signal that the limit causes.
+        """
         holder = next(identity for identity, held in self._holders.items() if held == vehicle)
         image = self._named if role == "agent" and vehicle in self._in_named else self._ours
         assert image is not None, "the image was chosen before"
@@ -173,6 +178,7 @@ class ContainerLab:
             argv,
             f"container:{holder}",
             self._docker,
+            max_file_bytes=max_file_bytes if image is self._ours else None,
             working_dir=str(cwd),
             environment=image.environment(env),
         )
@@ -232,6 +238,7 @@ class ContainerLab:
         argv: Sequence[str],
         network: str,
         limits: DockerOptions,
+        max_file_bytes: int | None = None,
         **settings: Any,
     ) -> tuple[str, str]:
         """Create a container, and return its name and ID."""
@@ -239,7 +246,7 @@ class ContainerLab:
         life = self._incarnations[vehicle, role]
         name = f"{self._name}-{role}-{vehicle}" + (f"-{life}" if life > 1 else "")
         kept = [self._rundir.path, *([self._rundir.keys[vehicle]] if vehicle in self._rundir.keys else [])]
-        options = recipe(self._engine.api, image, argv, kept, network, limits)
+        options = recipe(self._engine.api, image, argv, kept, network, limits, max_file_bytes)
         labels = ownership.labels(self._name, vehicle, role)
         try:
             created = await self._engine.ask(

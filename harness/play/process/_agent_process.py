@@ -20,7 +20,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from harness.archive.directory import RunDirectory
-from harness.archive.traces import HANDLER_RUN, SUFFIX, read_trace
+from harness.archive.trace_files import SUFFIX
+from harness.archive.traces import HANDLER_RUN, read_trace
 from harness.errors import AgentFailedError, HarnessError, MachineError, ScenarioError, UnsupportedError
 from harness.play._vehicle_keys import KeyDirectories
 from harness.play.agent_control import (
@@ -37,6 +38,7 @@ from harness.play.agent_control import (
 from harness.play.child_processes import ChildProcesses
 from harness.play.process._run_lab import MissionLab, Program
 from harness.play.process.agent_mission import mission_file
+from harness.play.trace_space import trace_quota
 from harness.play.variant import variant_in_use
 from harness.scenario import Scenario
 from netem.errors import SpawnError
@@ -182,6 +184,7 @@ class AgentProcess:
                 stdout=output,
                 stderr=output,
                 role="agent",
+                max_file_bytes=trace_quota(scenario, self._rundir.path),
             )
         except SpawnError as error:
             if scenario.command_of(self.agent_id) is None:

@@ -75,6 +75,7 @@ class MissionLab(Protocol):
         stdout: Path,
         stderr: Path,
         role: Role,
+        max_file_bytes: int | None = None,
     ) -> Program: ...
 
     async def connect(self, vehicle: int, port: int, *, timeout_s: float) -> socket: ...

@@ -1,5 +1,8 @@
 """Write the files of a simulated run, and define the interface of an object that records its events."""
 
+import errno
+import os
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
@@ -15,21 +18,31 @@ class DiskRecorder:
 
     tracing = True
 
-    def __init__(self, rundir: RunDirectory) -> None:
+    def __init__(self, rundir: RunDirectory, trace_quota: int) -> None:
+        """`trace_quota` is the maximum size of each trace, in bytes."""
         self._rundir = rundir
+        self._left = defaultdict[int, int](lambda: trace_quota)
+        """Number of bytes that the trace of each agent may still grow."""
         self._traces: dict[int, TraceFile] = {}
 
     def begin(self, incarnation: Incarnation) -> None:
         agent_id = incarnation.agent.agent_id
         if agent_id not in self._traces:
             self._traces[agent_id] = TraceFile(self._rundir.agents / f"{agent_id}.trace.jsonl")
-        self._traces[agent_id].write(header_line(**header(incarnation)))
+        self._append(agent_id, header_line(**header(incarnation)))
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
         """Do nothing, because the file with the agent's blocks contains this information."""
 
     def write(self, agent_id: int, entries: list[Entry]) -> None:
-        self._traces[agent_id].write("".join([entry.to_line() for entry in entries]))
+        self._append(agent_id, "".join([entry.to_line() for entry in entries]))
+
+    def _append(self, agent_id: int, lines: str) -> None:
+        trace = self._traces[agent_id]
+        self._left[agent_id] -= len(lines)
+        if self._left[agent_id] < 0 and trace.problem is None:
+            trace.problem = os.strerror(errno.EFBIG)
+        trace.write(lines)
 
     def changed(self, record: dict[str, Any]) -> None:
         self._rundir.append_network(record)

@@ -16,6 +16,7 @@ from harness.play.simulation.air import VirtualAir
 from harness.play.simulation.foreign._answer import AgentLacksError
 from harness.play.simulation.run_files import DiskRecorder
 from harness.play.simulation.simulation import Simulation, no_vehicles
+from harness.play.trace_space import trace_quota
 from harness.scenario import Scenario
 from harness.scenario.faults import VehicleFault
 
@@ -79,7 +80,8 @@ class SimulationBackend(Backend):
             if interrupted.is_set():
                 raise InterruptedRunError(f"the run was interrupted at mission second {simulation.now():.0f}")
 
-        with closing(DiskRecorder(rundir)) as files, _programs(scenario, rundir) as programs:
+        quota = trace_quota(scenario, rundir.path)
+        with closing(DiskRecorder(rundir, quota)) as files, _programs(scenario, rundir) as programs:
             capture = _captures(rundir, scenario) if scenario.capture else None
             air = capture.air if capture else VirtualAir
             if scenario.gcs and pace is None:

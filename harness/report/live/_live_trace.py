@@ -5,12 +5,13 @@ An agent that is a process writes the trace of each incarnation into its own dir
 holds all incarnations.
 """
 
-import os
 from collections import deque
+from io import FileIO
 from pathlib import Path
 
-from harness.archive.bounded_file import open_plain_file
-from harness.archive.traces import MAX_LINE_BYTES, SUFFIX
+from harness.archive.bounded_file import BoundedFile, open_plain_file
+from harness.archive.trace_files import is_packed, open_trace, trace_file
+from harness.archive.traces import MAX_LINE_BYTES
 
 _CHUNK_BYTES = 256 * 1024
 
@@ -24,7 +25,7 @@ class GrowingFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.trouble: str | None = None
-        self._file: int | None = None
+        self._file: BoundedFile | FileIO | None = None
         self._lines: deque[bytes] = deque()
         self._partial_line = b""
 
@@ -37,7 +38,7 @@ class GrowingFile:
 
     def close(self) -> None:
         if self._file is not None:
-            os.close(self._file)
+            self._file.close()
             self._file = None
 
     def _read(self) -> bool:
@@ -46,14 +47,17 @@ class GrowingFile:
             return False
         try:
             if self._file is None:
-                self._file = open_plain_file(self.path)
-            data = os.read(self._file, _CHUNK_BYTES)
+                packed = is_packed(self.path)
+                self._file = open_trace(self.path) if packed else FileIO(open_plain_file(self.path))
+            data = self._file.read(_CHUNK_BYTES)
         except FileNotFoundError:
             return False
         except OSError as error:
             self.trouble = f"cannot be read: {error.strerror}"
             return False
         if not data:
+            if isinstance(self._file, BoundedFile) and self._file.problem:
+                self.trouble = f"breaks off: {self._file.problem}"
             return False
         *complete, self._partial_line = (self._partial_line + data).split(b"\n")
         self._lines.extend(line + b"\n" for line in complete)
@@ -69,7 +73,7 @@ class AgentTrace:
         self._agents, self._agent_id = agents, agent_id
         self._incarnation = 1
         self._headers = 0
-        self._file = GrowingFile(agents / f"{agent_id}{SUFFIX}")
+        self._file = GrowingFile(trace_file(agents, agent_id))
 
     @property
     def trouble(self) -> str | None:
@@ -90,7 +94,7 @@ class AgentTrace:
             if line is not None:
                 return line
             self._file.close()
-            self._file = GrowingFile(self._later / self._file.path.name)
+            self._file = GrowingFile(trace_file(self._later, self._agent_id))
             self._incarnation, self._headers = self._incarnation + 1, 0
 
     @property

@@ -9,7 +9,8 @@ import pytest
 
 from harness.archive.archive import RunArchive
 from harness.archive.history import end_of_traces, history_of
-from harness.archive.traces import SUFFIX, Trace
+from harness.archive.trace_files import SUFFIX
+from harness.archive.traces import Trace
 from harness.errors import RunDirectoryError
 from harness.report.live import feed as feeds
 from harness.report.live._agent_course import KEY_LENGTH, AgentCourse, Change

@@ -1,0 +1,78 @@
+"""The disk space that the traces of a run need: an estimate before the start, and a quota that protects the disk.
+
+Each agent that receives a message writes a line to its trace, so traces grow with the third power of the number of
+agents, or faster. A trace ends at its quota as it ends on a full disk: with a whole line, and with a reason in
+`run.json`. Without a quota, the traces would leave no space for exports, verdict and report.
+"""
+
+import math
+import shutil
+from itertools import pairwise
+from pathlib import Path
+
+from harness.archive.trace_files import PACKED_FROM_BYTES, PACKED_SHARE
+from harness.scenario import Scenario
+
+MEGABYTE = 1_000_000
+SHARE_OF_FREE_SPACE = 0.5
+LEAST_BYTES_PER_AGENT = 8 * MEGABYTE
+"""Minimum quota of an agent. The limit also applies to its export and its store, which are much smaller."""
+MEAN_S = 30.0
+MESSAGES_PER_MINUTE = ((2, 4), (5, 38), (10, 229), (15, 885), (20, 2010), (30, 6050), (50, 25_500), (100, 90_700))
+"""Number of agents, and messages of the swarm per minute with an event every 30 s: docs/appendix/growth.md."""
+BYTES_PER_LINE = 800
+LINES_WITHOUT_IDLE_RECEIPTS = 2
+"""Lines for each message in virtual time, which delivers only messages that can affect their receivers."""
+
+
+def trace_quota(scenario: Scenario, directory: Path) -> int:
+    """Return the maximum size of one agent's trace, in bytes."""
+    free = shutil.disk_usage(_existing(directory)).free
+    total = free * SHARE_OF_FREE_SPACE if scenario.trace_quota_mb is None else scenario.trace_quota_mb * MEGABYTE
+    return max(LEAST_BYTES_PER_AGENT, round(total / len(scenario.roster)))
+
+
+def estimated_bytes(scenario: Scenario, *, all_delivered: bool) -> int:
+    """Return the estimated size of all traces together.
+
+    With `all_delivered`, traces also record messages that have no effect, as those of processes do.
+    """
+    agents = len(scenario.roster)
+    messages = _messages_per_minute(agents) * scenario.duration_s / 60
+    if scenario.events.source == "random":
+        messages *= MEAN_S / scenario.events.mean_s
+    return round(messages * (agents if all_delivered else LINES_WITHOUT_IDLE_RECEIPTS) * BYTES_PER_LINE)
+
+
+def space_sentence(scenario: Scenario, directory: Path, *, all_delivered: bool) -> tuple[str, str]:
+    """Return a remark on large traces, and a warning if they will probably not fit. Both are empty for small traces."""
+    expected = estimated_bytes(scenario, all_delivered=all_delivered)
+    quota = trace_quota(scenario, directory) * len(scenario.roster)
+    if expected < PACKED_FROM_BYTES and expected < quota:
+        return "", ""
+    packed = _size(expected * PACKED_SHARE)
+    remark = f"traces: about {_size(expected)} during the run, packed to about {packed} after it"
+    if expected < quota:
+        return remark, ""
+    source = "half of the free disk space" if scenario.trace_quota_mb is None else "`trace_quota_mb`"
+    return remark, (
+        f"the traces will probably end early, because their quota is {_size(quota)} ({source}), and the run will then "
+        "not be judged completely: raise the quota, or choose fewer agents or a shorter mission"
+    )
+
+
+def _messages_per_minute(agents: int) -> float:
+    """Interpolate on a logarithmic scale. Beyond the table, continue its last or first step."""
+    steps = [*pairwise(MESSAGES_PER_MINUTE)]
+    (low, few), (high, many) = next((step for step in steps if agents <= step[1][0]), steps[-1])
+    exponent = math.log(many / few) / math.log(high / low)
+    return float(few * (agents / low) ** exponent)
+
+
+def _size(size_bytes: float) -> str:
+    return f"{size_bytes / 1e9:.1f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.0f} MB"
+
+
+def _existing(directory: Path) -> Path:
+    """Return the directory, or the nearest directory above it that exists."""
+    return next(path for path in (directory.absolute(), *directory.absolute().parents) if path.exists())
