@@ -1,1 +1,1 @@
-"""The test harness for UCP agents. `harness.cli` is the command line, and `harness.api` is the Python API."""
+"""The test harness for UCP agents. `harness.cli` is its command line, and `harness.api` is its Python API."""

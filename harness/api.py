@@ -1,4 +1,4 @@
-"""The public names of the harness. Programs and notebooks import them from here.
+"""The public names of the harness. Other programs and notebooks should import names only from here.
 
     from harness.api import load_scenario, run
 

@@ -1,4 +1,4 @@
-"""The command line: the list of commands, in panels.
+"""The command line of the harness, with the list of all commands.
 
 Exit statuses, of which `docs/reference/commands.md` has a table:
 
@@ -35,7 +35,7 @@ MAX_NAME = 200
 
 
 class CommandEntry(NamedTuple):
-    """An entry of the list of commands."""
+    """An entry in the list of commands."""
 
     panel: str
     """Heading of the command in the help."""
@@ -155,7 +155,7 @@ OLD_NAMES = {
 
 
 class OldCommandNameError(HarnessError):
-    """The user called a command by its old name.
+    """An error: the user called a command by its old name.
 
     `git bisect run` stops at status 128. It would take status 2 for a bad commit.
     """
@@ -164,7 +164,7 @@ class OldCommandNameError(HarnessError):
 
 
 class LazyCommandGroup(TyperGroup):
-    """All commands. The module of a command is imported when the command is called."""
+    """All commands. The module of a command is imported only when the command is called."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] in COMMANDS:
@@ -220,7 +220,7 @@ def _harness(
 
 
 class _OutputWithoutBrokenPipe(io.FileIO):
-    """Standard output. When its reader ends early (`| head`), the command continues without output."""
+    """Standard output. If its reader ends early (`| head`), the command continues without output."""
 
     def write(self, data: Any, /) -> int:
         try:
@@ -231,7 +231,7 @@ class _OutputWithoutBrokenPipe(io.FileIO):
 
 
 def main() -> NoReturn:
-    """Run the console script. A mistake of the user ends in one sentence and an exit status, never in a traceback."""
+    """Run the command line. A mistake of the user gives one sentence and an exit status, never a traceback."""
     if sys.stdout is None:  # the caller closed it
         sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     elif sys.stdout is (original := sys.__stdout__):

@@ -1,4 +1,4 @@
-"""Errors for users: one sentence that names the cause and a solution, and the exit status of the command line."""
+"""Define errors for users, each with one sentence that names the cause and a solution, and its exit status."""
 
 import shlex
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ result. 130: interrupted. `harness.cli` lists all of them."""
 
 
 class HarnessError(Exception):
-    """The base of all errors that the harness raises for its users. The message is one sentence with a solution.
+    """The base class of all errors that users can cause. The message is one sentence with a solution.
 
     `exit_status` is the exit status of the command line.
     """
@@ -23,34 +23,34 @@ class HarnessError(Exception):
 
 
 class ScenarioError(HarnessError):
-    """A scenario or matrix is wrong, or not suitable for the requested command or backend."""
+    """An error: a scenario or matrix is wrong, or does not suit the requested command or backend."""
 
 
 class ExportError(HarnessError):
-    """A chain export is missing, or cannot be read, written or used for the request."""
+    """An error: a chain export is missing, or cannot be read, written or used for the request."""
 
 
 class CaptureError(HarnessError):
-    """A capture of packets cannot be read."""
+    """An error: a packet capture cannot be read."""
 
 
 class RunDirectoryError(HarnessError):
-    """The run directory cannot be written or read."""
+    """An error: the run directory cannot be written or read."""
 
 
 class FieldError(HarnessError):
-    """Records of a flight cannot be used, or the request does not fit them."""
+    """An error: records of a flight cannot be used, or do not suit the request."""
 
 
 class MachineError(HarnessError):
-    """This machine cannot fulfil the request, for example because a package is missing."""
+    """An error: this machine cannot fulfil the request, for example because a package is missing."""
 
     exit_status = CANNOT_HERE
 
 
 @contextmanager
 def extra(name: str, purpose: str) -> Iterator[None]:
-    """Import packages of an extra of this package inside of the context.
+    """Import the optional packages of the extra `name` inside the context.
 
     Raises MachineError with the install command if a package is missing. `purpose` is the subject of its sentence.
     """
@@ -62,17 +62,17 @@ def extra(name: str, purpose: str) -> Iterator[None]:
 
 
 class UnsupportedError(MachineError):
-    """An agent under test does not support a feature that the run needs. The run is not judged."""
+    """An error: an agent under test lacks a feature that the run needs. The run is not judged."""
 
     @classmethod
     def of(cls, agent_id: int, command: Sequence[str], words: str) -> Self:
-        """Return the error of an agent. `words` is the message of the agent, which may be empty."""
+        """Return the error for an agent. `words` is the message of the agent, which may be empty."""
         why = words.rstrip(".") or "it does not say why"
         return cls(f"not supported by agent {agent_id} ({shlex.join(command)}): {why}")
 
 
 class AgentFailedError(HarnessError):
-    """An agent under test crashed, hung, did not start, or gave an invalid answer.
+    """An error: an agent under test crashed, hung, could not be started, or gave an invalid answer.
 
     `outcome` says which, in a word. `detail` completes a sentence that starts with "agent 3".
     """
@@ -87,6 +87,6 @@ class AgentFailedError(HarnessError):
 
 
 class InterruptedRunError(HarnessError):
-    """The user interrupted the run."""
+    """An error: the user interrupted the run."""
 
     exit_status = INTERRUPTED

@@ -1,4 +1,4 @@
-"""A pause of Python's cycle collector, for code that makes a million objects without cycles.
+"""Pause Python's garbage collection of cycles, for code that creates a million objects without cycles.
 
 The collector would scan these objects again and again. It takes a third of the time to make or read handler runs, and
 an eighth of the time to import a command. A simulated run leaves no cycles, so reference counting frees all of it.
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def gc_paused() -> Iterator[None]:
-    """Stop the collector inside the context. It is also a decorator."""
+    """Stop the garbage collection of cycles inside the context. This function is also a decorator."""
     collects = gc.isenabled()
     gc.disable()
     try:

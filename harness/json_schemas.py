@@ -1,4 +1,4 @@
-"""JSON Schemas of the documents that other programs read and write.
+"""Write the JSON schemas of all documents that other programs read and write.
 
 Pydantic generates the schemas of the harness from its models. `ucp.contract.schemas` builds the schemas of the agent
 contract. Git has neither, because both follow from the code. `tests/harness/schemas.sha256` has their digests. The
@@ -39,20 +39,20 @@ MODELS: dict[str, type[BaseModel]] = {
 
 
 def generate(name: str) -> dict[str, Any]:
-    """Return the schema of the harness with this name, a key of `MODELS`."""
+    """Return the JSON schema with this name, which is a key of `MODELS`."""
     schema = MODELS[name].model_json_schema(by_alias=True)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
 def texts() -> dict[str, str]:
-    """Return the text of each schema of the harness and of the agent contract, by its path in the wheel."""
+    """Return the text of each JSON schema by its path in the installed package."""
     documents = {f"harness/schemas/{name}.schema.json": generate(name) for name in MODELS}
     documents |= {f"ucp/contract/schemas/{name}.schema.json": schemas.generate(name) for name in schemas.DOCUMENTS}
     return {path: json.dumps(document, indent=1) + "\n" for path, document in documents.items()}
 
 
 def write_all(folder: Path) -> None:
-    """Write every schema below `folder`, at its path in the wheel."""
+    """Write every JSON schema below `folder`, at its path in the installed package."""
     for path, text in texts().items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text, encoding="utf-8")

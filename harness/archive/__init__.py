@@ -1,3 +1,3 @@
-"""The run directory and its files: written while a run is active, and read afterwards by checker, report and
-commands.
+"""Write and read the files of a run directory. Backends write them, and the checker, the report and the commands read
+them.
 """

@@ -1,4 +1,4 @@
-"""The archive of a run: the files in its directory, or files from the field, complete or damaged.
+"""Read the files of a run, or of a real flight, whether they are complete or damaged.
 
 Checker, report and all other commands read runs through this module. It reads each file once, at its first use.
 Unusable data is left out. `problems` has a sentence for each damaged or wrong file. `gaps` has a sentence for each
@@ -71,7 +71,7 @@ class RecordedRun(NamedTuple):
 
 
 class HeldBlock(NamedTuple):
-    """A block that agent `holder` holds in its `chain`, `deque` or reconcile `stack`.
+    """A block that agent `holder` holds in its `chain`, its `deque` or its reconcile `stack`.
 
     `position` counts from 0, the oldest block of a chain first. The inception block is not counted.
     """
@@ -83,7 +83,7 @@ class HeldBlock(NamedTuple):
 
 
 class RunArchive:
-    """The archive of a run: the files in a run directory, in a directory of exports, or single export files.
+    """The files of a run: those in a run directory, in a directory of exports, or single export files.
 
     Files are read at first use, and once. `directory` is the first directory with a record, else the first given
     directory, else None. `exports` and `traces` have the readable files by agent. `problems` has a sentence for each
@@ -116,7 +116,7 @@ class RunArchive:
 
     @property
     def recorded(self) -> bool:
-        """True if run.json exists and can be read at least in part."""
+        """True if the file run.json exists and at least a part of it can be read."""
         return self._record_file is not None and self._record_file.error is None
 
     @property
@@ -126,22 +126,22 @@ class RunArchive:
 
     @property
     def judged_record(self) -> JudgedRecord | None:
-        """The part of run.json that the checker needs. None if any key of it is missing or damaged."""
+        """The part of run.json that the checker needs, or None if any key of this part is missing or damaged."""
         return self._record_file.judged if self._record_file else None
 
     @property
     def record_error(self) -> RunDirectoryError | None:
-        """The reason why nothing of an existing run.json can be read, else None."""
+        """The reason why an existing run.json cannot be read at all, or None."""
         return self._record_file.error if self._record_file else None
 
     @property
     def record_problems(self) -> list[str]:
-        """A sentence for each error in run.json. Errors in the keys that the checker needs come first."""
+        """A sentence for each error in run.json. Errors in keys that the checker needs come first."""
         return self._record_file.problems if self._record_file else []
 
     @cached_property
     def origin(self) -> RunRecord:
-        """The record of the run that the exports come from, also if only files in its directory were given."""
+        """The content of run.json for the exports, even if only single files of the run directory were given."""
         if self.directory is not None:
             return self.record
         beside = dict.fromkeys(path.parent for file in self._export_files for path in (file.parent, file))
@@ -154,12 +154,12 @@ class RunArchive:
 
     @cached_property
     def roster(self) -> list[int]:
-        """The IDs of the agents: those in the record, else those that left files."""
+        """The IDs of the agents: those in run.json, or else those of agents that left files."""
         names = (path.name.partition(".")[0] for directory in self._agents for path in directory.glob("*.*.json*"))
         return self.record.known_agents or sorted({int(name) for name in names if _AGENT_ID.fullmatch(name)})
 
     def forget_record(self) -> None:
-        """Read run.json again at its next use, because it has been rewritten."""
+        """Forget the content of run.json after it was rewritten, so that it is read again."""
         for name in ("_record_file", "origin", "roster"):
             self.__dict__.pop(name, None)
 
@@ -167,12 +167,12 @@ class RunArchive:
 
     @cached_property
     def exports(self) -> Exports:
-        """The chain exports by agent; `errors` has a sentence for each unusable file."""
+        """The chain exports by agent. `errors` contains a sentence for each unusable file."""
         return read_exports(self._export_files)
 
     @cached_property
     def before_final_reconcile(self) -> dict[int, Export]:
-        """The chain exports before the final reconcile, by agent; empty without a final reconcile."""
+        """The chain exports before the final reconcile, by agent. There are none without a final reconcile."""
         return self._before_final_reconcile.by_agent
 
     @cached_property
@@ -182,16 +182,16 @@ class RunArchive:
 
     @cached_property
     def traces(self) -> dict[int, Trace]:
-        """The trace of each agent, in order of IDs. All traces are then in memory."""
+        """The trace of each agent in order of IDs. This loads all traces into memory."""
         return self._read_traces[0]
 
     def trace_lines(self, agent_id: int) -> Iterator[HandlerRunLine]:
-        """Yield the lines of an agent's handler runs. Raises RunDirectoryError at a damaged line."""
+        """Yield the trace lines with handler runs of an agent. Raises RunDirectoryError at a damaged line."""
         assert self.directory is not None
         return read_trace_lines(trace_file(agents_directory(self.directory), agent_id))
 
     def handler_runs(self) -> Iterator[RecordedRun]:
-        """Yield every handler run, trace by trace, agents in order of their IDs.
+        """Yield every handler run, trace by trace, in order of agent IDs.
 
         The function reads traces line by line and does not keep them. Memory therefore stays small for traces of any
         length. Raises RunDirectoryError at the first damaged line. `traces` has the lines before it.
@@ -201,7 +201,7 @@ class RunArchive:
                 yield RecordedRun(line.agent_id, line.incarnation, line.number, line.parse())
 
     def blocks(self) -> Iterator[HeldBlock]:
-        """Yield every block that an agent holds in its export, agents in order of their IDs.
+        """Yield every block that an agent holds in its export, in order of agent IDs.
 
         `problems` has a sentence for each export that cannot be read.
         """
@@ -213,7 +213,7 @@ class RunArchive:
 
     @cached_property
     def epoch_us(self) -> int | None:
-        """The timestamp of mission second 0, from the headers of most traces. None without a readable header."""
+        """The timestamp of mission second 0, which most trace headers contain, or None without a readable header."""
         epochs = Counter(
             epoch for path in self._trace_files if type(epoch := read_clock(path).get("epoch_us")) is int
         ).most_common(1)
@@ -237,7 +237,7 @@ class RunArchive:
 
     @cached_property
     def _read_traces(self) -> tuple[dict[int, Trace], list[str], list[str]]:
-        """The traces, and their problems and gaps."""
+        """Return the traces, and sentences about their problems and gaps."""
         traces: dict[int, Trace] = {}
         problems, gaps = [], []
         skim = self._skim and self.large
@@ -273,12 +273,12 @@ class RunArchive:
 
     @cached_property
     def public_keys(self) -> "PublicKeys | None":
-        """The public keys of a secured mission; None if there are none, or if they cannot be used."""
+        """The public keys of a secured mission, or None if there are none or they cannot be used."""
         return self._public_keys[0]
 
     @cached_property
     def _public_keys(self) -> tuple["PublicKeys | None", list[str]]:
-        """Return the public keys, and a sentence on each problem with them."""
+        """Return the public keys, and a sentence about each problem with them."""
         if self._trusted_keys is not None:
             return self._trusted_keys, []
         beside = [*([self.directory] if self.directory else []), *self._agents]
@@ -301,7 +301,9 @@ class RunArchive:
 
     @property
     def anchor(self) -> str | None:
-        """The source that vouches for the public keys: the user, or run.json with their fingerprint. Else None."""
+        """The source that confirms the public keys: the user, or run.json with their fingerprint. None without a
+        source.
+        """
         if self._trusted_keys is not None:
             return "--keys"
         keys = self.public_keys
@@ -309,7 +311,7 @@ class RunArchive:
 
     @property
     def stores(self) -> dict[int, Path]:
-        """The store of the last incarnation of each agent that has one, by agent ID."""
+        """The store on disk of each agent that has one, by agent ID. It is the one since the agent's last restart."""
         if self.directory is None:
             return {}
         agents = agents_directory(self.directory)
@@ -323,11 +325,11 @@ class RunArchive:
     # Network, vehicles and the rogue node
 
     def network(self, vehicles: Collection[int]) -> Connectivity:
-        """Return which of `vehicles` could reach each other when. Empty for exports without a run."""
+        """Return which vehicles could reach each other at each time. The result is empty for exports without a run."""
         return read_connectivity(self._in_directory(NETWORK_FILE), vehicles)
 
     def link_losses(self, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
-        """Yield times and the loss, 0 to 1, of links among `vehicles`: first all links, then changed ones."""
+        """Yield mission seconds with the loss rates (0 to 1) of links: first of all links, then of changed ones."""
         return read_link_losses(self._in_directory(NETWORK_FILE), vehicles)
 
     def tracks(self, vehicles: Collection[int]) -> Tracks:
@@ -335,21 +337,23 @@ class RunArchive:
         return read_tracks(self._in_directory(TRACKS_FILE), vehicles)
 
     def injected(self, model: type[Record]) -> Iterable[Record]:
-        """Return the datagrams that a rogue node sent, each as a `model`."""
+        """Return the datagrams that the rogue node sent, each as an object of type `model`."""
         return JsonLines(self._in_directory(ROGUE_FILE), model)
 
     def conditions(self, model: type[Record]) -> list[Record] | None:
-        """Return the recorded changes of network and faults, each as a `model`; None without a record."""
+        """Return the recorded network changes and faults, each as an object of type `model`, or None without a
+        record.
+        """
         path = self._in_directory(NETWORK_FILE)
         return [*JsonLines(path, model)] if path is not None and path.is_file() else None
 
     def channel(self) -> list[ChannelLine] | None:
-        """Return the journal of the shared channel; None without a journal."""
+        """Return the log of the shared radio channel, or None if there is none."""
         path = self._in_directory(CHANNEL_FILE)
         return [*JsonLines(path, ChannelLine)] if path is not None and path.is_file() else None
 
     def lag(self) -> MeasuredLag | None:
-        """Return the measured lag of the machine and the agents; None without a record."""
+        """Return the measured delays of the machine and the agents, or None if they were not measured."""
         path = self._in_directory(LAG_FILE)
         lines = [*JsonLines(path, LagLine)] if path is not None and path.is_file() else []
         return MeasuredLag(lines) if lines else None
@@ -358,7 +362,7 @@ class RunArchive:
 
     @property
     def problems(self) -> list[str]:
-        """A sentence for each damaged or unusable file, with its name."""
+        """A sentence for each damaged or unusable file, with the name of the file."""
         before = self._before_final_reconcile.errors
         return [*self.record_problems, *self._read_traces[1], *self._public_keys[1], *self.exports.errors, *before]
 
@@ -386,7 +390,7 @@ class RunArchive:
             yield f"{TRACKS_FILE} is missing: the positions of the vehicles are unknown"
 
     def within(self, sentence: str) -> str:
-        """Return a sentence with file names relative to the run directory."""
+        """Return the sentence with file names relative to the run directory."""
         return sentence if self.directory is None else sentence.replace(f"{self.directory}{os.sep}", "")
 
     def _in_directory(self, name: str) -> Path | None:

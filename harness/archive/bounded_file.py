@@ -1,4 +1,4 @@
-"""Read files of unknown origin within limits: whole files, and JSON Lines one line at a time.
+"""Read files of unknown origin with a size limit: whole files, or JSON Lines one line at a time.
 
 Records may come from other people and other machines. A file may be damaged, compressed, endless or not a regular file.
 Readers in this package therefore limit the bytes they read, and report a problem as a sentence in place of an
@@ -23,13 +23,13 @@ _CHUNK_BYTES = 256 * 1024
 
 
 class BoundedFile(io.BufferedReader):
-    """The content of a file as a binary stream, decompressed if the file is gzip data.
+    """The content of a file as a binary stream. If the file is gzip data, it is decompressed.
 
     `problem` is empty, or says why the content ends early. It is known after the stream was read to its end.
     """
 
     def __init__(self, path: Path, most_bytes: int = MAX_BYTES) -> None:
-        """Open the file for at most `most_bytes` of content. Raises OSError if it cannot be opened or is no regular
+        """Open the file to read at most `most_bytes` of content. Raises OSError if it is not a readable regular
         file.
         """
         self._content = _Content(path, most_bytes)
@@ -77,7 +77,7 @@ class _Content(io.RawIOBase):
         super().close()
 
     def _next(self, most: int) -> bytes:
-        """Return up to `most` bytes of content. Empty at the end."""
+        """Return up to `most` bytes of content, or no bytes at the end."""
         return self._unpacked(most) if self.packed else self._file.read(most)
 
     def _unpacked(self, most: int) -> bytes:
@@ -129,7 +129,7 @@ Record = TypeVar("Record", bound=BaseModel)
 
 
 class JsonLines(Generic[Record]):
-    """The lines of a JSON Lines file that are valid for `model`.
+    """The lines of a JSON Lines file that are valid for the type `model`.
 
     A missing file, or None as the path, has no lines. Lines that are not valid are skipped and counted.
     """
@@ -167,11 +167,11 @@ class JsonLines(Generic[Record]):
             self._problem = f"cannot be read: {error.strerror}"
 
     def leave_out(self) -> None:
-        """Count the last yielded line as unusable, because the caller rejected it."""
+        """Count the last line as unusable, because the caller rejected it."""
         self._left_out += 1
 
     def problems(self) -> list[str]:
-        """Return a sentence for each problem that the iteration found, for output to the user."""
+        """Return a sentence for each problem that was found while the lines were read."""
         problems = []
         if self._left_out:
             lines = "1 damaged or unknown line is" if self._left_out == 1 else ""

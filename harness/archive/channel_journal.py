@@ -1,4 +1,6 @@
-"""The journal of a shared channel: a line of `channel.jsonl` for each message that left a radio, or that it dropped."""
+"""Define a line of `channel.jsonl`, the log of a shared radio channel. It describes a message that a radio sent or
+dropped.
+"""
 
 from typing import Annotated
 
@@ -10,8 +12,9 @@ Reason = Annotated[str, Field(max_length=20)]
 
 
 class ChannelLine(BaseModel):
-    """The fate of a message. `sequence` is its number, or None for a datagram that is no message of the vehicle's
-    agent."""
+    """The receivers and losses of one message. `sequence` is None for a datagram that is not a message of the vehicle's
+    agent.
+    """
 
     model_config = ConfigDict(strict=True)
 

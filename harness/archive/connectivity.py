@@ -1,4 +1,4 @@
-"""The connectivity of the vehicles over mission time, read from `network.jsonl`.
+"""Find out which vehicles were connected at each time, from the network changes in `network.jsonl`.
 
 A link joins two vehicles that receive each other directly. A pair that loses all messages has no link. Two kinds of
 change are recorded. A change in the scenario is recorded as the network conditions that it requests. A change through
@@ -34,7 +34,7 @@ Components = tuple[frozenset[int], ...]
 
 @dataclass(frozen=True, slots=True)
 class Topology:
-    """The connected components of the living vehicles from mission second `at_s` on, the largest first.
+    """The groups of connected living vehicles from mission second `at_s` on. The largest group is first.
 
     `what` names the change that caused them.
     """
@@ -46,7 +46,7 @@ class Topology:
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """The mean and the highest loss of the links between living vehicles from mission second `at_s` on, 0 to 1.
+    """The mean and the highest loss rate (0 to 1) of links between living vehicles from mission second `at_s` on.
 
     Links with a loss of 1 are not counted, because they are no links.
     """
@@ -65,7 +65,7 @@ SAME_LOSS = 0.05
 
 
 def quality(loss: float) -> int:
-    """Return the grade of a link with this loss, from 0 (best) to 4 (no link)."""
+    """Return the quality of a link with this loss rate, from 0 (best) to 4 (no link)."""
     return bisect_right(QUALITY_LIMITS, loss)
 
 
@@ -102,13 +102,13 @@ class Connectivity:
         return [pair for pair in combinations(living, 2) if not _is_on(self._cut.get(pair, ()), at_s)]
 
     def loss(self, pair: Pair, at_s: float) -> float:
-        """Return the loss of a pair at mission second `at_s`, as in `pair_losses`."""
+        """Return the loss rate of a pair of vehicles at mission second `at_s`, as in `pair_losses`."""
         losses = self.pair_losses.get(pair, [])
         at = bisect_right(losses, at_s, key=itemgetter(0))
         return losses[at - 1][1] if at else 1.0
 
     def airborne_intervals(self, vehicle: int, end_s: float) -> list[tuple[float, float, bool]]:
-        """Return the intervals in which the vehicle flew, as (start, end, lost at the end).
+        """Return the intervals in which the vehicle flew, each as (start, end, true if it was lost at the end).
 
         They end at `end_s` at the latest.
         """
@@ -130,7 +130,7 @@ class NetworkLine(BaseModel):
 
 
 class NetworkReplay:
-    """The state of the network after each line of its record. `apply` takes the lines in order."""
+    """The state of the network after each line of its record. `apply` must be called with the lines in order."""
 
     def __init__(self, vehicles: Collection[int]) -> None:
         self.vehicles = tuple(sorted(vehicles))
@@ -166,13 +166,13 @@ class NetworkReplay:
             self.lost -= set(line.agents)
 
     def losses(self, at_s: float) -> Losses:
-        """Return the mean and the highest loss of the current links."""
+        """Return the mean and the highest loss rate of the current links."""
         lost = [loss for pair in self._scripted if self._is_up(pair) for loss in self._directions(pair)]
         mean = sum(lost) / len(lost) if lost else 0.0
         return Losses(at_s, round(mean, 3), round(max(lost, default=0.0), 3))
 
     def by_link(self) -> dict[Link, float]:
-        """Return the current loss of each link, in each direction. 1.0 if it passes no message."""
+        """Return the current loss rate of each link in each direction. It is 1.0 if no message passes."""
         losses: dict[Link, float] = {}
         for low, high in self._scripted:
             there, back = (1.0, 1.0) if self.lost & {low, high} else self._directions((low, high))
@@ -180,11 +180,13 @@ class NetworkReplay:
         return losses
 
     def directions(self, pair: Pair) -> tuple[float, float]:
-        """Return the current loss of a pair, from the lower to the higher ID and back. 1.0 without a link."""
+        """Return the current loss rates of a pair: from the lower to the higher ID, and back. They are 1.0 without a
+        link.
+        """
         return self._directions(pair) if self._is_up(pair) else (1.0, 1.0)
 
     def by_pair(self) -> dict[Pair, float]:
-        """Return the current loss of each pair as the mean of both directions. 1.0 without a link."""
+        """Return the current loss rate of each pair, as the mean of both directions. It is 1.0 without a link."""
         return {pair: sum(self._directions(pair)) / 2 if self._is_up(pair) else 1.0 for pair in self._scripted}
 
     def _is_up(self, pair: Pair) -> bool:
@@ -219,12 +221,14 @@ def _asked_loss(conditions: NetworkConditions, sender: int, receiver: int) -> fl
 
 
 def _loss(link: LinkConditions) -> float:
-    """Return the long-term mean loss of a link, 0 to 1."""
+    """Return the long-term mean loss rate of a link, from 0 to 1."""
     return link.loss.mean if isinstance(link.loss, GilbertElliott) else link.loss
 
 
 def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectivity:
-    """Read the connectivity of `vehicles`. Invalid lines, and lines before the first conditions, are left out."""
+    """Read which vehicles were connected at each time. Invalid lines, and lines before the first conditions, are left
+    out.
+    """
     lines = JsonLines(path, NetworkLine)
     network = NetworkReplay(vehicles)
     states: list[Topology] = []
@@ -262,7 +266,7 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
 
 
 def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
-    """Yield mission seconds and link losses, 0 to 1: first those of all links, then those of changed links.
+    """Yield mission seconds and loss rates (0 to 1) of links: first of all links, then of changed ones.
 
     The loss is 1 for a link that is partitioned, out of radio range, or belongs to a lost vehicle. Invalid lines are
     left out.
@@ -285,7 +289,7 @@ def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[t
 
 
 def _append_state(states: list[Topology], state: Topology) -> None:
-    """Append a state that differs from the last one. It replaces a last state of the same second."""
+    """Append a state that differs from the previous one. It replaces a state of the same second."""
     if states and states[-1].at_s == state.at_s:
         states.pop()
     if not states or states[-1].components != state.components:
@@ -301,5 +305,5 @@ def _toggle(times: dict[Key, list[float]], keys: Iterable[Key], at_s: float) -> 
 
 
 def _is_on(times: Sequence[float], at_s: float) -> bool:
-    """Return whether a state that changes at each of these times, and is off at first, is on at `at_s`."""
+    """Return true if something is on at `at_s` that is off at first and changes at each of these times."""
     return bisect_right(times, at_s) % 2 == 1

@@ -1,4 +1,4 @@
-"""The run directory: the files of a run. Every later command reads them.
+"""Create a run directory and write its files. All later commands read them.
 
 run.json            resolved scenario, seed, versions, backend, engine, verdict
 agents/7.*          mission file, chain export, trace and log of agent 7, and its store if it keeps one
@@ -43,7 +43,7 @@ ROGUE_CONTROL = "rogue.control"
 
 
 class RunDirectory:
-    """The directory of a run in progress. Backends work in it, and the mission appends its records to it.
+    """The directory of a run in progress. Backends create files in it, and the mission appends its records.
 
     Raises RunDirectoryError if the directory cannot be made or is not empty. Methods that write raise OSError on a disk
     error, unless they document another error.
@@ -64,37 +64,37 @@ class RunDirectory:
         claim(path, self.agents, self.vehicles)
 
     def vehicle(self, vehicle_id: int, incarnation: int = 1) -> Path:
-        """Make and return the directory of a vehicle. A replacement of a lost vehicle has a directory of its own."""
+        """Create the directory of a vehicle and return it. A replacement of a lost vehicle has its own directory."""
         path = self.vehicles / (str(vehicle_id) if incarnation == 1 else f"{vehicle_id}-{incarnation}")
         path.mkdir(exist_ok=True)
         return path
 
     def agent(self, agent_id: int, incarnation: int = 1) -> Path:
-        """Make and return the directory of an agent. Each incarnation after the first has a directory of its own."""
+        """Create the directory of an agent and return it. Each restart of the agent has its own directory."""
         path = self.agents if incarnation == 1 else self.agents / f"{agent_id}-{incarnation}"
         path.mkdir(exist_ok=True)
         return path
 
     def capture(self) -> Path:
-        """Make and return the directory for captures."""
+        """Create the directory for packet captures and return it."""
         path = self.path / "capture"
         path.mkdir()
         return path
 
     def write_mission(self, directory: Path, agent_id: int, mission: Mapping[str, Any]) -> Path:
-        """Write the mission file, which an agent reads at its start (ucp/contract/CONTRACT.md), and return its path."""
+        """Write the mission file, which an agent reads at its start (ucp/contract/CONTRACT.md). Return its path."""
         path = directory / f"{agent_id}.mission.json"
         write_json_atomically(path, dict(mission))
         return path
 
     def copy_export(self, agent_id: int, directory: Path) -> None:
-        """Copy the export of a later incarnation, if there is one, to the directory in which the checker expects it."""
+        """Copy the chain export of a restarted agent to the directory in which the checker expects it."""
         export = directory / f"{agent_id}{SUFFIX}"
         if directory != self.agents and export.exists():
             shutil.copyfile(export, self.agents / export.name)
 
     def append_trace(self, agent_id: int, directory: Path, copied_bytes: int = 0) -> int:
-        """Append the new part of a later incarnation's trace to the agent's trace, and return its size in bytes.
+        """Append the new part of a restarted agent's trace to its whole trace. Return the size of this part in bytes.
 
         `copied_bytes` is the size of the part that was appended before. An incomplete last line is left out: the agent
         was killed while it wrote the line, or is still writing it.
@@ -113,19 +113,19 @@ class RunDirectory:
         return len(added)
 
     def keep_exports_before_final_reconcile(self) -> None:
-        """Copy the current exports, which hold the chains before the operator's final reconcile."""
+        """Copy the current exports, which contain the chains before the final reconcile."""
         kept = self.path / BEFORE_FINAL_RECONCILE
         kept.mkdir()
         for path in export_paths(self.path):
             shutil.copyfile(path, kept / path.name)
 
     def write_public_keys(self, keys: "PublicKeys") -> None:
-        """Write the public keys of a secured mission. The checker verifies signatures with them."""
+        """Write the public keys of a secured mission, with which the checker verifies signatures."""
         write_json_atomically(self.path / PUBLIC_KEYS_FILE, keys.to_json())
         self.keys_fingerprint = keys.fingerprint
 
     def append_network(self, record: Mapping[str, Any]) -> None:
-        """Append a change of the network, or a fault of agents, as it was applied at mission second `at_s`."""
+        """Append a network change or a fault, as it happened at mission second `at_s`."""
         self._append(NETWORK_FILE, record)
 
     def append_injected(self, record: Mapping[str, Any]) -> None:
@@ -133,7 +133,7 @@ class RunDirectory:
         self._append(ROGUE_FILE, record)
 
     def append_channel(self, record: Mapping[str, Any]) -> None:
-        """Append the line of a message on a shared channel."""
+        """Append the log line of a message on a shared radio channel."""
         self._append(CHANNEL_FILE, record)
 
     def append_tracks(self, at_s: float, places: Mapping[int, Place]) -> None:
@@ -146,7 +146,7 @@ class RunDirectory:
             file.write(json.dumps(record, separators=(",", ":")) + "\n")
 
     def write_record(self, record: RunRecord) -> None:
-        """Write run.json completely or not at all. Raises MachineError if the disk is full."""
+        """Write run.json, completely or not at all. Raises MachineError if the disk is full."""
         try:
             write_json_atomically(self.path / RUN_FILE, record.to_json())
         except OSError as error:
@@ -157,7 +157,7 @@ class RunDirectory:
 
 
 def claim(directory: Path, *inner: Path) -> None:
-    """Make the directory, or use an existing empty one, and make the directories `inner` in it.
+    """Create the directory, or use an existing empty one. Then create the directories `inner` in it.
 
     Raises RunDirectoryError if the directory cannot be made or is not empty.
     """
@@ -176,7 +176,7 @@ def claim(directory: Path, *inner: Path) -> None:
 
 
 def default_path(name: str) -> Path:
-    """Return `runs/<name of the scenario>-<local time>` in the current directory, with a number if that path exists."""
+    """Return the path `runs/<name of the scenario>-<local time>`. If it exists, a number is appended."""
     words = "".join(character if character.isalnum() else " " for character in name).split()
     base = RUNS / f"{'_'.join(words).lower()[:60] or 'run'}-{time.strftime('%Y%m%d-%H%M%S')}"
     candidate, number = base, 2

@@ -1,4 +1,4 @@
-"""The event data of blocks, in plain or sealed.
+"""Decode the event data of blocks, and decrypt them if the key is known.
 
 A secured mission may seal event data: the agents encrypt it for the depot, and only the depot's key opens it.
 """
@@ -17,13 +17,15 @@ if TYPE_CHECKING:
 
 
 class SealedError(MalformedEventsError):
-    """Event data is sealed, and no given key opens it. The message completes a sentence about the block."""
+    """An error: event data are encrypted, and no known key decrypts them. The message completes a sentence about the
+    block.
+    """
 
 
 @dataclass(frozen=True)
 class EventData:
-    """A reader of the event data of one mission. `sealed` is true if the mission seals it, and `depot` holds the key if
-    given.
+    """Decodes the event data of one mission. `sealed` is true if they are encrypted, and `depot` contains the key if
+    known.
     """
 
     sealed: bool = False
@@ -31,12 +33,12 @@ class EventData:
 
     @property
     def is_closed(self) -> bool:
-        """True if the data is sealed and no key was given."""
+        """True if the data are encrypted and the key is unknown."""
         return self.sealed and self.depot is None
 
     @classmethod
     def of(cls, exports: Iterable[Export], depot: "Depot | None" = None) -> "EventData":
-        """Return the reader for the exports of one mission.
+        """Return the decoder for the exports of one mission.
 
         Raises ExportError if `depot` is given, and the mission seals its data for another depot or not at all.
         """
@@ -54,11 +56,11 @@ class EventData:
         return cls(key is not None, depot)
 
     def of_block(self, block: ExportedBlock) -> bytes:
-        """Return the plain event data of a block (Section 3.1). Raises SealedError."""
+        """Return the decrypted event data of a block (Section 3.1). Raises SealedError without the key."""
         return self.opened(block.event_bytes, block.agent_id, block.timestamp_us)
 
     def opened(self, event_data: bytes, agent_id: int, timestamp_us: int) -> bytes:
-        """Return the plain form of a block's event data. `agent_id` and `timestamp_us` are those of the block.
+        """Return event data in decrypted form. `agent_id` and `timestamp_us` are those of the block.
 
         Raises SealedError.
         """
@@ -74,5 +76,7 @@ class EventData:
             raise SealedError(str(error)) from None
 
     def events(self, block: ExportedBlock) -> list[LoggableEvent]:
-        """Return the events of a block, oldest first. Raises SealedError, or MalformedEventsError for damaged data."""
+        """Return the events in a block. The oldest is first. Raises SealedError, or MalformedEventsError for damaged
+        data.
+        """
         return decode_events(self.of_block(block))

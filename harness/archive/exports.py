@@ -1,4 +1,4 @@
-"""Read chain exports (`ucp-chain-export/1`) of a run or from the field, and name their blocks.
+"""Read chain exports (`ucp-chain-export/1`) of a run or a real flight, and name their blocks.
 
 Exports from the field may be truncated, edited, duplicated or from another mission. Each unusable file gets one
 sentence, and the other files are read. This module validates only the format. Whether the hashes recompute is
@@ -68,7 +68,7 @@ class ExportedBlock(BaseModel):
 
     @property
     def event_bytes(self) -> bytes:
-        """The loggable events in the encoding of a block (Section 3.1). They may be sealed."""
+        """The encoded events of a block (Section 3.1). They may be encrypted."""
         return base64.b64decode(self.event_data)
 
 
@@ -83,7 +83,7 @@ class ExportedInception(BaseModel):
 
     @property
     def data(self) -> bytes:
-        """The initial data that all agents of the mission received (Section 3.4.1)."""
+        """The data of the inception block, which all agents of the mission received (Section 3.4.1)."""
         return base64.b64decode(self.block_data)
 
 
@@ -136,13 +136,13 @@ class Export(BaseModel):
 
     @property
     def top_chain_hash(self) -> str:
-        """The chain hash of the last block of the chain, or of the inception block if the chain has no other."""
+        """The hash of the whole chain. If the chain is empty, it is the chain hash of the inception block."""
         top = self.chain[-1].chain_hash if self.chain else None
         return top or self.inception.chain_hash
 
     @cached_property
     def chain_of_block_hashes(self) -> tuple[str, ...]:
-        """Block hashes of the chain without the inception block, oldest first."""
+        """The block hashes of the chain without the inception block. The oldest is first."""
         return tuple(block.block_hash for block in self.chain)
 
     def blocks(self) -> Iterable[ExportedBlock]:
@@ -154,14 +154,14 @@ class Export(BaseModel):
 
 @dataclass
 class Exports:
-    """The exports of one mission by agent. `errors` has a sentence for each unusable file."""
+    """The exports of one mission by agent. `errors` contains a sentence for each unusable file."""
 
     by_agent: dict[int, Export] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
 
 
 class ExportMaker:
-    """A maker of exports of agents in this process, without files. Agents that hold the same block share one object for
+    """Creates exports of agents in this process without files. Agents that hold the same block share one object for
     it.
     """
 
@@ -176,8 +176,8 @@ class ExportMaker:
         signatures: Mapping[bytes, bytes] | None = None,
         head: Mapping[str, Any] | None = None,
     ) -> Export:
-        """Return the export that `read_export` would read from a file that `ucp.export.export_chain` wrote of this
-        state. `head` is the signed head of a secured agent.
+        """Return the same export that `read_export` would read from a file about this agent. `head` is the signed head
+        of a secured agent.
         """
         inception, signed = state.chain.inception, signatures or {}
         return Export.model_construct(
@@ -221,7 +221,7 @@ def _base64(data: bytes) -> str:
 
 
 def read_export(path: Path) -> Export:
-    """Read an export. Raises ExportError with one sentence that names the file, the error and its place."""
+    """Read an export. Raises ExportError. The message names the file, the error and its place."""
     try:
         if path.stat().st_size > MAX_EXPORT_BYTES:
             raise ExportError(f"{path}: larger than {MAX_EXPORT_BYTES} bytes, which is too large for an export")
@@ -246,7 +246,7 @@ def json_error(path: Path, error: ValueError | RecursionError) -> ExportError:
 
 
 def parse_export(path: Path, document: Any) -> Export:
-    """Return the export in a JSON document. `path` is its file. Raises ExportError like `read_export`."""
+    """Return the export in a JSON document. `path` is the name of its file. Raises ExportError like `read_export`."""
     if not isinstance(document, dict) or "schema" not in document:
         raise ExportError(f"{path}: not a chain export (it has no `schema`)")
     if document["schema"] != SCHEMA:
@@ -258,7 +258,7 @@ def parse_export(path: Path, document: Any) -> Export:
 
 
 def read_exports(paths: Iterable[Path]) -> Exports:
-    """Read the exports of one mission. `errors` of the result has a sentence for each unusable file.
+    """Read the exports of one mission. In the result, `errors` contains a sentence for each unusable file.
 
     If the exports belong to several missions, the mission with the most exports is used, or that of the first file if
     several have the most. Of two different exports of one agent, the later one is used.
@@ -305,7 +305,7 @@ def export_paths(directory: Path) -> list[Path]:
 
 
 def agents_directory(directory: Path) -> Path:
-    """Return the directory of exports and traces: `agents` in a run directory, else the directory itself."""
+    """Return the directory with exports and traces: `agents` in a run directory, or else the directory itself."""
     agents = directory / "agents"
     return agents if agents.is_dir() else directory
 

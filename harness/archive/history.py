@@ -1,4 +1,5 @@
-"""The history of a run: votes, reconciles and commits of each agent, and the messages between agents.
+"""Compute the history of a run from traces: votes, reconciles and commits of each agent, and the messages between
+agents.
 
 The traces are the only source. If an agent is lost, or the run ends, its vote and its reconcile end at that time.
 """
@@ -46,7 +47,7 @@ REASONS = {
 
 @dataclass(frozen=True, slots=True)
 class Vote:
-    """The vote of an agent on its own block, in mission seconds.
+    """The vote of an agent on its own block, with times in mission seconds.
 
     `outcome` is the branch of Algorithm 5, or CUT_SHORT.
     """
@@ -70,7 +71,7 @@ class Phase:
 
 @dataclass(frozen=True, slots=True)
 class Reconcile:
-    """A reconcile of an agent, in mission seconds.
+    """A reconcile of an agent, with times in mission seconds.
 
     `phases` follow each other without a gap. `done` is false if the reconcile was cut short.
     """
@@ -85,7 +86,7 @@ class Reconcile:
 
 @dataclass(frozen=True, slots=True)
 class Commit:
-    """The addition of a block to a chain. `how` is a value of COMMITTED_BY."""
+    """The addition of a block to a chain. `how` is one of the values of COMMITTED_BY."""
 
     agent: int
     at_s: float
@@ -95,7 +96,7 @@ class Commit:
 
 @dataclass(frozen=True, slots=True)
 class Tie:
-    """The end of phase 2 in a tie. `branch` names its result."""
+    """A tie at the end of reconcile phase 2. `branch` names its result."""
 
     agent: int
     at_s: float
@@ -119,7 +120,7 @@ HistoryEvent = ActivityStart | Vote | Reconcile | Tie | Commit
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A broadcast.
+    """A broadcast message with its receivers.
 
     `seq` is the sequence number of its sender. `receipts` has the agent and the mission second of each handler run that
     the broadcast triggered.
@@ -135,7 +136,7 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """The history of all agents, agent by agent and in order of time. `messages` is None if they were not requested."""
+    """The history of all agents, by agent and in order of time. `messages` is None if they were not requested."""
 
     votes: list[Vote]
     reconciles: list[Reconcile]
@@ -145,19 +146,19 @@ class History:
 
 
 def has_possible_time(run: HandlerRun) -> bool:
-    """Return whether the recorded time of a handler run is possible."""
+    """Return true if the recorded time of a handler run is possible."""
     return 0 <= run.t <= LATEST_S
 
 
 def incarnations(trace: Trace) -> list[list[HandlerRun]]:
-    """Return the handler runs of each incarnation of an agent. Runs with an impossible time are left out."""
+    """Return the handler runs of an agent, divided at its restarts. Runs with an impossible time are left out."""
     return [[run for _, run in runs if has_possible_time(run)] for runs in trace.incarnations()]
 
 
 def history_of(
     traces: Mapping[int, Trace], faults: Iterable[FaultRecord], end_s: float, *, whole: bool = True
 ) -> History:
-    """Return the history of a run that ended at mission second `end_s`. With `whole=False` it has no messages."""
+    """Return the history of a run that ended at mission second `end_s`. With `whole=False`, messages are left out."""
     ends: dict[int, list[float]] = defaultdict(list)
     for fault in faults:
         if fault.kind.ends_incarnation:
@@ -189,7 +190,7 @@ def _append(history: History, steps: Iterable[HistoryEvent]) -> None:
 
 
 class HistoryReader:
-    """A reader of the handler runs of one incarnation, one after another.
+    """Reads the handler runs of an agent between two restarts, one after another.
 
     The report and the live page both use this class, so both show the same start and end of each vote and reconcile. A
     reconcile that begins during a vote does not end the vote. The vote ends when its timer expires.
@@ -204,7 +205,7 @@ class HistoryReader:
         self._phases: list[Phase] = []
 
     def feed(self, run: HandlerRun) -> Iterator[HistoryEvent]:
-        """Yield the history events of the next handler run."""
+        """Yield the parts of the history that the next handler run begins or ends."""
         self._now_s = run.t
         if run.handler == "process_next_deque_block" and run.branch == "proposed":
             self._vote = next((sent.block or "" for sent in run.sent), ""), run.t
@@ -221,7 +222,7 @@ class HistoryReader:
                 yield Commit(self._agent, run.t, block, COMMITTED_BY.get(run.handler, "otherwise"))
 
     def end(self, at_s: float) -> Iterator[HistoryEvent]:
-        """Yield the vote and the reconcile that the end of the incarnation at `at_s` cuts short."""
+        """Yield the vote and the reconcile that the end of the agent at `at_s` interrupts."""
         at_s = max(at_s, self._now_s)
         yield from self._end_vote(at_s, CUT_SHORT)
         yield from self._end_reconcile(at_s, done=False)
@@ -233,7 +234,7 @@ class HistoryReader:
             yield Vote(self._agent, block, since_s, max(at_s, since_s), outcome)
 
     def _continue_reconcile(self, run: HandlerRun) -> Iterator[HistoryEvent]:
-        """Yield the history events of a handler run during a reconcile."""
+        """Yield the parts of the history that a handler run during a reconcile begins or ends."""
         if run.branch.startswith("tie:"):
             yield Tie(self._agent, run.t, run.branch)
         if run.handler == "reconcile_finalize" and run.branch == "done":
@@ -262,7 +263,7 @@ class HistoryReader:
 
 
 def _messages(traces: Mapping[int, Trace]) -> list[Message]:
-    """Return all messages with their receipts.
+    """Return all messages with their receivers.
 
     Sequence numbers begin again with each incarnation. A receipt therefore belongs to the latest message with its
     number that was sent before it.
@@ -289,7 +290,7 @@ def _messages(traces: Mapping[int, Trace]) -> list[Message]:
 
 
 def end_of_traces(traces: Mapping[int, Trace]) -> float:
-    """Return the mission second of the last handler run. 0 without any."""
+    """Return the mission second of the last handler run, or 0 if there is none."""
     return max((run.t for trace in traces.values() for run in trace.runs if has_possible_time(run)), default=0.0)
 
 

@@ -1,4 +1,4 @@
-"""Read `lag.jsonl`: how late the machine woke programs during a run, and how busy the processes of each agent were.
+"""Read `lag.jsonl`: how late the machine woke up programs during a run, and how busy the processes of each agent were.
 
 `harness/play/process/_lag_probe.py` writes this file.
 """
@@ -32,16 +32,16 @@ class LagLine(BaseModel):
 
 
 class MeasuredLag:
-    """The lag that `lag.jsonl` shows at any time of the run."""
+    """The measured delays of the machine at any time of the run."""
 
     def __init__(self, lines: list[LagLine]) -> None:
         self._lines = sorted(lines, key=lambda line: line.until_s)
         self._ends = [line.until_s for line in self._lines]
 
     def explains(self, agent_id: int, from_s: float, until_s: float) -> float | None:
-        """Return the lag, in seconds of wall time, of an agent that runs a timer at `until_s` that expired at `from_s`.
+        """Return the measured delay, in seconds of wall time, of a timer that expired at `from_s` and ran at `until_s`.
 
-        None if the lag of the agent was not measured all the time.
+        Return None if the delays of the agent were not measured all the time.
         """
         lines = self._lines[bisect_left(self._ends, from_s) : bisect_left(self._ends, until_s) + 1]
         agent = str(agent_id)

@@ -1,4 +1,4 @@
-"""Read run.json in any condition: complete, truncated, of another version, or edited.
+"""Read run.json in any condition: complete, truncated, modified, or of another version.
 
 Invalid parts are removed, each as small as possible, until the rest is valid. A list loses only its invalid entries. An
 entry without a required key is removed as a whole. Rejecting the whole file instead would lose the record of every
@@ -35,7 +35,7 @@ NOT_AN_OBJECT = "input should be an object"
 
 @dataclass(frozen=True)
 class InvalidPart:
-    """The invalid parts of one top-level key.
+    """The invalid parts below one key at the top level.
 
     `where` and `what` describe the first one, and `more` counts the others.
     """
@@ -51,7 +51,7 @@ class InvalidPart:
 
 
 def validate_leniently(model: type[Model], document: dict[str, Any]) -> tuple[Model, list[InvalidPart]]:
-    """Return the valid part of `document` as a `model`, and a description of the removed parts.
+    """Return the valid part of `document` as an object of type `model`, and a description of the removed parts.
 
     All keys of the model must have defaults. Unknown keys are ignored. A lone surrogate in a text becomes a question
     mark. `document` is changed. Raises ValueError if it has more than MAX_ERRORS errors.
@@ -102,7 +102,7 @@ def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, l
 
 
 def _repair(place: Place, problem: ErrorDetails) -> bool:
-    """Replace lone surrogates in a text by question marks. Return whether that was possible."""
+    """Replace lone surrogates in a text by question marks. Return true if that was possible."""
     holder, key = place
     if problem["type"] == LONE_SURROGATE and isinstance(text := holder[key], str):
         holder[key] = text.encode(errors="replace").decode()
@@ -128,12 +128,12 @@ MAX_VALUES = 2_000_000
 
 
 class DamagedRecordError(RunDirectoryError):
-    """`run.json` is missing, truncated or edited."""
+    """An error: the file run.json is missing, truncated or modified."""
 
 
 @dataclass(frozen=True)
 class RecordFile:
-    """The content of a run.json. `record` is its valid part, and `problems` has a sentence for each invalid part."""
+    """The content of a file run.json. `record` is its valid part, and `problems` describes its invalid parts."""
 
     record: RunRecord = field(default_factory=RunRecord)
     judged: JudgedRecord | None = None
@@ -144,7 +144,7 @@ class RecordFile:
 
 
 def read_record(path: Path) -> RecordFile:
-    """Read the record in `path`. If no part can be used, the result has an `error`.
+    """Read the file run.json at `path`. If no part of it can be used, the result has an `error`.
 
     The error is a DamagedRecordError, unless the file is intact and has another schema.
     """

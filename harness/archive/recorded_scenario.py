@@ -1,4 +1,4 @@
-"""Find the scenario to play: a scenario file, or the scenario that a run directory recorded."""
+"""Find the scenario to play: in a scenario file, or in the records of a run directory."""
 
 from pathlib import Path
 
@@ -9,7 +9,8 @@ from harness.scenario import Scenario, load_scenario
 
 
 def load_recorded_scenario(path: Path) -> tuple[Scenario, int | None]:
-    """Return a scenario and its seed: from a scenario file, from the library by name, or from a run directory.
+    """Return a scenario and its seed, from a scenario file, by the name of an included scenario, or from a run
+    directory.
 
     The seed is None unless `path` is a run directory. Raises HarnessError.
     """

@@ -1,4 +1,4 @@
-"""The spread of the mission data over time: the agents' chains at each mission second, computed from their traces.
+"""Compute how the mission data spread over the agents: the agents' chains at each mission second, from their traces.
 
 The checker computes the same figures (`harness.checker._figures`) for the end of a run. Only chains of living agents
 count. Copies are counted in these chains, for each completed block.
@@ -16,8 +16,8 @@ from ucp.trace import HandlerRun
 
 @dataclass(frozen=True, slots=True)
 class Replication:
-    """The figures from mission second `at_s` on: lengths in blocks, the number of distinct chains, and copies per
-    block.
+    """The figures from mission second `at_s` on: chain lengths in blocks, the number of different chains, and copies
+    per block.
 
     Copies are None until an agent completes a block.
     """
@@ -31,7 +31,7 @@ class Replication:
 
 
 def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -> list[Replication]:
-    """Return the figures at 0 s, and after each change."""
+    """Return the figures at 0 s and after each change."""
     steps: list[tuple[float, int, int, FaultRecord | HandlerRun]] = []
     for fault in faults:
         steps += [(fault.at_s, 0, agent, fault) for agent in fault.agents or () if agent in traces]
@@ -56,7 +56,7 @@ def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -
 
 
 class _Chains:
-    """The chains of the living agents, with shared counts.
+    """The chains of the living agents, with counts of the blocks in them.
 
     Each chain is a path of prefix numbers. Equal prefixes of different chains have the same number, so a common prefix
     is found by comparing one number.
@@ -82,9 +82,7 @@ class _Chains:
             self._paths.setdefault(agent, [])
 
     def apply_run(self, agent: int, incarnation: int, run: HandlerRun) -> None:
-        """Apply the changes of a handler run. The first run of a new incarnation empties the chain. Runs of a lost
-        incarnation are ignored.
-        """
+        """Apply the changes of a handler run. The first run after a restart empties the chain."""
         if incarnation > self._incarnation[agent]:
             self._incarnation[agent] = incarnation
             self._empty(agent)

@@ -1,4 +1,4 @@
-"""The runs in a folder, newest first."""
+"""List the run directories in a folder. The newest is first."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ RUNS = Path("runs")
 
 @dataclass(frozen=True)
 class PastRun:
-    """A run directory with its record. `problem` is the reason why the record cannot be read, else None."""
+    """A run directory with its record. `problem` is the reason why the record cannot be read, or None."""
 
     path: Path
     record: RunRecord
@@ -28,7 +28,7 @@ class PastRun:
 
 
 def past_runs(folder: Path, most: int) -> Iterator[PastRun]:
-    """Yield the newest runs in `folder`, at most `most`, by the time at which their records were last written.
+    """Yield the newest runs in `folder`, at most `most` of them, by the time at which run.json was last written.
 
     Raises RunDirectoryError if it is no folder.
     """

@@ -1,4 +1,4 @@
-"""The record of one run: run.json, schema `ucp-run/1`. Later versions may add keys, but remove or rename none.
+"""Define run.json, the record of one run (`ucp-run/1`). Later versions may add keys, but never remove or rename one.
 
 The harness writes the whole record. A record that it reads may come from a killed run or another version, or may be
 edited. Therefore each key of a `RunRecord` has a default that means unknown.
@@ -221,11 +221,11 @@ class ChannelLateness(_Model):
 
     @property
     def tolerable(self) -> bool:
-        """True if nineteen in twenty deliveries were at most `TOLERATED_LATENESS_S` late, and none was missing."""
+        """True if at least 95 % of all deliveries were at most `TOLERATED_LATENESS_S` late, and none was missing."""
         return self.p95_s <= TOLERATED_LATENESS_S and not self.missed and not self.unsent
 
     def in_words(self) -> str:
-        """Return a sentence about the lateness of deliveries, and about missing ones."""
+        """Return a sentence about late and missing deliveries."""
         late = (
             f"One in twenty messages arrived {self.p95_s:.2g} s or more late, and the latest {self.most_s:.2g} s late"
         )
@@ -265,14 +265,14 @@ class ChannelRecord(_Model):
     FRAMES: ClassVar[str] = "frames"
 
     def counts(self) -> Counter[tuple[str, int]]:
-        """Return the number of frames as (FRAMES, 0), and the losses as (reason, vehicle)."""
+        """Return the number of frames under (FRAMES, 0), and the losses under (reason, vehicle)."""
         counts = Counter({(self.FRAMES, 0): self.frames})
         for reason, by_vehicle in (*self.lost.items(), *self.dropped.items()):
             counts.update({(reason, int(vehicle)): count for vehicle, count in by_vehicle.items()})
         return counts
 
     def total(self, reason: str) -> int:
-        """Return the number of frames or messages lost for this reason."""
+        """Return the number of frames or messages that were lost for this reason."""
         return sum((self.lost.get(reason) or self.dropped.get(reason, {})).values())
 
 
@@ -430,12 +430,12 @@ class JudgedRecord(_Model):
 
     @property
     def switched_off(self) -> dict[int, float]:
-        """Agent ID -> mission second at which the agent exported its chain and ended, before the end of the run."""
+        """The agents that exported their chain and ended before the end of the run, with the mission second of each."""
         off = (fault for fault in self.faults if fault.kind.exports_chain)
         return {agent_id: fault.at_s for fault in off for agent_id in fault.agents or ()}
 
     def end_of(self, agent_id: int) -> float | None:
-        """Return the mission second of the end of this agent. None if the record does not have it."""
+        """Return the mission second at which the agent ended, or None if the record does not contain it."""
         return self.switched_off.get(agent_id, self.mission_s)
 
 
@@ -514,12 +514,12 @@ class RunRecord(JudgedRecord):
 
     @property
     def known_agents(self) -> list[int]:
-        """The IDs of all agents in the record, ascending, also of agents without files."""
+        """The IDs of all agents in the record in ascending order, including agents without files."""
         requested = self.scenario.roster if self.scenario else ()
         return sorted({*self.roster, *requested, *map(int, self.agents), *map(int, self.vehicles)})
 
     def late_answers(self) -> str | None:
-        """Return a sentence if agents took longer for their answers than the shared channel assumes; else None."""
+        """Return a sentence if agents took longer for their answers than the shared channel assumes, otherwise None."""
         answers = self.channel.answers if self.channel else None
         model = self.scenario.network.channel if self.scenario else None
         if self.scenario is None or model is None or answers is None or answers.count < ENOUGH_ANSWERS:
@@ -534,11 +534,11 @@ class RunRecord(JudgedRecord):
 
     @property
     def expect(self) -> Expect:
-        """The expected results of the scenario. Empty if it has none."""
+        """The expected results in the scenario. It is empty if the scenario has none."""
         return (self.scenario and self.scenario.expect) or Expect()
 
     def unmet_expectations(self, chains: Mapping[int, Sequence[str]]) -> Iterator[tuple[str, list[str]]]:
-        """Yield each kind of expectation besides verdicts that the scenario has, with a sentence for each unmet one.
+        """Yield each kind of expectation other than verdicts, with a sentence for each one that was not met.
 
         `chains` has the block hashes of each agent's chain.
         """
@@ -553,5 +553,5 @@ class RunRecord(JudgedRecord):
         return {**self.characteristics, **further}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the JSON document with all keys."""
+        """Return the record as a JSON object with all keys."""
         return self.model_dump(mode="json", by_alias=True)

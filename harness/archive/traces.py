@@ -59,7 +59,7 @@ class Header(BaseModel):
         return self
 
     def to_line(self) -> str:
-        """Return the header as a line of a trace."""
+        """Return the header as a line of a trace file."""
         fields = self.model_dump(by_alias=True)
         in_order = {name: fields[name] for name in _HEADER_KEYS if fields[name] is not None}
         return json.dumps(in_order, separators=(",", ":")) + "\n"
@@ -97,7 +97,7 @@ ASIDE = TypeAdapter(DroppedDatagram | CommandEntry)
 
 
 def read_clock(path: Path) -> dict[str, Any]:
-    """Return the clock in the header of a trace. Empty if the header cannot be read."""
+    """Return the clock in the header of a trace. It is empty if the header cannot be read."""
     try:
         with open_trace(path) as file:
             return HEADER.validate_json(file.readline(MAX_LINE_BYTES)).clock
@@ -106,7 +106,7 @@ def read_clock(path: Path) -> dict[str, Any]:
 
 
 class Gap(NamedTuple):
-    """A place in a trace at which lines are missing or damaged. `position` is the number of runs before it.
+    """A place in a trace at which lines are missing or damaged. `position` is the number of handler runs before it.
 
     `lines` and `lost_bytes` count the unreadable lines in the file. The number of lines that were never written is
     unknown.
@@ -119,7 +119,7 @@ class Gap(NamedTuple):
 
 @dataclass
 class Trace:
-    """The trace of one agent, in all its incarnations.
+    """The trace of one agent, including all its restarts.
 
     `starts` has the index in `runs` at which each incarnation after the first begins. `asides` are the entries that are
     no handler runs, each with the number of runs before it. A trace from the field (`harness.field.ingest`) may have
@@ -140,7 +140,7 @@ class Trace:
     """Line numbers of `runs` and of `asides` in the file. None if the file has no other lines."""
 
     def incarnations(self) -> Iterator[Iterator[tuple[int, HandlerRun]]]:
-        """Yield the handler runs of each incarnation, with line numbers from 1.
+        """Yield the handler runs between two restarts, with line numbers from 1, for each part of the trace.
 
         A header line begins each incarnation.
         """
@@ -160,7 +160,7 @@ class Trace:
         )
 
     def numbered_asides(self) -> Iterator[tuple[int, DroppedDatagram | CommandEntry]]:
-        """Yield the asides with their line numbers."""
+        """Yield the lines about dropped datagrams and commands, with their line numbers."""
         if self.lines is not None:
             yield from zip(self.lines[1], (aside for _, aside in self.asides), strict=True)
             return
@@ -195,7 +195,7 @@ class Trace:
                 yield self.runs[position]
 
     def skimmed(self) -> "Trace":
-        """Return the trace without handler runs that only received a message.
+        """Return the trace without those handler runs that only received a message.
 
         Line numbers of `incarnations` are then wrong.
         """
@@ -216,14 +216,14 @@ class Trace:
         return [block for run in self.runs for operation, block in run.changes if operation == "complete"]
 
     def chain_changed_at(self) -> float:
-        """Return the mission second of the last change of the chain. 0 without any."""
+        """Return the mission second of the last change of the chain, or 0 if there is none."""
         return max(
             (run.t for run in self.runs if any("chain" in operation for operation, _ in run.changes)), default=0.0
         )
 
 
 class HeldBlocks:
-    """The blocks that an agent holds: in which place, how often, and which ones it has completed."""
+    """The blocks that an agent holds: where, how often, and which ones it completed itself."""
 
     def __init__(self) -> None:
         self.places: dict[str, Counter[str]] = {place: Counter() for place in PLACES}
@@ -238,7 +238,7 @@ class HeldBlocks:
         agent did not hold."""
 
     def replay(self, run: HandlerRun) -> None:
-        """Apply the changes of the next handler run of the same incarnation."""
+        """Apply the changes of the next handler run. The object covers the time between two restarts."""
         self.impossible = None
         for operation, block in run.changes:
             if operation == "complete":
@@ -266,7 +266,7 @@ class HeldBlocks:
 
 
 def parse_line(line: bytes) -> Header | Entry:
-    """Return the entry in a line of a trace. Raises ValueError if the line is invalid."""
+    """Return the content of a trace line. Raises ValueError if the line is invalid."""
     if b'"handler"' in line:
         return HANDLER_RUN.validate_json(line)
     return ASIDE.validate_json(line) if b'"schema"' not in line else HEADER.validate_json(line)
@@ -281,13 +281,13 @@ def gap_line(gap: Gap) -> str:
 
 
 def parse_gap(line: bytes) -> tuple[int, int] | None:
-    """Return the numbers of lost lines and lost bytes if this line stands for lost lines, else None."""
+    """Return the numbers of lost lines and lost bytes if this line stands for lost lines, otherwise None."""
     match = _LOST.fullmatch(line.strip())
     return None if match is None else (int(match[1]), int(match[2]))
 
 
 def only_receives(run: HandlerRun) -> bool:
-    """Return whether the handler received a message and changed nothing."""
+    """Return true if the handler received a message and changed nothing."""
     return not run.changes and run.handler.startswith("receive_")
 
 
@@ -307,7 +307,7 @@ def why_not_a_trace(path: Path) -> str:
 
 
 def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
-    """Read the trace in `path`. Returns None if there is no file, or it does not begin like a trace.
+    """Read the trace at `path`. Return None if the file does not exist, or does not begin like a trace.
 
     With `skim`, handler runs that only received a message are skipped without validation. Line numbers of
     `incarnations` are then wrong.
@@ -354,7 +354,7 @@ Record = TypeVar("Record")
 
 
 class HandlerRunLine(NamedTuple):
-    """A line of a trace with a handler run. Line numbers and incarnations count from 1."""
+    """A trace line with a handler run. Line numbers and restarts count from 1."""
 
     path: Path
     number: int
@@ -363,12 +363,12 @@ class HandlerRunLine(NamedTuple):
     text: bytes
 
     def parse(self) -> HandlerRun:
-        """Return the handler run. Raises RunDirectoryError if the line is invalid."""
+        """Return the handler run in the line. Raises RunDirectoryError if the line is invalid."""
         return _validated(HANDLER_RUN, self.path, self.number, self.text)
 
 
 def read_trace_lines(path: Path) -> Iterator[HandlerRunLine]:
-    """Yield the lines with handler runs. An incomplete last line, left by a killed agent, is skipped.
+    """Yield the lines with handler runs. An incomplete last line, which a killed agent left, is skipped.
 
     Raises RunDirectoryError at an invalid line, or if the file cannot be read or is empty.
     """

@@ -1,4 +1,4 @@
-"""The positions of the vehicles over mission time, read from `tracks.jsonl`, in metres from the centre of the field."""
+"""Read the positions of the vehicles over mission time from `tracks.jsonl`, in metres from the centre of the field."""
 
 from bisect import bisect_right
 from collections.abc import Collection
@@ -29,7 +29,7 @@ class Fix(NamedTuple):
 
 @dataclass(frozen=True)
 class Tracks:
-    """The positions of each vehicle, at least one, in order of time.
+    """The positions of each vehicle in order of time. There is at least one for each.
 
     `problems` has a sentence for each unreadable part.
     """
@@ -38,9 +38,7 @@ class Tracks:
     problems: list[str]
 
     def at(self, vehicle: int, at_s: float) -> Fix:
-        """Return the position of a vehicle at any second: interpolated between two fixes, constant before the first
-        and after the last.
-        """
+        """Return the position of a vehicle at any second, interpolated between two recorded positions."""
         fixes = self.by_vehicle[vehicle]
         position = bisect_right(fixes, at_s, key=attrgetter("at_s"))
         before, after = fixes[max(position - 1, 0)], fixes[min(position, len(fixes) - 1)]
@@ -48,7 +46,7 @@ class Tracks:
 
 
 def between(before: Fix, after: Fix, at_s: float) -> Fix:
-    """Return the position of a vehicle that flies straight and at constant speed from one fix to the next."""
+    """Return the position of a vehicle that flies straight and at constant speed between two positions."""
     share = (at_s - before.at_s) / (after.at_s - before.at_s)
     return Fix(
         at_s,
@@ -68,7 +66,7 @@ class TrackLine(BaseModel):
 
 
 def read_tracks(path: Path | None, vehicles: Collection[int]) -> Tracks:
-    """Read the tracks of `vehicles`. A vehicle without fixes has none. Lines that name another vehicle are left out."""
+    """Read the positions of `vehicles`. Lines about other vehicles are left out."""
     lines = JsonLines(path, TrackLine)
     fixes: dict[int, list[Fix]] = {}
     known = set(vehicles)

@@ -1,4 +1,4 @@
-"""The known names in traces: names of handlers, timers, branches, messages and operations.
+"""List the known names in traces: names of handlers, timers, branches, messages and operations.
 
 An agent may use names that are not in CONTRACT.md and still behave correctly. A check that depends on an unknown name
 gives "not applicable" or "unknown", never a violation.
@@ -54,7 +54,7 @@ MAX_SHOWN = 40
 
 
 def unknown_names(runs: Iterable[HandlerRun]) -> UnknownNames:
-    """Return the first unknown name of each kind. A branch is unknown if its handler cannot take it."""
+    """Return the first undefined name of each kind. A branch counts as undefined if its handler cannot take it."""
     unknown: UnknownNames = {}
     for handler, branch in dict.fromkeys((run.handler, run.branch) for run in runs):
         if handler not in HANDLERS:
@@ -91,18 +91,20 @@ def unknown_names(runs: Iterable[HandlerRun]) -> UnknownNames:
 
 
 def tally_is_known(run: HandlerRun) -> bool:
-    """Return whether all keys of the tally are known for the handler."""
+    """Return true if all keys of the vote count are defined for the handler."""
     keys = TALLIES.get(run.handler)
     return not run.tally or keys is None or keys.issuperset(run.tally)
 
 
 def has_unknown_kind(trigger: UnknownTrigger) -> bool:
-    """Return whether the trigger names a kind that the contract lacks, as opposed to no kind or a malformed one."""
+    """Return true if the trigger names a kind that the agent contract does not define. A malformed trigger gives
+    false.
+    """
     return bool(trigger.fields) and KINDS.isdisjoint(trigger.fields)
 
 
 def timer_that_ended(run: HandlerRun, trigger: TimerTrigger) -> str:
-    """Return the timer that triggered the run.
+    """Return the name of the timer that triggered the handler run.
 
     For an unknown name, this is the timer that starts the run's handler, if any.
     """
@@ -111,17 +113,17 @@ def timer_that_ended(run: HandlerRun, trigger: TimerTrigger) -> str:
 
 
 def timers_are_known(run: HandlerRun) -> bool:
-    """Return whether all timers that the run started have known names."""
+    """Return true if all timers that the handler run started have defined names."""
     return not run.started or TIMERS.issuperset(run.started)
 
 
 def branch_is_known(run: HandlerRun) -> bool:
-    """Return whether the run's handler can take its branch."""
+    """Return true if the handler can take the branch of this run."""
     return run.branch in BRANCHES.get(run.handler, ())
 
 
 def first_unknown(unknown: UnknownNames, kinds: Collection[Kind] | None = None) -> str | None:
-    """Return the description of the first unknown name, of the given kinds or of any kind. None if there is none."""
+    """Return the description of the first undefined name of these kinds (or of any kind), or None."""
     return next((description for kind, description in unknown.items() if kinds is None or kind in kinds), None)
 
 

@@ -1,1 +1,1 @@
-"""The commands of the command line, one module each; harness/cli.py puts them together."""
+"""The commands of the command line. Each module defines one, and harness/cli.py lists them."""

@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share."""
+"""Define options and arguments that several commands share."""
 
 import contextlib
 import shutil
@@ -25,7 +25,7 @@ BundleOption = Annotated[
 
 
 def complete_scenario(typed: str) -> list[str]:
-    """Return the completions of a scenario argument: names of the library, YAML files and directories."""
+    """Return completions for a scenario argument: names of included scenarios, YAML files and directories."""
     from harness.scenario.load import scenario_names
 
     beside = Path(typed).parent if not typed.endswith("/") else Path(typed)
@@ -38,7 +38,9 @@ def _may_hold_scenario(path: Path) -> bool:
 
 
 def opener_of(bundle: Path | None) -> "Opener | None":
-    """Return the opener of a secured mission's datagrams. None without a bundle. Raises KeysError, MachineError."""
+    """Return an object that decrypts the datagrams of a secured mission, or None without a key file. Raises KeysError,
+    MachineError.
+    """
     if bundle is None:
         return None
     with extra("secure", "--bundle"):
@@ -59,7 +61,7 @@ DepotKey = Annotated[
 
 
 def depot_of(path: Path | None) -> "Depot | None":
-    """Return the depot whose key is in the file. None without a file. Raises KeysError, MachineError."""
+    """Return the key that decrypts event data, from a file, or None without a file. Raises KeysError, MachineError."""
     if path is None:
         return None
     with extra("secure", "--depot-key"):
@@ -74,7 +76,7 @@ KeysOption = Annotated[
 
 
 def trusted_keys(path: Path | None) -> "PublicKeys | None":
-    """Return the public keys in a file or a directory that the user trusts. None without a path.
+    """Return the public keys in a file or directory that the user trusts, or None without a path.
 
     Raises KeysError, MachineError.
     """
@@ -93,7 +95,7 @@ def trusted_keys(path: Path | None) -> "PublicKeys | None":
 
 
 def roster_of(text: str) -> int | list[int]:
-    """Return the value of the key `agents` of a scenario: a number, or a list of IDs. Raises ScenarioError."""
+    """Return the value for the key `agents` of a scenario: a number, or a list of IDs. Raises ScenarioError."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isascii() and part.isdecimal() and len(part) < 10 for part in parts):
         raise ScenarioError(f"`--agents` is {text!r}: use a number of agents, or IDs such as 10,28,32")
@@ -101,7 +103,9 @@ def roster_of(text: str) -> int | list[int]:
 
 
 def refuse_existing(paths: Iterable[Path]) -> None:
-    """Raise RunDirectoryError if an output file exists. Call it before the work, whose results could not be written."""
+    """Raise RunDirectoryError if an output file exists. Call this before long work whose results could not be
+    written.
+    """
     for path in paths:
         if path.exists():
             raise RunDirectoryError(f"{path} exists: choose another file; existing files are not overwritten")
@@ -129,7 +133,7 @@ def write_new(path: Path, parts: Iterable[str]) -> None:
 
 @contextlib.contextmanager
 def write_whole(path: Path) -> Iterator[None]:
-    """Run a block that writes a new file or directory, and remove it if the block fails.
+    """Yield while the caller writes a new file or directory. If the caller fails, remove it.
 
     Raises RunDirectoryError if `path` exists or cannot be created, and MachineError if writing fails.
     """

@@ -1,4 +1,4 @@
-"""`ucp-harness bisect`: find the commit that changes an outcome, or try one state of the code for `git bisect run`."""
+"""Implement `ucp-harness bisect`, which finds the commit that changes a result, or tests one state of the code."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,13 +37,13 @@ ONCE = "With --once"
 
 
 class OnceUsageError(typer.BadParameter):
-    """A mistake in the arguments of --once."""
+    """An error: the arguments for the option --once are wrong."""
 
     exit_code = WRONG_ONCE_REQUEST
 
 
 class BisectCommand(TyperCommand):
-    """The command `bisect`. With --once, wrong arguments give status 128, at which `git bisect run` stops."""
+    """The command `bisect`. With --once, wrong arguments give exit status 128, at which `git bisect run` stops."""
 
     def make_context(self, info_name: str | None, args: list[str], *rest: Any, **options: Any) -> Any:
         once = "--once" in args
@@ -144,7 +144,7 @@ class _PlayRequest:
     limit_s: float
 
     def workshops(self, directory: Path) -> list[Workshop]:
-        """Return one workshop for each agent command. Raises HarnessError."""
+        """Return an object for each agent command that plays the scenario or record. Raises HarnessError."""
         subject = subject_of(self.subject, self.seed, self.agent)
         workshops = []
         for number, command in enumerate(self.commands):
@@ -206,7 +206,7 @@ def _try_once(
 
 
 def _changes(before: Outcome | None, outcomes: Sequence[Outcome], of_records: bool) -> list[str]:
-    """Return the differences from the expected outcome, from the record, or from the first outcome."""
+    """Return the differences from the expected result, from the record, or from the first result."""
     if before is not None:
         return [sentence for outcome in outcomes for sentence in differences(before, outcome)]
     if of_records:

@@ -1,4 +1,4 @@
-"""`ucp-harness calibrate`: fit the radio of a scenario to a real flight."""
+"""Implement `ucp-harness calibrate`, which fits the radio of a scenario to a real flight."""
 
 from pathlib import Path
 from typing import Annotated

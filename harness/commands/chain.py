@@ -1,4 +1,4 @@
-"""`ucp-harness chain`: print the chains of a run as text or JSON, or write their positions as a map."""
+"""Implement `ucp-harness chain`, which prints the chains of a run, or writes their positions as a map."""
 
 import json
 from pathlib import Path
@@ -51,7 +51,7 @@ def chain_command(
 def _write_maps(
     map_tracks: list[Track], shown: logbook.Logbook, geojson_file: Path | None, kml_file: Path | None
 ) -> None:
-    """Write the tracks into the requested files. Raises ExportError without tracks."""
+    """Write the paths of vehicles to the requested files. Raises ExportError if there are none."""
     if not map_tracks:
         why = "the events are not of vehicles, and the run has no recorded tracks"
         if shown.telemetry:

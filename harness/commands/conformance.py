@@ -1,4 +1,4 @@
-"""`ucp-harness conformance`: test whether one agent follows Algorithms 1 to 20. The harness plays its peers."""
+"""Implement `ucp-harness conformance`, which tests whether a single agent follows Algorithms 1 to 20."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ from ucp.agent import HANDLERS
 
 
 class ConformanceRequestError(HarnessError):
-    """The options of `ucp-harness conformance` contradict each other, or name no Algorithm."""
+    """An error: the options of `ucp-harness conformance` contradict each other, or name no Algorithm."""
 
 
 def conformance_command(
@@ -118,7 +118,7 @@ def _test_all(agents: Mapping[str, Sequence[str]], only: str | None, page: Path,
 
 
 def _unused_path(place: Path) -> Path:
-    """Return `place`, or a path next to it with the first free number, so that earlier results stay."""
+    """Return `place`, or a path with the first free number, so that earlier results are not overwritten."""
     number, fresh = 1, place
     while fresh.exists():
         number += 1

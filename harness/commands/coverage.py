@@ -1,4 +1,6 @@
-"""`ucp-harness coverage` and `validate`: compare recorded runs with all states, and with the TLA+ specification."""
+"""Implement `ucp-harness coverage` and `validate`, which compare runs with all states and with the TLA+
+specification.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -66,7 +68,7 @@ def coverage_command(
 
 
 def _relevant_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that differ from the default and affect the steps of an agent."""
+    """Return the settings that differ from their defaults and affect the steps of an agent."""
     default = dataclasses.asdict(Settings())
     return {
         name: value

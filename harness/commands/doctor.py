@@ -1,4 +1,4 @@
-"""`ucp-harness doctor` and `clean`: report the abilities of this machine, and remove leftover containers."""
+"""Implement `ucp-harness doctor` and `clean`, which report what this machine can do and remove leftover containers."""
 
 from typing import Annotated
 

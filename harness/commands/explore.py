@@ -1,4 +1,4 @@
-"""`ucp-harness explore`: search for a violation and shrink it, or hunt for new states for some time."""
+"""Implement `ucp-harness explore`, which searches for a violation, or for new states for some time."""
 
 import re
 from pathlib import Path
@@ -99,7 +99,7 @@ def explore_command(
 
 
 def _load_request(scenario: Path, secured: bool) -> tuple[Scenario, int | None]:
-    """Return the scenario. If `scenario` is a run directory, also return the seed of the run."""
+    """Return the scenario. If the argument is a run directory, also return the seed of the run."""
     request, recorded_seed = load_recorded_scenario(scenario)
     return request.secured() if secured else request, recorded_seed
 

@@ -1,4 +1,4 @@
-"""`ucp-harness export`: write a run as files for Foxglove, PlotJuggler, Perfetto and ROS 2."""
+"""Implement `ucp-harness export`, which writes a run as files for Foxglove, PlotJuggler, Perfetto and ROS 2."""
 
 from collections.abc import Callable
 from pathlib import Path

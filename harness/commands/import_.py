@@ -1,4 +1,4 @@
-"""`ucp-harness import`: convert records of any implementation or recorder into the format of the harness."""
+"""Implement `ucp-harness import`, which converts records of any program to the formats of the harness."""
 
 from enum import Enum
 from pathlib import Path
@@ -17,7 +17,7 @@ from harness.field.adapters.rosbag_adapter import RosBag
 
 
 class RecordFormat(Enum):
-    """The formats with an adapter in the harness."""
+    """The file formats that the harness can import."""
 
     CSV = "csv"
     ROSBAG = "rosbag"

@@ -1,4 +1,5 @@
-"""`ucp-harness keys`: make the keys of a mission, write the bundle of each vehicle, and revoke keys.
+"""Implement `ucp-harness keys`, which creates the keys of a mission, writes key files for vehicles, and excludes
+vehicles.
 
 All secret keys stay in the key directory at the ground. A vehicle gets only its bundle.
 """

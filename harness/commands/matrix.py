@@ -1,4 +1,4 @@
-"""`ucp-harness matrix`: play a scenario for all loss rates, swarm sizes, mission lengths, backends and seeds."""
+"""Implement `ucp-harness matrix`, which plays a scenario with many combinations of values and seeds."""
 
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -97,7 +97,9 @@ def matrix_command(
 def _compare_with_variant(
     request: matrix.Matrix, variant: Variant, directory: Path, spread: Spread, as_json: bool
 ) -> NoReturn:
-    """Play the matrix with the original and with the variant, each into its own directory, and compare the results."""
+    """Play the matrix with the original protocol and with the variant, each into its own directory. Then compare the
+    results.
+    """
     original = matrix.run_matrix(request, directory / "original", spread)
     matrix_outputs.write(original, directory / "original")
     if original.record.outcome == "interrupted":

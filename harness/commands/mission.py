@@ -1,4 +1,6 @@
-"""`ucp-harness mission`: write the mission file of each vehicle, and check that all files belong to one mission."""
+"""Implement `ucp-harness mission`, which writes the mission files of all vehicles and checks that files belong
+together.
+"""
 
 import base64
 import ipaddress
@@ -191,7 +193,7 @@ def _texts(option: str, pairs: list[str] | None) -> dict[str, str]:
 
 
 def _pairs(option: str, pairs: list[str] | None) -> dict[str, Any]:
-    """Return the value of each key. A value that is no JSON is text."""
+    """Return the value of each key. A value that is not valid JSON counts as text."""
     values: dict[str, Any] = {}
     for key, text in _texts(option, pairs).items():
         try:
@@ -202,6 +204,6 @@ def _pairs(option: str, pairs: list[str] | None) -> dict[str, Any]:
 
 
 def _events(values: dict[str, Any]) -> dict[str, Any]:
-    """Split the value of `log` at its commas, so that `--event log=mode,position` needs no brackets."""
+    """Divide the value of `log` at its commas, so that `--event log=mode,position` needs no brackets."""
     log = values.get("log")
     return {**values, "log": log.split(",")} if isinstance(log, str) else values

@@ -1,4 +1,4 @@
-"""`ucp-harness packets`: list the datagrams in the captures of the vehicles."""
+"""Implement `ucp-harness packets`, which lists the datagrams in packet captures."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -82,6 +82,6 @@ def _output_lines(
 
 
 def _paint() -> Paint:
-    """Return a function that paints text red on a terminal, and leaves it unchanged elsewhere."""
+    """Return a function that colours text red on a terminal, and otherwise returns it unchanged."""
     console = output()
     return partial(typer.style, fg="red") if console.is_terminal and not console.no_color else str

@@ -1,4 +1,4 @@
-"""`ucp-harness prove`: explore all states that a swarm can reach within bounds."""
+"""Implement `ucp-harness prove`, which explores all states that a swarm can reach within bounds."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -171,7 +171,7 @@ def prove_command(
 
 
 def _compare(against: str, bounds: Bounds, limits: Limits, out: Path | None, as_json: bool) -> NoReturn:
-    """Prove the original too, and compare. Both proofs reduce states, or neither does: else livelocks would differ."""
+    """Run the same proof for the original agent core, and compare both results."""
     with original.code_of(against) as code, StatusLine() as status_line, sigterm_as_ctrl_c():
         if bounds.reduced and original.is_edited(code):
             complain(f"state reduction is disabled: it assumes the released core, and {against} has another one")

@@ -1,4 +1,4 @@
-"""`ucp-harness reconstruct`: make a scenario that reproduces a recorded flight."""
+"""Implement `ucp-harness reconstruct`, which writes a scenario that reproduces a recorded flight."""
 
 from pathlib import Path
 from typing import Annotated

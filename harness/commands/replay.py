@@ -1,4 +1,4 @@
-"""`ucp-harness replay`: give the recorded inputs of an agent to the reference, and compare each step."""
+"""Implement `ucp-harness replay`, which gives an agent's recorded inputs to the reference and compares each step."""
 
 from bdb import BdbQuit
 from collections.abc import Iterable, Sequence
@@ -81,7 +81,7 @@ def _play(console: Console, records: Sequence[Record], until: float | None, as_j
 def _step_through(
     console: Console, record: Record, until: float | None, at_start: bool, breaks: Sequence[str], debug: bool
 ) -> NoReturn:
-    """Step through a record by the user's commands. At the end of the commands, replay the rest."""
+    """Step through a record by the user's commands. When the commands end, replay the rest."""
     _print_problems(record)
     names = ReplayNames(record)
     player = Player(record, until, IN_USE if debug else REFERENCE)
@@ -103,7 +103,7 @@ def _step_through(
 
 
 def _in_use(in_use: ReplayResult, result: ReplayResult) -> list[Text]:
-    """Return a sentence if the core of this installation does not play the record as the reference does."""
+    """Return a sentence if the installed agent core plays the record differently than the reference does."""
     if [each.line for each in in_use.deviations] == [each.line for each in result.deviations]:
         return []
     edited = f", with the edited {', '.join(edited_files())}," if edited_files() else ""

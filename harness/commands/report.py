@@ -1,4 +1,6 @@
-"""`ucp-harness check`, `report` and `watch`: judge a run again, write its report again, or show it as a film."""
+"""Implement `ucp-harness check`, `report` and `watch`, which judge a run again, write its report, or replay it as a
+film.
+"""
 
 import asyncio
 import os
@@ -55,7 +57,7 @@ def report_command(run: Annotated[Path, typer.Argument(help="Run directory.")]) 
 
 
 def _missing(source: report.ReportSource) -> Iterator[str]:
-    """Yield a sentence for each part that a complete run has and this run lacks."""
+    """Yield a sentence for each part of a complete run that this run lacks."""
     if source.archive.recorded and source.record.outcome == "running":
         yield "the end of the run is not recorded: the run is still active, or it was killed"
     if not source.record.characteristics:

@@ -1,4 +1,4 @@
-"""`ucp-harness run`: play a scenario and judge it."""
+"""Implement `ucp-harness run`, which plays a scenario and judges it."""
 
 import secrets
 from contextlib import nullcontext
@@ -217,7 +217,7 @@ def _with_options(
     image_from_host: bool,
     programs: Programs,
 ) -> Scenario:
-    """Return the scenario with the options of the command line, which override the keys of the file."""
+    """Return the scenario with the options of the command line, which replace keys of the file."""
     document: dict[str, Any] = scenario.model_dump() | command_keys(scenario, programs)
     if speedup is not None:
         if not 0 < speedup <= 1000:

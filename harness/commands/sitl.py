@@ -1,4 +1,4 @@
-"""`ucp-harness sitl install`, `list` and `path`: ArduPilot's SITL binaries in the user's cache."""
+"""Implement `ucp-harness sitl`, which installs and lists the simulator binaries of ArduPilot in the user's cache."""
 
 import json
 import os
@@ -96,7 +96,7 @@ def list_binaries(
 
 @dataclass(frozen=True)
 class _AvailableBinary:
-    """A SITL binary on this machine, as `list --json` prints it."""
+    """A simulator binary on this machine, as `list --json` prints it."""
 
     vehicle: VehicleType
     source: str
@@ -148,7 +148,7 @@ def _build_details(vehicle: VehicleType, binary: Path) -> dict[str, Any]:
 
 
 class _DownloadBar:
-    """A progress bar on a terminal. Elsewhere it only reports that the command waits for another install."""
+    """A progress bar on a terminal. Elsewhere, it only reports that the command waits for another installation."""
 
     def __init__(self, console: Console, what: str) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn())

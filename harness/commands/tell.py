@@ -1,4 +1,4 @@
-"""`ucp-harness tell` and `ucp-harness shell`: act on an active run, and open a shell in its network."""
+"""Implement `ucp-harness tell` and `shell`, which control an active run and open a shell in its network."""
 
 import asyncio
 import os
@@ -59,7 +59,7 @@ def tell_command(
 
 
 def _parse_requests(sentence: str) -> list[dict[str, Any]]:
-    """Return the control requests that mean the same as a sentence of the user, such as "speed 10".
+    """Return the requests for a sentence of the user, such as "speed 10".
 
     Raises ScenarioError for an unknown sentence.
     """

@@ -1,4 +1,4 @@
-"""Output that several commands share: results as text or JSON on standard output, problems on standard error."""
+"""Print results as text or JSON on standard output, and problems on standard error. All commands use this module."""
 
 import io
 import json
@@ -34,7 +34,7 @@ UNLIMITED = 1_000_000
 
 
 def output(*, stderr: bool = False, highlight: bool = True) -> Console:
-    """Return a console. Outside a terminal, its lines are as long as their text, unless COLUMNS sets a width."""
+    """Return a console for output. Outside a terminal, lines are not wrapped unless COLUMNS sets a width."""
     console = Console(stderr=stderr, highlight=highlight)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = UNLIMITED
@@ -42,7 +42,7 @@ def output(*, stderr: bool = False, highlight: bool = True) -> Console:
 
 
 def show_result(console: Console, result: checker.Result, record: RunRecord) -> None:
-    """Print verdicts and figures. `record` has the expectations of the scenario."""
+    """Print verdicts and figures. `record` contains the expectations of the scenario."""
     expect, table = record.expect, Table.grid(padding=(0, 2))
     for key, judgement in result.judgements.items():
         expected = expect.remark(key, judgement.verdict) == AS_EXPECTED
@@ -81,7 +81,7 @@ def show_rogue(console: Console, injected: list[RogueInjection]) -> None:
 
 
 def end_sweep(record: "MatrixRecord", table: RenderableType | None, picture: Path) -> NoReturn:
-    """Print the result of a sweep and exit. Without a table, print JSON."""
+    """Print the result of a matrix and exit. Without a table, print JSON."""
     if table is None:
         print_json(record.to_json())
     else:
@@ -95,7 +95,7 @@ def end_sweep(record: "MatrixRecord", table: RenderableType | None, picture: Pat
 
 
 def print_lines(texts: Iterable[str]) -> None:
-    """Print lines without markup. A character that the terminal lacks becomes a question mark."""
+    """Print lines without markup. A character that the terminal cannot show becomes a question mark."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
     for text in texts:
@@ -111,7 +111,7 @@ def complain(sentence: str) -> None:
 
 
 class StatusLine:
-    """The progress of a command on standard error: one line that changes on a terminal, elsewhere a line every 10 s."""
+    """A progress display on standard error: one changing line on a terminal, otherwise a line every 10 s."""
 
     def __init__(self) -> None:
         self._console = Console(stderr=True)

@@ -1,4 +1,4 @@
-"""The option --variant, which `harness.cli` adds to each command that plays or judges agents."""
+"""Define the option --variant, which each command that plays or judges agents has."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,7 +9,7 @@ from harness.commands._shared_options import RARE
 
 
 def variant_option() -> Any:
-    """Return the option --variant. The variant is in force until the command ends."""
+    """Return the option --variant. The variant is active until the command ends."""
 
     def put_in_force(ctx: typer.Context, file: Path | None) -> None:
         if file is not None and not ctx.resilient_parsing:

@@ -1,1 +1,1 @@
-"""Helpers for output: text, colours, SVG charts, Markdown, and JUnit XML."""
+"""Helpers for all output: text, colours, SVG charts, Markdown, and JUnit XML."""

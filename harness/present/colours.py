@@ -1,4 +1,4 @@
-"""A colour for each agent, distinguishable with any colour vision, in light and in dark mode.
+"""Choose a colour for each agent. The colours differ for any colour vision, in light and in dark mode.
 
 The first eight colours are those of Okabe and Ito (https://jfly.uni-koeln.de/color/), with grey in place of black.
 Further agents get the same hues lighter, darker, and with a dashed outline. After 32 agents the colours repeat. No
@@ -25,7 +25,7 @@ Rgb = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Ink:
-    """The style of an agent's blocks. Colours are `#rrggbb`."""
+    """The colours for an agent's blocks, in the form `#rrggbb`."""
 
     fill: str
     stroke: str
@@ -34,18 +34,18 @@ class Ink:
 
 
 def inks(agent_ids: Iterable[int]) -> dict[int, Ink]:
-    """Return an ink for each agent. The same set of agents always gets the same inks."""
+    """Return the colours of each agent. The same set of agents always gets the same colours."""
     return {agent_id: _ink(position) for position, agent_id in enumerate(sorted(set(agent_ids)))}
 
 
 def ramp(first: Rgb, last: Rgb, steps: int) -> list[Ink]:
-    """Return inks from one colour to another for growing values. Choose two colours of different lightness."""
+    """Return a row of colours from `first` to `last` for growing values. Both should differ in lightness."""
     fills = [_mixed(first, last, step / (steps - 1)) for step in range(steps)]
     return [Ink(fill, fill, _text_on(fill)) for fill in fills]
 
 
 def contrast(first: str, second: str) -> float:
-    """Return the contrast ratio of WCAG 2, from 1 to 21."""
+    """Return the contrast ratio of two colours by WCAG 2, from 1 to 21."""
     dark, light = sorted((_luminance(first), _luminance(second)))
     return (light + 0.05) / (dark + 0.05)
 

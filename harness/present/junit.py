@@ -1,4 +1,4 @@
-"""JUnit XML for build servers such as Jenkins, GitLab and GitHub.
+"""Write JUnit XML for build servers such as Jenkins, GitLab and GitHub.
 
 The output follows https://github.com/jenkinsci/xunit-plugin, junit-10.xsd, which is the strictest known schema.
 """
@@ -25,7 +25,7 @@ class Case:
 
 
 def to_xml(suite: str, classname: str, started_at: str, wall_s: float | None, cases: Iterable[Case]) -> str:
-    """Return a file with one suite. Characters that XML does not allow become question marks."""
+    """Return a JUnit XML file with one suite. Characters that XML does not allow become question marks."""
     all_cases = list(cases)
     failures, skipped = sum(bool(case.wrong) for case in all_cases), sum(case.skipped is not None for case in all_cases)
     counts = {"tests": str(len(all_cases)), "failures": str(failures), "errors": "0"}

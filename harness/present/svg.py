@@ -1,4 +1,4 @@
-"""Common parts of charts: axes with ticks, marks, and an SVG file with panels side by side.
+"""Draw the common parts of charts: axes with ticks, marks, and an SVG file with several charts.
 
 Colours are attributes, so that programs without style sheets also draw the chart. `chart.css` adds a dark scheme.
 """
@@ -26,7 +26,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 48, 18, 34, 40  # margins of a panel around its a
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A mapping from values to pixels. With `log`, the values must be above 0."""
+    """A mapping from values to pixels. With `log`, values must be above 0."""
 
     first: float
     last: float
@@ -44,7 +44,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """The rectangle of a panel."""
+    """The rectangle of a chart in a picture."""
 
     x: float
     y: float
@@ -53,17 +53,17 @@ class Area:
 
     @property
     def across(self) -> tuple[float, float]:
-        """Start and end of a horizontal axis."""
+        """The start and end of a horizontal axis in pixels."""
         return self.x + _LEFT, self.x + self.width - _RIGHT
 
     @property
     def up(self) -> tuple[float, float]:
-        """Start and end of a vertical axis."""
+        """The start and end of a vertical axis in pixels."""
         return self.y + self.height - _BOTTOM, self.y + _TOP
 
 
 def grid(count: int, columns: int, top: float, height: float) -> list[Area]:
-    """Return the rectangles of panels, row by row, below `top`."""
+    """Return the rectangles for `count` charts below `top`, row by row."""
     width = (WIDTH - 2 * MARGIN) / columns
     return [Area(MARGIN + at % columns * width, top + at // columns * height, width, height) for at in range(count)]
 
@@ -81,7 +81,7 @@ def share_axis(place: tuple[float, float]) -> Axis:
 
 
 def log_axis(first: float, last: float, place: tuple[float, float], most: int = 6) -> Axis:
-    """Return an axis that covers `first` to `last`, with at most `most` ticks.
+    """Return a logarithmic axis that covers `first` to `last`, with at most `most` ticks.
 
     The ticks are powers of ten, with further values between them if there is room.
     """
@@ -97,15 +97,15 @@ def log_axis(first: float, last: float, place: tuple[float, float], most: int = 
 
 
 def step(span: float, most: int) -> float:
-    """Return the smallest round step (1, 2, 2.5 or 5 times a power of ten) that divides the span into at most `most`
-    steps.
+    """Return the smallest round step (1, 2, 2.5 or 5 times a power of ten) that needs at most `most` steps for
+    `span`.
     """
     unit: float = 10.0 ** math.floor(math.log10(span / most))
     return next(factor * unit for factor in (1, 2, 2.5, 5, 10) if factor * unit * most >= span * (1 - 1e-9))
 
 
 def frame(title: str, across: Axis, up: Axis, across_texts: Iterable[str], up_texts: Iterable[str]) -> Markup:
-    """Draw a panel's title, grid lines and ticks."""
+    """Draw the title, grid lines and ticks of a chart."""
     parts = [
         Markup('<text x="{}" y="{}" font-weight="600" fill="{}">{}</text>').format(
             n(across.start - _LEFT + 4), n(up.end - _TOP + 16), INK, title
@@ -128,7 +128,7 @@ def frame(title: str, across: Axis, up: Axis, across_texts: Iterable[str], up_te
 
 
 def line(points: Iterable[tuple[float, float]], number: int) -> Markup:
-    """Draw a line through these points, in the colour and dashes of the panel's line `number`."""
+    """Draw a line through these points, with the colour and dashes of line number `number`."""
     dash = DASHES[number % len(DASHES)]
     return Markup('<path class="line" d="M{}" stroke="{}" stroke-width="2" stroke-linejoin="round"{}/>').format(
         "L".join(f"{n(x)} {n(y)}" for x, y in points),
@@ -154,7 +154,7 @@ def name(x: float, y: float, anchor: str, number: int, text: str) -> Markup:
 def document(
     height: float, heading: str, about: str, description: str, panels: Iterable[Markup], foot: str, *, ids: str = ""
 ) -> str:
-    """Return a file of its own, which refers to nothing.
+    """Return a complete SVG file, which needs no other files.
 
     `description` describes the picture in words. `ids` is a prefix that makes the IDs unique on a page with several
     pictures.
@@ -191,7 +191,7 @@ def document(
 
 
 def n(number: float) -> str:
-    """Format a coordinate to a tenth of a pixel."""
+    """Format a coordinate in pixels with one decimal."""
     return f"{number:.1f}".removesuffix(".0")
 
 

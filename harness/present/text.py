@@ -1,4 +1,4 @@
-"""Values as text: for people, for a terminal, and for Markdown."""
+"""Convert values to text for readers, for a terminal, and for Markdown."""
 
 import json
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ MAX_WORD = 120
 
 
 def moment(timestamp_us: int) -> str:
-    """Format a block's timestamp to the millisecond."""
+    """Return a block's timestamp as text, with milliseconds."""
     if _EPOCH_FROM_US <= timestamp_us <= _LAST_EPOCH_US:
         at = datetime.fromtimestamp(timestamp_us // 1_000_000, UTC)
         return f"{at:%Y-%m-%d %H:%M:%S}.{timestamp_us // 1000 % 1000:03d} UTC"
@@ -23,7 +23,7 @@ def moment(timestamp_us: int) -> str:
 
 
 def started(text: Any) -> str:
-    """Format an ISO 8601 time as date, time and zone. Any other text is returned unchanged."""
+    """Return an ISO 8601 time as date, time and zone. Any other text is returned unchanged."""
     try:
         at = datetime.fromisoformat(str(text))
     except ValueError:
@@ -32,17 +32,17 @@ def started(text: Any) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Format mission or wall time in seconds: "45 s", "1200 s"."""
+    """Return a number of seconds as text, such as "45 s" or "1200 s"."""
     return f"{_shortest(seconds)}\u00a0s"
 
 
 def percent(share: float) -> str:
-    """Format a share from 0 to 1, such as "12.5 %"."""
+    """Return a share from 0 to 1 as text, such as "12.5 %"."""
     return f"{_shortest(100 * share)}\u00a0%"
 
 
 def value(anything: Any) -> str:
-    """Format a JSON value for a table cell."""
+    """Return a JSON value as text for a table cell."""
     if anything is None:
         return "\u2013"
     if isinstance(anything, bool):
@@ -55,7 +55,7 @@ def value(anything: Any) -> str:
 
 
 def label(key: str) -> str:
-    """Turn a JSON key into a label: real_time_factor -> real time factor."""
+    """Convert a JSON key to a label: "real_time_factor" becomes "real time factor"."""
     return key.replace("_", " ")
 
 
@@ -64,12 +64,12 @@ def _shortest(number: float) -> str:
 
 
 def row(fields: Iterable[str]) -> str:
-    """Return a row of a Markdown table. The fields are Markdown."""
+    """Return a row of a Markdown table. The fields may contain Markdown."""
     return f"| {' | '.join(fields)} |"
 
 
 def escaped(text: str) -> str:
-    """Return the text as literal Markdown on one line."""
+    """Return the text as Markdown that shows it literally on one line."""
     line = " ".join(text.splitlines())
     return "".join(f"\\{character}" if character in "\\`*_{}[]<>#|~&" else character for character in line)
 
@@ -78,12 +78,12 @@ _CONTROL = dict.fromkeys((*range(32), *range(127, 160)), "�")
 
 
 def shown(words: str, style: str = "") -> Text:
-    """Return one line of text. Control characters become replacement characters."""
+    """Return the text as one line. Control characters are replaced by visible characters."""
     return Text(words.translate(_CONTROL), style=style)
 
 
 def did_you_mean(word: object, allowed: Iterable[object]) -> str:
-    """Return "; did you mean `loss_15`?" with the nearest of the allowed words. Empty if none is near."""
+    """Return a hint such as "; did you mean `loss_15`?" with the most similar allowed word, or an empty text."""
     from difflib import get_close_matches  # imported late, because only errors need it
 
     nearest = get_close_matches(str(word)[:MAX_WORD], map(str, allowed), n=1)

@@ -1,4 +1,5 @@
-"""UCP in pytest: the fixtures `swarm` and `scenario`. Scenarios with an `expect:` section and stories are tests.
+"""Provide the pytest fixtures `swarm` and `scenario`. Scenarios with an `expect:` section, and stories, also become
+tests.
 
 pytest loads this module in every session, so it imports the rest of the harness only when a test uses a fixture.
 """
@@ -99,7 +100,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 @pytest.fixture
 def swarm(request: pytest.FixtureRequest) -> Iterator[Swarm]:
-    """A swarm that the test controls: five agents without loss, unless a marker changes that."""
+    """Provide a swarm that the test controls. It has five agents and no loss, unless a marker changes that."""
     from harness.pytest_plugin._fixtures import swarm_for
 
     yield from swarm_for(request.node)
@@ -107,7 +108,7 @@ def swarm(request: pytest.FixtureRequest) -> Iterator[Swarm]:
 
 @pytest.fixture
 def scenario(request: pytest.FixtureRequest) -> Iterator[Findings]:
-    """The verdicts and figures of one run of the scenario that the marker `scenario` names."""
+    """Provide the verdicts and figures of one run of the scenario in the marker `scenario`."""
     from harness.pytest_plugin._fixtures import scenario_for
 
     yield from scenario_for(request.node)
@@ -115,7 +116,7 @@ def scenario(request: pytest.FixtureRequest) -> Iterator[Findings]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None]:
-    """Judge the run at the end of its test, not in the teardown. A violation is then a failure of the test."""
+    """Judge the run as a part of its test, and not after it. A violation is then a failure of the test."""
     try:
         yield
     except Exception:

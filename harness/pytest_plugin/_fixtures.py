@@ -1,4 +1,4 @@
-"""The implementation of the fixtures `swarm` and `scenario`, imported when a test uses one of them."""
+"""Implement the fixtures `swarm` and `scenario`. This module is imported when a test uses one of them."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +22,7 @@ DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1}
 
 
 def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
-    """Yield the swarm of a test. `Trial` ends and judges the run. If the test is aborted, the run ends here."""
+    """Yield the swarm of a test. If the test is aborted, the run ends here."""
     with one_sentence():
         options = Options.of(node.config)
         keys = {**DEFAULTS, "name": node.name[:200], "vehicles": {"kind": "none"}}
@@ -43,7 +43,7 @@ def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
 
 
 def scenario_for(node: pytest.Item) -> Iterator[Findings]:
-    """Play the scenario that the marker names, and yield its findings."""
+    """Play the scenario that the marker names, and yield its verdicts and figures."""
     with one_sentence():
         options = Options.of(node.config)
         path, keys = _marked(node)
@@ -79,7 +79,7 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
 
 
 def _backend_and_seed(backend: Any, seed: Any, options: Options) -> tuple[BackendName, int]:
-    """Return the values of the command line, or else those of the marker. Raises ScenarioError."""
+    """Return the backend and seed from the command line, or else from the marker. Raises ScenarioError."""
     if backend not in BACKEND_NAMES:
         *names, last = map(repr, BACKEND_NAMES)
         raise ScenarioError(f"`backend` is {backend!r}: use {', '.join(names)} or {last}")

@@ -1,4 +1,4 @@
-"""Scenarios and stories as pytest items: one for each backend and seed."""
+"""Turn scenarios and stories into tests, one for each backend and seed."""
 
 from collections.abc import Iterator
 from difflib import unified_diff
@@ -39,7 +39,7 @@ class ScenarioFile(pytest.File):
 
 
 class ScenarioItem(pytest.Item):
-    """One run of a scenario. `pytest_runtest_call` judges it, like the run of every test."""
+    """The test of one run of a scenario. `pytest_runtest_call` judges the run."""
 
     def __init__(self, *, scenario: Scenario, backend: BackendName, seed: int, **node: Any) -> None:
         super().__init__(**node)
@@ -80,7 +80,7 @@ class StoryFile(pytest.File):
 
 
 class StoryItem(pytest.Item):
-    """One run of a story. `pytest_runtest_call` judges it, like the run of every test."""
+    """The test of one run of a story. `pytest_runtest_call` judges the run."""
 
     def __init__(self, *, play: Story, backend: BackendName, **node: Any) -> None:
         super().__init__(**node)
@@ -130,13 +130,13 @@ class StoryItem(pytest.Item):
             pytest.fail(f"{self.path} cannot be written: {error.strerror}", pytrace=False)
 
     def _played_text(self, archive: RunArchive) -> str:
-        """Return the text of the story with the answers of this run."""
+        """Return the text of the story with the reactions of agents in this run."""
         narrator = Narrator(archive.traces, self._story.scenario.roster)
         answers = [narrator.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
         return self._story.with_answers(answers)
 
     def _unknown_word(self, archive: RunArchive) -> str | None:
-        """Return a description of the first word of a trace that stories do not know, or None."""
+        """Return a description of the first name in a trace that stories do not support, or None."""
         for agent_id, trace in archive.traces.items():
             if unknown := first_unknown(unknown_names(trace.runs)):
                 return f"{unknown} in the trace of agent {agent_id}"

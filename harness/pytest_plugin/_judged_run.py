@@ -1,4 +1,4 @@
-"""The run of a test: its directory, its verdict, and the comparison with the scenario's expectations."""
+"""Judge the run of a test, and compare it with the scenario's expectations."""
 
 import re
 import shlex
@@ -23,7 +23,7 @@ from harness.scenario.expect import Expect
 
 
 class Trial:
-    """A run of a test. `finish` ends the run and judges it. If its argument is true, the agents settle first."""
+    """The run of a test. `finish` ends and judges it. If its argument is true, it waits until the agents are idle."""
 
     def __init__(self, scenario: Scenario, finish: Callable[[bool], Run]) -> None:
         self._expect = scenario.expect or Expect()
@@ -32,7 +32,7 @@ class Trial:
         self.passed = False
 
     def end_of_test(self) -> None:
-        """Raise pytest's Failed if the run differs from its expectations."""
+        """Raise pytest's exception Failed if the run differs from its expectations."""
         try:
             finished = self._finish(True)
         except HarnessError as error:
@@ -44,7 +44,7 @@ class Trial:
         self.passed = True
 
     def end_of_failed_test(self) -> str:
-        """Return the findings about the run, which are printed beside the failure of the test."""
+        """Return the findings about the run as text, to print them together with the failure of the test."""
         try:
             finished = self._finish(False)
         except HarnessError as error:
@@ -80,7 +80,7 @@ class Trial:
 
 
 def _report_lines(finished: Run) -> list[str]:
-    """Return the path of the report, and the command that plays the run again."""
+    """Return lines with the path of the report, and the command that plays the run again."""
     again = shlex.join(["ucp-harness", "run", str(finished.directory), "--backend", str(finished.record.backend)])
     return [f"report: {finished.report}", f"again, with seed {finished.record.seed}: {again}"]
 
@@ -103,7 +103,7 @@ MAX_NAME = 100
 
 
 def new_directory(node: pytest.Item, options: Options) -> Path:
-    """Create an empty directory for a run of this test. Raises RunDirectoryError."""
+    """Create an empty directory for the run of this test. Raises RunDirectoryError."""
     name = re.sub(r"\W+", "-", node.nodeid).strip("-")[-MAX_NAME:]
     if options.keep is None:
         factory = node.config._tmp_path_factory  # type: ignore[attr-defined] # items of YAML files have no fixtures
@@ -121,6 +121,6 @@ def new_directory(node: pytest.Item, options: Options) -> Path:
 
 
 def discard(directory: Path, options: Options) -> None:
-    """Remove the directory of a run without unexpected findings, except with `--ucp-keep`."""
+    """Remove the directory of a run without unexpected findings, unless the option `--ucp-keep` is set."""
     if options.keep is None:
         shutil.rmtree(directory, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""`--ucp-kernel uml`: run the whole session in User Mode Linux, which has netem and needs no root."""
+"""Implement `--ucp-kernel uml`, which runs all tests in User Mode Linux. It supports netem and needs no root."""
 
 import os
 import shutil
@@ -16,7 +16,7 @@ from netem.errors import UmlError
 
 
 def session_inside(config: pytest.Config) -> int | None:
-    """Run the session in User Mode Linux with the same command line, and return its exit status.
+    """Run all tests in User Mode Linux with the same command line, and return the exit status.
 
     Return None if the session already runs inside, or if User Mode Linux is missing. In the latter case,
     `refuse_outside` skips single tests. The files of failed tests are kept after the guest has ended.
@@ -37,7 +37,7 @@ def session_inside(config: pytest.Config) -> int | None:
 
 
 def refuse_outside(backend: BackendName) -> None:
-    """Raise MachineError if this backend needs User Mode Linux, and it is missing. Virtual time needs no kernel."""
+    """Raise MachineError if this backend needs User Mode Linux and the tests do not run in it."""
     if in_virtual_time(backend):
         return
     if why := BACKENDS[backend].not_in_uml:

@@ -1,4 +1,4 @@
-"""A mission that a test controls: its timeline grows action by action during the run.
+"""Play a mission that a test controls. Each action of the test is added to the timeline during the run.
 
 The actions come from another thread than the one of the mission's loop. Real processes therefore run on, and vehicles
 fly, while the test computes or stops in a debugger. Each action that changes something becomes an entry of the
@@ -34,7 +34,7 @@ Action = Callable[[mission.Swarm], Awaitable[Any]]
 
 
 class LiveTimeline(GrowingTimeline):
-    """Plays the mission and performs actions.
+    """Plays the mission and performs the actions of the test.
 
     `play` runs in the thread of the loop, and `started` is set when the mission begins. `queue_action` queues an
     action.
@@ -69,11 +69,11 @@ class LiveTimeline(GrowingTimeline):
         self._actions.put_nowait((action, answer))
 
     def stop(self) -> None:
-        """End the queue of actions."""
+        """Accept no further actions."""
         self._actions.put_nowait(None)
 
     async def change(self, swarm: mission.Swarm, **entry: Any) -> float:
-        """Apply an entry of a timeline now. Return its `at_s`. Raises ScenarioError if it is impossible."""
+        """Apply an entry of a timeline now, and return its `at_s`. Raises ScenarioError if that is impossible."""
         at_s = self.next_instant(swarm)
         before, document = self.scenario, self.scenario.model_dump()
         document["timeline"].append({"at_s": at_s, **entry})
@@ -88,7 +88,7 @@ class LiveTimeline(GrowingTimeline):
         return at_s
 
     async def undo(self, swarm: mission.Swarm, at_s: float) -> None:
-        """End the network change with this `at_s` now, if it has not ended before."""
+        """End the network change that began at `at_s`, if it has not ended before."""
         document = self.scenario.model_dump()
         (entry,) = (entry for entry in document["timeline"] if entry["at_s"] == at_s)
         over_s = _next_instant(max(swarm.now(), self._played_s))
@@ -108,7 +108,7 @@ class LiveTimeline(GrowingTimeline):
         self._completed = await swarm.completed()
 
     async def hold(self, swarm: mission.Swarm, **which: Any) -> int:
-        """Delay the messages that match these keys from now on. Return the number of the fate. Raises ScenarioError."""
+        """Hold back matching messages from now on. Return the number of this rule. Raises ScenarioError."""
         if unknown := next((key for key in which if key not in HOLDABLE), None):
             raise ScenarioError(f"`{unknown}` is unknown: use one of {', '.join(HOLDABLE)}")
         if which in self._holds.values():
@@ -127,7 +127,7 @@ class LiveTimeline(GrowingTimeline):
         return number
 
     async def release(self, swarm: mission.Swarm, **which: Any) -> None:
-        """Deliver the messages of one hold, or of all holds without keys.
+        """Deliver the messages held back by one rule, or by all rules if no keys are given.
 
         Raises ScenarioError if there is no such hold.
         """
@@ -138,7 +138,7 @@ class LiveTimeline(GrowingTimeline):
             await self.let_go(swarm, number)
 
     async def let_go(self, swarm: mission.Swarm, number: int) -> None:
-        """End this hold, if it is still active."""
+        """Deliver the messages held back by this rule, if it is still active."""
         if self._holds.pop(number, None) is None:
             return
         document = self.scenario.model_dump()
@@ -148,7 +148,7 @@ class LiveTimeline(GrowingTimeline):
         await swarm.release(number, self.scenario.fates[number])
 
     async def until_run(self, swarm: mission.Swarm, sought: SoughtRun, limit_s: float) -> int | None:
-        """Continue until an agent runs this handler and branch. Return its ID, or None after `limit_s`.
+        """Continue until an agent runs this handler and branch. Return its ID, or None at `limit_s`.
 
         Raises ScenarioError for an unknown handler, branch or agent.
         """
@@ -182,7 +182,7 @@ class LiveTimeline(GrowingTimeline):
         await self.until(swarm, mission_s)
 
     async def until_idle(self, swarm: mission.Swarm, limit_s: float) -> RunOutcome | None:
-        """Continue until all agents have voted since the last action and are idle. Return None after `limit_s`.
+        """Continue until all agents have voted since the last action and are idle. Return None at `limit_s`.
 
         The snapshot is taken while no chain changes, because real processes run on. Only a vote shows an agent that its
         chain differs from the others' (Section 3.2).
@@ -215,7 +215,7 @@ class LiveTimeline(GrowingTimeline):
         return silent
 
     async def end(self, swarm: mission.Swarm, *, reconcile_finally: bool) -> None:
-        """End the mission, if it has not ended. Raises ScenarioError if a second final reconcile is requested."""
+        """End the mission if it has not ended. Raises ScenarioError if a second final reconcile is requested."""
         if swarm.played.final_reconcile is not None:
             if reconcile_finally:
                 raise ScenarioError("the final reconcile is over: a mission has one, at its end")
@@ -229,7 +229,7 @@ class LiveTimeline(GrowingTimeline):
         await mission.settle(swarm, self.scenario)
 
     async def break_off(self, swarm: mission.Swarm) -> None:
-        """End the mission here, so that the recorded scenario ends at the moment at which the test failed.
+        """End the mission now, because the test failed. The recorded scenario also ends here.
 
         A scenario lasts at least as long as its timeline. If a change lasts longer, the recorded duration stays.
         """
@@ -245,7 +245,7 @@ class LiveTimeline(GrowingTimeline):
 
 
 def _next_instant(mission_s: float) -> float:
-    """Return a slightly later time, at which all earlier messages have been sent."""
+    """Return a slightly later time, by which all earlier messages have been sent."""
     return round(mission_s + INSTANT_S, 3)
 
 
@@ -254,7 +254,7 @@ def _until(mission_s: float) -> dict[str, float]:
 
 
 def _in_words(which: dict[str, Any]) -> str:
-    """Return the keys as a test writes them."""
+    """Return the keys in the notation of a test."""
     return ", ".join(f"{key}={value!r}" for key, value in which.items()) or "every message"
 
 
@@ -263,7 +263,7 @@ def _ids(agents: Iterable[int]) -> str:
 
 
 def _entry(at_s: float, keys: dict[str, Any]) -> TimelineEntry:
-    """Return the validated entry. Raises ScenarioError."""
+    """Return a validated timeline entry. Raises ScenarioError."""
     try:
         return TimelineEntry.model_validate({"at_s": at_s, **keys})
     except ValidationError as error:

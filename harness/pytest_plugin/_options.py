@@ -1,4 +1,4 @@
-"""Command-line options of pytest for runs. They override the values of tests and scenarios."""
+"""Define pytest's command-line options for runs. They replace the values in tests and scenarios."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from harness.scenario.load import parse
 
 @dataclass(frozen=True)
 class Options:
-    """The options of a session. An option that is not given is None."""
+    """The options of a pytest session. An option that is not given is None."""
 
     backend: BackendName | None
     seed: int | None
@@ -31,7 +31,7 @@ class Options:
 
     @classmethod
     def of(cls, config: pytest.Config) -> "Options":
-        """Return the options of a session. Raises ScenarioError."""
+        """Return the options of a pytest session. Raises ScenarioError."""
         backend, seed, speedup, keep = (
             config.getoption(f"--ucp-{name}") for name in ("backend", "seed", "speedup", "keep")
         )
@@ -49,7 +49,7 @@ class Options:
         )
 
     def applied_to(self, scenario: Scenario) -> Scenario:
-        """Return the scenario with these options applied. Raises ScenarioError."""
+        """Return the scenario changed by these options. Raises ScenarioError."""
         document = scenario.model_dump()
         if self.speedup is not None:
             document["speedup"] = self.speedup
@@ -59,7 +59,7 @@ class Options:
         return parse(document) if document != scenario.model_dump() else scenario
 
     def refuse(self, backend: BackendName) -> None:
-        """Raise MachineError if the backend cannot play in the requested kernel."""
+        """Raise MachineError if the backend cannot be used with the requested kernel."""
         if self.in_uml:
             from harness.pytest_plugin._kernel_option import refuse_outside
 

@@ -1,4 +1,4 @@
-"""The key under which a test item stores its run."""
+"""Define the key under which pytest stores the run of a test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decide which YAML files are scenarios with expectations.
+"""Decide which YAML files are scenarios that contain expectations.
 
 Other files are not parsed, because a project has many of them.
 """
@@ -18,7 +18,7 @@ EMPTY_SECTION = re.compile(rb"[ \t]*(?:\{[ \t]*\})?[ \t]*(?:#.*)?\s*")
 
 
 def is_selected(path: Path, config: pytest.Config) -> bool:
-    """Return whether a test path or a path on the command line contains the file; `pytest .` names the root."""
+    """Return true if a path that pytest was given contains the file. `pytest .` names the root."""
     if PLACES not in config.stash:
         config.stash[PLACES] = _places(config)
     return any(path.is_relative_to(place) for place in config.stash[PLACES])
@@ -34,13 +34,13 @@ def _places(config: pytest.Config) -> list[Path]:
 
 
 def _matching(root: Path, pattern: str) -> Iterable[Path]:
-    """Return the paths that match a test path, which may be a pattern."""
+    """Return the paths that match a path in pytest's configuration, which may be a pattern."""
     path = root / pattern
     return [path] if path.exists() else root.glob(pattern)
 
 
 def is_expectation_scenario(path: Path) -> bool:
-    """Return whether the file looks like a scenario with an `expect` section, judged by its top-level keys.
+    """Return true if the file looks like a scenario with an `expect` section, judged by its top-level keys.
 
     The section must contain one of its keys. If it is empty, all top-level keys must be keys of a scenario. If its keys
     are misspelt, the file must also have more keys than `name` and `expect`, because tests of other tools have these

@@ -1,4 +1,4 @@
-"""Verdicts and figures of a run, for tests."""
+"""Provide the verdicts and figures of a run for tests."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ EVIDENCE_SHOWN = 5
 
 @dataclass(frozen=True, repr=False)
 class JudgementInTest:
-    """A verdict under its number or key. In a failing assert, its text contains the reason."""
+    """A verdict with its number or key. In a failing assert, its text contains the reason."""
 
     key: str
     name: str
@@ -29,19 +29,19 @@ class JudgementInTest:
 
     @property
     def title(self) -> str:
-        """ "characteristic 6, one uniform chain" or "steps"."""
+        """The title of the check, such as "characteristic 6, one uniform chain" or "steps"."""
         return self.key if self.key in FURTHER_CHECKS else f"characteristic {self.key}, {self.name}"
 
     @property
     def holds(self) -> bool:
-        """True for the good verdict: `holds`, `as specified`, `agree` or `finished`."""
+        """True if the verdict is `holds`, `as specified`, `agree` or `finished`."""
         return kind_of(self.verdict) == "good"
 
     def __repr__(self) -> str:
         return f"<{self.title}: {self.verdict}: {self.reason}>"
 
     def lines(self) -> list[str]:
-        """Return the verdict as one line, followed by its evidence."""
+        """Return the verdict as one line of text, followed by its evidence."""
         lines = [f"{self.title}: {self.verdict}: {self.reason}"]
         lines += [f"    agent {finding.agent_id}: {finding.detail}" for finding in self.evidence[:EVIDENCE_SHOWN]]
         if len(self.evidence) > EVIDENCE_SHOWN:
@@ -51,7 +51,7 @@ class JudgementInTest:
 
 @dataclass(frozen=True, repr=False)
 class Findings:
-    """The value of the fixture `scenario`: the run directory and the verdict, at the end of the run or during it."""
+    """The value of the fixture `scenario`: the directory and the verdicts of a run."""
 
     directory: Path
     result: Result
@@ -68,7 +68,7 @@ class Findings:
         return JudgementInTest.of(str(number), characteristic)
 
     def judgement(self, key: str) -> JudgementInTest:
-        """Return the verdict on `steps`, `records` or `liveness`. Raises ScenarioError for another key."""
+        """Return the verdict on `steps`, `records` or `liveness`. Raises ScenarioError for any other key."""
         __tracebackhide__ = True
         judgement = self.result.beside.get(key)
         if judgement is None:
@@ -77,11 +77,11 @@ class Findings:
 
     @property
     def figures(self) -> dict[str, float | int | None]:
-        """The figures of run.json, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
+        """The figures in run.json, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
         return self.result.figures
 
     def chain(self, agent: int) -> list[str]:
-        """Return the names of the blocks in the agent's chain, such as "4.11", oldest first.
+        """Return the names of the blocks in the agent's chain, such as "4.11". The oldest is first.
 
         Raises ScenarioError if the agent has left no chain.
         """
@@ -94,5 +94,5 @@ class Findings:
 
     @property
     def report(self) -> Path:
-        """The path of the report. It exists after the test, if the test failed or with `--ucp-keep`."""
+        """The path of the report. It exists after the test if the test failed, or if `--ucp-keep` is set."""
         return self.directory / "report.html"

@@ -1,4 +1,4 @@
-"""The fixture `swarm`: a swarm on any backend that a test controls, action by action, in mission seconds."""
+"""Provide the fixture `swarm`: a swarm on any backend that a test controls step by step, in mission seconds."""
 
 import asyncio
 import math
@@ -31,11 +31,13 @@ _VERBS = [*(kind.what for kind in TIMELINE_FAULTS), *INJECTIONS]
 
 
 class RunEndedError(Exception):
-    """The run ended before the test, because an agent, a vehicle or the machine failed."""
+    """An error: the run ended before the test, because an agent, a vehicle or the machine failed."""
 
 
 class _Block(AbstractContextManager[None]):
-    """The result of an action, for `with`. It undoes the action at the end of the block, unless the block failed."""
+    """The result of an action, for use with `with`. At the end of the block it undoes the action, unless the block
+    failed.
+    """
 
     def __init__(self, undo: Callable[[], object]) -> None:
         self._undo = undo
@@ -47,7 +49,7 @@ class _Block(AbstractContextManager[None]):
 
 
 class Swarm:
-    """The value of the fixture `swarm`: agents on any backend that a test controls.
+    """The value of the fixture `swarm`: agents on any backend, controlled by a test.
 
     Times are mission seconds, and agents are named by their IDs. Between two calls virtual time stands still. Real
     processes go on, and faults that are due in the meantime happen at the next call. Queries between two actions are
@@ -89,7 +91,7 @@ class Swarm:
                 raise
 
     def partition(self, *groups: list[int], for_s: float | None = None) -> AbstractContextManager[None]:
-        """Cut the groups of agents off from each other. Agents in no group form another group.
+        """Separate the groups of agents from each other. Agents in no group form another group.
 
         `with swarm.partition([1, 2]):` heals at the end of its block.
         """
@@ -108,7 +110,7 @@ class Swarm:
         self._change(heal=True)
 
     def loss(self, probability: float, for_s: float | None = None) -> AbstractContextManager[None]:
-        """Let every receiver lose each message with this probability, 0 to 1.
+        """Let every receiver lose each message with this probability, from 0 to 1.
 
         This and the conditions below last for `for_s` mission seconds, or until the end of a `with` block
         (`with swarm.loss(0.5):`), or for the rest of the run.
@@ -117,7 +119,7 @@ class Swarm:
         return self._for_a_block(loss=probability, for_s=for_s)
 
     def network(self, for_s: float | None = None, **keys: Any) -> AbstractContextManager[None]:
-        """Set keys of a scenario's `network`: `network(delay=0.2, receivers={3: {"loss": 1}})`."""
+        """Set keys of a scenario's section `network`: `network(delay=0.2, receivers={3: {"loss": 1}})`."""
         __tracebackhide__ = True
         return self._for_a_block(network=keys, for_s=for_s)
 
@@ -130,7 +132,7 @@ class Swarm:
         for_s: float | None = None,
         **keys: Any,
     ) -> AbstractContextManager[None]:
-        """Set the conditions from one agent to another: `link(1, 2, loss=0.9)`.
+        """Set the network conditions from one agent to another: `link(1, 2, loss=0.9)`.
 
         `both` includes the opposite direction.
         """
@@ -140,7 +142,7 @@ class Swarm:
         return self.network(for_s, links=[{"from": sender, "to": receiver, "both": both, **keys}])
 
     def hold(self, message: str | None = None, **which: Any) -> AbstractContextManager[None]:
-        """Delay matching messages until `release`, in virtual time only.
+        """Hold back matching messages until `release` is called. This only works in virtual time.
 
         Messages match by `message`, `sender`, `receiver`, `block` and `count`, as in a scenario's `fates`. A criterion
         that is not given matches all. The end of `with swarm.hold("Commit Block", sender=2):` releases the messages,
@@ -152,12 +154,12 @@ class Swarm:
         return _Block(partial(self._act, lambda swarm: self._timeline.let_go(swarm, number)))
 
     def release(self, message: str | None = None, **which: Any) -> None:
-        """Deliver the messages that `hold` delays by these criteria, or all delayed messages."""
+        """Deliver the messages that `hold` holds back by these criteria, or all such messages."""
         __tracebackhide__ = True
         self._act(lambda swarm: self._timeline.release(swarm, **_of_message(message, which)))
 
     def __getattr__(self, verb: str) -> Callable[..., None]:
-        """Return the method of a fault or an injection; it takes the keys of its timeline entry.
+        """Return the method for a fault or an injection. Its arguments are the keys of a timeline entry.
 
         Faults: `kill(2, 4)`, `reboot(3, down_s=10)`. Injections: `replay("Commit Block", sender=2, count=3)`,
         `flood(for_s=10, per_s=50)`.
@@ -180,32 +182,32 @@ class Swarm:
         return [*super().__dir__(), *_VERBS]
 
     def _inject(self, verb: str, message: str | None = None, **keys: Any) -> None:
-        """Let the rogue node send this from now on."""
+        """Let the rogue node (a sender outside the swarm) send this from now on."""
         __tracebackhide__ = True
         self._change(**{verb: _of_message(message, keys)})
 
     @property
     def now_s(self) -> float:
-        """Mission seconds since the start."""
+        """The number of mission seconds since the start."""
         __tracebackhide__ = True
         return float(self._run_action(_now))
 
     def run_for(self, seconds: float) -> None:
-        """Let the mission go on for `seconds` mission seconds."""
+        """Continue the mission for this number of mission seconds."""
         __tracebackhide__ = True
         if not 0 <= seconds < math.inf:
             raise ScenarioError(f"a mission cannot run for {seconds:g} s: use a time above 0")
         self._act(lambda swarm: self._timeline.until(swarm, swarm.now() + seconds))
 
     def run_until(self, mission_s: float) -> None:
-        """Let the mission go on until `mission_s`, a mission second in the future."""
+        """Continue the mission until `mission_s`, a mission second in the future."""
         __tracebackhide__ = True
         self._act(lambda swarm: self._timeline.from_now_until(swarm, mission_s))
 
     def wait_for(
         self, handler: str, branch: str | None = None, agent: int | None = None, limit_s: float = 1800.0
     ) -> int:
-        """Let the mission go on until an agent runs this handler, with this branch if given. Return the agent's ID.
+        """Continue the mission until an agent runs this handler, with this branch if given. Return the agent's ID.
 
         A run that the last action caused counts. Names are those of traces (ucp/contract/HANDLERS.md). Raises
         AssertionError if no agent runs it within `limit_s` mission seconds.
@@ -222,7 +224,7 @@ class Swarm:
         return int(found)
 
     def wait_idle(self, limit_s: float = 1800.0) -> None:
-        """Let the mission go on until all agents are idle after the last action.
+        """Continue the mission until all agents are idle after the last action.
 
         Each running agent must also have proposed a block of its own since that action. Raises AssertionError if this
         takes longer than `limit_s` mission seconds.
@@ -234,30 +236,30 @@ class Swarm:
         self._seen = self._judge_by_now(played)
 
     def final_reconcile(self) -> None:
-        """End the mission: stop events, lift all conditions, and let one agent after another reconcile."""
+        """End the mission: stop events, remove all network conditions, and let each agent in turn reconcile."""
         __tracebackhide__ = True
         self._act(lambda swarm: self._timeline.end(swarm, reconcile_finally=True))
 
     # Queries
 
     def characteristic(self, number: int) -> JudgementInTest:
-        """Return the verdict by now on a characteristic, 1 to 6: `holds`, `verdict`, `reason` and `evidence`."""
+        """Return the present verdict on a characteristic, 1 to 6: `holds`, `verdict`, `reason` and `evidence`."""
         __tracebackhide__ = True
         return self._findings().characteristic(number)
 
     def judgement(self, key: str) -> JudgementInTest:
-        """Return the verdict by now on `steps`, `records` or `liveness`."""
+        """Return the present verdict on `steps`, `records` or `liveness`."""
         __tracebackhide__ = True
         return self._findings().judgement(key)
 
     @property
     def figures(self) -> dict[str, float | int | None]:
-        """The figures of run.json by now, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
+        """The present figures, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
         __tracebackhide__ = True
         return self._findings().figures
 
     def chain(self, agent: int) -> list[str]:
-        """Return the names of the blocks in the agent's chain, such as "4.11", oldest first."""
+        """Return the names of the blocks in the agent's chain, such as "4.11". The oldest is first."""
         __tracebackhide__ = True
         return self._findings().chain(agent)
 
@@ -268,11 +270,11 @@ class Swarm:
 
     @property
     def report(self) -> Path:
-        """The path of the report. It exists after the test, if the test failed or with `--ucp-keep`."""
+        """The path of the report. It exists after the test if the test failed, or if `--ucp-keep` is set."""
         return self.directory / "report.html"
 
     def _findings(self) -> Findings:
-        """Return the findings at the first query after the last action, or at the end of `wait_idle`."""
+        """Return the verdicts and figures, computed at the first query after an action."""
         __tracebackhide__ = True
         if self._seen is None:
             self._seen = self._judge_by_now(self._run_action(_snapshot))
@@ -311,7 +313,7 @@ class Swarm:
             self._loop.call_soon_threadsafe(callback, *arguments)
 
     def finish(self, settle: bool) -> Run:
-        """End the run and judge it: after the agents have settled if `settle` is true, otherwise at once.
+        """End the run and judge it. If `settle` is true, first wait until the agents are idle.
 
         Raises MachineError.
         """

@@ -1,1 +1,1 @@
-"""Functions that play and judge a scenario: one run in a directory or in memory, or many runs on all cores."""
+"""Play and judge a scenario: one run in a directory or in memory, or many runs on all processor cores."""

@@ -1,4 +1,4 @@
-"""States of the code: commits that are checked out in a clone, and processes that run with them.
+"""Check out earlier commits of the code in a clone, and run processes with them.
 
 The clone shares the objects of the repository, but has its own working tree, index and `git bisect` state. The
 repository therefore never changes. If the process is killed, only one temporary directory remains.
@@ -25,7 +25,7 @@ GRACE_S = 30.0
 
 @dataclass(frozen=True)
 class ProcessResult:
-    """The end of a process. `status` is None if the process exceeded its time limit and was stopped."""
+    """The result of a process. `status` is None if it exceeded its time limit and was stopped."""
 
     status: int | None
     stdout: str
@@ -38,9 +38,9 @@ class ProcessResult:
         return lines[-1].removeprefix("ucp-harness: ")[:300] if lines else "it said nothing"
 
     def raised_in(self, directory: Path) -> str | None:
-        """Return the exception that ended the process, with its innermost line in `directory`.
+        """Return the exception that ended the process, with its innermost source line in `directory`.
 
-        None if there is no such line.
+        Return None if there is no such line.
         """
         if "Traceback (most recent call last)" not in self.stderr:
             return None
@@ -57,7 +57,7 @@ class ProcessResult:
 def run_python(
     arguments: Sequence[str], *, first: Sequence[Path], cwd: Path, limit_s: float | None, stdin: str | None = None
 ) -> ProcessResult:
-    """Run this interpreter with the directories `first` at the beginning of the module path.
+    """Run this Python interpreter with the directories `first` at the beginning of its module path.
 
     The process has its own session. If the caller is interrupted, the process receives SIGTERM, and SIGKILL after
     GRACE_S.
@@ -106,7 +106,7 @@ def _stop(process: "subprocess.Popen[str]") -> None:
 
 @contextmanager
 def interrupted_by_sigterm() -> Iterator[None]:
-    """Treat SIGTERM like Ctrl-C in this context, so that temporary files are removed. Raises InterruptedRunError."""
+    """Treat SIGTERM like Ctrl-C inside the context, so that temporary files are removed. Raises InterruptedRunError."""
 
     def interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt
@@ -137,12 +137,12 @@ _GIT_LOCATION_VARIABLES = (
 
 
 class RepositoryError(HarnessError):
-    """The repository or the revision cannot be bisected."""
+    """An error: git cannot search this repository, or does not know the revision."""
 
 
 @dataclass(frozen=True)
 class Commit:
-    """A commit. `files` has the paths of the changed files."""
+    """A commit. `files` contains the paths of the changed files."""
 
     hash: str
     date: str
@@ -157,13 +157,13 @@ class Commit:
 
 @dataclass(frozen=True)
 class SuspectCommits:
-    """The result of a bisection: the first bad commit, or several candidates if commits could not be played."""
+    """The result of a search: the first bad commit, or several candidates if some commits could not be tested."""
 
     first: tuple[str, ...]
 
 
 class History:
-    """A clone of the repository. `tree` is its working tree."""
+    """A clone of the repository. `tree` is its working directory."""
 
     def __init__(self, repository: Path, tree: Path) -> None:
         self._repository = repository
@@ -171,7 +171,7 @@ class History:
 
     @classmethod
     def clone(cls, repository: Path, tree: Path) -> "History":
-        """Clone the repository into `tree`. Raises RepositoryError."""
+        """Clone the repository into the directory `tree`. Raises RepositoryError."""
         history = cls(repository, tree)
         top = history._git(repository, "rev-parse", "--git-common-dir").strip()
         source = str((repository / top).resolve())
@@ -179,7 +179,7 @@ class History:
         return history
 
     def resolve(self, revision: str) -> str:
-        """Return the commit hash of a revision of the repository. Raises RepositoryError."""
+        """Return the hash of the commit that a revision names. Raises RepositoryError."""
         try:
             commit_expression = f"{revision}^{{commit}}"
             return self._git(
@@ -193,15 +193,15 @@ class History:
         self._git(self.tree, "clean", "--quiet", "-xffd")
 
     def between(self, good: str, bad: str) -> int:
-        """Return the number of commits after the good one, up to the bad one."""
+        """Return the number of commits after the good one, up to and including the bad one."""
         return int(self._git(self.tree, "rev-list", "--count", f"{good}..{bad}"))
 
     def begin(self, good: str, bad: str) -> "str | SuspectCommits":
-        """Start the bisection, check out the first commit to play, and return its hash."""
+        """Start the search. Check out the first commit to test, and return its hash."""
         return self._next(self._git(self.tree, "bisect", "start", bad, good, accept=(0, 2)))
 
     def mark(self, mark: Mark) -> "str | SuspectCommits":
-        """Record the verdict on the current commit, and check out the next one.
+        """Record the verdict on the present commit, and check out the next one to test.
 
         Returns its hash, or the result of the bisection.
         """

@@ -1,4 +1,4 @@
-"""Play many tasks on all cores of this machine, with a progress bar. No process remains afterwards.
+"""Run many tasks on all processor cores of this machine, with a progress bar. Afterwards no process remains.
 
     with sweep(tasks, work, jobs, what="runs") as outcomes:
         for task, outcome in outcomes:
@@ -44,7 +44,7 @@ _PR_SET_PDEATHSIG = 1
 
 @dataclass(frozen=True, slots=True)
 class FailedTask:
-    """The outcome of a task that failed. `reason` is one sentence."""
+    """The result of a task that failed. `reason` is one sentence."""
 
     reason: str
 
@@ -58,7 +58,7 @@ def cores() -> int:
 def sweep(
     tasks: Iterable[T], work: Callable[[T], R], jobs: int, *, what: str | None = None, in_order: bool = True
 ) -> Iterator[Iterator[tuple[T, R | FailedTask]]]:
-    """Yield each task with its outcome, in the order of `tasks`, or with `in_order` false as soon as it is known.
+    """Yield each task with its result, in the order of `tasks`, or as soon as it is known if `in_order` is false.
 
     - `jobs`: number of processes. With 1, the tasks run in this process.
     - `what`: name of the tasks for a progress bar on standard error. None shows no bar.
@@ -79,7 +79,7 @@ def sweep(
 
 
 def outcome_of(work: Callable[[T], R], task: T) -> R | FailedTask | HarnessError:
-    """Return the outcome of one task. The parent process passes it to `raise_error`."""
+    """Return the result of one task. The parent process passes it to `raise_error`."""
     try:
         return work(task)
     except HarnessError as error:
@@ -91,14 +91,14 @@ def outcome_of(work: Callable[[T], R], task: T) -> R | FailedTask | HarnessError
 
 
 def raise_error(outcome: R | HarnessError) -> R:
-    """Raise the outcome if it is an error. Otherwise return it."""
+    """Raise the result of a task if it is an error. Otherwise return it."""
     if isinstance(outcome, HarnessError):
         raise outcome
     return outcome
 
 
 class Worker(Generic[T, R]):
-    """A process that answers each task with an outcome, until it is killed. It ends with this process."""
+    """A process that executes tasks until it is killed. It also ends with its parent process."""
 
     def __init__(self, work: Callable[[T], R]) -> None:
         self.connection, its_end = _FORK.Pipe()
@@ -126,7 +126,9 @@ def _serve(work: Callable[[T], R], connection: Connection, parent: int) -> None:
 
 
 class _Pool(Generic[T, R]):
-    """A pool of workers with one task each. If a worker dies, only its task fails, and a new worker replaces it."""
+    """A pool of workers that execute one task each. If a worker dies, only its task fails, and a new worker replaces
+    it.
+    """
 
     def __init__(self, work: Callable[[T], R], jobs: int, count: Callable[[Any], Any], in_order: bool) -> None:
         self._work, self._jobs, self._count, self._in_order = work, jobs, count, in_order
@@ -189,7 +191,7 @@ def _death(exit_code: int) -> str:
 
 @contextlib.contextmanager
 def signals_blocked() -> Iterator[None]:
-    """Block SIGINT and SIGTERM inside the context. A process that is forked here starts with blocked signals."""
+    """Block SIGINT and SIGTERM inside the context. A process that is forked there starts with these signals blocked."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         yield
@@ -212,7 +214,7 @@ def sigterm_as_ctrl_c() -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress_bar(what: str | None, total: int | None) -> Iterator[Callable[[Any], Any]]:
-    """Yield a function that counts the outcomes that pass through it, and shows their number.
+    """Yield a function that counts the results passed to it and shows their number.
 
     It shows a bar on a terminal, and otherwise a line every few seconds. It draws without a thread, because forking a
     process with threads is unsafe.

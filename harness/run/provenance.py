@@ -1,4 +1,4 @@
-"""The software that played and judged a run: the key `versions` of run.json, matrix.json and findings.json."""
+"""Record the versions of the software that played and judged a run, for the key `versions` of result files."""
 
 import hashlib
 import platform
@@ -43,7 +43,7 @@ MODIFIED = "-dirty"
 
 
 def same_judge(recorded: Mapping[str, str]) -> bool:
-    """Return true if these versions and the present ones are those of the same, unmodified checker."""
+    """Return true if the recorded versions and the present ones belong to the same, unmodified checker."""
     present = versions()
     return not present.get("commit", "").endswith(MODIFIED) and all(
         recorded.get(key) == present.get(key) for key in JUDGE
@@ -51,7 +51,7 @@ def same_judge(recorded: Mapping[str, str]) -> bool:
 
 
 def differing_versions(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
-    """Return the differing versions of harness, commit, core and reference in words, such as "core x and y"."""
+    """Return the versions that differ between two records, such as "core x and y"."""
     return [
         f"{key} {a.get(key, 'unknown')} and {b.get(key, 'unknown')}"
         for key in ("ucp-harness", "commit", "core", "reference")
@@ -61,14 +61,14 @@ def differing_versions(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
 
 @cache
 def _reference_version() -> str:
-    """Return the digest of the reference that judges steps."""
+    """Return a digest of the reference implementation that judges steps."""
     files = sorted(Path(reference.__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 
 @cache
 def _commit() -> str | None:
-    """Return the commit of the clone from which the harness runs. None for an installed package."""
+    """Return the git commit of the running harness, or None for an installed package."""
     if not (ROOT / ".git").exists():
         return None
     try:

@@ -1,4 +1,4 @@
-"""One run from scenario to verdict: play, check, and write the record, the report and the replay file."""
+"""Play one run completely: play the scenario, check it, and write the record, the report and the replay file."""
 
 import asyncio
 import signal
@@ -40,7 +40,9 @@ REPLAY_FILE = "replay.yaml"
 
 
 def replay_of(record: RunRecord, by_hand_s: Collection[float]) -> str:
-    """Return the text of the replay file. `by_hand_s` are the seconds of the timeline entries from a user."""
+    """Return the text of a scenario file that repeats the run. `by_hand_s` contains the times of entries that a user
+    added.
+    """
     assert record.scenario is not None
     document = record.scenario.model_dump(mode="json", exclude_defaults=True)
     timeline = [{"at_s": entry["at_s"], **entry} for entry in document["timeline"]]
@@ -58,7 +60,7 @@ def replay_of(record: RunRecord, by_hand_s: Collection[float]) -> str:
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its directory, outcome, record, verdict, and the exit status of the command line.
+    """A finished run: its directory, result, record and verdict, and the exit status for the command line.
 
     `result` is the verdict, `record` the content of run.json, `report` the path of report.html, and `wall_s` the wall
     time in seconds. `timer_lag` is the lateness of the agents' timers; it is None in virtual time, or if too few are
@@ -87,7 +89,7 @@ def run(
     delivers_all: bool = False,
     interventions: Interventions | None = None,
 ) -> Run:
-    """Play a scenario, check it, and write the run directory.
+    """Play a scenario, check it, and write the run directory. Return the finished run.
 
     - `seed`: 0 or more. It fixes events, faults and everything else that the harness draws.
     - `out`: the run directory, new or empty. Without it, a new directory under `runs/`.
@@ -131,7 +133,7 @@ def run(
 
 
 class RunRecording:
-    """The directory of a run and its record, from its start to the verdict.
+    """The directory and the record of a run, from its start to its verdict.
 
     Raises RunDirectoryError if `out` is neither new nor empty, and MachineError if the record cannot be written.
     """
@@ -154,16 +156,16 @@ class RunRecording:
         self.directory.write_record(self._record)
 
     def fail(self, error: HarnessError) -> None:
-        """Record that the run could not start."""
+        """Record that the run could not be started."""
         self._update(outcome="failed", outcome_detail=str(error))
 
     def update_scenario(self, scenario: Scenario) -> None:
-        """Record the played scenario: the original one with the requests of the user so far."""
+        """Record the played scenario, including the events that the user has requested so far."""
         self._scenario = scenario
         self._update(scenario=scenario)
 
     def record_requests(self, interventions: Interventions) -> None:
-        """Write the requests of the user so far to the record, and a scenario that plays them again."""
+        """Write the user's requests to the record so far, and a scenario that plays them again."""
         self.update_scenario(interventions.scenario)
         by_hand_s = [entry.at_s for entry in interventions.by_hand]
         replay = replay_of(self._record, by_hand_s)
@@ -173,7 +175,7 @@ class RunRecording:
             raise MachineError(f"{self.directory.path / REPLAY_FILE} cannot be written: {error.strerror}") from None
 
     def record_outcome(self, played: RunOutcome) -> None:
-        """Write the outcome so far to the record."""
+        """Write the result so far to the record."""
         self._update(
             engine=played.engine,
             mission_s=played.mission_s,
@@ -194,7 +196,7 @@ class RunRecording:
         )
 
     def end(self, played: RunOutcome, report_progress: ReportProgress = lambda step: None) -> Run:
-        """Check the run, and write record and report. `report_progress` receives each long step of the check in words.
+        """Check the run, and write its record and report. `report_progress` is called with the name of each long step.
 
         Raises MachineError if they cannot be written.
         """
@@ -237,13 +239,13 @@ def _updated(record: RunRecord, **keys: Any) -> RunRecord:
 async def _play_with_requests(
     interventions: Interventions, directory: RunDirectory, swarm: mission.Swarm, scenario: Scenario
 ) -> None:
-    """Play a mission with requests of a user, which may also come from another process."""
+    """Play a mission in which a user, or another process, can request events."""
     async with serve_requests(interventions, directory.path):
         await interventions.story(swarm, scenario)
 
 
 def _outcome_of(run: Coroutine[Any, Any, RunOutcome], interrupted: asyncio.Event) -> RunOutcome:
-    """Run a coroutine to its end. Use another thread if this thread runs an event loop, as in a notebook."""
+    """Run a coroutine to its end. If this thread already runs an event loop, as in a notebook, use another thread."""
     try:
         asyncio.get_running_loop()
     except RuntimeError:

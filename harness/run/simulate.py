@@ -1,4 +1,4 @@
-"""Play and judge scenarios in virtual time and in memory, without a run directory.
+"""Play and judge scenarios in virtual time in memory, without a run directory.
 
 The checker is the same as for other runs. It gets the evidence directly from the agents instead of from files.
 """
@@ -39,7 +39,7 @@ Returned = TypeVar("Returned")
 
 @dataclass(frozen=True)
 class Simulated:
-    """A run in memory: its outcome (`played`), the evidence, and the verdict (`result`)."""
+    """A run in memory: its result (`played`), its evidence, and its verdict (`result`)."""
 
     played: RunOutcome
     evidence: Evidence
@@ -49,7 +49,7 @@ class Simulated:
 def simulate(
     scenario: Scenario, seed: int, *, tracing: bool = False, deliver_all: bool = False, again: bool = False
 ) -> Simulated:
-    """Play a scenario in virtual time and check it, all in memory, without a run directory.
+    """Play a scenario in virtual time and check it in memory, without a run directory. Return the run.
 
     - `seed`: 0 or more. The same scenario and seed give the same run.
     - `tracing`: record handler runs. Without them characteristic 1 cannot be judged, and 2 and 3 only at the end.
@@ -67,7 +67,7 @@ def simulate(
 def simulate_in_memory(
     memory: "MemoryRecorder", scenario: Scenario, seed: int, *, again: bool = False, **options: Any
 ) -> Simulated:
-    """Simulate as `simulate` does. `memory` stores the run, and `options` go to the simulation."""
+    """Play and check a scenario like `simulate`. `memory` stores the run, and `options` are those of the simulation."""
     SimulationBackend().refuse(scenario)
     simulation = Simulation(scenario, seed, memory, **options)
     with closing(simulation):
@@ -85,7 +85,7 @@ def simulate_in_memory(
 
 
 def check_determinism(scenario: Scenario, seed: int) -> None:
-    """Check that foreign agents repeat their answers when they get the same inputs again.
+    """Check that foreign agents (separate programs) give the same answers to the same inputs again.
 
     Raises HarnessError if an agent does not, or does not support the mission. A crashed or hung agent raises no error
     here, because its run reports it.
@@ -95,7 +95,7 @@ def check_determinism(scenario: Scenario, seed: int) -> None:
 
 
 def run_to_end(story: Coroutine[Any, Any, Returned]) -> Returned:
-    """Run a coroutine without an event loop. It must not wait. A mission in virtual time does not wait."""
+    """Run a coroutine without an event loop. It must never wait, which is the case for a mission in virtual time."""
     try:
         story.send(None)
     except StopIteration as end:
@@ -110,7 +110,7 @@ def _header(incarnation: Incarnation) -> Header:
 
 
 class MemoryRecorder:
-    """A recorder that stores traces and records in memory for the checker."""
+    """Stores traces and records of a simulated run in memory for the checker."""
 
     def __init__(self, tracing: bool) -> None:
         self.tracing = tracing
@@ -129,28 +129,28 @@ class MemoryRecorder:
             trace.starts.append(len(trace.runs))
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
-        """Do nothing: the block has the event."""
+        """Do nothing, because the block contains the event."""
 
     def write(self, agent_id: int, entries: list[Entry]) -> None:
         self._traces[agent_id].extend(entries)
 
     def changed(self, record: dict[str, Any]) -> None:
-        """Do nothing: the record of the run has it."""
+        """Do nothing, because the record of the run contains the change."""
 
     def injected(self, record: dict[str, Any]) -> None:
         self._injected.add([InjectedDatagram.model_validate(record)])
 
     def transmitted(self, record: dict[str, Any]) -> None:
-        """Do nothing: the record of the run has the totals."""
+        """Do nothing, because the record of the run contains the totals."""
 
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
-        """Do nothing: the checker needs no positions."""
+        """Do nothing, because the checker does not need positions."""
 
     def keep_chains(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
         self._kept = self._exports(at_s, incarnations)
 
     def export(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
-        """Do nothing: the evidence comes from the agents."""
+        """Do nothing, because the checker reads the chains from the agents."""
 
     def evidence(self, simulation: Simulation) -> Evidence:
         record = JudgedRecord.model_validate(
@@ -203,7 +203,7 @@ ENDED = "ended"
 
 @gc_paused()
 def simulated(scenario: Scenario, seed: int) -> Result:
-    """Simulate with traces and return the verdict. If an agent crashes or hangs, return only a judgement on that."""
+    """Simulate a scenario with traces, and return the verdict. After a crash of an agent, it only covers the crash."""
     try:
         return simulate(scenario, seed, tracing=True).result
     except AgentFailedError as error:
@@ -218,7 +218,7 @@ def result_of_failure(error: AgentFailedError) -> Result:
 
 
 def evidence_lines(violated: dict[str, Judgement]) -> list[str]:
-    """Return lines on the violated checks and their evidence."""
+    """Return lines of text about the failed checks and their evidence."""
     lines = []
     for key, judgement in violated.items():
         if key in CHARACTERISTICS:
@@ -232,7 +232,7 @@ def evidence_lines(violated: dict[str, Judgement]) -> list[str]:
 
 
 def choose_path(out: Path | None, name: str) -> Path:
-    """Return the path of the new file: `out`, or a new name under `runs/`. Raises RunDirectoryError if it exists."""
+    """Return the path for a new file: `out`, or a new name under `runs/`. Raises RunDirectoryError if `out` exists."""
     if out is not None and out.exists():
         raise RunDirectoryError(f"{out} exists: choose another --out; existing files are not overwritten")
     path = out or default_path(f"{name} shrunk").with_suffix(".yaml")
@@ -244,7 +244,9 @@ def choose_path(out: Path | None, name: str) -> Path:
 
 
 def write_new_file(path: Path, text: str) -> Path:
-    """Write the file and return its path, with a number if another process took the name. Raises MachineError."""
+    """Write a new file and return its path. A number is appended if another process took the name. Raises
+    MachineError.
+    """
     free, number = path, 2
     while True:
         try:

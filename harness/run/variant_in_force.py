@@ -1,4 +1,4 @@
-"""A protocol variant in force: agents play it, and the reference judges by it."""
+"""Apply a protocol variant to the agents and to the reference implementation."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,7 +14,8 @@ from harness.play.variant import Variant, core_in_force, load_variant, replaced
 
 @contextmanager
 def in_force(variant: Variant | Path | None) -> Iterator[Variant | None]:
-    """Play and judge by a variant, or by the variant in a file. None is the original protocol.
+    """Play and judge with a variant, or with the variant in a file, inside the context. None means the original
+    protocol.
 
     Processes that are forked meanwhile have the variant as well. Raises VariantError.
     """

@@ -1,4 +1,4 @@
-"""Names of blocks and chains for output: `3.12` if known, else the first digits of the hash.
+"""Name blocks and chains in output: `3.12` if the name is known, or else the first digits of the hash.
 
 The exports of a run give the names. Without exports, the order of an agent's first proposals gives them, because an
 agent proposes its blocks in the order in which it completed them. That requires a capture from the agent's first
@@ -19,10 +19,10 @@ DIGITS = 8
 
 
 class BlockNames:
-    """The names of all blocks and chains in a set of transmissions."""
+    """The names of all blocks and chains in a set of transmitted messages."""
 
     def __init__(self, transmissions: Iterable[Transmission], runs: Iterable[Path]) -> None:
-        """Learn the names. `runs` are directories that may hold exports."""
+        """Collect the names. `runs` are directories that may contain exports."""
         self._blocks: dict[bytes, str] = {}
         self._top_of: dict[bytes, bytes | None] = {}
         self._mentioned: set[bytes] = set()
@@ -43,7 +43,7 @@ class BlockNames:
         return self._blocks.get(block_hash)
 
     def chain(self, chain_hash: bytes) -> str:
-        """Return the first digits of a chain hash, with the block on top of the chain if it is known."""
+        """Return the first digits of a chain hash, with the top block of the chain if it is known."""
         digits = chain_hash.hex()[:DIGITS]
         if chain_hash not in self._top_of:
             return digits
@@ -51,7 +51,7 @@ class BlockNames:
         return f"{digits} ({'inception' if top is None else self.block(top)})"
 
     def find(self, query: str) -> bytes:
-        """Return the hash of the block with this name, or with this beginning of its hash.
+        """Return the hash of the block with this name, or whose hash begins with this text.
 
         Raises CaptureError if no block or several blocks match.
         """
@@ -101,7 +101,7 @@ class BlockNames:
 
 
 def run_directories(paths: Iterable[Path]) -> list[Path]:
-    """Return the run directories among `paths`, and the run directories that contain captures among `paths`."""
+    """Return the run directories among `paths`, and those that contain captures among `paths`."""
     runs = [
         path if path.is_dir() else path.resolve().parent.parent
         for path in paths

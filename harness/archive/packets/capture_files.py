@@ -1,4 +1,4 @@
-"""Find capture files, and read those of one mission together, with one clock."""
+"""Find packet capture files, and read those of one mission together with a common clock."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,7 +16,7 @@ SUFFIXES = (".pcapng", ".pcap")
 
 
 class Clock(NamedTuple):
-    """The conversion of capture time to mission seconds. `epoch_ns` is mission second 0.
+    """The conversion of capture times to mission seconds. `epoch_ns` is mission second 0.
 
     `of_run` is false if no capture has a comment with the start of the run. Then `epoch_ns` is the time of the first
     packet. Captures from the field differ by the errors of the vehicles' clocks.
@@ -31,7 +31,7 @@ class Clock(NamedTuple):
 
 
 class Captures(NamedTuple):
-    """The captures of one mission. `errors` has a sentence for each unusable file."""
+    """The packet captures of one mission. `errors` contains a sentence for each unusable file."""
 
     used: list[Capture]
     datagrams: list[Datagram]
@@ -65,7 +65,7 @@ def capture_files(paths: Iterable[Path]) -> list[Path]:
 
 
 def read_captures(paths: Iterable[Path], opener: "Opener | None" = None) -> Captures:
-    """Read all captures of one mission. The first capture with a comment determines the mission.
+    """Read all captures of one mission. The first capture with a comment determines which mission that is.
 
     Captures from the field have no comment and are always used. `opener` decrypts the sealed datagrams of a secured
     mission.

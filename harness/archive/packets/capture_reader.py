@@ -1,4 +1,4 @@
-"""Read one capture file: the datagrams that one vehicle, or one other observation point, sent or received.
+"""Read one packet capture file: the datagrams that one vehicle, or another observer, sent or received.
 
 The capture of a run names its vehicle in a comment (`ucp-harness run --capture`). A capture from the field has no
 comment. It belongs to the sender of its outbound datagrams, else to the vehicle in its file name, such as `7.pcap`.
@@ -34,7 +34,7 @@ ListenerName = int | str
 
 
 class CaptureComment(BaseModel):
-    """The comment in a capture of a run, as JSON in the section header. `epoch_us` is mission second 0."""
+    """The comment of the harness in a packet capture, as JSON in the section header. `epoch_us` is mission second 0."""
 
     ucp_harness: Literal[1]
     vehicle: AgentId
@@ -43,7 +43,7 @@ class CaptureComment(BaseModel):
 
 
 class Datagram:
-    """A datagram, identified by its bytes, with all its sightings in all captures.
+    """A datagram, identified by its bytes, with all its occurrences in all captures.
 
     `seen` is a flat array, because there may be millions of sightings. It alternates a time in ns with a number that
     encodes the capture and the direction of the frame.
@@ -58,13 +58,13 @@ class Datagram:
         self.seen = array("q")
 
     def sightings(self) -> Iterable[tuple[int, int, int]]:
-        """Return (time in ns, number of the capture, direction) of each sighting."""
+        """Return (time in ns, number of the capture, direction) for each occurrence."""
         seen = self.seen
         return ((seen[i], seen[i + 1] >> 2, seen[i + 1] & 3) for i in range(0, len(seen), 2))
 
 
 class Capture:
-    """A capture file. It covers the time from `began_ns` to `ended_ns`, None if unknown.
+    """A packet capture file. It covers the time from `began_ns` to `ended_ns`, which are None if unknown.
 
     `sees_itself` is true if the file also contains the datagrams that its vehicle sent.
     """
@@ -93,7 +93,7 @@ class Capture:
     def read(
         self, datagrams: dict[bytes, Datagram], most_frames: int | None = None, opener: "Opener | None" = None
     ) -> None:
-        """Add the datagrams of the file, or of its first frames, to `datagrams`. `opener` decrypts sealed datagrams.
+        """Add the datagrams of the file, or of its first frames, to `datagrams`. `opener` decrypts secured datagrams.
 
         Raises CaptureError if the file is not a capture.
         """
@@ -162,7 +162,9 @@ class Capture:
             return None
 
     def direction(self, sender: int, direction: int) -> int:
-        """Return the direction of a datagram. If the file lacks it, datagrams from the vehicle itself are outbound."""
+        """Return the direction of a datagram. If the file lacks it, datagrams from the vehicle itself count as
+        outbound.
+        """
         return direction or (OUTBOUND if sender == self.vehicle else INBOUND)
 
 

@@ -1,4 +1,4 @@
-"""The losses on a shared channel, as `channel.jsonl` of a run has them."""
+"""Read the losses on a shared radio channel from `channel.jsonl`."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -16,7 +16,7 @@ DROPS = ("queue", "too_long")
 
 
 def channel_losses(runs: Iterable[Path]) -> ChannelLosses:
-    """Return the losses of these run directories. Lines that cannot be read have no effect."""
+    """Return the losses in these run directories. Unreadable lines are ignored."""
     return {
         (line.sender, line.sequence): {line.dropped: []} if line.dropped else line.lost
         for run in runs
@@ -26,7 +26,9 @@ def channel_losses(runs: Iterable[Path]) -> ChannelLosses:
 
 
 def loss_reasons(losses: ChannelLosses, transmission: Transmission) -> dict[str, list[ListenerName]]:
-    """Return the vehicles that lost the message on the channel, by reason. All vehicles lose a dropped message."""
+    """Return the vehicles that lost the message on the channel, by reason. If the radio dropped it, these are all
+    vehicles.
+    """
     named = {
         reason: [name for name in transmission.lost_by if reason in DROPS or name in vehicles]
         for reason, vehicles in losses.get((transmission.sender, transmission.sequence), {}).items()

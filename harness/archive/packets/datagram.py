@@ -1,4 +1,4 @@
-"""Extract the UCP datagram from a frame, and summarise its message.
+"""Extract the UCP datagram from a captured frame, and summarise its message.
 
 A frame with a wrong checksum was damaged, and the receiver's kernel dropped it. There is one exception: a UDP checksum
 that covers only the addresses. The sender's kernel writes it and leaves the rest to the network card, but a virtual
@@ -38,7 +38,7 @@ _ENDS = struct.Struct("!4H")
 
 
 class NotUcpError(ValueError):
-    """The frame contains no intact UCP datagram. `reason` is one of a few fixed texts, so that it can be counted."""
+    """An error: the frame does not contain a valid UCP datagram. `reason` is one of a few fixed texts."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -46,7 +46,7 @@ class NotUcpError(ValueError):
 
 
 def unwrap(frame: Frame) -> tuple[bytes, int]:
-    """Return the UDP payload and the direction of a frame.
+    """Return the UDP data and the direction of a frame.
 
     Raises NotUcpError if the frame contains no UDP payload, or is truncated or damaged.
     """
@@ -127,7 +127,7 @@ TOP_OF_CHAIN = "top of chain"
 
 
 class MessageSummary(NamedTuple):
-    """The type and content of a message. Of a sealed message only the type, `message`, is known.
+    """The type and content of a message. If the message is encrypted, only its type is known.
 
     `answer` is the content of a response: approve, disapprove, yes, no, top of chain, or block.
     """
@@ -139,12 +139,12 @@ class MessageSummary(NamedTuple):
 
     @property
     def is_sealed(self) -> bool:
-        """True if the content is unknown. Each readable message names a block or a chain."""
+        """True if the content is unknown because the message is encrypted."""
         return self.block_hash is None and self.chain_hash is None
 
     @property
     def request_key(self) -> tuple[str, bytes | None] | None:
-        """The type and subject of the responses to this request, for comparison with `answers`. None if this is no
+        """The type and subject of the answers to this request, for comparison with `answers`. None if it is not a
         request.
 
         Responses do not name the agent that asked.
@@ -154,12 +154,12 @@ class MessageSummary(NamedTuple):
 
     @property
     def answers(self) -> tuple[str, bytes | None] | None:
-        """The type and subject of this response. None if this is no response."""
+        """The type and subject of this answer, or None if it is not an answer."""
         return None if self.answer is None else (self.message, self._subject)
 
     @property
     def _subject(self) -> bytes | None:
-        """The chain or block that request and response both name.
+        """The chain or block that both the request and its answer name.
 
         A Next In Sequence response names the found block too, but the request named only the chain.
         """

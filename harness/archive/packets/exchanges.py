@@ -1,4 +1,4 @@
-"""Match requests with their responses, and count the losses of each link.
+"""Match requests with their answers, and count the losses of each link.
 
 Responses are broadcast and do not name the agent that asked. But an agent answers each request at once or never, and in
 order. Therefore the responses of an agent are assigned from the last to the first: each answers the latest request on
@@ -18,7 +18,7 @@ _Asked = tuple[float, int]
 
 
 class RequestOutcome(NamedTuple):
-    """The outcome of a request at vehicle `by`. `response` is its first response, or None.
+    """The result of a request at vehicle `by`. `response` is the first answer of this vehicle, or None.
 
     The outcome is "answered" unless the response is known to be lost on its way to the agent that asked.
     """
@@ -29,7 +29,7 @@ class RequestOutcome(NamedTuple):
 
 
 class Exchanges:
-    """The responses to each request."""
+    """The answers to each request."""
 
     def __init__(self, transmissions: Sequence[Transmission]) -> None:
         self._responses: dict[int, list[Transmission]] = {}
@@ -37,11 +37,11 @@ class Exchanges:
             self._responses.setdefault(request.number, []).append(response)
 
     def responses(self, request: Transmission) -> Sequence[Transmission]:
-        """Return the responses to a request in the order of sending."""
+        """Return the answers to a request in the order of sending."""
         return self._responses.get(request.number, ())
 
     def answers(self, request: Transmission) -> list[RequestOutcome]:
-        """Return the outcome of a request at each vehicle that received or lost it."""
+        """Return the result of a request at each vehicle that received or lost it."""
         first: dict[int, Transmission] = {}
         for response in self.responses(request):
             first.setdefault(response.sender, response)
@@ -60,7 +60,7 @@ class Exchanges:
 
 
 def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission, Transmission]]:
-    """Yield (request, response) pairs. A forged response answers no request."""
+    """Yield each pair of request and answer. A forged answer belongs to no request."""
     asked: dict[Subject, list[_Asked]] = {}
     reached: dict[tuple[ListenerName, Subject], list[_Asked]] = {}
     sent: dict[tuple[ListenerName, Subject], list[Transmission]] = {}
@@ -85,7 +85,7 @@ def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission
 
 
 class LinkLosses(NamedTuple):
-    """Losses on a link: the receiver should have received `sent` datagrams, and did not receive `lost` of them."""
+    """The losses on a link: the receiver should have received `sent` datagrams, and did not receive `lost` of them."""
 
     sender: int
     receiver: ListenerName

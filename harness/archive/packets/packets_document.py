@@ -1,5 +1,6 @@
-"""The output of `ucp-harness packets --json`, schema `ucp-packets/1`. Later versions may add keys, but remove or rename
-none."""
+"""Define the JSON output of `ucp-harness packets` (`ucp-packets/1`). Later versions may add keys, but never remove or
+rename one.
+"""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -116,7 +117,7 @@ def document(
     names: BlockNames,
     losses: ChannelLosses,
 ) -> Iterator[str]:
-    """Yield the lines of one JSON document, with one line per datagram."""
+    """Yield the lines of one JSON document. Each datagram has its own line."""
     clock = captures.clock
     packets = PacketsRecord(
         epoch_us=clock.epoch_ns // 1000,

@@ -1,4 +1,4 @@
-"""Write transmissions as text, one line each, in the order of sending, for use with `less` and `grep`."""
+"""Print messages as text in the order of sending, one line each, for use with `less` and `grep`."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -31,7 +31,7 @@ Paint = Callable[[str], str]
 
 
 class TransmissionText:
-    """The text of transmissions and outcomes. `paint` highlights losses."""
+    """Formats messages and the results of requests. `paint` highlights losses."""
 
     def __init__(self, names: BlockNames, paint: Paint, losses: ChannelLosses) -> None:
         self._names = names
@@ -39,7 +39,7 @@ class TransmissionText:
         self._losses = losses
 
     def transmission(self, transmission: Transmission) -> str:
-        """Return the line of a transmission: time, sender, message and receivers."""
+        """Return the line for a message: time, sender, content and receivers."""
         what = f"{transmission.summary.message:<26}  {self.content(transmission.summary):<46}"
         parts = [f"{transmission.at_s:>12.3f}  {transmission.sender:>5}  {what}  -> {_receivers(transmission)}"]
         if transmission.lost_by:
@@ -59,7 +59,7 @@ class TransmissionText:
         return "  ".join(parts)
 
     def _reasons(self, transmission: Transmission) -> str:
-        """Return why the channel lost the message, if there was a channel and it lost it."""
+        """Return the reason why the shared radio channel lost the message, or an empty text."""
         words = [
             reason.replace("_", " ") + ("" if reason in DROPS else f": {_list(names)}")
             for reason, names in loss_reasons(self._losses, transmission).items()
@@ -90,7 +90,7 @@ class TransmissionText:
                 return block
 
     def answers(self, answers: Iterable[RequestOutcome]) -> str:
-        """Return the outcomes of a request. Vehicles with the same outcome are listed together."""
+        """Return the results of a request as text. Vehicles with the same result are listed together."""
         together: dict[str, list[ListenerName]] = {}
         for answer in sorted(answers, key=lambda answer: _OUTCOMES.index(answer.outcome)):
             together.setdefault(self._outcome(answer), []).append(answer.by)
@@ -107,7 +107,7 @@ class TransmissionText:
 
 
 def header(captures: Captures) -> str:
-    """Return the line with the captured vehicles and the start of mission time."""
+    """Return a line with the captured vehicles and the start of mission time."""
     vehicles = sorted({capture.vehicle for capture in captures.used if capture.vehicle is not None})
     points = [capture.path.name for capture in captures.used if capture.vehicle is None]
     clock = captures.clock
@@ -120,9 +120,7 @@ def header(captures: Captures) -> str:
 def transmission_lines(
     transmissions: Iterable[Transmission], exchanges: Exchanges, text: TransmissionText, answers_of: int | None
 ) -> Iterator[str]:
-    """Yield the line of each transmission, and below a request its outcomes, at all vehicles or only at
-    `answers_of`.
-    """
+    """Yield a line for each message, and below each request its results at all vehicles or only at `answers_of`."""
     for transmission in transmissions:
         yield text.transmission(transmission)
         if transmission.summary.request_key:
@@ -132,7 +130,7 @@ def transmission_lines(
 
 
 def exchange_lines(exchanges_shown: Sequence[Exchange], exchanges: Exchanges, text: TransmissionText) -> Iterator[str]:
-    """Yield the lines of the exchanges about a block: each with its answers and missing answers.
+    """Yield lines about a block's messages, each with its answers and its missing answers.
 
     The last line lists the vehicles that the block reached.
     """
@@ -150,7 +148,7 @@ def exchange_lines(exchanges_shown: Sequence[Exchange], exchanges: Exchanges, te
 
 
 def totals(captures: Captures, transmissions: Sequence[Transmission]) -> Iterator[str]:
-    """Yield the lines with totals, and with the other contents of the captures."""
+    """Yield lines with totals, and with the other contents of the captures."""
     lost = sum(len(transmission.lost_by) for transmission in transmissions)
     received = sum(len(transmission.received) for transmission in transmissions)
     counted = [

@@ -1,4 +1,4 @@
-"""Read capture files (pcapng and pcap, both byte orders) frame by frame, from any origin.
+"""Read packet capture files of any origin frame by frame (pcapng and pcap, both byte orders).
 
 scapy is not used, because its reader drops the comment and the statistics of a section, does not report where a file is
 damaged, and trusts any length in a file. Formats: draft-ietf-opsawg-pcapng, draft-ietf-opsawg-pcap.
@@ -57,11 +57,11 @@ class _Interface(NamedTuple):
 
 
 class _BrokenError(Exception):
-    """The rest of the file cannot be read."""
+    """An error: the rest of the file cannot be read."""
 
 
 class CaptureFile:
-    """A capture file. Iteration reads its frames and sets the attributes.
+    """A packet capture file. Iteration yields its frames, and sets the attributes.
 
     `comment` is the comment of the first section. `started_ns`, `ended_ns` and `dropped` (the number of frames that the
     capture missed) come from the statistics and are None without them. `problem` describes where the reading ended
@@ -81,7 +81,7 @@ class CaptureFile:
         return sum(self._dropped.values()) if self._dropped else None
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames. Raises CaptureError if the file cannot be read or is not a capture."""
+        """Yield the frames. Raises CaptureError if the file cannot be read or is not a packet capture."""
         try:
             with BoundedFile(self.path) as file:
                 magic = file.peek(4)[:4]
@@ -157,7 +157,7 @@ class CaptureFile:
 
 
 def _blocks(file: BinaryIO) -> Iterator[tuple[int, str, int, bytes]]:
-    """Yield (offset in the file, byte order, type, body) of each pcapng block."""
+    """Yield (offset in the file, byte order, type, body) for each pcapng block."""
     offset, order = 0, "<"
     lengths = struct.Struct("<2I")
     while head := file.read(8):
@@ -200,7 +200,7 @@ def _halves(order: str, value: bytes) -> int:
 
 
 def _options(order: str, data: bytes) -> dict[int, bytes]:
-    """Return the options by code. Of several options with the same code, the first is used."""
+    """Return the options by their code. Of several options with the same code, the first counts."""
     options: dict[int, bytes] = {}
     position, head = 0, struct.Struct(order + "2H")
     while position + head.size <= len(data):

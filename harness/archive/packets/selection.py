@@ -1,4 +1,4 @@
-"""Select transmissions by sender, receiver, message, time or block."""
+"""Select messages by sender, receiver, type, time or block."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ MESSAGES = [message.NAME for message in TYPE_CODES]
 
 @dataclass(frozen=True)
 class Selection:
-    """Conditions on transmissions. A condition that is None accepts every transmission. The case of `message` is
+    """Conditions on messages. A condition that is None accepts every message. The case of letters in `message` is
     ignored.
 
     Raises CaptureError for an unknown message or an empty time interval.
@@ -34,7 +34,7 @@ class Selection:
             raise CaptureError("--between {:g} {:g}: the first second is not before the last".format(*self.between_s))
 
     def filter(self, transmissions: Iterable[Transmission], captures: Captures) -> Iterator[Transmission]:
-        """Yield the transmissions that meet the conditions. With a receiver, other receivers are removed from them.
+        """Yield the messages that meet the conditions. With a receiver, other receivers are removed from the results.
 
         Raises CaptureError if the receiver has no capture.
         """
@@ -60,7 +60,7 @@ class Selection:
 
 
 class Exchange(NamedTuple):
-    """A transmission that answers nothing, and the answers to it that concern the selected block."""
+    """A message that is not an answer, together with those answers to it that concern the selected block."""
 
     first: Transmission
     answers: Sequence[Transmission]
@@ -69,7 +69,7 @@ class Exchange(NamedTuple):
 def exchanges_about(
     block_hash: bytes, transmissions: Iterable[Transmission], exchanges: Exchanges
 ) -> Iterator[Exchange]:
-    """Yield all exchanges about a block in the order of sending."""
+    """Yield all messages about a block, with their answers, in the order of sending."""
     answer_numbers: set[int] = set()
     for transmission in transmissions:
         answers = [answer for answer in exchanges.responses(transmission) if answer.summary.block_hash == block_hash]
@@ -79,7 +79,7 @@ def exchanges_about(
 
 
 def in_order(exchanges: Iterable[Exchange]) -> list[Transmission]:
-    """Return all transmissions of some exchanges, each once, in the order of sending."""
+    """Return all messages in these groups, each once, in the order of sending."""
     by_number = {
         transmission.number: transmission
         for exchange in exchanges

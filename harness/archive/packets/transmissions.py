@@ -1,4 +1,4 @@
-"""Join the sightings of all captures into transmissions, each with its receivers.
+"""Combine the packets in all captures into messages, each with its receivers.
 
 A datagram is identified by its bytes. A restarted agent may send the same bytes again. Therefore each reception belongs
 to the latest transmission of the datagram before it. If a complete capture of the sender does not contain the
@@ -20,8 +20,8 @@ captured then, and `at_s` is the time of the first reception. `forged`: the agen
 
 
 class Reception(NamedTuple):
-    """The reception of a datagram by one listener: the number of copies, and the mission seconds of the first and
-    last copy.
+    """The reception of a datagram at one vehicle: the number of copies, and the mission seconds of the first and last
+    one.
     """
 
     by: ListenerName
@@ -31,7 +31,7 @@ class Reception(NamedTuple):
 
 
 class Transmission(NamedTuple):
-    """A datagram, sent once at mission second `at_s`. `number` counts from 0 in the order of sending.
+    """A datagram that was sent once at mission second `at_s`. `number` counts all of them in order, from 0.
 
     `seen_leaving` is the listener whose capture contains the sending. The listeners in `lost_by` captured at that time
     but did not receive the datagram. Those in `absent` did not capture at that time, so their reception is unknown.
@@ -53,7 +53,7 @@ class Transmission(NamedTuple):
         return [reception.by for reception in self.received]
 
     def for_receiver(self, receiver: ListenerName) -> "Transmission":
-        """Return the transmission with one receiver only."""
+        """Return a copy that has only this receiver."""
         return self._replace(
             received=tuple(reception for reception in self.received if reception.by == receiver),
             lost_by=tuple(name for name in self.lost_by if name == receiver),
@@ -62,7 +62,7 @@ class Transmission(NamedTuple):
 
 
 class _Listeners:
-    """The captured vehicles and observation points, each with its captures."""
+    """The captured vehicles and other observers, each with its packet captures."""
 
     def __init__(self, captures: Iterable[Capture]) -> None:
         self._transmissions: dict[ListenerName, list[Capture]] = {}
@@ -74,7 +74,7 @@ class _Listeners:
         return any(capture.listening(time_ns) for capture in self._transmissions.get(name, ()))
 
     def would_record_sending(self, sender: ListenerName, time_ns: int) -> bool:
-        """Return whether a datagram that the sender sent at this time must be in its captures.
+        """Return true if a datagram that the sender sent at this time must be in its packet captures.
 
         It need not be if the captures contain only received datagrams, or have missed frames.
         """
@@ -84,7 +84,7 @@ class _Listeners:
 
 
 def join(captures: Captures) -> list[Transmission]:
-    """Return all transmissions in the order of sending."""
+    """Return all messages in the order of sending."""
     by_number = {capture.number: capture for capture in captures.used}
     listeners = _Listeners(captures.used)
     transmissions = [
@@ -99,7 +99,7 @@ def join(captures: Captures) -> list[Transmission]:
 def _transmissions(
     datagram: Datagram, captures: Mapping[int, Capture], listeners: _Listeners, clock: Clock
 ) -> Iterator[Transmission]:
-    """Yield the transmissions of one datagram."""
+    """Yield each sending of one datagram."""
     left: list[tuple[int, ListenerName]] = []
     arrived: list[tuple[int, ListenerName]] = []
     for time_ns, number, direction in sorted(datagram.sightings()):

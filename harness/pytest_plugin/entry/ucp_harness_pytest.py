@@ -1,4 +1,5 @@
-"""The entry point that pytest loads in each environment with the harness. It loads the plugin if the packages are ours.
+"""The entry point that pytest loads. It loads the plugin unless other packages have the names of the harness's
+packages.
 
 A project may have a folder with the name of one of our packages, and one process can import only one of both. In this
 case the plugin is not loaded, and the project's tests run as without it. A test that uses a fixture of the harness
@@ -18,7 +19,7 @@ OURS = {"harness": "pytest_plugin", "ucp": "quirks", "sitl": "pilot.py", "netem"
 
 
 def find_foreign_packages() -> list[Path]:
-    """Return other packages with the name of one of ours that Python imports first."""
+    """Return other packages that have the names of our packages and that Python imports first."""
     here = Path.cwd()
     places = [here / name for name in OURS if (here / name / "__init__.py").exists()]
     for name in OURS:
@@ -43,12 +44,12 @@ if hidden := find_foreign_packages():
 
     @pytest.fixture
     def swarm() -> NoReturn:
-        """Fail with the reason."""
+        """Fail with the reason why the plugin is not loaded."""
         pytest.fail(WHY, pytrace=False)
 
     @pytest.fixture
     def scenario() -> NoReturn:
-        """Fail with the reason."""
+        """Fail with the reason why the plugin is not loaded."""
         pytest.fail(WHY, pytrace=False)
 
 else:
