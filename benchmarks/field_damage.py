@@ -309,7 +309,8 @@ def bring_home(asked: Scenario, number: int, backend: BackendName, run: Path, ho
 # The commands
 
 ACCUSATION = re.compile(
-    r"deviates|behaves (only )?as with|did not react|expired too early|does not do what", re.IGNORECASE
+    r"deviates|behaves (only )?as with|did not react|^agent \d+ should have|expired too early|does not do what",
+    re.IGNORECASE,
 )
 """A text of `reconstruct` that blames an agent."""
 
@@ -352,12 +353,12 @@ def run_reconstruct(home: Path, concluded: Concluded, whole: Undamaged) -> None:
     for sentence in [*concluded.reasons, *made.remarks]:
         if ACCUSATION.search(sentence):
             concluded.accusations.append(f"reconstruct: {sentence}")
-    for agent_id in made.reproduced:
-        export, played = whole.chains.get(agent_id), made.simulated.evidence.exports.get(agent_id)
-        if not (home / f"{agent_id}.chain.json").exists() or not export or not played or "export" in concluded.damage:
-            continue
-        if export.chain_of_block_hashes != played.chain_of_block_hashes:
-            concluded.accusations.append(f"reconstruct: claims the chain of agent {agent_id}, which differs")
+    claimed: dict[str, str] = made.document["expect"].get("chains", {})
+    if {*map(int, claimed)} != {*made.reproduced} & {*made.simulated.evidence.exports}:
+        concluded.accusations.append("reconstruct: the scenario expects other chains than those that it reproduces")
+    for agent, top in claimed.items():
+        if (export := whole.chains.get(int(agent))) is not None and export.top_chain_hash != top:
+            concluded.accusations.append(f"reconstruct: claims the chain of agent {agent}, which differs")
 
 
 def run_replay(home: Path, concluded: Concluded, whole: Undamaged) -> None:

@@ -346,7 +346,8 @@ class _Attempt:
             if self._explained == len(self._sent) or self._sent[self._explained].datagram != encode(
                 agent.agent_id, sequence, message
             ):
-                self.problem = f"should have sent a {message.NAME} by t={now:.3f} s, but its capture has none"
+                what = f"sends a {message.NAME} by t={now:.3f} s with its inferred inputs"
+                self.problem = f"{what}, and its capture has none, so an input is missing or has another time"
                 self._detect_pause(at_s)
                 return
             self._explained += 1

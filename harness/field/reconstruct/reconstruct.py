@@ -182,7 +182,7 @@ def reconstruct(
     remarks += table.contradictions
     remarks += _clocks_in_words(table)
     outcomes = [AgentOutcome(agent_id, _blocks(simulated, agent_id), why.get(agent_id)) for agent_id in recorded_agents]
-    document["expect"] = _expected(simulated, rehearsals)
+    document["expect"] = _expected(simulated, {*rehearsals} - {*why})
     return Reconstruction(document, outcomes, remarks, difference, simulated, table, wrong_signatures)
 
 
@@ -235,14 +235,15 @@ def _blocks(simulated: Simulated, agent_id: int) -> int:
     return len(export.chain) if export else 0
 
 
-def _expected(simulated: Simulated, rehearsals: Mapping[int, Rehearsal]) -> Document:
-    """Return the expected results of the scenario: the chains, and the bad verdicts that occurred in the flight."""
+def _expected(simulated: Simulated, reproduced: set[int]) -> Document:
+    """Return the expected results of the scenario: the reproduced chains, and the bad verdicts of the flight."""
     exports = simulated.evidence.exports
-    chains = {str(agent): exports[agent].top_chain_hash for agent in sorted(rehearsals) if agent in exports}
+    chains = {str(agent): exports[agent].top_chain_hash for agent in sorted(reproduced) if agent in exports}
     bad = {key: simulated.result.judgements[key].verdict for key in simulated.result.bad}
     characteristics = {key: verdict for key, verdict in bad.items() if key.isdecimal()}
     further = {key: verdict for key, verdict in bad.items() if not key.isdecimal()}
-    return {**({"characteristics": characteristics} if characteristics else {}), **further, "chains": chains}
+    expected: Document = {"characteristics": characteristics} if characteristics else {}
+    return {**expected, **further, **({"chains": chains} if chains else {})}
 
 
 WIDTH = 116
@@ -266,6 +267,9 @@ def _sentences(
     yield from (f"- {remark}" for remark in reconstruction.remarks)
     yield from (f"- not used: {sentence}" for sentence in left_out)
     yield "Agents receive only the messages of `fates` and `datagrams`; messages without effect are left out."
-    yield "`expect` is the recorded result. If it shows a mistake that is fixed now, write the correct result instead."
+    yield (
+        "`expect` is the recorded result, with the reproduced chains only. If it shows a mistake that is fixed now, "
+        "write the correct result instead."
+    )
     yield f"  ucp-harness run {path} --backend sim --seed {SEED}"
     yield f"  pytest {path}"
