@@ -40,7 +40,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_site_has_every_page_and_every_link_target(site: Path) -> None:
     for page in PAGES[1:]:
-        assert (site / page.relative_to(REPOSITORY / "docs").with_suffix(".html")).exists(), page
+        name = "index.html" if page.stem == "README" else f"{page.stem}.html"
+        assert (site / page.parent.relative_to(REPOSITORY / "docs") / name).exists(), page
     assert (site / "index.html").exists()
     assert (site / "ucp" / "contract" / "CONTRACT.html").exists()
     for page in site.rglob("*.html"):

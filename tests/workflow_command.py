@@ -1,0 +1,23 @@
+"""The command `ucp-harness` of a runner in the tests of workflows, without the work that takes long.
+
+`conformance` and `doctor` only parse their options, and a hunt plays two runs.
+"""
+
+import sys
+from pathlib import Path
+
+from harness.cli import load_command, main
+
+if __name__ == "__main__":
+    name, *arguments = sys.argv[1:]
+    if name in ("conformance", "doctor"):
+        parsed = load_command(name).make_context(name, arguments).params
+        for option in ("junit", "page"):
+            if parsed.get(option):
+                Path(parsed[option]).write_text("<testsuite/>")
+        sys.exit(0)
+    if "--for" in arguments:
+        at = arguments.index("--for")
+        arguments[at : at + 2] = ["--runs", "2"]
+    sys.argv[1:] = [name, *arguments]
+    main()
