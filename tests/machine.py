@@ -1,7 +1,7 @@
 """Requirements of tests that need more than Python. A test is skipped if this machine lacks a requirement.
 
 The environment variable `UCP_REQUIRE` lists requirements that must not be missing, separated by commas: "lab", "netem",
-"nftables", "uml", "cc", "browser", "tshark", "docker", "tlc", "jq" and "ros". If one of these is missing, the test fails.
+"nftables", "uml", "cc", "browser", "tshark", "docker", "tlc", "jq" and "ros". If one is missing, the test fails.
 """
 
 from __future__ import annotations
