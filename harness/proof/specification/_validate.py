@@ -226,14 +226,18 @@ def _look(constants: Constants, batch: _Batch, validation: Validation) -> None:
         validation.rejected.append(Rejected(name, life.agent_id, life.number, line, handler, what))
 
 
+def _config(constants: Constants) -> str:
+    """Return the TLC configuration for agents with these constants."""
+    assigned = (f"  {name} = {in_tla(value)}" for name, value in constants)
+    return "\n".join(["SPECIFICATION Spec", "VIEW Position", "CONSTANTS", *assigned, ""])
+
+
 def _rejected(constants: Constants, batch: _Batch) -> dict[int, tuple[int, tuple[str, ...]]]:
     """Return the rejected agents of a batch by number (from 1), each with the first rejected step and its differing
     parts. Raises CheckerError.
     """
-    assigned = (f"  {name} = {in_tla(value)}" for name, value in constants)
-    config = "\n".join(["SPECIFICATION Spec", "VIEW Position", "CONSTANTS", *assigned, ""])
     records = {"Lives": module(batch.lives, batch.chains)}
-    with looked_at("Recorded", config, others=records, memory_mb=MEMORY_MB) as said:
+    with looked_at("Recorded", _config(constants), others=records, memory_mb=MEMORY_MB) as said:
         rejected = {
             int(number): (int(step), tuple(sorted(_WHAT.findall(what))))
             for number, step, what in _REJECTED.findall(said.told)

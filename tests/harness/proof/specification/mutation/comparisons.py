@@ -1,5 +1,6 @@
 """Comparisons of the agent core with the specification, each of which can be repeated with an edited specification."""
 
+import abc
 import functools
 import re
 import shutil
@@ -11,20 +12,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
-from harness.archive.traces import Header, Trace
+from harness.archive.traces import Trace
+from harness.archive.vocabulary import BRANCHES
 from harness.proof.bounds import Bounds
 from harness.proof.graph._exploration import explore
 from harness.proof.model._global_states import Swarm
-from harness.proof.specification import Recorded, _spec_states, _tlc, _validate
+from harness.proof.specification import Recorded, _recorded_lives, _spec_states, _tlc, _validate
 from harness.proof.specification._second_opinion import _config
-from tests.harness.checker.reference.random_inputs import LIFE, ROSTER, Inputs
+from tests.harness.checker.reference import random_inputs
+from tests.harness.checker.reference.random_inputs import LIFE, ROSTER
+from tests.harness.proof.specification.mutation.directed_inputs import DATA, directed_traces, new_trace
 from ucp.agent import Agent
 from ucp.events import EVENT_HEADER_BYTES, MAX_EVENT_BYTES
 from ucp.settings import Settings
 from ucp.store import StoredState
-from ucp.trace import SCHEMA, HandlerRun, in_base64
+from ucp.trace import HandlerRun
 
 NO_GAP = {"finalize_gap_s": 0}
 READINGS = {"vote_names_chain": True, "changed_before_tally": True, "phase1_tie": "pop", "phase2_tie": "block"}
@@ -142,37 +146,81 @@ def _explored(bounds: Bounds, specifications: Mapping[int, str], states: int) ->
 
 
 @dataclass(frozen=True)
-class RandomInputs:
-    """The steps of an agent with random inputs, compared with the steps that the specification allows."""
+class Inputs(abc.ABC):
+    """The steps of an agent with given inputs, compared with the steps that the specification allows."""
 
-    inputs: int
     settings: tuple[tuple[str, Any], ...] = ()
 
     @property
+    @abc.abstractmethod
+    def inputs(self) -> str:
+        """A noun phrase for tables."""
+
+    @abc.abstractmethod
+    def traces(self) -> list[Trace]:
+        """Return traces of the agent core. All have the same settings."""
+
+    @property
     def name(self) -> str:
-        return ", ".join([f"{self.inputs:,} random inputs", *_settings_words(dict(self.settings))])
+        return ", ".join([self.inputs, *_settings_words(dict(self.settings))])
 
     @functools.cached_property
-    def recorded(self) -> list[Recorded]:
-        """The trace of the agent core."""
-        return [Recorded("random inputs", [random_trace(0, self.inputs, dict(self.settings))])]
+    def encoded(self) -> tuple[_validate.Constants, _validate._Batch]:
+        """The steps of the core, with the settings of the specification."""
+        with _all_tallies():
+            [batch] = _validate._batches([Recorded(self.name, self.traces())], _validate.Validation())
+        assert not any(life.unread for life in batch[1].lives)
+        return batch
 
     def prepare(self) -> None:
-        assert self.recorded
+        assert self.encoded
 
     def differences(self, specifications: Sequence[str]) -> list[str | None]:
         return [self._difference(specification) for specification in specifications]
 
     def _difference(self, specification: str) -> str | None:
-        [(constants, batch)] = _validate._batches(self.recorded, _validate.Validation())
-        assert not any(life.unread for life in batch.lives)
         try:
             with _modules_with(specification):
-                return "other steps" if _validate._rejected(constants, batch) else None
+                return "other steps" if _validate._rejected(*self.encoded) else None
         except _tlc.CheckerError as error:
             if INVALID.search(str(error)):
                 raise ValueError(f"the edited text is no specification: {error}") from None
             return NO_VALUE
+
+
+class DirectedInputs(Inputs):
+    """The stories of `directed_inputs`."""
+
+    @property
+    def inputs(self) -> str:
+        return "directed inputs"
+
+    def traces(self) -> list[Trace]:
+        return directed_traces(dict(self.settings))
+
+
+class RandomInputs(Inputs):
+    """Inputs that fit the state of the agent, nearly fit it, or do not fit it at all."""
+
+    COUNT: ClassVar = 2_500
+
+    @property
+    def inputs(self) -> str:
+        return f"{self.COUNT:,} random inputs"
+
+    def traces(self) -> list[Trace]:
+        return [random_trace(0, self.COUNT, dict(self.settings))]
+
+
+@contextmanager
+def _all_tallies() -> Iterator[None]:
+    """Compare the tally after each handler run. Other agents need not keep one that counts nothing at the moment."""
+    before = _recorded_lives.COUNTING
+    _recorded_lives.COUNTING = frozenset(branch for branches in BRANCHES.values() for branch in branches)
+    try:
+        yield
+    finally:
+        _recorded_lives.COUNTING = before
 
 
 def _settings_words(settings: Mapping[str, Any]) -> list[str]:
@@ -198,15 +246,13 @@ def _modules_with(specification: str) -> Iterator[None]:
 def random_trace(seed: int, count: int, settings: dict[str, Any]) -> Trace:
     """Return the trace of an agent that gets `count` random inputs, in incarnations of LIFE inputs each."""
     rng, now = Random(seed), 0.0
-    inputs = Inputs(rng, newest_us=4)
-    sizes = {"max_block_bytes": MAX_EVENT_BYTES + 2 * EVENT_HEADER_BYTES + 40}
-    used = Settings(**{**sizes, **settings})
-    header = {"agent_id": 1, "roster": list(ROSTER), "settings": used.to_json(), "clock": {"epoch_us": 0}}
-    trace = Trace(Header(**{"schema": SCHEMA, **header, "initial_data": in_base64(b"mission")}))
+    inputs = random_inputs.Inputs(rng, newest_us=4)
+    used = Settings(**{"max_block_bytes": MAX_EVENT_BYTES + 2 * EVENT_HEADER_BYTES + 40, **settings})
+    trace = new_trace(used)
     stored: StoredState | None = None
     for number in range(count):
         if number % LIFE == 0:
-            agent = Agent(1, ROSTER, b"mission", used)
+            agent = Agent(1, ROSTER, DATA, used)
             if stored is not None:
                 trace.starts.append(len(trace.runs))
                 agent.boot(stored, now)

@@ -1,5 +1,6 @@
 """Mistakes as data: `edits.yaml`."""
 
+import functools
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -11,13 +12,24 @@ from harness.proof.specification import _tlc
 EDITS_FILE = Path(__file__).with_name("edits.yaml")
 
 
+class Reason(NamedTuple):
+    """The reason why an edit changes nothing, and an invariant of an agent `a`, in TLA+, that implies it."""
+
+    because: str
+    always: str
+
+
 class Edit(NamedTuple):
-    """A mistake in the specification: `new` in place of `old`, in the operator of this Algorithm (0: shared text)."""
+    """A mistake in the specification: `new` in place of `old`, in the operator of this Algorithm (0: shared text).
+
+    If the edit changes nothing, `reason` explains it.
+    """
 
     algorithm: int
     about: str
     old: str
     new: str
+    reason: Reason | None = None
 
     @property
     def name(self) -> str:
@@ -39,7 +51,12 @@ def specification() -> str:
     return (_tlc.MODULES / "UCP.tla").read_text("utf-8")
 
 
-def edits() -> list[Edit]:
+@functools.cache
+def edits() -> tuple[Edit, ...]:
     """Return all mistakes, in the order of the Algorithms."""
     by_algorithm = yaml.safe_load(EDITS_FILE.read_text("utf-8"))
-    return [Edit(algorithm, *words) for algorithm, listed in by_algorithm.items() for words in listed]
+    return tuple(
+        Edit(algorithm, about, old, new, *(Reason(**reason) for reason in reasons))
+        for algorithm, listed in by_algorithm.items()
+        for about, old, new, *reasons in listed
+    )

@@ -12,7 +12,14 @@ from typing import Any, NamedTuple
 from harness.proof.bounds import Bounds, Network
 from harness.proof.specification import _tlc
 from harness.run.parallel import FailedTask, cores, sweep
-from tests.harness.proof.specification.mutation.comparisons import NO_GAP, READINGS, Comparison, RandomInputs, States
+from tests.harness.proof.specification.mutation.comparisons import (
+    NO_GAP,
+    READINGS,
+    Comparison,
+    DirectedInputs,
+    RandomInputs,
+    States,
+)
 from tests.harness.proof.specification.mutation.edits import Edit, edits, specification
 from ucp.agent_files import write_atomically
 
@@ -26,6 +33,9 @@ def _states(agents: int, blocks: int, network: Network, settings: Mapping[str, A
     return States(Bounds(agents, blocks, network, settings=settings, **keys))
 
 
+OTHER_SETTINGS = tuple({**READINGS, **NO_GAP}.items())
+"""Settings of an agent, as different from the defaults as the specification allows."""
+
 COMPARISONS: tuple[Comparison, ...] = (
     _states(2, 1, "lossy"),
     _states(2, 2, "lossless"),
@@ -34,14 +44,12 @@ COMPARISONS: tuple[Comparison, ...] = (
     _states(3, 2, "lossless"),
     _states(3, 2, "lossless", READINGS),
     _states(2, 3, "lossless", NO_GAP, timers_any=False),
-    _states(3, 3, "lossless", crossing=False),
-    RandomInputs(2_500),
-    RandomInputs(2_500, tuple(READINGS.items())),
-    RandomInputs(2_500, tuple(NO_GAP.items())),
-    _states(3, 3, "lossless"),
-    _states(2, 3, "lossy"),
+    DirectedInputs(),
+    DirectedInputs(OTHER_SETTINGS),
+    RandomInputs(),
+    RandomInputs(OTHER_SETTINGS),
 )
-"""All comparisons, in the order in which they are tried: states from the cheapest bounds on, steps, large bounds."""
+"""All comparisons, in the order in which they are tried. The tests make each with the unedited specification."""
 BATCH = 16
 """Number of edited specifications in one comparison."""
 
@@ -118,15 +126,23 @@ def _find(comparison: Comparison, results: dict[str, Found], jobs: int) -> None:
             store(results)
 
 
+def _row(title: str, group: Sequence[Edit], results: Mapping[str, Found]) -> str:
+    found = sum(results[edit.name].by is not None for edit in group)
+    without_effect = sum(edit.reason is not None for edit in group)
+    return f"| {title} | {len(group)} | {found} | {without_effect} | {len(group) - found - without_effect} |"
+
+
 def tables() -> str:
-    """Return the tables of the page: the mistakes of each Algorithm, and the comparisons that find them first."""
+    """Return the tables of the page: the mistakes of each Algorithm, the reasons of those without effect, and the
+    comparisons that find the others first.
+    """
     results = stored()
-    lines = ["| Algorithm | mistakes | found | not found so far |", "|--:|--:|--:|--:|"]
+    lines = ["| Algorithm | mistakes | found | without effect | open |", "|--:|--:|--:|--:|--:|"]
     for algorithm, group in groupby(edits(), lambda edit: edit.algorithm):
-        found = [results[edit.name].by is not None for edit in group]
-        lines.append(f"| {algorithm or 'shared text'} | {len(found)} | {sum(found)} | {len(found) - sum(found)} |")
-    found = [result.by is not None for result in results.values()]
-    lines.append(f"| all | {len(found)} | {sum(found)} | {len(found) - sum(found)} |")
+        lines.append(_row(str(algorithm) if algorithm else "shared text", list(group), results))
+    lines.append(_row("all", edits(), results))
+    lines += ["", "| mistake without effect | reason |", "|---|---|"]
+    lines += [f"| {edit.name} | {edit.reason.because} |" for edit in edits() if edit.reason]
     lines += ["", "| comparison | mistakes tried | found |", "|---|--:|--:|"]
     for comparison in COMPARISONS:
         finds = sum(result.by == comparison.name for result in results.values())
