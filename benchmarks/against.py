@@ -1,4 +1,5 @@
-"""Measure runs in virtual time against those of another revision: `python -m benchmarks.against HEAD~20 [--rounds 15]`.
+"""Compare the speed of simulated runs with that of another revision: `python -m benchmarks.against HEAD~20 [--rounds
+15]`.
 
 The other revision is checked out in a temporary directory. Both revisions play the same seeds alternately, each in a
 process of its own. The ratio is the processor time of this revision divided by that of the other one, in the same
@@ -40,7 +41,7 @@ LARGE = {
 
 
 class Player:
-    """A process that plays runs with the code in `root`."""
+    """A process that plays runs with the code in the directory `root`."""
 
     def __init__(self, root: Path) -> None:
         self._process = subprocess.Popen(
@@ -52,7 +53,7 @@ class Player:
         )
 
     def seconds(self, what: str, seed: int) -> float:
-        """Return the processor time of each run, in seconds."""
+        """Return the processor time of each run in seconds."""
         assert self._process.stdin and self._process.stdout, "they are pipes"
         self._process.stdin.write(f"{what}/{seed}\n")
         self._process.stdin.flush()

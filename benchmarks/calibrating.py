@@ -1,4 +1,4 @@
-"""Count how often the intervals of `calibrate` cover the parameters of simulated flights.
+"""Count how often the confidence intervals of `calibrate` contain the true parameters of simulated flights.
 
     python -m benchmarks.calibrating [--flights N] [--first NUMBER]
 
@@ -54,14 +54,16 @@ def scenario_of(number: int, agents: int = 5, duration_s: float = 1200.0) -> tup
 
 
 def calibrated(number: int, directory: Path, **options: Any) -> tuple[Calibration, DeliveryModel]:
-    """Fly a flight, and calibrate it."""
+    """Simulate a flight and calibrate it. Return the calibration and the true parameters."""
     scenario, truth = scenario_of(number, **options)
     record = run(Scenario.model_validate(scenario), number, directory, Silent(), "sim").directory
     return calibrate([record]), truth
 
 
 def covered(calibration: Calibration, truth: DeliveryModel) -> dict[str, bool]:
-    """Return for each true parameter whether its interval contains it. Empty without a fit."""
+    """Return, for each true parameter, true if its confidence interval contains it. The result is empty without a
+    fit.
+    """
     if calibration.fit is None:
         return {}
     intervals = calibration.fit.intervals

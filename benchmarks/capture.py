@@ -1,4 +1,5 @@
-"""Measure the rate and the cost of captures: `python -m benchmarks.capture [--vehicles N] [--bytes B] [--rounds R]`.
+"""Measure the rate and the cost of packet captures: `python -m benchmarks.capture [--vehicles N] [--bytes B] [--rounds
+R]`.
 
 In a lab without conditions one vehicle broadcasts at each rate, in a new lab for each rate. N vehicles capture N frames
 of each packet: one at its sender, and one at each other vehicle. `dropped` is the share of frames missing in the files,
@@ -35,7 +36,9 @@ _Row = dict[str, Any]
 
 
 async def once(vehicles: int, rate: int, packets: int, size: int, folder: Path) -> dict[str, float]:
-    """Broadcast this number of packets with `size` bytes of data at `rate` packets per second; 0 means no limit."""
+    """Broadcast packets with `size` bytes of data at `rate` packets per second, and return figures. 0 means no
+    limit.
+    """
     captures = folder / f"{rate}-{time.monotonic_ns()}"
     captures.mkdir()
     async with await Lab.open(range(1, vehicles + 1), log=folder / "lab.log") as lab:
@@ -55,12 +58,12 @@ async def once(vehicles: int, rate: int, packets: int, size: int, folder: Path) 
 
 
 def _pause_s(rate: int) -> float:
-    """Return the pause between two bursts. A packet takes about 20 us itself."""
+    """Return the pause between two groups of packets in seconds. A packet itself takes about 20 microseconds."""
     return max(0.0, _BURST / rate - _BURST * 20e-6) if rate else 0.0
 
 
 async def _broadcast(lab: Lab, packets: int, size: int, pause_s: float, folder: Path) -> float:
-    """Return the duration of the broadcasts, in seconds."""
+    """Return the duration of the broadcasts in seconds."""
     numbers = (_PORT, packets, 0, lab.broadcast, size, pause_s)
     argv = [sys.executable, "-I", "-S", _probe.__file__, "broadcast", *map(str, numbers)]
     output = folder / "broadcast.log"

@@ -1,4 +1,4 @@
-"""Compare the shared channel of `netem.channel` with ns-3: `python -m benchmarks.channel_against_ns3 [--jobs J]`.
+"""Compare the shared radio channel of `netem.channel` with ns-3: `python -m benchmarks.channel_against_ns3 [--jobs J]`.
 
     pip install ns3==3.44.post0 && python -m benchmarks.channel_against_ns3 --measure [--jobs J]
 
@@ -133,7 +133,7 @@ class Cell:
 
     @property
     def per_second(self) -> float:
-        """Return the messages per second of a station."""
+        """Return the number of messages per second of each station."""
         sharing = 3 if self.family == "hidden" else self.n
         return self.load / sharing / (airtime_us(self.standard, BEACON_BYTES) / 1e6)
 
@@ -148,13 +148,15 @@ class Cell:
 
     @property
     def after(self) -> int:
-        """Return the number of messages that keep up the load until the last ones that count have left the queues."""
+        """Return the number of messages that are sent after the counted ones, so that the load stays the same until the
+        end.
+        """
         return (12 if self.load > 0.6 else 3) * self.n
 
 
 @dataclass(frozen=True)
 class Delivery:
-    """Shares of 0 to 1 with their standard errors. Only votes have `asked` and `majority`."""
+    """Shares from 0 to 1 with their standard errors. Only votes have `asked` and `majority`."""
 
     delivered: float
     error: float
@@ -165,7 +167,7 @@ class Delivery:
 
 
 def airtime_us(standard: Standard, payload: int) -> float:
-    """Return the airtime of a UDP datagram, without the signal extension of 802.11g."""
+    """Return the sending time of a UDP datagram in microseconds, without the signal extension of 802.11g."""
     bits = 8 * (payload + HEADER_BYTES)
     return 192.0 + bits if standard == "b" else 20.0 + 4 * math.ceil((22 + bits) / 24)
 
@@ -237,7 +239,7 @@ def in_ns3(program: Path, cell: Cell) -> Delivery | None:
 
 
 def measure(jobs: int) -> None:
-    """Play all cells that the table lacks, and write the table after each of them."""
+    """Play all settings that the table lacks, and write the table after each of them."""
     found = read_table() if TABLE.exists() else {}
     missing = [cell for cell in cells() if cell not in found]
     with tempfile.TemporaryDirectory() as directory, ThreadPoolExecutor(jobs) as pool:
@@ -270,7 +272,7 @@ def read_table() -> dict[Cell, Delivery]:
 
 
 def radio(cell: Cell) -> Contention:
-    """Return the preset of the model with the settings of ns-3."""
+    """Return the radio model with the settings of ns-3."""
     preset = PRESETS["wifi_1" if cell.standard == "b" else "wifi_6"]
     assert isinstance(preset, Contention)
     if cell.standard == "a":
@@ -355,7 +357,7 @@ def mean(samples: Sequence[float]) -> tuple[float, float]:
 
 
 def compare(jobs: int) -> Rows:
-    """Play the cells of the table in the model. A row has the figures in percent and the difference in points."""
+    """Play the settings of the table in the model. A row contains the figures in percent and their difference."""
     table = read_table()
     with ProcessPoolExecutor(jobs) as pool:
         played = dict(zip(table, pool.map(in_model, table, chunksize=8), strict=True))
@@ -375,7 +377,7 @@ def compare(jobs: int) -> Rows:
 
 
 def summary(rows: Rows) -> Rows:
-    """Return the number of cells, and the lowest and highest difference, of each family, standard and size."""
+    """Return the number of settings, and the lowest and highest difference, for each group."""
     groups: dict[tuple[str, str, int], list[float]] = {}
     for row in rows:
         groups.setdefault((row["family"], row["standard"], row["n"]), []).append(row["difference"])

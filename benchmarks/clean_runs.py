@@ -1,4 +1,4 @@
-"""Check thousands of different runs of correct agents. No check may have a finding.
+"""Check thousands of different runs of correct agents. No check may report a finding.
 
     python -m benchmarks.clean_runs [RUNS] [FIRST]
 
@@ -75,7 +75,7 @@ def _death(draw: Random, agents: int, duration_s: float) -> list[dict[str, Any]]
 
 
 def judge(number: int) -> tuple[list[str], dict[str, str]]:
-    """Return a sentence for each bad judgement, and all verdicts."""
+    """Return a sentence for each bad verdict, and all verdicts."""
     result = simulate(scenario(number), number, tracing=True).result
     bad = [f"{key}: {judgement.verdict}: {judgement.reason}" for key, judgement in result.judgements.items()]
     verdicts = {key: judgement.verdict for key, judgement in result.judgements.items()}

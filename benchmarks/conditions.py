@@ -1,4 +1,4 @@
-"""Measure the conditions that engines apply, more often than `ucp-harness doctor --measure`, and also in virtual time.
+"""Measure how exactly engines apply network conditions, more often than `ucp-harness doctor --measure`.
 
     python -m benchmarks.conditions [--packets N] [--rounds R] [--json]
 
@@ -25,7 +25,7 @@ from netem.observers import in_lab, in_medium
 
 
 def observers() -> dict[str, Observer]:
-    """Return the observers of all engines that work on this machine."""
+    """Return the measuring functions for all engines that work on this machine."""
     working = {finding.name for finding in examine() if finding.ok}
     kernel = {engine: in_lab(engine) for engine in get_args(EngineName) if engine in working}
     return {**kernel, "medium": in_medium(seed=1)}

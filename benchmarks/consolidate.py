@@ -1,4 +1,4 @@
-"""Measure the time and memory of `consolidate` for a large swarm, whose chains agree or diverge.
+"""Measure the time and memory of `consolidate` for a large swarm whose chains agree or diverge.
 
 python -m benchmarks.consolidate [AGENTS [BLOCKS]]
 """

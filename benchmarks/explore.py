@@ -1,4 +1,4 @@
-"""Compare the local states reached by a hunt and by random seeds: `python -m benchmarks.explore`.
+"""Compare the number of agent states that a search and random seeds reach: `python -m benchmarks.explore`.
 
 Each round gives both methods the same processor time on one core. The order changes from round to round, and each round
 has its own seeds. The same code plays, follows and judges the runs of both. `small` has three agents that complete
@@ -34,7 +34,7 @@ SEEDS_OF_ROUND = 1_000_000
 
 
 def seeds_alone(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, Reached]:
-    """Return the number of runs, and the local states that they reached."""
+    """Return the number of runs with random seeds, and the agent states that they reached."""
     reached, runs, ends_s = Reached(), 0, time.process_time() + budget_s
     while time.process_time() < ends_s:
         reached.add(play_trial(scenario, first_seed + runs).reached)
@@ -43,7 +43,9 @@ def seeds_alone(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[i
 
 
 def hunted(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, Reached]:
-    """Return the number of runs, and the local states that they reached. The budget includes the start of the hunt."""
+    """Return the number of runs of a search, and the agent states that they reached, including the start of the
+    search.
+    """
     ends_s = time.process_time() + budget_s
     limits, begun = initial_documents(scenario, range(first_seed, first_seed + 4))
     hunt = Hunt(limits, Random(first_seed))
@@ -86,7 +88,7 @@ def compare(scenario: Scenario, rounds: int, seconds: float) -> None:
 
 
 def of(reached: Reached, there: Existing | None) -> str:
-    """Format the number of local states, and the number of existing states within the bounds among them."""
+    """Return the number of agent states as text, with the number of those that exist within the bounds."""
     if there is None:
         return str(len(reached.states))
     return f"{len(reached.states)} ({len(reached.states & there.states)} of {len(there.states)})"

@@ -1,4 +1,4 @@
-"""Damage the records of flights of right agents in many ways, and count the false accusations of the commands.
+"""Damage the records of correct agents in many ways, and count the commands' false accusations.
 
     python -m benchmarks.field_damage [--simulated N] [--processes N] [--first NUMBER] [--only KIND]
 
@@ -46,7 +46,7 @@ BLOCK_BYTES = 4096
 
 
 class NotPossibleError(Exception):
-    """The files of this flight cannot be damaged in this way."""
+    """An error: the files of this flight cannot be damaged in this way."""
 
 
 # Damage
@@ -151,7 +151,7 @@ def cut_block_out(home: Path, draw: Random) -> None:
 
 
 def fill_disk(home: Path, draw: Random) -> None:
-    """Cut out a long part, from the middle of a line to the beginning of another."""
+    """Remove a long part of a file, from the middle of one line to the beginning of another."""
     path = _a_trace(home, draw)
     lines = _lines(path)
     begin = draw.randrange(1, len(lines) // 2)
@@ -174,7 +174,7 @@ def lose_agent(home: Path, draw: Random) -> None:
 
 
 def lose_incarnation(home: Path, draw: Random) -> None:
-    """Cut out one incarnation of a restarted agent."""
+    """Remove the part of a trace between two restarts."""
     for path in sorted(home.glob("*.trace.jsonl")):
         lines = _lines(path)
         starts = [number for number, line in enumerate(lines) if b'"schema"' in line]
@@ -213,7 +213,7 @@ def cut_export(home: Path, draw: Random) -> None:
 
 
 def cut_capture(home: Path, draw: Random) -> None:
-    """Leave exports and captures, one of them cut."""
+    """Keep only exports and packet captures, and cut one capture short."""
     _keep(home, ".chain.json", ".pcapng")
     path = draw.choice(sorted(home.glob("*.pcapng")))
     data = path.read_bytes()
@@ -295,7 +295,7 @@ def scenario(number: int, backend: BackendName, quirk: str | None = None) -> Sce
 
 
 def bring_home(asked: Scenario, number: int, backend: BackendName, run: Path, home: Path) -> dict[int, Export]:
-    """Play a flight and copy the files of its vehicles to `home`. Returns the exports."""
+    """Play a flight and copy the files of its vehicles to `home`. Return the exports."""
     opening = BACKENDS[backend].open(asked, number, RunDirectory(run), Silent(), asyncio.Event())
     asyncio.run(play_on(opening, asked))
     home.mkdir()
@@ -317,7 +317,7 @@ ACCUSATION = re.compile(
 
 @dataclass(frozen=True)
 class Undamaged:
-    """The facts about a flight: the undamaged exports, and the verdicts of `check` on the undamaged files."""
+    """The facts about a flight: the undamaged exports, and the verdicts on the undamaged files."""
 
     chains: dict[int, Export]
     wrong: tuple[str, ...]
@@ -325,7 +325,7 @@ class Undamaged:
 
 @dataclass
 class Concluded:
-    """The conclusions from one set of files.
+    """The conclusions of all commands from one set of files.
 
     `accusations` has a sentence for each statement that an agent is wrong, and `reasons` for each chain that
     `reconstruct` declares impossible.
@@ -390,7 +390,7 @@ COMMANDS: tuple[Command, ...] = (run_reconstruct, run_replay, run_check, run_con
 
 
 def conclude(home: Path, damage: str, whole: Undamaged, commands: Sequence[Command] | None = None) -> Concluded:
-    """Run the commands, all by default, on the files."""
+    """Run the commands (by default all) on the files, and return their conclusions."""
     concluded = Concluded(damage)
     for command in COMMANDS if commands is None else commands:
         try:
@@ -403,7 +403,7 @@ def conclude(home: Path, damage: str, whole: Undamaged, commands: Sequence[Comma
 
 
 def fly(number: int, backend: BackendName, only: str | None = None, quirk: str | None = None) -> list[Concluded]:
-    """Play a flight, and damage its files in all ways that are possible."""
+    """Play a flight, damage its files in all possible ways, and return the conclusions."""
     asked = scenario(number, backend, quirk)
     found = []
     with TemporaryDirectory(prefix="field-damage-") as kept:

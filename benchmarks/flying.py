@@ -1,4 +1,5 @@
-"""Measure the processor time of a swarm of real vehicles: `python -m benchmarks.flying [--vehicles 20] [--seconds 90]`.
+"""Measure the processor time of a swarm of real vehicle programs: `python -m benchmarks.flying [--vehicles 20]
+[--seconds 90]`.
 
 The ArduCopters fly a plan at speedup 1, with agents at 15 % loss. A ground station requests four updates per second
 from each vehicle, and a client reads the live page. Ground station and client belong to this process, which is not
@@ -43,7 +44,7 @@ def scenario(vehicles: int, seconds: float) -> dict[str, Any]:
 
 
 class GroundStation(asyncio.DatagramProtocol):
-    """Request all data streams of each vehicle, and count the received bytes."""
+    """A ground station that requests all messages of each vehicle, and counts the received bytes."""
 
     def __init__(self) -> None:
         self.taken = 0
@@ -63,7 +64,7 @@ class GroundStation(asyncio.DatagramProtocol):
 
 
 def spent(root: int, run: Path) -> dict[str, float]:
-    """Return the processor seconds of a process and its descendants up to now, by their part in the run."""
+    """Return the processor seconds that a process and its descendants have used, by their part in the run."""
     processes: dict[int, tuple[int, float]] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal():

@@ -1,4 +1,4 @@
-"""Measure agents of another implementation in virtual time: `python -m benchmarks.foreign [-- COMMAND...]`.
+"""Measure the speed of agents in another language in virtual time: `python -m benchmarks.foreign [-- COMMAND...]`.
 
 COMMAND is the agent; without it, the benchmark uses the harness's own agent as a program. The missions have 20 minutes,
 five agents and 15 % loss. They run on `--jobs` cores with traces and all checks. The same missions also run with the
@@ -48,7 +48,7 @@ def measure(scenario: Scenario, missions: int, jobs: int) -> tuple[float, int]:
 
 
 def processor_s(scenario: Scenario, missions: int = 10) -> tuple[float, float]:
-    """Return the processor seconds of this process and of the agents for one mission, without the start of agents."""
+    """Return the processor seconds of this process and of the agents for one mission, without the agents' start."""
 
     def used(who: int) -> float:
         usage = resource.getrusage(who)
@@ -72,7 +72,7 @@ def left_behind(simulated: Simulated, *, with_traces: bool) -> object:
 
 
 def same(command: list[str], seeds: int, jobs: int) -> int:
-    """Return the number of missions with a difference."""
+    """Return the number of missions in which the agents behave differently."""
 
     def work(task: tuple[str, int]) -> str:
         name, seed = task

@@ -1,4 +1,5 @@
-"""Send forgeries, replays and repeated nonces to secured agents: `python -m benchmarks.forgeries [--each 1000000]`.
+"""Send forged, repeated and otherwise invalid datagrams to secured agents: `python -m benchmarks.forgeries [--each
+1000000]`.
 
 An agent with keys, which has received messages of others, gets `--each` forged datagrams of each class. A row counts
 the accepted ones, shows whether the state of the agent changed, and gives the processor time for one datagram, also as
@@ -61,7 +62,7 @@ def listener() -> SecuredAgent:
 
 
 def messages(draw: Random) -> list[Message]:
-    """Return a message of each shape."""
+    """Return one message of each type and form."""
     a, b = draw.randbytes(32), draw.randbytes(32)
     block = Block(2, draw.randrange(2**40), draw.randbytes(draw.randrange(1, 300)))
     return [BlockAddRequest(a, b), CommitBlock(block, a), ChainContainResponse(a, True), BlockResponse(block)]
@@ -188,7 +189,7 @@ CLASSES: dict[str, Callable[[Random], Iterator[bytes]]] = {
 
 
 def all_of(agent: SecuredAgent) -> dict[str, Any]:
-    """Return all state that a datagram might change."""
+    """Return all parts of the agent's state that a datagram might change."""
     state, session = agent.state, agent.session
     return {
         "received": agent.received.copy(),
@@ -209,7 +210,7 @@ def all_of(agent: SecuredAgent) -> dict[str, Any]:
 def forge(
     make: Callable[[Random], Iterator[bytes]], count: int, seed: int = 1
 ) -> tuple[int, bool, float, Counter[str]]:
-    """Return the number of accepted forgeries, whether state changed, processor seconds, and reasons for drops."""
+    """Return the number of accepted forgeries, true if the state changed, processor seconds, and reasons for drops."""
     agent, forgeries = listener(), make(Random(1))
     before, seconds, answered = all_of(agent), 0.0, 0
     for _ in range(-(-count // AT_ONCE)):
@@ -233,7 +234,7 @@ def flying(duration_s: float, **more: Any) -> Scenario:
 
 
 class ReplayingAir(VirtualAir):
-    """Deliver each message to all other agents again, `LATER_S` seconds after it was sent."""
+    """A simulated network that delivers each message to all other agents again, `LATER_S` seconds later."""
 
     def broadcast(
         self,
@@ -253,7 +254,8 @@ class ReplayingAir(VirtualAir):
 
 
 def replays(runs: int, loss: float) -> tuple[int, int, list[str]]:
-    """Return the number of missions with unchanged chains, of datagrams dropped as replayed, and the findings.
+    """Return the number of missions with unchanged chains, the number of datagrams dropped as repeated, and the
+    findings.
 
     With loss, an agent that lost a datagram handles its first repetition, as if the radio was slow. The chains may then
     differ, so the checker judges each step instead.
@@ -270,7 +272,7 @@ def replays(runs: int, loss: float) -> tuple[int, int, list[str]]:
 
 
 def nonces(seeds: Iterable[int]) -> tuple[int, int]:
-    """Return the number of sealed datagrams, and the number of those with a key and nonce used before in their run."""
+    """Return the number of encrypted datagrams, and the number of those that reused a key and nonce."""
     used: set[tuple[int, int]] = set()
     sealed = twice = 0
     sealing = SenderKeys.encrypt

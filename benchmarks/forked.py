@@ -1,4 +1,5 @@
-"""Count the swarms that never become idle after a partition, for each cure: `python -m benchmarks.forked`.
+"""Count the swarms that never become idle after a partition, for each protocol correction: `python -m
+benchmarks.forked`.
 
 A random partition divides 3 to 8 agents, which complete some blocks in their groups. Then the partition heals, and no
 messages are lost. The agents complete one to three more blocks, and have 20 minutes to become idle. In half of the runs

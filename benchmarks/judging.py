@@ -1,4 +1,4 @@
-"""Measure the handler runs per second that the step judge compares on one core, and the size of records.
+"""Measure how many handler runs per second the checker compares on one processor core, and the size of records.
 
     python -m benchmarks.judging [ROUNDS]
 

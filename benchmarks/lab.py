@@ -1,4 +1,5 @@
-"""Measure the start and stop of the lab: `python -m benchmarks.lab [--rounds R] [--json] [--mininet] [N ...]`.
+"""Measure the start and stop of the virtual network: `python -m benchmarks.lab [--rounds R] [--json] [--mininet] [N
+...]`.
 
 With `--mininet`, each round also starts and stops the same number of Mininet hosts on one Linux bridge. This needs root
 and the Debian packages mininet and bridge-utils. `build` and `start` are compared with `Lab.open`, and `stop` with
@@ -41,11 +42,11 @@ _Row = dict[str, Any]
 
 
 class _CannotError(Exception):
-    """This machine lacks a requirement. The message names it."""
+    """An error: this machine lacks a requirement. The message names it."""
 
 
 async def lab_once(vehicles: int, log: Path) -> _Row:
-    """Return the seconds in which a lab of `vehicles` vehicles starts and stops, and its engine."""
+    """Return the seconds in which a virtual network starts and stops, and its engine."""
     start = time.perf_counter()
     lab = await Lab.open(range(1, vehicles + 1), log=log)
     up = time.perf_counter()
@@ -54,7 +55,7 @@ async def lab_once(vehicles: int, log: Path) -> _Row:
 
 
 def mininet_once(hosts: int) -> _Row:
-    """Return the seconds of Mininet for this number of hosts, in namespaces that end with all their contents."""
+    """Return the seconds in which Mininet starts and stops this number of hosts."""
     argv = _namespaces.command([_PYTHON, str(_MININET), str(hosts)], user_namespace=False)
     done = subprocess.run(argv, capture_output=True, text=True, timeout=_MININET_DEADLINE_S, check=False)
     if done.returncode != 0:
@@ -111,7 +112,7 @@ def pairs(vehicles: int, rounds: int, log: Path) -> list[_Row]:
 
 
 async def pairs_once(vehicles: int, engine: EngineName, log: Path) -> tuple[float, float]:
-    """Return the seconds to set a loss for each directed pair, and the seconds to change all of them."""
+    """Return the seconds to set a loss for each pair of vehicles, and the seconds to change all of them."""
     directed = list(itertools.permutations(range(1, vehicles + 1), 2))
     losses = [number / (len(directed) + 1) for number in range(1, len(directed) + 1)]
     seconds = []

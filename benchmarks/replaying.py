@@ -1,4 +1,4 @@
-"""Measure `replay` of a long record: the start, the speed, and a single step back.
+"""Measure `replay` with a long record: its start, its speed, and a single step back.
 
     python -m benchmarks.replaying [ROUNDS]
 
@@ -31,7 +31,7 @@ BACKS = 200
 
 @gc_paused()
 def fly(directory: Path) -> None:
-    """Play two hours and deliver all messages, so that each trace has all inputs of its agent."""
+    """Play two hours and deliver all messages, so that each trace contains all inputs of its agent."""
     asked = scenario(AGENTS).model_copy(update={"duration_s": DURATION_S})
     simulation = Simulation(asked, 1, DiskRecorder(RunDirectory(directory)), deliver_all=True)
     story = mission.play(simulation, asked)
@@ -48,13 +48,13 @@ def timed(what: Callable[[], object]) -> float:
 
 
 def opened(directory: Path) -> None:
-    """Run the command that a user runs."""
+    """Run the same command as a user."""
     command = [sys.executable, "-m", "harness.cli", "replay", directory, "--agent", str(AGENT), "--step"]
     subprocess.run(command, input=b"next\nquit\n", stdout=subprocess.DEVNULL, check=True)
 
 
 def backs(record: Record) -> list[float]:
-    """Return the seconds of single steps back, from random positions."""
+    """Return the seconds that single steps back take, from random positions."""
     player, draw = Player(record), Random(1)
     player.to_end()
     took = []

@@ -1,4 +1,4 @@
-"""Combine the figures of all rounds of a benchmark, as a table or as JSON."""
+"""Combine the figures of all rounds of a benchmark, and print them as a table or as JSON."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Spread:
 
     @classmethod
     def of_ratios(cls, figures: Sequence[float], others: Sequence[float]) -> Spread:
-        """Return the ratios of two figures of the same round, so that a slow phase of the machine affects both."""
+        """Return the ratios of two figures from the same rounds, so that a slow machine affects both."""
         return cls.of(figure / other for figure, other in zip(figures, others, strict=True))
 
     def __format__(self, form: str) -> str:
@@ -34,7 +34,7 @@ class Spread:
 
 
 def show(rows: Sequence[Mapping[str, Any]], forms: Mapping[str, str], as_json: bool) -> None:
-    """Print rows with the same keys; `forms` has the format of the spreads of each key."""
+    """Print rows with the same keys. `forms` contains the format for each key."""
     if as_json:
         json.dump([{k: asdict(v) if isinstance(v, Spread) else v for k, v in row.items()} for row in rows], sys.stdout)
         sys.stdout.write("\n")

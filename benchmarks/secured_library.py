@@ -1,4 +1,4 @@
-"""Play the library with and without keys: `python -m benchmarks.secured_library [--seeds 8] [SCENARIO ...]`.
+"""Play all included scenarios with and without keys: `python -m benchmarks.secured_library [--seeds 8] [SCENARIO ...]`.
 
 In virtual time, with the same seed, all agents must export the same chains with keys and without: the same block
 hashes in the same order. A matrix is played at each of its loss rates. Without arguments the benchmark leaves out
@@ -28,7 +28,7 @@ TOO_LARGE = "growth_matrix"
 
 
 class Compared(NamedTuple):
-    """A scenario to play with and without keys; `without` lists the parts that cannot be compared."""
+    """A scenario to play with and without keys. `without` lists the parts that cannot be compared."""
 
     name: str
     scenario: Scenario
@@ -36,7 +36,7 @@ class Compared(NamedTuple):
 
 
 def in_both(name: str, scenario: Scenario) -> Compared:
-    """Return the parts of a scenario that mean the same with and without keys."""
+    """Return the parts of a scenario that have the same meaning with and without keys."""
     timeline = [entry for entry in scenario.timeline if not entry.injection]
     heard = [entry for entry in timeline if not (entry.fault and entry.fault.needs_keys)]
     left_out = {
@@ -61,7 +61,7 @@ def all_of(names: Sequence[str]) -> Iterator[Compared]:
 
 
 def difference(task: tuple[Compared, int]) -> str | None:
-    """Return the first difference between the chains with and without keys; None if they are complete and equal."""
+    """Return the first difference between the chains with and without keys, or None if they are complete and equal."""
     (_, plain, _), seed = task
     without, keyed = (simulate(scenario, seed).result.chains for scenario in (plain, plain.secured()))
     for agent_id in sorted(without.keys() | keyed.keys()):
@@ -77,7 +77,7 @@ def difference(task: tuple[Compared, int]) -> str | None:
 
 
 def compare(asked: Sequence[Compared], seeds: range, jobs: int) -> dict[str, list[str]]:
-    """Return the differing seeds of each scenario with a difference."""
+    """Return the seeds with a difference, for each scenario that has any."""
     different: dict[str, list[str]] = defaultdict(list)
     tasks = [(compared, seed) for compared in asked for seed in seeds]
     with sweep(tasks, difference, jobs, what="missions" if sys.stderr.isatty() else None) as outcomes:

@@ -1,4 +1,4 @@
-"""Measure the cost of security: `python -m benchmarks.securing [--rounds 200] [--missions 20]`.
+"""Measure the cost of encryption and signatures: `python -m benchmarks.securing [--rounds 200] [--missions 20]`.
 
 The first table has the bytes and the processor time of each message, plain and secured, to send and to receive. The
 second one has whole missions in virtual time: a sweep, and runs with traces. Each secured run is compared with the
@@ -119,7 +119,7 @@ def per_mission(missions: int) -> None:
 
 
 def matrix(seeds: int) -> None:
-    """Measure the same cells and seeds plain and secured, and the cost that each secured run must have at least."""
+    """Measure the same runs with and without keys, and the smallest cost that keys must have."""
     plain_s = secured_s = 0.0
     datagrams = 0
     for loss in LOSS_OF_MATRIX:
@@ -148,7 +148,7 @@ def matrix(seeds: int) -> None:
 
 
 def as_processes(speedup: float) -> bool:
-    """Return whether five agents keep up with the clock, plain and secured, by the vote timers in their traces."""
+    """Return true if five agent processes keep up with the clock with and without keys, by their vote timers."""
     plain = Scenario.model_validate(
         {"name": "clock", "network": {"loss": 0.15}, "vehicles": {"kind": "none"}, "speedup": speedup}
     )

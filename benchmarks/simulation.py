@@ -1,4 +1,4 @@
-"""Measure the simulation against a null model: `python -m benchmarks.simulation [--rounds 5]`.
+"""Compare the speed of the simulation with that of a trivial model: `python -m benchmarks.simulation [--rounds 5]`.
 
 `--agents 200 --loss 0.15 --settle 1200 --rounds 1` is the largest swarm. `--matrix` also measures 8 x 200 runs of five
 agents.
@@ -35,7 +35,7 @@ def scenario(agents: int, loss: float, settle_s: float) -> Scenario:
 
 
 def null_model(agents: int, loss: float, broadcasts: int) -> int:
-    """Deliver this number of broadcasts, spread over the mission; return the number of deliveries."""
+    """Deliver this number of broadcasts over a mission without agents. Return the number of deliveries."""
     coming: list[tuple[float, int, int]] = []
     seen: set[tuple[int, int]] = set()
     held = dict.fromkeys(range(agents), 0)
@@ -79,7 +79,7 @@ def main() -> None:
 
 
 def matrix() -> None:
-    """Play all cells like `ucp-harness matrix` on one core, without files."""
+    """Play all runs like `ucp-harness matrix` on one processor core, without writing files."""
     for loss in MATRIX_LOSS:
         cell = scenario(5, loss, 1800.0)
         for seed in range(MATRIX_SEEDS):

@@ -1,4 +1,4 @@
-"""Measure the start of an agent and its memory: `python -m benchmarks.start HEAD~20 [--rounds 20]`.
+"""Measure the start time of an agent and its memory: `python -m benchmarks.start HEAD~20 [--rounds 20]`.
 
 Another revision of the project is checked out in a temporary directory. Agents of both revisions start alternately,
 alone on the loopback interface. Ratios are of one round. An agent is ready when its control socket answers. The
@@ -52,7 +52,7 @@ def _mission() -> dict[str, Any]:
 
 
 def start(command: Sequence[str], root: Path) -> tuple[float, float, float]:
-    """Return wall and processor time until the agent is ready, in ms, and its resident size then, in MB."""
+    """Return the wall time and processor time in ms until the agent is ready, and its memory in MB."""
     with tempfile.TemporaryDirectory() as directory:
         (Path(directory) / "7.mission.json").write_text(json.dumps(_mission()), encoding="utf-8")
         env = {**os.environ, "PYTHONPATH": str(root)}

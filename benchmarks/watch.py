@@ -1,4 +1,4 @@
-"""Measure the server of the live page: `python -m benchmarks.watch [--agents 50] [--minutes 4] [--speedup 1]`.
+"""Measure the web server of the live page: `python -m benchmarks.watch [--agents 50] [--minutes 4] [--speedup 1]`.
 
 A run in virtual time writes the files of real agents: all received messages are in the traces, and vehicles fly. Then
 these files grow again at the same times. The server process reads them ten times per second for one browser, which is a
@@ -36,7 +36,7 @@ def played(directory: Path, agents: int, minutes: float) -> None:
 
 
 def written(directory: Path) -> Written:
-    """Return each line of a run and the mission second at which it was written."""
+    """Return each line of a run with the mission second at which it was written."""
     lines: Written = []
     for path in directory.rglob("*.jsonl"):
         at_s = 0.0
@@ -48,7 +48,7 @@ def written(directory: Path) -> Written:
 
 
 async def serve(directory: Path, lines: Written, speedup: float, ready: multiprocessing.Queue[object]) -> None:
-    """Let the files grow, and read them. The time to write them is not counted."""
+    """Let the files of a run grow, and read them. The time to write them is not counted."""
     with closing(Feed(directory)) as feed, closing(ChangeLog()) as log:
         async with Server(log, directory, live=True).open(0) as address:
             ready.put(address)
@@ -74,7 +74,7 @@ async def serve(directory: Path, lines: Written, speedup: float, ready: multipro
 
 
 def read(address: str) -> None:
-    """Act as a browser that reads all messages and draws nothing."""
+    """Read all messages like a browser, without drawing them."""
 
     async def listen() -> None:
         async with aiohttp.ClientSession() as client, client.ws_connect(f"{address}live", max_msg_size=0) as socket:

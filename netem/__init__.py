@@ -1,4 +1,5 @@
-"""Packets between two vehicles: conditions, the network lab, and the engines that apply conditions.
+"""Control the packets between vehicles: network conditions, a virtual network, and the kernel mechanisms that apply
+conditions.
 
 `__all__` lists the public names. A name is imported at its first use, because the first process of every lab imports
 this package. A lazy import keeps its start fast.

@@ -1,4 +1,4 @@
-"""Netlink attributes (RFC 3549; linux/netlink.h) as bytes.
+"""Encode and decode netlink attributes (RFC 3549; linux/netlink.h).
 
 The package has its own small codec for speed. A lab of 100 vehicles with a condition for each pair needs 20,000
 requests, and 10,000 answers when it is read back.
@@ -23,7 +23,7 @@ def nested(kind: int, *attributes: bytes) -> bytes:
 
 
 def number(kind: int, value: int) -> bytes:
-    """Return an attribute with 32 bits."""
+    """Return an attribute with a 32-bit number."""
     return attribute(kind, struct.pack("=I", value))
 
 
@@ -32,7 +32,7 @@ def text(kind: int, value: str) -> bytes:
 
 
 def parse(data: bytes) -> dict[int, bytes]:
-    """Return the payloads by kind. If a kind occurs twice, the last one counts."""
+    """Return the contents of the attributes by kind. If a kind occurs twice, the last one counts."""
     payloads = {}
     offset = 0
     while offset + _HEADER.size <= len(data):
@@ -43,5 +43,5 @@ def parse(data: bytes) -> dict[int, bytes]:
 
 
 def parse_number(payload: bytes | None) -> int | None:
-    """Return the value of an attribute with 32 bits, or None if it is missing."""
+    """Return the value of a 32-bit attribute, or None if it is missing."""
     return None if payload is None else int.from_bytes(payload[:4], sys.byteorder)

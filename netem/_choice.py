@@ -1,4 +1,4 @@
-"""Choose the engine of a lab: the requested one, or the first that works on this kernel."""
+"""Choose the kernel mechanism (engine) that applies network conditions: the requested one, or the first that works."""
 
 from __future__ import annotations
 

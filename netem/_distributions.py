@@ -1,4 +1,4 @@
-"""Distributions of delays: quantiles of tc-netem(8)'s distributions, in the form of netem's own tables.
+"""Compute the quantiles of the delay distributions in tc-netem(8), in the form of netem's own tables.
 
 netem draws an entry of a table and multiplies it by the jitter. iproute2 contains such tables as files (normal.dist,
 pareto.dist, paretonormal.dist), but not every machine has them. Therefore the tables are computed here.

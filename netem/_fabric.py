@@ -1,4 +1,4 @@
-"""The switch and the cables: bridge `air`, and for each vehicle a network namespace with a veth pair.
+"""Build the virtual network: a bridge named `air`, and a network namespace with a cable (veth pair) for each vehicle.
 
 A vehicle has the interface `eth0` with its address and a default route (ArduPilot built with CAN needs a route for its
 multicast). The other end, `v<ID>`, is a port of the bridge in the lab's own namespace. There the engines handle each
@@ -31,7 +31,7 @@ _CARRIER_DEADLINE_S = 5.0
 
 
 class Fabric:
-    """The lab's network, built in the network namespace of the calling thread."""
+    """The virtual network, built in the network namespace of the calling thread."""
 
     def __init__(self, vehicles: Sequence[int], networks: Mapping[int, int]) -> None:
         self.vehicles = tuple(vehicles)
@@ -49,11 +49,11 @@ class Fabric:
         self._wait_for_carrier()
 
     def port_index(self, vehicle: int) -> int:
-        """Return the interface number of a vehicle's switch port `v<ID>` in the lab's namespace."""
+        """Return the interface number of a vehicle's switch port `v<ID>`."""
         return _FIRST_PORT_INDEX + self.vehicles.index(vehicle)
 
     def inside(self, vehicle: int | None) -> AbstractContextManager[None]:
-        """Run a block in a vehicle's network, or in the lab's own for None."""
+        """Run code in the network of a vehicle, or in the network of the switch for None."""
         return _namespaces.inside(self.home if vehicle is None else self._namespaces[vehicle], self.home)
 
     def inodes(self) -> dict[int, int]:
@@ -61,7 +61,7 @@ class Fabric:
         return {vehicle: os.fstat(namespace).st_ino for vehicle, namespace in self._namespaces.items()}
 
     def _namespace(self, vehicle: int) -> Netlink:
-        """Make a vehicle's namespace unless it exists. Return a netlink socket inside it."""
+        """Create the network namespace of a vehicle unless it exists. Return a netlink socket inside it."""
         if vehicle in self._namespaces:
             _namespaces.enter_network(self._namespaces[vehicle])
         else:
@@ -85,7 +85,7 @@ class Fabric:
         )
 
     def _wait_for_carrier(self) -> None:
-        """Wait until the bridge forwards on each port. The kernel detects a new cable after a short time."""
+        """Wait until the bridge forwards packets on each port. The kernel detects a new cable after a short time."""
         deadline = time.monotonic() + _CARRIER_DEADLINE_S
         while True:
             ready = forwarding(self.netlink)
@@ -99,18 +99,18 @@ class Fabric:
 
 
 def _disable_ipv6() -> None:
-    """Disable IPv6 on new links, because it would send packets on an idle link."""
+    """Disable IPv6 on new links, because it would send packets when no program does."""
     _sysctl("ipv6/conf/default/disable_ipv6", b"1")
 
 
 def _bypass_firewall() -> None:
-    """Keep br_netfilter, which Docker often loads, from filtering packets of the bridge."""
+    """Prevent br_netfilter, which Docker often loads, from filtering packets of the bridge."""
     for protocol in ("iptables", "ip6tables", "arptables"):
         _sysctl(f"bridge/bridge-nf-call-{protocol}", b"0")
 
 
 def _sysctl(name: str, value: bytes) -> None:
-    """Set a value of the current network namespace, if the kernel has it."""
+    """Set a kernel parameter of the current network namespace, if the kernel has it."""
     try:
         fd = os.open(f"/proc/sys/net/{name}", os.O_WRONLY | os.O_CLOEXEC)
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The netlink requests of the fabric about links, addresses and routes.
+"""Build the netlink requests for the links, addresses and routes of the virtual network.
 
 Messages and numbers come from linux/rtnetlink.h, if_link.h, if_addr.h and veth.h. See rtnetlink(7).
 """
@@ -32,7 +32,7 @@ def set_up(what: str, index: int) -> Request:
 
 
 def bridge(name: str, index: int) -> Request:
-    """Return a request for an active bridge.
+    """Return a request that creates and activates a bridge.
 
     Without spanning tree and forward delay, ports forward at once. Without multicast snooping, multicast reaches all
     vehicles, as it does by radio.
@@ -61,7 +61,7 @@ def veth_pair(name: str, index: int, bridge: int, *, far_name: str, far_index: i
 
 
 def address(what: str, index: int, own: str, prefix_length: int, broadcast: str) -> Request:
-    """Return a request for an IPv4 address of a link."""
+    """Return a request that gives a link an IPv4 address."""
     attributes = [
         attribute(kind, socket.inet_aton(each))
         for kind, each in ((_IFA_LOCAL, own), (_IFA_ADDRESS, own), (_IFA_BROADCAST, broadcast))
@@ -71,7 +71,9 @@ def address(what: str, index: int, own: str, prefix_length: int, broadcast: str)
 
 
 def default_route(what: str, index: int) -> Request:
-    """Return a request for a default route without a gateway: all addresses are neighbours on that link."""
+    """Return a request for a default route without a gateway, so that all addresses count as neighbours on this
+    link.
+    """
     kind = (_RT_TABLE_MAIN, _RTPROT_STATIC, _RT_SCOPE_LINK, _RTN_UNICAST)
     return Request(what, RTM_NEWROUTE, _RTMSG.pack(socket.AF_INET, 0, 0, 0, *kind, 0) + number(_RTA_OIF, index), NEW)
 
@@ -88,7 +90,7 @@ def _forwards(port: bytes) -> bool:
 
 
 def flood_broadcasts(port: str, index: int, on: bool) -> Request:
-    """Return a request that makes the bridge send broadcasts of other ports to this port, or keeps it from that."""
+    """Return a request that makes the bridge send broadcasts of other ports to this port, or stops it."""
     flag = nested(_IFLA_PROTINFO, attribute(_IFLA_BRPORT_BCAST_FLOOD, bytes([on])))
     return Request(f"set bcast_flood of {port}", RTM_SETLINK, _IFINFOMSG.pack(socket.AF_BRIDGE, 0, index, 0, 0) + flag)
 

@@ -1,4 +1,6 @@
-"""The orchestrator's end of the control socket: requests, answers, and reports of ended processes."""
+"""Send requests to the process inside the virtual network, and receive its answers and its reports of ended
+programs.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ class _Request:
 
 
 class Channel:
-    """The connection to one `netem.init`. When that process has ended, each request fails with the same error."""
+    """The connection to the process `netem.init`. After this process has ended, each request fails with the same
+    error.
+    """
 
     def __init__(self, control: socket.socket, log: Path) -> None:
         control.setblocking(False)
@@ -45,7 +49,7 @@ class Channel:
         return self._end is None
 
     async def inside(self) -> bool:
-        """Wait for the first report of the lab's first process. Return False if it has ended instead."""
+        """Wait for the first report of the process. Return False if it has ended instead."""
         return await asyncio.shield(self._inside)
 
     async def ask(self, what: str, **arguments: Any) -> Answer:
@@ -72,7 +76,7 @@ class Channel:
             await self._loop.sock_sendall(self._control, data)
 
     def close(self) -> None:
-        """Close the connection, which ends the lab."""
+        """Close the connection. This ends the virtual network."""
         self._finish("The lab is closed")
 
     def _receive(self) -> None:

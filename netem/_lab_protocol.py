@@ -1,4 +1,5 @@
-"""The protocol between orchestrator and lab: JSON objects with length prefixes on a Unix stream socket.
+"""Define the messages between the harness and its virtual network: JSON objects with length prefixes on a Unix stream
+socket.
 
 Sockets accompany a message as SCM_RIGHTS (unix(7)). Such a message has their number in its key `descriptors`. Both
 sides keep the order.
@@ -21,7 +22,7 @@ _MAX_DESCRIPTORS = 64
 
 
 class WireError(Exception):
-    """Invalid data in the stream. Everything after it is unusable."""
+    """An error: the stream contains invalid data. Everything after them is unusable."""
 
 
 def encode(message: dict[str, Any]) -> bytes:
@@ -32,7 +33,7 @@ def encode(message: dict[str, Any]) -> bytes:
 
 
 class Receiver:
-    """Splits the stream of a socket into messages and descriptors."""
+    """Divides the data of a socket into messages and file descriptors."""
 
     def __init__(self) -> None:
         self._data = bytearray()

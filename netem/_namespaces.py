@@ -1,4 +1,4 @@
-"""Private networks for processes: unshare(1) around the lab's first process, and setns(2) inside it.
+"""Create private networks for processes, with unshare(1) for the first process and setns(2) inside it.
 
 The first process is PID 1 of its own PID namespace. Its end therefore ends each process of the lab, and afterwards the
 kernel removes namespaces, links and rules. Three mechanisms end it: the orchestrator closes the control socket or dies,
@@ -22,7 +22,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def unshare_network() -> None:
-    """Move this thread into a new network namespace (unshare(2); `os.unshare` is Python 3.12)."""
+    """Move this thread into a new network namespace (unshare(2), because `os.unshare` needs Python 3.12)."""
     _check(_libc.unshare(CLONE_NEWNET))
 
 
@@ -32,13 +32,13 @@ def open_network() -> int:
 
 
 def enter_network(namespace: int) -> None:
-    """Move this thread into a network namespace (setns(2); `os.setns` is Python 3.12)."""
+    """Move this thread into a network namespace (setns(2), because `os.setns` needs Python 3.12)."""
     _check(_libc.setns(namespace, CLONE_NEWNET))
 
 
 @contextmanager
 def inside(namespace: int, home: int) -> Iterator[None]:
-    """Run a block in network namespace `namespace`, then return to `home` (both descriptors)."""
+    """Run code in the network namespace `namespace`, and then return to `home`. Both are file descriptors."""
     enter_network(namespace)
     try:
         yield
@@ -66,7 +66,7 @@ def command(argv: Sequence[str], *, user_namespace: bool, die_with_parent: bool 
 
 
 def user_namespace_choices() -> tuple[bool, ...]:
-    """Return the values of `user_namespace` to try, in order.
+    """Return the values of `user_namespace` to try, in this order.
 
     Root needs no user namespace unless its rights are limited.
     """
@@ -74,7 +74,7 @@ def user_namespace_choices() -> tuple[bool, ...]:
 
 
 def probe() -> tuple[bool, str]:
-    """Return whether this machine allows the namespaces, with the mode, or with the message of the refused tool."""
+    """Return true if this machine allows network namespaces, and a description or the error message."""
     message = ""
     for user_namespace in user_namespace_choices():
         argv = command(["true"], user_namespace=user_namespace, die_with_parent=False)
@@ -91,13 +91,15 @@ def probe() -> tuple[bool, str]:
 
 
 def not_executed(message: str) -> tuple[str, str] | None:
-    """Return program and reason from a tool's message about a program that it could not start, or None."""
+    """Return the program and the reason from a tool's error message about a program that it could not start, or
+    None.
+    """
     match = re.fullmatch(r"(?:unshare|setpriv): failed to execute (.+): (.+)", message)
     return (match[1], match[2]) if match else None
 
 
 def user() -> str:
-    """Return the user who executes programs, such as "user mail". Root of a user namespace is the user outside."""
+    """Return the user who executes programs, such as "user mail". In a user namespace, root is the user outside."""
     uid = os.geteuid()
     for line in Path("/proc/self/uid_map").read_text().splitlines():
         inside, outside, count = map(int, line.split())
@@ -111,7 +113,7 @@ def user() -> str:
 
 
 def way_out(message: str) -> str:
-    """Return advice for namespaces that were refused with this message, from the settings of this machine."""
+    """Return advice for the user after this machine refused namespaces with this message."""
     if "not installed" in message:
         return "Install util-linux (Debian, Ubuntu: apt install util-linux)."
     if not_executed(message):

@@ -1,4 +1,4 @@
-"""A netlink socket that sends requests in batches (rtnetlink(7)), without a round trip for each request.
+"""Send requests to the kernel in batches through a netlink socket (rtnetlink(7)), which is fast.
 
 A lab of 100 vehicles needs about 900 requests. One system call and one wait for each of them would take most of its
 start time. The socket belongs to the namespace in which it was opened.
@@ -42,7 +42,7 @@ _BATCH_BYTES = 64 << 10  # a socket accepts about three times as much at once
 
 @dataclass(frozen=True)
 class Request:
-    """One change for the kernel. `what` names it in an error."""
+    """One request to the kernel. `what` names it in error messages."""
 
     what: str
     type: int
@@ -51,7 +51,7 @@ class Request:
 
 
 class Netlink:
-    """A NETLINK_ROUTE socket of the caller's network namespace."""
+    """A NETLINK_ROUTE socket in the caller's network namespace."""
 
     def __init__(self) -> None:
         kind = socket.SOCK_RAW | socket.SOCK_CLOEXEC

@@ -1,4 +1,4 @@
-"""Engine "nftables": loss and partitions as rules of `table bridge air`, for kernels without sch_netem.
+"""The engine "nftables": it applies loss and partitions with rules in `table bridge air`, on kernels without netem.
 
 The rules are in the forward hook of the bridge. It handles each packet of any protocol once per receiver, because the
 switch has already copied broadcasts. Each receiver therefore has its own random draws. A packet is first marked with
@@ -51,7 +51,7 @@ _COMMANDS_AT_ONCE = 500
 
 
 class NftablesEngine(Engine):
-    """Independent loss per sender and receiver, and partitions.
+    """An engine for independent loss per sender and receiver, and for partitions.
 
     Conditions that need a queue or a memory are not supported.
     """
@@ -112,7 +112,7 @@ class NftablesEngine(Engine):
         return commands
 
     def _loss(self, conditions: NetworkConditions) -> list[list[dict[str, Any]]]:
-        """Return the commands for each receiver."""
+        """Return the commands that set the loss for each receiver."""
         differing: dict[int, dict[float, list[int]]] = {}
         for sender, receiver, link in conditions.differing_links():
             differing.setdefault(receiver, {}).setdefault(link.independent_loss, []).append(sender)
@@ -191,7 +191,7 @@ class NftablesEngine(Engine):
 
 
 def _grouped(parts: list[list[dict[str, Any]]]) -> Iterator[list[dict[str, Any]]]:
-    """Combine consecutive parts into groups of at most `_COMMANDS_AT_ONCE` commands. No part is divided."""
+    """Combine neighbouring parts into groups of at most `_COMMANDS_AT_ONCE` commands. No part is divided."""
     together: list[dict[str, Any]] = []
     for part in parts:
         if together and len(together) + len(part) > _COMMANDS_AT_ONCE:
@@ -218,7 +218,7 @@ def _match(operator: str, left: dict[str, Any], right: int) -> dict[str, Any]:
 
 
 def _loss_rules(chain: str, port: str, loss: float) -> list[dict[str, Any]]:
-    """Return rules that lose packets to a port with this probability, and pass the others."""
+    """Return rules that drop packets to a port with this probability, and pass the others."""
     drop: list[dict[str, Any]] = [{"counter": f"lost_{port}"}, {"drop": None}]
     if loss == 1.0:
         return [_rule(chain, *drop)]
@@ -232,7 +232,7 @@ def _loss_rules(chain: str, port: str, loss: float) -> list[dict[str, Any]]:
 
 
 def _verdicts(rules: list[list[dict[str, Any]]]) -> Iterator[tuple[str, str]]:
-    """Yield each port of a verdict map with the chain that its packets go to."""
+    """Yield each port in a verdict map, with the chain of rules for its packets."""
     for expressions in rules:
         for expression in expressions:
             if "vmap" in expression:
@@ -241,13 +241,13 @@ def _verdicts(rules: list[list[dict[str, Any]]]) -> Iterator[tuple[str, str]]:
 
 
 def _only_mark(rules: list[list[dict[str, Any]]]) -> int | None:
-    """Return the mark of the only group that the receiver accepts, or None if it accepts all."""
+    """Return the mark of the only group from which the receiver accepts packets, or None if it accepts all."""
     marks = [e["match"]["right"] for expressions in rules for e in expressions if "match" in e]
     return marks[0] if marks else None
 
 
 def _loss(rules: list[list[dict[str, Any]]]) -> float:
-    """Return the loss that these rules cause."""
+    """Return the loss rate that these rules cause."""
     for expressions in rules:
         if any("drop" in expression for expression in expressions):
             matches = [expression["match"] for expression in expressions if "match" in expression]

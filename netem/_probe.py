@@ -1,4 +1,5 @@
-"""Send and receive test packets inside vehicles. This file needs only the standard library, and is started by its path.
+"""Send and receive test packets inside a vehicle. This file needs only the standard library, and is started by its
+path.
 
     _probe.py receive PORT      receive the UDP datagrams of a port until SIGTERM
     _probe.py broadcast PORT COUNT FIRST BROADCAST_ADDRESS [BYTES [PAUSE_S]]
@@ -37,13 +38,13 @@ _MEMORY = struct.Struct("=2I")  # receive buffer: used and available bytes (sock
 
 
 def print_json(what: object) -> None:
-    """Print one line of JSON."""
+    """Print an object as one line of JSON."""
     sys.stdout.write(f"{json.dumps(what)}\n")
     sys.stdout.flush()
 
 
 def collect(source: socket.socket, size: int) -> list[tuple[bytes, int]]:
-    """Return all packets until SIGTERM and a short silence after it, each with its arrival time in ns.
+    """Return all packets until SIGTERM and a short silence after it, each with its time of arrival in nanoseconds.
 
     The packets stay in the socket's buffer as long as it has room, and the process has the lowest priority. Otherwise
     its own use of the processor would delay the packets that it measures.

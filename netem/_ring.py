@@ -1,4 +1,4 @@
-"""Capture all frames of one switch port with AF_PACKET, through a ring buffer shared with the kernel (TPACKET_V3).
+"""Capture all frames of one switch port, through a buffer that is shared with the kernel (AF_PACKET, TPACKET_V3).
 
 The kernel fills the blocks of the ring. It hands over a block when it is full or 100 ms old. A late reader finds all
 blocks that fit into the ring. The kernel counts the frames of the port and the frames that did not fit, so losses are
@@ -45,7 +45,7 @@ RETIRE_MS = 100
 
 
 class Ring:
-    """The frames that cross the port from now on, in a ring of `blocks` blocks.
+    """A ring buffer of `blocks` blocks with the frames that cross the port from now on.
 
     Raises OSError if the kernel lacks AF_PACKET, the port or the memory.
     """
@@ -67,11 +67,13 @@ class Ring:
         self._socket.bind((port, _ETH_P_ALL))
 
     def fileno(self) -> int:
-        """Return the file descriptor. It is readable when a block is available."""
+        """Return the file descriptor, which is readable when a block of frames is available."""
         return self._socket.fileno()
 
     def take(self) -> Iterator[tuple[int, bytes, bool]]:
-        """Yield (time in Unix ns, frame, whether it leaves the port) of the available frames, at most one ring."""
+        """Yield the available frames as (time in Unix ns, frame, true if it leaves the port), at most one ring buffer
+        full.
+        """
         memory = self._memory
         for _ in range(self._blocks):
             block = self._next * BLOCK_BYTES
@@ -94,13 +96,13 @@ class Ring:
             self._next = (self._next + 1) % self._blocks
 
     def stop(self) -> None:
-        """Accept no more frames."""
+        """Stop capturing frames."""
         nothing = array("Q", struct.pack("=HBBI", _RETURN, 0, 0, 0))
         address, _ = nothing.buffer_info()
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(nothing), address))
 
     def count(self) -> int:
-        """Update the counters from the kernel. Return the number of frames that can still be taken."""
+        """Update the counters from the kernel, and return the number of frames that can still be taken."""
         counts = self._socket.getsockopt(_SOL_PACKET, _STATISTICS, _COUNTS.size)
         received, dropped, _ = _COUNTS.unpack(counts)  # since the last call
         self.received += received

@@ -1,4 +1,4 @@
-"""The netlink requests of engine "netem" for one switch port.
+"""Build the netlink requests of the engine "netem" for one switch port.
 
 Numbers come from linux/pkt_sched.h, pkt_cls.h and tc_act/. HTB is used only for its classes. Their rate is the highest
 without the 64-bit attribute (34 Gbit/s), which is more than a veth pair carries.
@@ -71,7 +71,9 @@ _NETEM = struct.Struct("=6I")
 
 @dataclass(frozen=True)
 class Class:
-    """The conditions and packet counters of one class. The kernel does not report the distribution of its delay."""
+    """The conditions and packet counters of one traffic class. The kernel does not report the distribution of its
+    delay.
+    """
 
     link: LinkConditions
     passed: int
@@ -80,18 +82,18 @@ class Class:
 
 
 class TrafficControl:
-    """Requests for one switch port, given by its interface number."""
+    """Builds the requests for one switch port, which is given by its interface number."""
 
     def __init__(self, index: int) -> None:
         self.index = index
 
     def install(self) -> list[Request]:
-        """Return the netlink requests that install an HTB queueing discipline without classes."""
+        """Return the requests that install the queueing discipline HTB without traffic classes."""
         settings = struct.pack("=5I", 3, 10, 0, 0, 0)  # version, rate2quantum, default class, debug, direct packets
         return [Request("add qdisc htb", RTM_NEWQDISC, self._message("htb", _ROOT, _HTB, attribute(2, settings)), NEW)]
 
     def guard(self) -> list[Request]:
-        """Return requests for filters that drop all packets at this port until `accept_group` allows a group.
+        """Return the requests for filters that drop all packets at this port until `accept_group` allows a group.
 
         Frames with the mark of a relay pass.
         """
@@ -116,7 +118,7 @@ class TrafficControl:
         return [Request("set class of htb", RTM_NEWTCLASS, message, _SET), self.change_class(kind, link)]
 
     def change_class(self, kind: int, link: LinkConditions, *, table: bool = True) -> Request:
-        """Set the netem of a class, in place if it exists. Without `table`, its distribution stays."""
+        """Return the request that sets the conditions of a traffic class. Without `table`, its distribution stays."""
         options = _options(link, table)
         message = self._header(_HTB | kind, (0x8000 | kind) << 16) + text(_KIND, "netem") + options
         return Request("set qdisc netem", RTM_NEWQDISC, message, _SET)
@@ -125,21 +127,21 @@ class TrafficControl:
         return Request("delete class of htb", RTM_DELTCLASS, self._message("htb", _HTB, _HTB | kind))
 
     def mark(self, kind: int, group: int) -> Request:
-        """Assign a kind and a group to packets that enter at this port, in one step."""
+        """Return the request that assigns a kind and a group to packets that enter at this port."""
         parameters = attribute(2, struct.pack("=IIiii", 0, 0, _ACT_OK, 0, 0))
         edit = nested(1, text(1, "skbedit"), nested(2, parameters, number(3, _HTB | kind), number(5, group)))
         message = self._filter("basic", _INGRESS, 1, _ONLY, nested(3, edit))
         return Request("set filter basic with action skbedit", RTM_NEWTFILTER, message, _SET)
 
     def accept_group(self, group: int) -> Request:
-        """Let packets of a group leave at this port."""
+        """Return the request that lets packets of a group leave at this port."""
         return Request("add filter fw", RTM_NEWTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group), NEW)
 
     def reject_group(self, group: int) -> Request:
         return Request("delete filter fw", RTM_DELTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group))
 
     def read_mark(self, netlink: Netlink) -> tuple[int, int] | None:
-        """Return the kind and group that the kernel gives to packets that enter at this port."""
+        """Return the kind and group that the kernel assigns to packets that enter at this port."""
         for entry in netlink.dump("list filters", RTM_GETTFILTER, self._header(_INGRESS, 0)):
             edit = _inside(parse(entry[_TCMSG.size :]), _OPTIONS, 3, 1, 2)
             kind, group = parse_number(edit.get(3)), parse_number(edit.get(5))
@@ -148,7 +150,7 @@ class TrafficControl:
         return None
 
     def accepted_groups(self, netlink: Netlink) -> tuple[set[int], int]:
-        """Return the groups whose packets leave at this port, and the number of dropped packets of other groups."""
+        """Return the groups whose packets may leave at this port, and the number of dropped packets of other groups."""
         groups = set()
         cut = 0
         for entry in netlink.dump("list filters", RTM_GETTFILTER, self._header(_EGRESS, 0)):
@@ -162,7 +164,7 @@ class TrafficControl:
 
     @staticmethod
     def classes(netlink: Netlink) -> dict[int, dict[int, Class]]:
-        """Return the classes of all ports by interface number, from one request for the whole switch."""
+        """Return the traffic classes of all ports by interface number, from a single request."""
         classes: dict[int, dict[int, Class]] = {}
         for entry in netlink.dump("list qdiscs", RTM_GETQDISC, bytes(_TCMSG.size)):
             _, _, _, index, _, parent, _ = _TCMSG.unpack_from(entry)
@@ -188,7 +190,7 @@ class TrafficControl:
 
 
 def _inside(attributes: Mapping[int, bytes], *path: int) -> Mapping[int, bytes]:
-    """Return the attributes at the end of a path of nested attributes, or none if the path is missing."""
+    """Return the attributes at the end of a path of nested attributes, or none if the path does not exist."""
     for kind in path:
         attributes = parse(attributes.get(kind, b""))
     return attributes
@@ -196,7 +198,7 @@ def _inside(attributes: Mapping[int, bytes], *path: int) -> Mapping[int, bytes]:
 
 @lru_cache(maxsize=1 << 12)
 def _options(link: LinkConditions, table: bool) -> bytes:
-    """Return the conditions as netem's TCA_OPTIONS."""
+    """Return the conditions in the format of netem's TCA_OPTIONS."""
     delay = link.delay or Delay(0)
     latency_ns, jitter_ns = _nanoseconds(delay.mean_s), _nanoseconds(delay.jitter_s)
     loss = 0 if isinstance(link.loss, GilbertElliott) else _share(link.loss)
@@ -235,7 +237,7 @@ def _table(distribution: Distribution) -> bytes:
 
 
 def _link(options: bytes) -> LinkConditions:
-    """Return netem's options as conditions. It is the inverse of `_options`, except for the distribution."""
+    """Return netem's options as conditions. This is the inverse of `_options`, except for the distribution."""
     _, limit, loss, _, duplicate, _ = _NETEM.unpack_from(options)
     attributes = parse(options[_NETEM.size :])
     shares = (loss, duplicate, *(parse_number(attributes.get(key)) or 0 for key in (_NETEM_REORDER, _NETEM_CORRUPT)))
@@ -268,12 +270,12 @@ def _conditions(
 
 
 def _share(probability: float) -> int:
-    """Return a probability in netem's steps. A probability other than 0 and 1 does not become 0 or 1 by rounding."""
+    """Return a probability in netem's units. Rounding never changes it to 0 or 1."""
     if not 0.0 < probability < 1.0:
         return _ALWAYS if probability else 0
     return min(max(round(probability * _ALWAYS), 1), _ALWAYS - 1)
 
 
 def _nanoseconds(seconds: float) -> int:
-    """Return a time in nanoseconds. A time above 0 does not become 0 by rounding."""
+    """Return a time in nanoseconds. Rounding never changes a positive time to 0."""
     return max(round(seconds * _NANO), 1) if seconds else 0

@@ -1,4 +1,6 @@
-"""The counters of UDP datagrams in a network namespace, from /proc/net/snmp and /proc/net/netstat (proc_net(5))."""
+"""Read the counters of UDP datagrams in a network namespace, from /proc/net/snmp and /proc/net/netstat
+(proc_net(5)).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ _NET = Path("/proc/thread-self/net")
 
 @dataclass(frozen=True)
 class UdpCounters:
-    """Datagrams of all UDP sockets in the network of one vehicle, also of sockets that are closed.
+    """The counts of UDP datagrams in the network of one vehicle, including those of closed sockets.
 
     `broadcasts` counts the broadcasts that arrived, also the vehicle's own ones. `read` counts the datagrams that
     programs have read. `overflowed` counts those that the kernel discarded because the buffer of their socket was full,

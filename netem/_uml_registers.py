@@ -31,7 +31,9 @@ _COMPILE = ("cc", "-O2", "-shared", "-fPIC", "-ffreestanding", "-nostdlib")
 
 
 def needed(kernel: Path | None) -> bool:
-    """Return whether User Mode Linux needs the library on this processor; for None, whether any known version does."""
+    """Return true if User Mode Linux needs the library on this processor. None as the kernel means any known
+    version.
+    """
     if os.environ.get(FORCE):
         return True
     if _FLAGS.isdisjoint(Path("/proc/cpuinfo").read_text().split()):
@@ -44,12 +46,14 @@ def needed(kernel: Path | None) -> bool:
 
 
 def has_compiler() -> bool:
-    """Return whether the library can be compiled here."""
+    """Return true if the library can be compiled on this machine."""
     return shutil.which(_COMPILE[0]) is not None
 
 
 def preload(folder: Path) -> dict[str, str]:
-    """Compile the library into `folder`. Return environment variables for a kernel started there. Raises UmlError."""
+    """Compile the library into `folder`. Return the environment variables with which to start the kernel. Raises
+    UmlError.
+    """
     library = folder / "registers.so"
     done = subprocess.run(
         [*_COMPILE, "-o", library, SOURCE], capture_output=True, text=True, errors="replace", check=False

@@ -1,4 +1,4 @@
-"""The capture of a lab: a pcapng file for each vehicle, with all frames of its interface.
+"""Capture all frames of a virtual network, in a pcapng file for each vehicle.
 
     capture = await LiveCapture.start(lab, folder)
     await capture.begin(epoch_us, speedup)
@@ -43,7 +43,7 @@ def begin_file(folder: Path, vehicle: int, epoch_us: int, speedup: float) -> Pat
 
 
 class LiveCapture:
-    """A running capture, made by `LiveCapture.start`."""
+    """A running packet capture. `LiveCapture.start` creates it."""
 
     def __init__(self, vehicles: Sequence[int], folder: Path, process: LabProcess) -> None:
         self._vehicles = vehicles
@@ -54,7 +54,7 @@ class LiveCapture:
 
     @classmethod
     async def start(cls, lab: Lab, folder: Path, vehicles: Sequence[int] | None = None) -> LiveCapture:
-        """Capture the ports of `vehicles`, by default of all vehicles in the lab. Raises LiveCaptureError.
+        """Start to capture the ports of `vehicles`, by default of all vehicles. Raises LiveCaptureError.
 
         Frames wait in memory until `begin`.
         """
@@ -79,17 +79,17 @@ class LiveCapture:
         return capture
 
     async def begin(self, epoch_us: int, speedup: float) -> None:
-        """Create the files, and write the waiting frames. Raises OSError."""
+        """Create the files, and write the frames that have been captured so far. Raises OSError."""
         for vehicle in self._vehicles:
             begin_file(self._folder, vehicle, epoch_us, speedup)
         await self._process.send_signal(signal.SIGUSR1)
 
     async def watch(self) -> None:
-        """Wait for the capture to end by itself, then raise LiveCaptureError."""
+        """Wait until the capture ends by itself, then raise LiveCaptureError."""
         raise self._ended(await self._process.wait())
 
     async def stop(self) -> dict[int, dict[str, int]]:
-        """Finish the files. Return for each vehicle the number of `received` frames, and of these the number `dropped`.
+        """Finish the files. Return for each vehicle the number of frames, and the number of those that the file lacks.
 
         Dropped frames are in no file. Raises LiveCaptureError if the capture failed.
         """

@@ -1,4 +1,4 @@
-"""Network conditions: links and partitions as values, independent of the engine that applies them.
+"""Represent network conditions (links and partitions) independently of the mechanism that applies them.
 
 As in the thesis, conditions belong to the receiver: each receiver of a broadcast draws separately. In addition, the
 link from one sender to one receiver can have conditions of its own, in one direction. `netem.link` defines the
@@ -65,17 +65,17 @@ class NetworkConditions:
         return self.links.get((sender, receiver)) or self.receivers.get(receiver, self.default)
 
     def is_cut(self, sender: int, receiver: int) -> bool:
-        """Return true if the partition separates the two vehicles."""
+        """Return true if a partition separates the two vehicles."""
         return self._group(sender) != self._group(receiver)
 
     @property
     def fully_connected(self) -> bool:
-        """True without partition and without loss on any link. Packets may still be late or duplicated."""
+        """True if there is no partition and no link loses packets. Packets may still be late or duplicated."""
         links = (self.default, *self.receivers.values(), *self.links.values())
         return not self.partition and all(link.lossless for link in links)
 
     def needs(self) -> tuple[str, ...]:
-        """Return the conditions other than independent loss and partition.
+        """Return the names of the conditions other than independent loss and partition.
 
         Each occurs once, with its first place: "delay", "receivers 3 reorder", "links 1>2 delay".
         """
@@ -87,13 +87,15 @@ class NetworkConditions:
         return tuple(asked.values())
 
     def differing_links(self) -> Iterator[tuple[int, int, LinkConditions]]:
-        """Yield (sender, receiver, conditions) of the links that differ from the conditions of their receiver."""
+        """Yield (sender, receiver, conditions) for each link that differs from the other links to its receiver."""
         for (sender, receiver), link in self.links.items():
             if link != self.receivers.get(receiver, self.default):
                 yield sender, receiver, link
 
     def groups(self, vehicles: Iterable[int]) -> tuple[frozenset[int], ...]:
-        """Return the groups of these vehicles, vehicles in no group last. Without a partition, return one group."""
+        """Return the groups of these vehicles. Vehicles in no group form the last one. Without a partition, return one
+        group.
+        """
         members: dict[int, set[int]] = {}
         for vehicle in vehicles:
             members.setdefault(self._group(vehicle), set()).add(vehicle)
@@ -108,7 +110,7 @@ class NetworkConditions:
         return replace(self, partition=())
 
     def with_listener(self, listener: int, vehicles: Iterable[int]) -> NetworkConditions:
-        """Return the conditions with a further vehicle, whose links to and from `vehicles` are perfect.
+        """Return the conditions with one more vehicle, whose links to and from `vehicles` are perfect.
 
         The listener must reach all groups. Therefore links with a loss of 1 replace the partition.
         """
@@ -118,7 +120,7 @@ class NetworkConditions:
         return replace(self, links={**self.links, **cut, **heard}, partition=())
 
     def at_speed(self, speedup: float) -> NetworkConditions:
-        """Return the conditions on a clock on which the mission runs `speedup` times as fast.
+        """Return the conditions for a mission that runs `speedup` times as fast as wall time.
 
         A kernel measures wall time. It needs delays that are shorter, and rates that are higher, by this factor.
         """
@@ -151,7 +153,7 @@ class NetworkConditions:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> NetworkConditions:
-        """Return the conditions of this JSON object, as `to_json` returns it. Raises ConditionsError."""
+        """Return the conditions in this JSON object, which has the format of `to_json`. Raises ConditionsError."""
         keywords(cls, value)
         return cls(
             LinkConditions.from_json(value.get("default", {})),

@@ -1,4 +1,4 @@
-"""The interface of engines. An engine lets the kernel apply conditions to packets, and reports the results.
+"""Define the interface of engines. An engine makes the kernel apply conditions to packets, and reports the result.
 
 There are two engines: `netem.tc` (tc-netem(8)) and `netem._nft` (nft(8)). For each receiver, both report the kernel's
 counts of passed, lost and cut packets. The counts start with the lab and are not reset by a change. After each change,
@@ -32,7 +32,7 @@ _MAX_WORDS = 600  # characters of conditions in an error message
 
 @dataclass(frozen=True)
 class ReceiverFigures:
-    """The kernel's conditions and counters for packets to one vehicle.
+    """The conditions and packet counters of the kernel for one receiver.
 
     `link` applies to all senders except those in `links`. `cut_from` lists the senders that a partition separates.
     `passed`, `lost` (by chance or a full queue) and `cut` count packets since the start of the lab. A broadcast counts
@@ -48,14 +48,14 @@ class ReceiverFigures:
 
     @classmethod
     def of(cls, held: Mapping[int, LinkConditions], cut_from: tuple[int, ...], *counts: int) -> ReceiverFigures:
-        """Return the figures from the conditions of each sender. `counts` are in the order of the fields."""
+        """Return the figures for one receiver from the conditions of each sender."""
         ((usual, _),) = Counter(held.values()).most_common(1) or [(LinkConditions(), 0)]
         differing = {sender: link for sender, link in held.items() if link != usual}
         return cls(usual, differing, cut_from, *counts)
 
     @property
     def loss(self) -> float | GilbertElliott:
-        """The loss of `link`."""
+        """The loss of `link`: a probability, or a model of loss in bursts."""
         return self.link.loss
 
     def from_sender(self, sender: int) -> LinkConditions:
@@ -69,7 +69,7 @@ class ReceiverFigures:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ReceiverFigures:
-        """Return the value of a JSON object that `to_json` made."""
+        """Return the object that is described by this JSON object, which has the format of `to_json`."""
         own = {field.name for field in fields(cls)}
         return cls(
             LinkConditions.from_json({key: figure for key, figure in value.items() if key not in own}),
@@ -92,13 +92,13 @@ class Applied:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Applied:
-        """Return the value of a JSON object that `to_json` made."""
+        """Return the object that is described by this JSON object, which has the format of `to_json`."""
         figures = {int(vehicle): ReceiverFigures.from_json(entry) for vehicle, entry in value["receivers"].items()}
         return cls(value["engine"], figures)
 
 
 class Engine(ABC):
-    """Applies conditions at the switch ports of a fabric."""
+    """A mechanism that applies conditions at the ports of the virtual switch."""
 
     name: ClassVar[str]
     has_queues: ClassVar[bool]
@@ -116,10 +116,10 @@ class Engine(ABC):
 
     @abstractmethod
     def read(self) -> Applied:
-        """Return the conditions and counters of the kernel."""
+        """Return the conditions and counters that the kernel reports."""
 
     def apply(self, conditions: NetworkConditions) -> Applied:
-        """Change the conditions, and return the state of the kernel afterwards.
+        """Change the conditions, and return the state that the kernel reports afterwards.
 
         Raises ConditionsError for an unknown vehicle. Raises EngineError if the engine does not support the conditions,
         if the kernel refuses them, or if its state differs from them. Then the previous conditions are restored, or the
@@ -170,7 +170,7 @@ class Engine(ABC):
 
 @lru_cache(maxsize=1 << 15)
 def _differing(asked: LinkConditions, held: LinkConditions) -> tuple[str, ...]:
-    """Return the keys whose values differ by more than the engines' resolution."""
+    """Return the keys whose values differ by more than an engine can resolve."""
     wanted, actual = _flat(asked.to_json()), _flat(held.to_json())
     if not (asked.delay and asked.delay.jitter_s and held.delay and held.delay.jitter_s):
         for flat in (wanted, actual):

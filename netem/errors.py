@@ -1,18 +1,18 @@
-"""The errors of this package. Each message is a sentence that says what to do."""
+"""The errors of this package. Each message is one sentence with a solution."""
 
 from __future__ import annotations
 
 
 class NetemError(Exception):
-    """Base class of all errors that `netem` raises for its callers."""
+    """The base class of all errors that the package `netem` raises."""
 
 
 class ConditionsError(NetemError, ValueError):
-    """Invalid conditions. The message names the key, the value and the allowed values."""
+    """An error: conditions are invalid. The message names the key, the value and the allowed values."""
 
 
 class NetlinkError(NetemError):
-    """The kernel refused a netlink request. `errno` and the message come from the kernel."""
+    """An error: the kernel refused a netlink request. `errno` and the message come from the kernel."""
 
     def __init__(self, message: str, errno: int) -> None:
         super().__init__(message)
@@ -20,15 +20,15 @@ class NetlinkError(NetemError):
 
 
 class EngineError(NetemError):
-    """An engine could not be used, or the kernel refused a change of conditions."""
+    """An error: an engine cannot be used, or the kernel refused a change of conditions."""
 
 
 class LabError(NetemError):
-    """The lab failed, or a request to it failed."""
+    """An error: the virtual network failed, or a request to it failed."""
 
 
 class LabUnavailable(LabError):  # noqa: N818  (a state of the machine)
-    """This machine cannot run the lab or the requested engine. `way_out` is the remedy."""
+    """An error: this machine cannot run the virtual network or the requested engine. `way_out` is the user's remedy."""
 
     def __init__(self, reason: str, way_out: str, stage: str = "namespaces") -> None:
         super().__init__(f"{reason.rstrip('.')}. {way_out}")
@@ -38,12 +38,14 @@ class LabUnavailable(LabError):  # noqa: N818  (a state of the machine)
 
 
 class SpawnError(LabError):
-    """A program could not be started in the lab. The message contains that of the operating system."""
+    """An error: a program could not be started in the virtual network. The message includes that of the operating
+    system.
+    """
 
 
 class UmlError(NetemError):
-    """User Mode Linux is missing, did not boot, hung or panicked."""
+    """An error: User Mode Linux is missing, did not boot, hung or crashed."""
 
 
 class LiveCaptureError(NetemError):
-    """A capture of packets failed to start, or ended early."""
+    """An error: a packet capture could not be started, or ended early."""

@@ -1,4 +1,4 @@
-"""Figures of a received stream of packets, with their 99.9 % intervals.
+"""Estimate properties of a received stream of packets, with 99.9 % confidence intervals.
 
 Shares have Wilson's interval. Means and deviations have the normal interval. Losses in bursts are not independent, so
 such a stream counts as a smaller number of independent packets, according to its correlation. Rate and limit are not
@@ -27,7 +27,7 @@ _Z = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure with its 99.9 % interval, and the number of packets behind it. Without packets, all are 0."""
+    """An estimate with its 99.9 % confidence interval and its number of packets. Without packets, all values are 0."""
 
     measured: float
     low: float
@@ -37,7 +37,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Lateness:
-    """The lateness of the machine in seconds: for each packet of a stream on its way, and for each timer."""
+    """The delays of the machine itself in seconds: of packets in a stream, and of timers."""
 
     way_s: Sequence[float]
     timers_s: Sequence[float]
@@ -59,12 +59,12 @@ _NOTHING = Estimate(0.0, 0.0, 0.0, 0)
 
 
 def lost(received: ReceivedStream) -> Estimate:
-    """Return the share of lost packets, for independent losses."""
+    """Return the share of lost packets, if losses are independent."""
     return share(sum(_losses(received)), len(received.sent_s))
 
 
 def lost_in_bursts(received: ReceivedStream) -> Estimate:
-    """Return the share of lost packets, for losses of a Markov chain with two states."""
+    """Return the share of lost packets, if losses follow a Markov chain with two states."""
     losses = _losses(received)
     return share(sum(losses), len(losses), worth=_independence(losses))
 
@@ -94,14 +94,14 @@ def undelayed(received: ReceivedStream, delay_s: float) -> Estimate:
 
 
 def delay_mean(received: ReceivedStream) -> Estimate:
-    """Return the mean delay in seconds, without the time that packets take by themselves."""
+    """Return the mean delay in seconds, without the time that packets take on an undelayed link."""
     estimate = mean(_delays(received))
     timers = mean(received.lateness.timers_s)
     return Estimate(estimate.measured, estimate.low - max(0.0, timers.high), estimate.high, estimate.packets)
 
 
 def delay_deviation(received: ReceivedStream) -> Estimate:
-    """Return the standard deviation in seconds. The interval allows for the machine's own deviation."""
+    """Return the standard deviation of the delay in seconds. The interval accounts for the machine's own deviation."""
     estimate = deviation(_delays(received))
     own = sum(deviation(late_s).high ** 2 for late_s in (received.lateness.way_s, received.lateness.timers_s))
     low = math.sqrt(max(0.0, estimate.low**2 - own))
@@ -109,7 +109,7 @@ def delay_deviation(received: ReceivedStream) -> Estimate:
 
 
 def rate(received: ReceivedStream, packet_bits: int) -> Estimate:
-    """Return bits per second, from the longest run of packets each of which arrived while the next one was waiting.
+    """Return the data rate in bits per second, from the longest run of packets that arrived without a pause.
 
     The limits assume that both ends of the run may be as late as the latest packet.
     """
@@ -128,7 +128,7 @@ def rate(received: ReceivedStream, packet_bits: int) -> Estimate:
 
 
 def waiting_when_lost(received: ReceivedStream, delay_s: float) -> Estimate:
-    """Return the number of packets that waited for their delay when one was lost: the limit.
+    """Return the number of packets that waited for their delay when one was lost. This is the queue limit.
 
     For each lost packet, some packets must still have waited, because their delay was not over. Others may have waited,
     because they had not arrived yet. The medians of both numbers are the limits.
@@ -151,7 +151,7 @@ def waiting_when_lost(received: ReceivedStream, delay_s: float) -> Estimate:
 
 
 def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
-    """Return the share of `hits` in `count` draws, each worth `worth` independent draws (Wilson, 1927)."""
+    """Return the share of `hits` in `count` draws. Each counts as `worth` independent draws (Wilson, 1927)."""
     if count == 0:
         return _NOTHING
     ratio, draws = hits / count, count * worth
@@ -162,7 +162,7 @@ def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
 
 
 def mean(values: Sequence[float], *, packets: int | None = None) -> Estimate:
-    """Return the mean of independent values, taken from `packets` packets, by default one each."""
+    """Return the mean of independent values from `packets` packets. By default, there is one value per packet."""
     if len(values) < 2:
         return _NOTHING
     average, margin = fmean(values), _Z * math.sqrt(variance(values) / len(values))
@@ -170,7 +170,7 @@ def mean(values: Sequence[float], *, packets: int | None = None) -> Estimate:
 
 
 def deviation(values: Sequence[float]) -> Estimate:
-    """Return the standard deviation of independent values of any distribution, as the root of a mean of squares."""
+    """Return the standard deviation of independent values of any distribution."""
     if len(values) < 2:
         return _NOTHING
     middle = fmean(values)
@@ -185,7 +185,9 @@ def _losses(received: ReceivedStream) -> list[bool]:
 
 
 def _independence(losses: Sequence[bool]) -> float:
-    """Return the worth of one draw of a chain in independent draws: (1 - c) / (1 + c), with the correlation c."""
+    """Return the number of independent draws to which one draw of a correlated sequence is equivalent: (1 - c) / (1 +
+    c).
+    """
     loss = fmean(losses)
     if not 0 < loss < 1:
         return 1.0

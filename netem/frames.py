@@ -1,4 +1,4 @@
-"""Ethernet frames of UDP broadcasts as Linux makes them, with their checksums."""
+"""Build Ethernet frames with UDP broadcasts and their checksums, exactly as Linux does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The lab's first process. It builds the network, and then serves the orchestrator until that closes the connection.
+"""The first process inside the virtual network. It builds the network, and then executes requests of the harness.
 
 It is started as `python -m netem.init FD` inside fresh namespaces (see `netem._namespaces`), where it is PID 1. `FD` is
 its end of the control socket. It has one thread and one loop, because setns(2) moves a thread, and each child must
@@ -38,7 +38,7 @@ _MAX_UNREAD = 64 << 20  # maximum of unread bytes for the orchestrator
 
 @dataclass
 class _Connection:
-    """A TCP connection that is being opened for the orchestrator."""
+    """A TCP connection that is being opened for the harness."""
 
     request: int
     socket: socket.socket
@@ -52,7 +52,7 @@ def _limit_files(most_bytes: int) -> None:
 
 
 class Server:
-    """Serves one orchestrator. The orchestrator is trusted, but its requests are still checked."""
+    """Executes requests of the harness. They are trusted, but still checked."""
 
     def __init__(self, control: socket.socket) -> None:
         control.setblocking(False)
@@ -73,7 +73,7 @@ class Server:
         self._selector.register(self._wake, selectors.EVENT_READ, self._reap)
 
     def run(self) -> None:
-        """Serve until the orchestrator closes the connection or dies."""
+        """Run until the harness closes the connection or ends."""
         self._send({"event": "inside"})
         while self._open:
             deadlines = [connection.deadline for connection in self._connections.values()]
@@ -255,7 +255,7 @@ class Server:
     # Children
 
     def _reap(self, _: int) -> None:
-        """Report children that ended. Orphans, which the kernel assigns to PID 1, are only removed."""
+        """Report child processes that ended. Orphans, which the kernel assigns to this process, are only removed."""
         with contextlib.suppress(BlockingIOError):
             os.read(self._wake, 4096)
         while True:

@@ -1,4 +1,4 @@
-"""A lab: vehicles in namespaces of their own, connected to one switch called `air`.
+"""Run programs in a virtual network (lab): vehicles in network namespaces, connected to one switch named `air`.
 
     async with await Lab.open([1, 2, 3], log=run_dir / "lab.log") as lab:
         agent = await lab.spawn(1, ["my-agent"], cwd=..., env=..., stdout=..., stderr=...)
@@ -48,7 +48,7 @@ _CLOSE_DEADLINE_S = 5.0
 
 
 class LabProcess:
-    """A program in the lab, in a session of its own. It ends with the lab at the latest."""
+    """A program in the virtual network. It ends at the latest when the network is closed."""
 
     def __init__(self, channel: Channel, vehicle: int | None, pid: int, ended: asyncio.Future[int]) -> None:
         self._channel = channel
@@ -58,32 +58,36 @@ class LabProcess:
 
     @property
     def returncode(self) -> int | None:
-        """None while the process runs, then its exit status, or the negative number of the signal that killed it."""
+        """The exit status of the program, or the negative number of the signal that killed it. None while the program
+        runs.
+        """
         return self._ended.result() if self._ended.done() else None
 
     @property
     def end(self) -> str:
-        """The end of the process in words: the name of the signal that killed it, or its exit status."""
+        """A description of how the program ended: the name of a signal, or its exit status."""
         return in_words(self._ended.result())
 
     async def wait(self) -> int:
-        """Wait for the end, and return the return code. It is -SIGKILL if the process ended with the lab."""
+        """Wait until the program ends, and return the return code. It is -SIGKILL if the program ended with the
+        network.
+        """
         return await asyncio.shield(self._ended)
 
     async def send_signal(self, number: int) -> None:
-        """Send a signal to the process group. It has no effect after the end."""
+        """Send a signal to the program and its child processes. After the end of the program, do nothing."""
         if not self._ended.done():
             await self._channel.ask("signal", pid=self.pid, signal=int(number))
 
     async def pause(self) -> None:
-        """Stop the process by SIGSTOP until `resume`."""
+        """Suspend the program with SIGSTOP until `resume` is called."""
         await self.send_signal(signal.SIGSTOP)
 
     async def resume(self) -> None:
         await self.send_signal(signal.SIGCONT)
 
     async def terminate(self, grace_s: float) -> int:
-        """End the process by SIGTERM, or by SIGKILL after `grace_s` seconds. Return its return code."""
+        """End the program with SIGTERM, or with SIGKILL after `grace_s` seconds. Return its return code."""
         await self.send_signal(signal.SIGTERM)
         await self.resume()  # a stopped process cannot react to SIGTERM
         try:
@@ -117,7 +121,7 @@ class Lab:
         networks: Mapping[int, int] | None = None,
         log: Path,
     ) -> Lab:
-        """Open a lab for these vehicle IDs, 1 to 65535. The output of its first process goes to `log`.
+        """Open a virtual network for these vehicle IDs, 1 to 65535. The output of its first process goes to `log`.
 
         `engine` is the engine to use; by default the lab chooses one. `needs` lists the conditions other than loss and
         partition that the engine must support (`NetworkConditions.needs`). `networks` has descriptors of existing
@@ -184,7 +188,7 @@ class Lab:
     async def _start(
         self, engine: EngineName | None, needs: Sequence[str], networks: Mapping[int, int], log: Path
     ) -> str | None:
-        """Build the network. Return the message of the tool if it could not enter namespaces, otherwise None."""
+        """Build the network. Return the error message of the tool that could not enter namespaces, otherwise None."""
         if not await self._channel.inside():
             await self.close()
             message = _last_line(log)
@@ -217,7 +221,7 @@ class Lab:
 
     @property
     def network(self) -> Self:
-        """The lab itself. A lab of containers returns the lab that it is built on."""
+        """The network itself. A network of containers returns the one on which it is built."""
         return self
 
     async def spawn(
@@ -249,7 +253,7 @@ class Lab:
         return LabProcess(self._channel, vehicle, result["pid"], result["ended"])
 
     async def connect(self, vehicle: int, port: int, *, host: str = "127.0.0.1", timeout_s: float) -> socket.socket:
-        """Connect by TCP inside the network of a vehicle, and return a blocking socket. `host` is a numeric address.
+        """Open a TCP connection inside the network of a vehicle, and return the socket. `host` is a numeric address.
 
         Raises ConnectionError if no program listens there, and TimeoutError after `timeout_s` seconds.
         """
@@ -265,7 +269,7 @@ class Lab:
         return connection
 
     async def apply(self, conditions: NetworkConditions) -> Applied:
-        """Apply the conditions, and return the state of the kernel afterwards.
+        """Apply network conditions, and return the state that the kernel reports afterwards.
 
         Raises ConditionsError for a vehicle that does not exist, EngineError if the kernel refuses.
         """
@@ -274,22 +278,22 @@ class Lab:
         return Applied.from_json(result)
 
     async def read(self) -> Applied:
-        """Return the state and the counters of the kernel."""
+        """Return the conditions and counters that the kernel reports."""
         result, _ = await self._channel.ask("read")
         return Applied.from_json(result)
 
     async def datagrams(self) -> dict[int, UdpCounters]:
-        """Return the UDP datagrams that the kernel has counted in the network of each vehicle, by vehicle."""
+        """Return the counts of UDP datagrams in the network of each vehicle."""
         result, _ = await self._channel.ask("datagrams")
         return {int(vehicle): UdpCounters(**counted) for vehicle, counted in result.items()}
 
     async def watch(self) -> None:
-        """Wait until the first process of the lab ends by itself, then raise LabError."""
+        """Wait until the virtual network fails by itself, then raise LabError."""
         await self._process.wait()
         raise LabError("The lab's first process ended unexpectedly")
 
     async def close(self) -> None:
-        """End all processes of the lab, and remove it. Further calls have no effect."""
+        """End all programs in the network, and remove it. A second call does nothing."""
         self._channel.close()
         try:
             await asyncio.wait_for(self._process.wait(), _CLOSE_DEADLINE_S)
@@ -323,7 +327,7 @@ def _checked(vehicles: Sequence[int]) -> tuple[int, ...]:
 
 
 def in_words(returncode: int) -> str:
-    """Return the end of a process in words, such as "SIGKILL" or "status 3"."""
+    """Return a description of how a process ended, such as "SIGKILL" or "status 3"."""
     if returncode >= 0:
         return f"status {returncode}"
     number = -returncode

@@ -1,4 +1,4 @@
-"""Examine whether this machine can run a lab.
+"""Find out whether this machine can run a virtual network.
 
 Each fact comes from a real lab of two vehicles that is removed afterwards. Configuration files and lists of modules
 show only what might work.
@@ -20,7 +20,7 @@ from netem.lab import Lab, LabError
 
 @dataclass(frozen=True)
 class LabRequirement:
-    """A requirement of a lab: its state, an observation, and the remedy if it is missing.
+    """A requirement of the virtual network: its state, an observation, and the remedy if it is not met.
 
     Without a `needed` requirement there is no lab. One engine is sufficient.
     """
@@ -33,7 +33,7 @@ class LabRequirement:
 
 
 def examine() -> list[LabRequirement]:
-    """Return all requirements of a lab in order of dependence. Takes about half a second."""
+    """Return all requirements of a virtual network in order of dependence. This takes about half a second."""
     ok, message = _namespaces.probe()
     requirements = [LabRequirement("namespaces", ok, message, "" if ok else _namespaces.way_out(message))]
     if not ok:
@@ -62,7 +62,9 @@ def examine() -> list[LabRequirement]:
 
 
 def _shared_channel(log: Path) -> LabRequirement:
-    """Examine whether the kernel hands over broadcasts to a process, for a radio channel in real time."""
+    """Find out whether a process can take over broadcasts from the kernel, which a shared radio channel in real time
+    needs.
+    """
 
     async def attempt() -> str | None:
         async with await Lab.open((1, 2), log=log) as lab:
@@ -81,7 +83,7 @@ def _shared_channel(log: Path) -> LabRequirement:
 
 
 def _try(engine: Literal["netem", "nftables"] | None, log: Path) -> str | LabError:
-    """Return the engine of a test lab, or the reason why it could not be opened."""
+    """Return the engine of a test network, or the reason why it could not be opened."""
 
     async def attempt() -> str:
         async with await Lab.open((1, 2), engine=engine, log=log) as lab:

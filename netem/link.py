@@ -1,4 +1,4 @@
-"""Conditions of packets from one vehicle to another: loss, delay, duplicates, reordering, and more.
+"""Represent the conditions of packets from one vehicle to another: loss, delay, duplicates, reordering, and more.
 
 Names and meanings are those of tc-netem(8). The random draws of each packet are independent. JSON omits default values,
 so that a plain loss reads {"loss": 0.1}.
@@ -26,7 +26,7 @@ that a flood does not fill its memory."""
 
 @dataclass(frozen=True)
 class GilbertElliott:
-    """Loss in bursts, as netem's `loss gemodel p r 1-h 1-k`. Each value is a probability, 0 to 1.
+    """A model of loss in bursts, as in netem's `loss gemodel p r 1-h 1-k`. Each value is a probability, 0 to 1.
 
     A link is in a good or a bad state and starts in the good one. A packet is lost with the probability of the current
     state. Then the state may change: with probability `p` from good to bad, with probability `r` from bad to good.
@@ -49,7 +49,7 @@ class GilbertElliott:
 
     @property
     def lossless(self) -> bool:
-        """True if no packet can be lost, in any state that the link can reach."""
+        """True if no packet can be lost, in any state of the link."""
         return self.loss_good == 0.0 and (self.p == 0.0 or self.loss_bad == 0.0)
 
     def to_json(self) -> dict[str, Any]:
@@ -57,13 +57,13 @@ class GilbertElliott:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> GilbertElliott:
-        """Return the value of this JSON object, as `to_json` returns it. Raises ConditionsError."""
+        """Return the model in this JSON object, which has the format of `to_json`. Raises ConditionsError."""
         return cls(**keywords(cls, value, "loss", required=("p", "r")))
 
 
 @dataclass(frozen=True)
 class Delay:
-    """The delay of packets in seconds: 0 to 60 on average.
+    """The delay of packets in seconds. Its mean is 0 to 60.
 
     `jitter_s` is the greatest deviation of a uniform delay, and the standard deviation of the other distributions,
     which are drawn from netem's tables. It is at most `mean_s`, so a uniform delay is never negative. Negative delays
@@ -88,7 +88,7 @@ class Delay:
         object.__setattr__(self, "jitter_s", jitter_s)
 
     def at_speed(self, speedup: float) -> Delay:
-        """Return the delay on a clock that runs `speedup` times slower than mission time."""
+        """Return the delay in wall time for a mission that runs `speedup` times as fast."""
         return replace(self, mean_s=self.mean_s / speedup, jitter_s=self.jitter_s / speedup)
 
     def to_json(self) -> dict[str, Any]:
@@ -96,13 +96,13 @@ class Delay:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Delay:
-        """Return the value of this JSON object, as `to_json` returns it. Raises ConditionsError."""
+        """Return the delay in this JSON object, which has the format of `to_json`. Raises ConditionsError."""
         return cls(**keywords(cls, value, "delay", required=("mean_s",)))
 
 
 @dataclass(frozen=True)
 class LinkConditions:
-    """The conditions of packets on their way to one receiver, from all senders or from one.
+    """The conditions of packets to one receiver, from all senders or from one.
 
     `loss` is the probability, 0 to 1, that a packet is lost, drawn for each packet, or a model of bursts. `duplicate`
     is the probability that a packet arrives twice. It is drawn together with the loss: if a packet is both lost and
@@ -155,18 +155,18 @@ class LinkConditions:
 
     @property
     def lossless(self) -> bool:
-        """True if no packet can be lost, neither by loss nor by corruption or a full queue."""
+        """True if no packet can be lost by loss, corruption or a full queue."""
         lossless = self.loss.lossless if isinstance(self.loss, GilbertElliott) else self.loss == 0.0
         return lossless and self.corrupt == 0.0 and self.limit is None
 
     @property
     def remembers(self) -> bool:
-        """True if the fate of a packet depends on earlier packets of the same link, from one sender to one receiver."""
+        """True if the result of a packet depends on earlier packets from the same sender to the same receiver."""
         return isinstance(self.loss, GilbertElliott) or self.rate is not None or self.limit is not None
 
     @property
     def independent_loss(self) -> float:
-        """The probability of loss, the same for each packet. Raises ConditionsError for loss in bursts."""
+        """The loss rate, the same for each packet. Raises ConditionsError for loss in bursts."""
         if isinstance(self.loss, GilbertElliott):
             raise ConditionsError(f"loss: {self.loss} is in bursts; allowed here is a probability 0..1")
         return self.loss
@@ -185,7 +185,7 @@ class LinkConditions:
         return tuple(key for key, needed in asked.items() if needed)
 
     def at_speed(self, speedup: float) -> Self:
-        """Return the conditions on a clock that runs `speedup` times slower than mission time.
+        """Return the conditions in wall time for a mission that runs `speedup` times as fast.
 
         Delays become shorter, and the rate higher.
         """
@@ -209,7 +209,7 @@ class LinkConditions:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> LinkConditions:
-        """Return the value of this JSON object, as `to_json` returns it. Raises ConditionsError."""
+        """Return the conditions in this JSON object, which has the format of `to_json`. Raises ConditionsError."""
         known = keywords(cls, value)
         for key, kind in (("loss", GilbertElliott), ("delay", Delay)):
             if isinstance(known.get(key), Mapping):
@@ -218,7 +218,7 @@ class LinkConditions:
 
 
 def probability(key: str, value: object) -> float:
-    """Return the value as a float. Raises ConditionsError if it is no probability."""
+    """Return the value as a float. Raises ConditionsError if it is not a probability."""
     number = _number(key, value, "a probability 0..1")
     if not 0.0 <= number <= 1.0:
         hint = f" (for {value:g} % write {number / 100:g})" if 1.0 < number <= 100.0 else ""
@@ -227,7 +227,7 @@ def probability(key: str, value: object) -> float:
 
 
 def keywords(cls: type[Any], value: Mapping[str, Any], at: str = "", required: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return the fields of a dataclass from JSON. Raises ConditionsError for an unknown or missing key."""
+    """Return the fields of a dataclass from a JSON object. Raises ConditionsError for an unknown or missing key."""
     prefix = f"{at}." if at else ""
     allowed = [field.name for field in fields(cls)]
     for key in value:

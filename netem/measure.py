@@ -47,7 +47,7 @@ _FIRST_FREE = 4
 
 @dataclass(frozen=True)
 class Question:
-    """A question: `estimate` of the packets from `sender` to `receiver` should equal `asked`."""
+    """A comparison to make: the estimate from the packets between two vehicles should equal `asked`."""
 
     sender: int
     receiver: int
@@ -60,7 +60,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Study:
-    """Conditions and questions. All senders of questions broadcast."""
+    """A measurement: network conditions, and the comparisons to make. All senders broadcast packets."""
 
     conditions: NetworkConditions
     questions: tuple[Question, ...]
@@ -75,7 +75,7 @@ class Study:
 
     @property
     def vehicles(self) -> tuple[int, ...]:
-        """All vehicles, including the reference, which no condition and no partition may affect."""
+        """All vehicles of the measurement, including a reference vehicle that no condition affects."""
         conditions = self.conditions
         named = {*conditions.receivers, *chain(*conditions.links), *chain(*conditions.partition)}
         return tuple(sorted({*self.senders, *self.receivers, *named, REFERENCE}))
@@ -87,7 +87,7 @@ Observer = Callable[[Study, int], Mapping[tuple[int, int], ReceivedStream]]
 
 @dataclass(frozen=True)
 class AnswerRow:
-    """A question and its answer. `before` is the first answer if it was outside the interval."""
+    """A comparison and its result. `before` is the first result if it was wrong, and the measurement was repeated."""
 
     engine: str
     question: Question
@@ -96,7 +96,7 @@ class AnswerRow:
 
     @property
     def ok(self) -> bool:
-        """True if the interval contains the requested value, within the resolution of engines."""
+        """True if the confidence interval contains the requested value, within the resolution of engines."""
         asked = self.question.asked
         margin = RESOLUTION * max(1.0, asked)
         return self.answer.low - margin <= asked <= self.answer.high + margin
@@ -109,7 +109,7 @@ class AnswerRow:
 
 @dataclass(frozen=True)
 class EngineMeasurement:
-    """All rows of one engine, and the machine's lateness in seconds."""
+    """All results for one engine, and the delays of the machine in seconds."""
 
     engine: str
     rows: tuple[AnswerRow, ...]
@@ -130,7 +130,7 @@ class EngineMeasurement:
 
 
 def measure(engine: str, studies: Sequence[Study], observe: Observer, packets: int = PACKETS) -> EngineMeasurement:
-    """Answer the questions of the studies. Answers outside are measured again. Raises the errors of `observe`."""
+    """Run the measurements, and repeat those with wrong results. Raises the errors of `observe`."""
     rows: list[AnswerRow] = []
     late: list[Lateness] = []
     for study in studies:
@@ -158,7 +158,7 @@ def _answer(question: Question, streams: Mapping[tuple[int, int], ReceivedStream
 
 
 def studies(engine: str) -> tuple[Study, ...]:
-    """Return the studies of an engine: loss and partitions for "nftables", all conditions for "netem" and "medium".
+    """Return the measurements for an engine: loss and partitions for "nftables", all conditions for the others.
 
     Duplicates have their own study, because some kernels do not allow them beside other conditions (see `netem.tc`).
     """
@@ -170,7 +170,7 @@ def studies(engine: str) -> tuple[Study, ...]:
 
 @dataclass(frozen=True)
 class _Case:
-    """Conditions of a link, and its questions as (quantity, asked, estimate, unit)."""
+    """The conditions of a link, and the comparisons to make as (quantity, requested value, estimate, unit)."""
 
     condition: str
     link: LinkConditions
@@ -183,7 +183,9 @@ def _losses() -> list[_Case]:
 
 
 def _other_conditions(noticed: float) -> list[_Case]:
-    """Return the cases of all other conditions except duplicates. `noticed` is the share of detected corruptions."""
+    """Return the conditions other than loss and duplicates. `noticed` is the share of corrupted packets that are
+    detected.
+    """
     bursts = GilbertElliott(p=0.05, r=0.25)
     fixed, jitter_s = Delay(0.1), 0.02
     rate, limit = 500_000.0, 50
@@ -234,7 +236,7 @@ def _duplicates() -> list[_Case]:
 
 
 def _receivers(cases: Sequence[_Case]) -> Study:
-    """Return a study with one sender, and a receiver for each case."""
+    """Return a measurement with one sender, and a receiver for each of these conditions."""
     numbered = dict(enumerate(cases, _FIRST_FREE))
     questions = [
         Question(_SENDER, receiver, case.condition, *figure)
@@ -246,7 +248,9 @@ def _receivers(cases: Sequence[_Case]) -> Study:
 
 
 def _pairs() -> Study:
-    """Return a study with two simultaneous senders, different losses for single links, and one separated vehicle."""
+    """Return a measurement with two simultaneous senders, different losses for single links, and one separated
+    vehicle.
+    """
     there, back, rest = 0.4, 0.1, 0.2
     conditions = NetworkConditions(
         LinkConditions(rest),

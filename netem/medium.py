@@ -1,4 +1,4 @@
-"""The medium: the delivery of broadcasts in virtual time, drawn from a seed.
+"""Deliver broadcasts in virtual time. Random numbers from a seed decide about losses and delays.
 
 The medium is the third engine beside tc netem and nftables. It applies the same conditions without a kernel and without
 packets. Each receiver of a broadcast draws separately. With neither a delay nor a rate in the conditions, the latency
@@ -41,20 +41,20 @@ _TABLE_SIZE = 4096
 
 
 class RandomDraws(Protocol):
-    """The random draws of one broadcast. Receivers are numbered from 0 in the order of the medium's vehicles."""
+    """The random results of one broadcast. Receivers are numbered from 0 in the order of the vehicles."""
 
     latest: float
     """Upper bound, in seconds, of the time from sending to the arrival of any copy."""
 
     def copies_to(self, receiver: int) -> tuple[float, ...]:
-        """Return the delays, in seconds, of all copies that arrive at `receiver`."""
+        """Return the delays in seconds of all copies that arrive at this receiver."""
 
     def to_all(self) -> list[tuple[int, float]]:
-        """Return (receiver, delay in seconds) for each copy that arrives, ordered by receiver."""
+        """Return (receiver, delay in seconds) for each copy that arrives, in the order of receivers."""
 
 
 class Medium:
-    """The network between `vehicles` in virtual time. Conditions are perfect until the first call of `apply`."""
+    """The simulated network between `vehicles`. Conditions are perfect until `apply` is called."""
 
     def __init__(self, vehicles: Sequence[int], seed: int, latency: Delay = LATENCY) -> None:
         self.latency = latency
@@ -86,17 +86,17 @@ class Medium:
         self.latest = max(self.latest, *(air.latest for air in self._air))
 
     def certain_delays(self) -> tuple[float, float] | None:
-        """Return the least and the greatest delay in seconds. None if a random draw decides whether messages arrive."""
+        """Return the smallest and largest delay in seconds, or None if messages may be lost."""
         if not all(air.certain for air in self._air):
             return None
         return min(air.soonest_of_all for air in self._air), max(air.latest for air in self._air)
 
     def hears(self, sender: int, receiver: int) -> bool:
-        """Return true if no partition separates the two vehicles. Both are numbers from 0, not IDs."""
+        """Return true if no partition separates the two vehicles, which are given by their numbers from 0."""
         return self._group[sender] == self._group[receiver]
 
     def draw(self, sender: int, now: float, data_bytes: int) -> RandomDraws:
-        """Return the random draws of a broadcast: a UDP datagram of `data_bytes` bytes, sent at `now` seconds.
+        """Return the random results of a broadcast of `data_bytes` bytes, sent at the time `now` in seconds.
 
         `sender` is the number of a vehicle from 0, not its ID. The calls for one sender must be in time order.
         """
@@ -143,13 +143,13 @@ def _way(link: LinkConditions, latency: Delay) -> _Way:
 
 
 def _is_plain(link: LinkConditions) -> bool:
-    """Return true if a packet needs only one draw for loss and one for latency."""
+    """Return true if a packet needs only one random number for loss and one for latency."""
     uniform = link.delay is None or link.delay.distribution == "uniform"
     return uniform and not (link.duplicate or link.reorder or link.corrupt or link.remembers)
 
 
 class _PlainAir:
-    """Links with independent loss and uniform latency. Each receiver needs two words of 32 bits."""
+    """Links with independent loss and uniform latency. Each receiver needs two random numbers of 32 bits."""
 
     def __init__(self, links: list[LinkConditions], hears: list[bool], words: _Words, latency: Delay) -> None:
         self.receivers = len(links)
@@ -171,7 +171,7 @@ class _PlainAir:
 
 
 class _PlainDraws:
-    """The draws of one broadcast, as a position in the arrays of words."""
+    """The random results of one broadcast, as a position in the arrays of random numbers."""
 
     __slots__ = ("_air", "_at", "_latency", "_loss", "latest")
 
@@ -199,7 +199,7 @@ class _PlainDraws:
 
 
 class _Words:
-    """Two streams of words of 32 bits, drawn in blocks and used in parallel. Words from `next` on are unused."""
+    """Two streams of 32-bit random numbers, which are drawn in blocks. Numbers from `next` on are unused."""
 
     def __init__(self, loss: Random, latency: Random) -> None:
         self.loss = array("I")
@@ -208,7 +208,7 @@ class _Words:
         self.next = 0
 
     def take(self, count: int) -> int:
-        """Return the position of the next `count` words in the current arrays `loss` and `latency`.
+        """Return the position of the next `count` random numbers in the arrays `loss` and `latency`.
 
         The arrays never change. `refill` replaces them by new ones.
         """
@@ -219,7 +219,7 @@ class _Words:
         return at
 
     def refill(self, count: int) -> int:
-        """Draw a block of words for many times `count`, and return the position of the next one."""
+        """Draw a new block of random numbers, and return the position of the first unused one."""
         loss, latency = self._streams
         self.loss = self.loss[self.next :] + _draw(loss, _BROADCASTS_AT_ONCE * count)
         self.latency = self.latency[self.next :] + _draw(latency, _BROADCASTS_AT_ONCE * count)
@@ -234,7 +234,7 @@ def _draw(stream: Random, count: int) -> array[int]:
 
 
 class _AnyAir:
-    """Links with any conditions. Each receiver has all its draws, so that the draws of receivers are independent."""
+    """Links with any conditions. The random numbers of each receiver are independent of the other receivers."""
 
     soonest_of_all = 0.0
     latest = inf
@@ -288,7 +288,7 @@ class _Link:
             self._last, self._departures = before._last, before._departures
 
     def enqueue(self, now: float, bits: int, lots: _Copy, second: _Copy | None = None) -> tuple[float, ...]:
-        """Return the delays of the copies that arrive, of a packet sent at `now` and of its second copy."""
+        """Return the delays of the copies that arrive: of a packet sent at the time `now`, and of its duplicate."""
         conditions = self.conditions
         loss, turn, corruption, reordering, latency = lots
         lost = self._loses(loss, turn)
@@ -311,7 +311,7 @@ class _Link:
         return lot < (loss.loss_bad if bad else loss.loss_good)
 
     def _wait(self, now: float, bits: int, latency: float) -> float:
-        """Put a packet into the queue, and return its delay in seconds."""
+        """Put a packet into the queue of the link, and return its delay in seconds."""
         at = now + sample(self._delay, latency)
         if self.conditions.rate is not None:
             if self._last > now:
@@ -323,7 +323,7 @@ class _Link:
         return max(0.0, at - now)
 
     def _waiting(self, now: float) -> int:
-        """Return the number of packets in the queue."""
+        """Return the number of packets in the queue of the link."""
         while self._departures and self._departures[0] <= now:
             heappop(self._departures)
         return len(self._departures)
@@ -344,7 +344,7 @@ class _RepeatedDraws:
 
 
 def sample(delay: Delay, lot: float) -> float:
-    """Return the delay in seconds for a draw in 0..1 (exclusive). As in netem, a negative delay means at once."""
+    """Return the delay in seconds for a random number between 0 and 1. As in netem, a negative delay counts as 0."""
     if delay.distribution == "uniform":
         return delay.mean_s + delay.jitter_s * (2 * lot - 1)
     deviations = table(delay.distribution, _TABLE_SIZE)[int(lot * _TABLE_SIZE)] / SCALE

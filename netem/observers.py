@@ -1,4 +1,4 @@
-"""Observers for `netem.measure`: real packets between vehicles of a lab, or packets in virtual time."""
+"""Provide the packets for measurements: real packets in a virtual network, or packets in virtual time."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ _TRY_AGAIN = "this machine is too busy to measure just now: try again when it is
 
 
 def in_medium(seed: int) -> Observer:
-    """Return an observer of `netem.medium` without any lateness. Each stream differs, and all depend on the seed."""
+    """Return a function that measures simulated packets, which have no delays of the machine. All depend on the
+    seed.
+    """
     streams = itertools.count()
 
     def observe(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
@@ -58,7 +60,7 @@ def in_medium(seed: int) -> Observer:
 
 
 def in_lab(engine: EngineName) -> Observer:
-    """Return an observer of real packets. Each stream has its own lab.
+    """Return a function that measures real packets, each time in a new virtual network.
 
     If the kernel's engine passed more packets than arrived, the machine lost them, because a receive buffer or a
     processor's backlog was full. Such a stream says nothing about the engine, and is sent again more slowly. Raises
@@ -82,7 +84,7 @@ def in_lab(engine: EngineName) -> Observer:
 
 
 class DisturbedError(LabError):
-    """The machine itself lost packets, so the stream says nothing about the engine."""
+    """An error: the machine itself lost packets, so the measurement has no meaning."""
 
 
 async def _observe(
@@ -141,7 +143,7 @@ def check(
 
 
 class Arrival(NamedTuple):
-    """A received copy of a packet with its number from 0. Times are in seconds."""
+    """A received copy of a packet, which has a number from 0. Times are in seconds."""
 
     number: int
     sent_s: float
@@ -149,7 +151,7 @@ class Arrival(NamedTuple):
 
 
 def _arrivals(report: Mapping[str, Any], own: range) -> list[Arrival]:
-    """Return the packets of the sender with these numbers."""
+    """Return the received packets of one sender, which have these numbers."""
     each = zip(report["numbers"], report["at_s"], report["delays_s"], strict=True)
     return [Arrival(number - own.start, at_s - delay_s, at_s) for number, at_s, delay_s in each if number in own]
 
@@ -164,7 +166,7 @@ async def _wait_until_quiet(lab: Lab) -> Applied:
 
 
 class _Program:
-    """A program of `netem._probe` in a vehicle."""
+    """A program of `netem._probe` that runs in a vehicle."""
 
     def __init__(self, process: LabProcess, output: Path) -> None:
         self._process = process
@@ -179,7 +181,7 @@ class _Program:
         return cls(process, output)
 
     async def wait_for(self, word: str) -> None:
-        """Wait until the output contains the word, or until the program ends."""
+        """Wait until the output of the program contains the word, or until the program ends."""
         while word not in self._output.read_text() and self._process.returncode is None:
             await asyncio.sleep(0.01)
 
@@ -189,7 +191,7 @@ class _Program:
         return await self.end()
 
     async def end(self) -> Any:
-        """Wait for the end, and return the results."""
+        """Wait until the program ends, and return its results."""
         status = await self._process.wait()
         last = (self._output.read_text().splitlines() or [""])[-1]
         if status != 0:

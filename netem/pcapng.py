@@ -1,4 +1,4 @@
-"""Write captures of one Ethernet interface in the pcapng format (draft-ietf-opsawg-pcapng), block by block.
+"""Write packet captures of one Ethernet interface in the pcapng format (draft-ietf-opsawg-pcapng).
 
 The writer only appends, and the file is valid after each `flush`. A crash of the writer therefore loses only unwritten
 packets.
@@ -43,7 +43,7 @@ _PACKET_BYTES = _PACKET_HEAD.size + len(_DIRECTIONS[True]) + _BLOCK_LENGTH.size 
 
 
 def header(interface: str, comment: str) -> bytes:
-    """Return the start of a file: a section with this comment, and its only interface."""
+    """Return the beginning of a file: a section with this comment, and a description of its only interface."""
     section = struct.pack("<IHHq", _BYTE_ORDER_MAGIC, 1, 0, _UNKNOWN_LENGTH)
     about = _option(_COMMENT, comment.encode()) + _option(_USERAPPL, WRITER.encode())
     named = _option(_IF_NAME, interface.encode()) + _option(_IF_TSRESOL, _NANOSECONDS)
@@ -57,7 +57,7 @@ def _block(kind: int, body: bytes) -> bytes:
 
 
 class PcapngFile:
-    """Appends to a file that begins with `header`. Times are nanoseconds since the Unix epoch.
+    """A pcapng file to which frames are appended. Times are nanoseconds since the Unix epoch.
 
     `packet`, `flush` and `close` raise OSError with the file's name if writing fails. The file then ends with the last
     complete packet, and waiting packets are lost.
@@ -71,7 +71,7 @@ class PcapngFile:
         self.packets = 0
 
     def packet(self, at_ns: int, frame: bytes, *, outbound: bool) -> None:
-        """Append a frame that left by the interface (`outbound`) or reached it."""
+        """Append a frame that left through the interface (`outbound` is true) or arrived at it."""
         captured = len(frame)
         padding = -captured % 4
         length = _PACKET_BYTES + captured + padding
@@ -80,7 +80,7 @@ class PcapngFile:
         self._append(b"".join((head, frame, bytes(padding), _DIRECTIONS[outbound], _BLOCK_LENGTH.pack(length))))
 
     def statistics(self, at_ns: int, received: int, dropped: int) -> None:
-        """Append the number of frames that crossed the interface, and the number missing in this file."""
+        """Append the number of frames at the interface, and the number of those that this file lacks."""
         counts = _option(_ISB_IFRECV, struct.pack("<Q", received)) + _option(_ISB_IFDROP, struct.pack("<Q", dropped))
         at = struct.pack("<III", 0, at_ns >> 32, at_ns & 0xFFFFFFFF)
         self._append(_block(_STATISTICS, at + counts + _END_OF_OPTIONS))
@@ -92,7 +92,7 @@ class PcapngFile:
             self.flush()
 
     def flush(self) -> None:
-        """Write all waiting blocks, or none."""
+        """Write all blocks that wait in memory, or none of them."""
         if not self._pending:
             return
         data = memoryview(b"".join(self._pending))

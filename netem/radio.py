@@ -1,4 +1,4 @@
-"""Radio models: the loss between two places, and its effect on network conditions.
+"""Define radio models: the loss rate between two places, and its effect on network conditions.
 
 A radio is a function from distance to loss. The caller provides the positions of the vehicles.
 """
@@ -24,7 +24,7 @@ STEPS = 100
 
 @dataclass(frozen=True)
 class Place:
-    """The position of a vehicle: metres north, east and up from an origin that all vehicles share."""
+    """The position of a vehicle in metres north, east and up from a common origin."""
 
     north_m: float
     east_m: float
@@ -39,15 +39,17 @@ class Place:
 
 
 class Radio(Protocol):
-    """A radio: the loss between two vehicles, which depends only on their distance and is equal in both directions."""
+    """A radio model. The loss rate between two vehicles depends only on their distance, and is the same in both
+    directions.
+    """
 
     def loss(self, distance_m: float) -> float:
-        """Return the probability, 0 to 1, that a message over this distance is lost."""
+        """Return the probability, from 0 to 1, that a message over this distance is lost."""
 
 
 @dataclass(frozen=True)
 class HardRange:
-    """A radio that reaches every vehicle within `range_m` metres and none beyond, the disc model of most simulators.
+    """A radio that reaches every vehicle within `range_m` metres and none beyond. Most simulators use this model.
 
     The default is the outdoor range that tables give for IEEE 802.11n, the radio of the ARSENL swarm (Section 2.5 of
     the thesis).
@@ -64,7 +66,8 @@ class HardRange:
 
 @dataclass(frozen=True)
 class LogDistance:
-    """Log-distance path loss with log-normal shadowing (Rappaport, Wireless Communications, 2nd ed., 4.9 and 4.9.2).
+    """A radio with log-distance path loss and log-normal shadowing (Rappaport, Wireless Communications, 2nd ed., 4.9
+    and 4.9.2).
 
     At d metres the mean received power is power_dbm - PL(1 m) - 10 exponent log10(d), where PL(1 m) is the free-space
     loss of Friis over the first metre. Shadowing is a normal deviation from it with standard deviation `shadowing_db`.
@@ -106,7 +109,7 @@ class LogDistance:
 
 
 def links(radio: Radio, places: Mapping[int, Place]) -> dict[frozenset[int], float]:
-    """Return the loss of each pair of vehicles, rounded to steps. Pairs without loss are omitted."""
+    """Return the loss rate of each pair of vehicles, rounded to steps. Pairs without loss are omitted."""
     losses: dict[frozenset[int], float] = {}
     for first, second in combinations(places, 2):
         if lost := round(radio.loss(places[first].distance_m(places[second])) * STEPS) / STEPS:
@@ -115,7 +118,7 @@ def links(radio: Radio, places: Mapping[int, Place]) -> dict[frozenset[int], flo
 
 
 def over_the_air(conditions: NetworkConditions, losses: Mapping[frozenset[int], float]) -> NetworkConditions:
-    """Return the conditions with the additional loss of the radio. The two losses are independent."""
+    """Return network conditions that include the additional, independent loss of the radio."""
     if not losses:
         return conditions
     pairs = dict(conditions.links)
@@ -126,7 +129,7 @@ def over_the_air(conditions: NetworkConditions, losses: Mapping[frozenset[int], 
 
 
 def components(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> tuple[frozenset[int], ...]:
-    """Return the groups of vehicles that reach each other in both directions, largest first.
+    """Return the groups of vehicles that can reach each other in both directions. The largest is first.
 
     Vehicles may reach each other through others. A link with a loss of 1 does not connect.
     """

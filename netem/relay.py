@@ -1,4 +1,4 @@
-"""Take over the broadcasts between the vehicles of a lab from its switch, and deliver them one by one.
+"""Take over broadcasts from the virtual switch, and deliver them one by one.
 
     relay = Relay([1, 2, 3])        in the lab's own network
     relay.open()                    the switch no longer floods broadcasts to these vehicles
@@ -64,7 +64,7 @@ _NOT_THE_WHOLE = 0x3FFF  # flag "more fragments", and offset of a fragment
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A broadcast of a vehicle. `at_ns` is the time at which the kernel got it, on Python's monotonic clock."""
+    """A broadcast of a vehicle. `at_ns` is the time at which the kernel received it, on Python's monotonic clock."""
 
     vehicle: int
     at_ns: int
@@ -72,7 +72,7 @@ class Heard:
     """The Ethernet frame behind its `virtio_net_hdr`."""
 
     def udp_data(self, port: int) -> bytes | None:
-        """Return the data of an unfragmented UDP datagram to this port over IPv4; None for any other frame."""
+        """Return the data of an unfragmented IPv4 UDP datagram to this port, or None for any other frame."""
         at = _VNET_BYTES + _ETHERNET_BYTES
         frame = self.frame
         if frame[at - 2 : at] != _IPV4 or len(frame) < at + _IP_MIN_BYTES:
@@ -88,7 +88,7 @@ class Heard:
 
 
 class Relay:
-    """The broadcasts to these vehicles, from `open` to `close`. Raises OSError if the kernel lacks packet sockets.
+    """The broadcasts to these vehicles, taken over between `open` and `close`. Raises OSError without packet sockets.
 
     `others` are further vehicles of the lab. The relay takes their broadcasts too, but the switch still floods the
     broadcasts of all vehicles to them.
@@ -115,17 +115,17 @@ class Relay:
 
     @property
     def input(self) -> socket.socket:
-        """A socket that is readable when `take` returns broadcasts."""
+        """A socket that is readable when `take` can return broadcasts."""
         return self._input
 
     def open(self) -> None:
-        """Keep the switch from flooding broadcasts to the vehicles. Raises NetlinkError if the kernel refuses."""
+        """Stop the switch from delivering broadcasts to the vehicles. Raises NetlinkError if the kernel refuses."""
         for _ in self.take():
             pass  # the switch has flooded these
         self._flood(False)
 
     def close(self) -> None:
-        """Let the switch flood broadcasts again."""
+        """Let the switch deliver broadcasts again."""
         self._flood(True)
         self._input.close()
 
@@ -135,7 +135,7 @@ class Relay:
             netlink.send([flood_broadcasts(port, index, on) for port, index in ports])
 
     def take(self) -> Iterator[Heard]:
-        """Yield the broadcasts that wait, in the order in which the kernel got them."""
+        """Yield the waiting broadcasts, in the order in which the kernel received them."""
         slots = self._slots
         offset_ns = time.time_ns() - time.monotonic_ns()
         while True:
@@ -151,11 +151,11 @@ class Relay:
                 yield Heard(vehicle, seconds * 1_000_000_000 + ns - offset_ns, frame)
 
     def deliver(self, vehicle: int, frame: bytes) -> None:
-        """Send a frame of `Heard` to a vehicle. Raises OSError if its port does not accept it."""
+        """Deliver a frame to a vehicle. Raises OSError if its port does not accept the frame."""
         self._outputs[vehicle].send(frame)
 
     def count_missed(self) -> int:
-        """Update and return the number of broadcasts that did not fit into the buffer."""
+        """Return the updated number of broadcasts that did not fit into the buffer."""
         _, dropped = _COUNTS.unpack(self._input.getsockopt(_SOL_PACKET, _STATISTICS, _COUNTS.size))
         self.missed += dropped  # since the last call
         return self.missed
@@ -169,7 +169,7 @@ def _socket(protocol: int) -> socket.socket:
 
 
 def _attach_filter(packets: socket.socket, bridge: int) -> None:
-    """Accept only broadcasts that arrive at a port. The bridge itself gets a copy of each, which is not accepted."""
+    """Let the socket accept only broadcasts that arrive at a port of the bridge."""
     program = (
         (_LOAD, 0, 0, _PKTTYPE),
         (_JUMP_EQUAL, 0, 3, _BROADCAST),

@@ -1,4 +1,4 @@
-"""The capture program: `python -m netem.tap FOLDER VEHICLE...`, started in the lab's own network with the ports.
+"""Capture packets in a separate process: `python -m netem.tap FOLDER VEHICLE...`, started in the virtual network.
 
 It prints "ready" when all ports are captured. Frames then wait in memory until SIGUSR1. At that time, the files
 FOLDER/<ID>.pcapng exist, and frames are appended to them. SIGTERM ends the capture. The remaining frames are written,
@@ -33,14 +33,14 @@ _DRAIN_S = 10.0
 
 
 class Tap:
-    """One vehicle's port and file."""
+    """The port and the capture file of one vehicle."""
 
     def __init__(self, vehicle: int, blocks: int) -> None:
         self.vehicle = vehicle
         self.ring = Ring(addresses.port(vehicle), blocks)
 
     def open(self, folder: Path) -> bool:
-        """Open the file if it exists, and return whether it does. Raises OSError."""
+        """Open the file if it exists. Return true if it does. Raises OSError."""
         path = folder / f"{self.vehicle}.pcapng"
         exists = path.exists()
         if exists:
@@ -48,7 +48,7 @@ class Tap:
         return exists
 
     def write(self) -> None:
-        """Write the available frames. Raises OSError."""
+        """Write the available frames to the file. Raises OSError."""
         for at_ns, frame, leaves_port in self.ring.take():
             self._file.packet(at_ns, frame, outbound=not leaves_port)
         self._file.flush()
@@ -62,7 +62,7 @@ class Tap:
 
 
 def capture(folder: Path, vehicles: Sequence[int]) -> None:
-    """Capture until SIGTERM. Raises OSError."""
+    """Capture packets until SIGTERM. Raises OSError."""
     signals, wake = socket.socketpair()
     for number in (signal.SIGUSR1, signal.SIGTERM):
         signal.signal(number, lambda number, _: wake.send(bytes([number])))
@@ -89,7 +89,7 @@ def capture(folder: Path, vehicles: Sequence[int]) -> None:
 
 
 def _print_json(what: object) -> None:
-    """Print one line of JSON."""
+    """Print an object as one line of JSON."""
     sys.stdout.write(f"{json.dumps(what)}\n")
     sys.stdout.flush()
 

@@ -1,4 +1,4 @@
-"""Engine "netem": Linux netem at the switch ports, over netlink, on kernels with sch_netem.
+"""The engine "netem": it applies all conditions with the kernel's netem at the switch ports.
 
 A packet gets two numbers at its sender's port: the group of its sender in a partition, and the *kind* of its sender.
 All receivers treat senders of one kind alike. At the receiver's port it passes two stages. Packets of other groups are
@@ -47,14 +47,14 @@ _SURE_JITTER_S = (2**31 - 1) / 1e9
 
 
 def may_refuse(conditions: NetworkConditions) -> bool:
-    """Return whether some kernels with netem refuse these conditions (see the module)."""
+    """Return true if some kernels with netem refuse these conditions. The module's docstring explains why."""
     links = (conditions.default, *conditions.receivers.values(), *conditions.links.values())
     return any(link.duplicate or (link.delay and link.delay.jitter_s > _SURE_JITTER_S) for link in links)
 
 
 @dataclass
 class _Totals:
-    """Packets counted by removed classes."""
+    """The counters of packets in traffic classes that were removed."""
 
     passed: int = 0
     lost: int = 0
@@ -62,14 +62,14 @@ class _Totals:
 
 @dataclass
 class _ClassState:
-    """The last conditions of a class; None after a refusal of the kernel. `distribution` names its table."""
+    """The last conditions of a traffic class, or None after the kernel refused them. `distribution` names its table."""
 
     link: LinkConditions | None
     distribution: Distribution = "uniform"
 
 
 class NetemEngine(Engine):
-    """All conditions of netem, per sender and receiver."""
+    """An engine for all conditions of netem, for each pair of sender and receiver."""
 
     name = "netem"
     has_queues = True
@@ -143,7 +143,7 @@ class NetemEngine(Engine):
         self._loss_conditions = figures
 
     def _set(self, receiver: int, links: dict[int, LinkConditions]) -> None:
-        """Set the conditions of each kind at the receiver's port. Only differences are sent to the kernel."""
+        """Set the conditions at the receiver's port. Only differences are sent to the kernel."""
         port, held = self._ports[receiver], self._classes[receiver]
         requests: list[Request] = []
         changed: dict[int, _ClassState] = {}
@@ -162,7 +162,7 @@ class NetemEngine(Engine):
         held.update(changed)
 
     def _move(self, kinds: _Numbers, groups: _Numbers) -> None:
-        """Move all senders from their old kinds and groups to the new ones."""
+        """Move all senders from their old groups to the new ones."""
         kind, group = _numbers(kinds), _numbers(groups)
         new = {vehicle: (kind[vehicle], group[vehicle]) for vehicle in self._vehicles}
         accepting = [vehicle for vehicle in self._vehicles if group[vehicle] not in self._accepted[vehicle]]
@@ -180,7 +180,7 @@ class NetemEngine(Engine):
         self._accepted = {vehicle: {group[vehicle]} for vehicle in self._vehicles}
 
     def _remove_unused(self, gone: Callable[[int, Class], bool]) -> None:
-        """Remove unused classes for which `gone` is true, and keep their counts."""
+        """Remove the unused traffic classes for which `gone` returns true, and keep their packet counts."""
         used = set(self._kinds.values())
         unused = {v: unused for v, held in self._classes.items() if (unused := [k for k in held if k not in used])}
         if not unused:
@@ -202,12 +202,12 @@ class NetemEngine(Engine):
                     self._removed[receiver].lost += counted.dropped
 
     def _read_classes(self) -> dict[int, dict[int, Class]]:
-        """Return the classes at each receiver's port."""
+        """Return the traffic classes at each receiver's port."""
         classes = TrafficControl.classes(self._netlink)
         return {vehicle: classes.get(port.index, {}) for vehicle, port in self._ports.items()}
 
     def _filters(self) -> tuple[dict[int, tuple[int, int] | None], dict[int, tuple[set[int], int]]]:
-        """Return the marks and the accepted groups of each port."""
+        """Return the marks and the accepted groups at each port."""
         marks = {vehicle: port.read_mark(self._netlink) for vehicle, port in self._ports.items()}
         return marks, {vehicle: port.accepted_groups(self._netlink) for vehicle, port in self._ports.items()}
 
@@ -246,7 +246,7 @@ class NetemEngine(Engine):
         return ReceiverFigures.of(held, tuple(cut_from), passed, lost, cut)
 
     def _with_distribution(self, link: LinkConditions, receiver: int, kind: int) -> LinkConditions:
-        """Return the kernel's conditions with the distribution, which the kernel does not report."""
+        """Return the conditions that the kernel reports, with the distribution, which it does not report."""
         holds = self._classes[receiver].get(kind)
         if link.delay is None or not link.delay.jitter_s or holds is None or holds.distribution == "uniform":
             return link
@@ -254,7 +254,7 @@ class NetemEngine(Engine):
 
 
 def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[frozenset[int]]:
-    """Return the kinds: groups of senders that all receivers treat alike."""
+    """Return groups of senders that have the same conditions at every receiver."""
     shared = (conditions.default, *conditions.receivers.values())
     own: dict[int, list[object]] = {vehicle: [] for vehicle in vehicles}
     for sender, receiver, link in conditions.differing_links():
@@ -270,7 +270,7 @@ def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[fro
 
 
 def _classes(conditions: NetworkConditions, kinds: _Numbers, receiver: int) -> dict[int, LinkConditions]:
-    """Return the conditions of a receiver for each kind of other senders.
+    """Return the conditions of one receiver for each group of senders.
 
     A single vehicle has conditions for itself.
     """
@@ -280,7 +280,7 @@ def _classes(conditions: NetworkConditions, kinds: _Numbers, receiver: int) -> d
 
 
 def _number(sets: Iterable[frozenset[int]], before: _Numbers, taken: Iterable[int]) -> _Numbers:
-    """Return numbers for sets of vehicles. A set that stays keeps its number, and used numbers keep their meaning."""
+    """Return numbers for sets of vehicles. A set that existed before keeps its number."""
     used = {*taken, *before.values()}
     free = (number for number in range(1, MAX_KIND) if number not in used)
     return {members: before[members] if members in before else next(free) for members in sets}

@@ -1,4 +1,4 @@
-"""Run one command inside User Mode Linux, a kernel with netem that runs as an ordinary process.
+"""Run one command in User Mode Linux, a Linux kernel with netem that runs as an ordinary process.
 
     status = uml.run(["my-command", "--flag"], cwd=Path.cwd(), env=os.environ)
 
@@ -105,12 +105,12 @@ env -i {environment} {argv}
 
 
 def inside() -> bool:
-    """Return whether this process runs in User Mode Linux."""
+    """Return true if this process runs in User Mode Linux."""
     return "User Mode Linux" in Path("/proc/cpuinfo").read_text()
 
 
 def find() -> Path:
-    """Return the kernel. Raises UmlError with the names of missing packages."""
+    """Return the path of the kernel. Raises UmlError with the names of missing packages."""
     kernel = shutil.which("linux.uml")
     path = os.pathsep.join([os.environ.get("PATH", ""), SYSTEM_PATH])
     packages = {
@@ -127,7 +127,7 @@ def find() -> Path:
 
 
 def examine() -> str:
-    """Boot User Mode Linux. Return its path, and how it preserves registers. Raises UmlError, as `run` does."""
+    """Boot User Mode Linux as a test. Return its path, and how it preserves registers. Raises UmlError."""
     kernel = find()
     status = run(["true"], cwd=Path("/"), env={"PATH": SYSTEM_PATH})
     if status != 0:
@@ -137,7 +137,7 @@ def examine() -> str:
 
 
 def run(argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
-    """Run a command in its own kernel. Return its exit status; after a signal, 128 plus its number, as in shells.
+    """Run a command in its own kernel. Return its exit status, which is 128 plus the number of a signal that killed it.
 
     `env` is its environment, except for TMPDIR. In the main thread, Ctrl-C and SIGTERM go to the command. Before the
     guest has booted, they end everything with status 130. Raises UmlError if User Mode Linux is missing, does not boot,
@@ -186,7 +186,7 @@ def _init(command: Path) -> str:
 
 
 class _Guest:
-    """A started User Mode Linux. The caller must `end` it.
+    """A running User Mode Linux. The caller must call `end`.
 
     Its consoles write to files in `folder`, which are read while they grow. Pipes are unsuitable, because this kernel's
     consoles drop output if a pipe is full.
@@ -227,7 +227,7 @@ class _Guest:
         os.write(self._keyboard, keys)
 
     def follow(self) -> int:
-        """Copy the output of the command until it ends. Return its exit status. Raises UmlError."""
+        """Copy the output of the command until it ends, and return its exit status. Raises UmlError."""
         with contextlib.ExitStack() as stack:
             stdout, stderr, word = (
                 stack.enter_context((self._folder / name).open("rb", buffering=0))
@@ -262,7 +262,7 @@ class _Guest:
         return UmlError(f"User Mode Linux failed: {problem}; it last said: {last}")
 
     def end(self) -> None:
-        """Kill the guest, which may already have ended."""
+        """Kill the virtual machine, if it still runs."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -277,14 +277,14 @@ def _write(target: BinaryIO, data: bytes) -> None:
 
 
 def _exit_status(received: bytes) -> int | None:
-    """Return the exit status if its line is complete. The lines before it are empty."""
+    """Return the exit status, or None if its line is not complete yet."""
     *lines, _ = received.split(b"\n")
     return next((int(line) for line in lines if line.strip()), None)
 
 
 @contextlib.contextmanager
 def _forwarding_interrupts(guest: _Guest) -> Iterator[None]:
-    """Type Ctrl-C at the guest's console on Ctrl-C and SIGTERM. Only the main thread can do this."""
+    """Forward Ctrl-C and SIGTERM to the virtual machine as a typed Ctrl-C. Only the main thread can do this."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if not guest.up:

@@ -1,4 +1,4 @@
-"""Run a program inside a running User Mode Linux that another process started (`netem.uml`), at its own console.
+"""Run a program in a User Mode Linux that another process has started (`netem.uml`).
 
     for folder in uml_shell.guests():
         status = uml_shell.enter(folder, ["ip", "address"], cwd=Path.cwd(), env=os.environ)
@@ -47,7 +47,7 @@ exec env --default-signal=INT,QUIT -i {environment} {argv}
 
 
 def guests(proc: Path = Path("/proc")) -> list[Path]:
-    """Return the folders of running guests that this user may enter."""
+    """Return the folders of the running virtual machines that this user may enter."""
     folders: set[Path] = set()
     for cmdline in proc.glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
@@ -57,7 +57,9 @@ def guests(proc: Path = Path("/proc")) -> list[Path]:
 
 
 def enter(folder: Path, argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
-    """Run a program there with this terminal, and return its exit status. Raises UmlError if this fails."""
+    """Run a program in the virtual machine with this terminal, and return its exit status. Raises UmlError if that
+    fails.
+    """
     try:
         with (folder / _LOCK).open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -97,7 +99,7 @@ def _script(token: str, argv: Sequence[str], cwd: Path, env: Mapping[str, str]) 
 
 
 def _copy_until_end(folder: Path, token: bytes, keys: int, screen: io.FileIO) -> int:
-    """Copy input to the guest, and output between the start and end marks from the guest."""
+    """Copy input to the virtual machine, and copy its output between the start and end marks."""
     output, started = b"", False
     typing = sys.stdin.isatty()
     requested_at = -math.inf
@@ -129,14 +131,14 @@ def _copy_until_end(folder: Path, token: bytes, keys: int, screen: io.FileIO) ->
 
 
 def _certain_length(output: bytes) -> int:
-    """Return the length of the output that cannot belong to the end mark."""
+    """Return the length of the output that certainly does not belong to the end mark."""
     at = output.rfind(b"\0", -END_MARK_BYTES)
     return at if at >= 0 else len(output)
 
 
 @contextlib.contextmanager
 def _raw_terminal() -> Iterator[None]:
-    """Pass all keys to the guest, including Ctrl-C."""
+    """Pass all keys to the virtual machine, including Ctrl-C."""
     if not sys.stdin.isatty():
         yield
         return

@@ -1,4 +1,4 @@
-"""Vehicles: ArduPilot SITL, the embedded vehicle, and the pilot that flies either over MAVLink.
+"""Run simulated vehicles: ArduPilot SITL or the embedded vehicle model, and a pilot that flies them over MAVLink.
 
 `__all__` lists the public names. A name is imported at its first use, because every embedded vehicle imports this
 package. A lazy import keeps its start fast.

@@ -1,4 +1,5 @@
-"""The autopilot of the embedded vehicle: modes, arming, flight and missions. It has no socket, clock or parser.
+"""Simulate the autopilot of the embedded vehicle: modes, arming, flight and missions, without sockets, clocks or
+parsers.
 
 `Autopilot` is the vehicle. A client talks to it through a `Channel` (serial_channel.py). The messages that it sends at
 intervals are in streams.py. Times are simulated seconds since boot.
@@ -37,13 +38,13 @@ ACCEPTED, FAILED = int(mavlink.MAV_RESULT_ACCEPTED), int(mavlink.MAV_RESULT_FAIL
 
 
 class Listener(Protocol):
-    """A receiver of the messages that the vehicle sends without a request."""
+    """An object that receives the messages that the vehicle sends without a request."""
 
     def send(self, message: Any) -> None: ...
 
 
 class Autopilot:
-    """One vehicle. `epoch_us` is the time of its boot in microseconds since the Unix epoch."""
+    """The autopilot of one vehicle. `epoch_us` is the time of its boot in microseconds since the Unix epoch."""
 
     takes_missions = True
 
@@ -84,7 +85,7 @@ class Autopilot:
 
     @property
     def battery_used(self) -> float:
-        """The used share of the battery, 0 to 1."""
+        """The used share of the battery, from 0 to 1."""
         return self.used_mah / BATTERY_FULL_MAH
 
     @property
@@ -114,7 +115,7 @@ class Autopilot:
             self._lose_thrust()
 
     def say(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT to all clients."""
+        """Send a text message (STATUSTEXT) to all clients."""
         self._tell(mavlink.MAVLink_statustext_message(severity, text.encode()))
 
     def _tell(self, message: Any) -> None:
@@ -139,7 +140,7 @@ class Autopilot:
         return ACCEPTED
 
     def disarm(self, force: bool = False) -> int:
-        """Disarm.
+        """Disarm the vehicle. Return the result code of the MAVLink command.
 
         `force` (MAV_CMD_COMPONENT_ARM_DISARM, param2 21196) also works in flight, and the vehicle then falls.
         """
@@ -155,7 +156,7 @@ class Autopilot:
         return ACCEPTED
 
     def take_off(self, altitude_m: float) -> int:
-        """Execute MAV_CMD_NAV_TAKEOFF of a copter."""
+        """Execute MAV_CMD_NAV_TAKEOFF of a copter, and return the result code."""
         if self.vehicle_type != "copter":
             return self._refuse(f"Take-off refused: a {self.vehicle_type} does not take off in GUIDED")
         if not self.armed:
@@ -186,7 +187,7 @@ class Autopilot:
         return ACCEPTED
 
     def start_mission(self) -> int:
-        """Execute MAV_CMD_MISSION_START."""
+        """Execute MAV_CMD_MISSION_START, and return the result code."""
         if not self.armed or len(self.mission) < 2:
             return self._refuse("Mission start refused: not armed, or no mission")
         if self.mode != "AUTO":
@@ -196,14 +197,14 @@ class Autopilot:
         return ACCEPTED
 
     def set_speed(self, speed_ms: float) -> int:
-        """Execute MAV_CMD_DO_CHANGE_SPEED. The speed applies from the next place on."""
+        """Execute MAV_CMD_DO_CHANGE_SPEED, and return the result code. The speed applies from the next place on."""
         if not 0 < speed_ms <= MAX_SPEED_MS:
             return FAILED
         self._speed_ms = speed_ms
         return ACCEPTED
 
     def go_to(self, place: Point) -> int:
-        """Go to a place and stay there, in GUIDED mode."""
+        """Go to a place and stay there, in GUIDED mode. Return the result code."""
         if self.mode != "GUIDED" or not self.armed or not (self.airborne or self.vehicle_type == "rover"):
             return FAILED
         if not all(map(math.isfinite, place)) or abs(place.up_m) > MAX_ALTITUDE_M:
@@ -226,7 +227,7 @@ class Autopilot:
     # Faults and failsafes
 
     def simulate(self, name: str, value: float) -> None:
-        """Set a parameter of the simulation. A change of wind takes effect during a leg, too."""
+        """Set a parameter of the simulation. A change of wind also affects the current movement."""
         self.failsafes.parameters[name] = value
         if name in (WIND, WIND_FROM) and self._in_mission and self.current_item < len(self.mission):
             item = self.mission[self.current_item]
@@ -234,7 +235,7 @@ class Autopilot:
                 self._go_on_to(self.place(item.frame, item.x, item.y, item.z), self.current_item)
 
     def hear(self, system: int) -> None:
-        """Receive a heartbeat."""
+        """Process a heartbeat from this system."""
         if system == self.failsafes.parameters[STATION]:
             self.station_heard_s = self.now_s
 
@@ -242,7 +243,7 @@ class Autopilot:
         return self.failsafes.look(self.now_s, self.battery_used, self.motion.point, self.station_heard_s)
 
     def _save(self, failsafe: Failsafe) -> None:
-        """Act as ArduPilot does by itself: without a position a copter lands, and a rover holds."""
+        """React to a failsafe as ArduPilot does. Without a position, for example, a copter lands and a rover stops."""
         can_land = self.vehicle_type == "copter"
         if failsafe == "ekf":
             self.say(mavlink.MAV_SEVERITY_CRITICAL, "EKF variance")
@@ -277,7 +278,7 @@ class Autopilot:
         self._course, self._then, self._goal = Course(self.now_s, segments), then, None
 
     def _act(self) -> None:
-        """Begin the movement of the current mode. The vehicle is armed."""
+        """Begin the movement of the current flight mode. The vehicle must be armed."""
         self._in_mission = False
         match self.mode:
             case "AUTO" if self.airborne or self.vehicle_type != "copter":
@@ -338,7 +339,7 @@ class Autopilot:
     # The mission
 
     def _begin_item(self, number: int) -> None:
-        """Continue the mission from this item on. Items that take no time are executed at once."""
+        """Continue the mission from this item on. Items without a duration are executed at once."""
         self._in_mission = True
         while number < len(self.mission) and self.mission[number].command == mavlink.MAV_CMD_DO_CHANGE_SPEED:
             self.set_speed(self.mission[number].param2)
@@ -379,7 +380,7 @@ class Autopilot:
         self._begin(self._model.go_to(self.motion, place, speed_ms, self._place_before(number)), self._item_reached)
 
     def _place_before(self, number: int) -> Point | None:
-        """Return the place of the previous item. None if it is no place."""
+        """Return the place of the previous mission item, or None if it has no place."""
         for item in reversed(self.mission[1:number]):
             match item.command:
                 case mavlink.MAV_CMD_NAV_WAYPOINT | mavlink.MAV_CMD_NAV_LOITER_TIME:
@@ -390,7 +391,7 @@ class Autopilot:
         return None
 
     def _place_after(self, number: int) -> Point | None:
-        """Return the place of the next item, without speed changes. None if there is none."""
+        """Return the place of the next mission item other than a change of speed, or None."""
         places = (item for item in self.mission[number + 1 :] if item.command != mavlink.MAV_CMD_DO_CHANGE_SPEED)
         item = next(places, None)
         return None if item is None else self.place(item.frame, item.x, item.y, item.z)
@@ -410,7 +411,7 @@ class Autopilot:
             self._stay()
 
     def place(self, frame: int, lat_e7: int, lon_e7: int, alt_m: float) -> Point:
-        """Return a place in one of `FRAMES`, in metres from home.
+        """Return a place that is given in one of `FRAMES`, in metres from home.
 
         Latitude and longitude 0 mean the current position.
         """

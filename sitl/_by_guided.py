@@ -1,4 +1,4 @@
-"""Fly a plan leg by leg in GUIDED mode: the pilot sends the next place when the vehicle has reached the previous one.
+"""Fly a plan in GUIDED mode: the pilot sends the next place when the vehicle has reached the previous one.
 
 A plane takes off in its mode TAKEOFF. It cannot land in GUIDED mode, so its landing is a separate mission in AUTO mode.
 """
@@ -107,7 +107,7 @@ class GuidedFlight:
         return is_near(place, waypoint, self._to.vehicle_type)
 
     def _on_its_way(self) -> bool:
-        """Return whether the vehicle has accepted its target.
+        """Return true if the vehicle has accepted its target.
 
         A plane acknowledges it, and other vehicles begin to move.
         """

@@ -62,7 +62,7 @@ class MissionFlight:
         return self._legs[self._done]
 
     def _count(self) -> None:
-        """Count the completed waypoints. A landing is complete when the vehicle disarms."""
+        """Count the completed waypoints. A landing is complete when the vehicle is disarmed."""
         state = self._to.state
         reached, heading_for = state.reached or 0, state.item or 0
         while self._done < len(self._waypoints):

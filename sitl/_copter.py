@@ -1,4 +1,4 @@
-"""The motion of a copter. The figures are ArduCopter's default parameters, or measurements with ArduCopter 4.7."""
+"""Compute the motion of a copter, with ArduCopter's default parameters or measurements with ArduCopter 4.7."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SPIN_UP_S = 3.0  # from arming to the first movement, measured
 
 @dataclass(frozen=True)
 class Copter:
-    """The `MotionModel` of a copter: it stops at each place, and flies straight to the next one.
+    """The motion of a copter: it stops at each place, and flies straight to the next one.
 
     It waits `turning_s` before it leaves a place, and `settling_s` before it descends. The default values were measured
     in AUTO mode, in which ArduCopter smooths the path (WPNAV_JERK).

@@ -1,4 +1,4 @@
-"""The environment and the parts of the embedded vehicle, and the conditions of its failsafes.
+"""Simulate faults of the embedded vehicle, and decide when its failsafes act.
 
 Parameters have the names of ArduPilot and its simulation. The vehicle has a GPS, a battery, a receiver of a remote
 control, a fence and, if it is a copter, motors. A plane is affected by wind. There is no compass. Parameters of missing
@@ -64,7 +64,7 @@ Failsafe = Literal["ekf", "battery low", "battery critical", "station", "radio",
 
 
 class Failsafes:
-    """The failsafes of one vehicle. Times are its own seconds."""
+    """The failsafes of one vehicle. Times are seconds on its own clock."""
 
     def __init__(self, vehicle_type: VehicleType) -> None:
         self.parameters = {GPS: 1.0, VOLTS: BATTERY_FULL_V, **BATTERY, RC_FAIL: 0.0, STATION: 255.0}
@@ -92,7 +92,7 @@ class Failsafes:
         return self.parameters.get(THRUST, 1.0) < 0.5
 
     def over_ground(self, speed_ms: float, bearing_rad: float) -> float:
-        """Return the ground speed for an air speed and a bearing, clockwise from north."""
+        """Return the ground speed for an air speed and a bearing. Bearings are clockwise from north."""
         from_rad = math.radians(self.parameters.get(WIND_FROM, 0.0))
         head_ms = self.parameters.get(WIND, 0.0) * math.cos(bearing_rad - from_rad)
         return max(SLOWEST_MS, speed_ms - head_ms) if head_ms else speed_ms
@@ -102,7 +102,7 @@ class Failsafes:
         return max(0.0, self.parameters[VOLTS] - BATTERY_USED_V * used)
 
     def action(self, failsafe: Failsafe) -> str | None:
-        """Return the mode that a failsafe of the battery, a link or the fence selects, or None."""
+        """Return the flight mode to which a failsafe of the battery, a link or the fence switches, or None."""
         kind = self._vehicle_type
         if failsafe == "fence":
             return FENCE_ACTIONS[kind].get(self.parameters[FENCE_ACTION])
@@ -114,7 +114,7 @@ class Failsafes:
         return self._actions.get(self.parameters[WHEN_LOW if failsafe == "battery low" else WHEN_CRITICAL])
 
     def breaches_fence(self, place: Point) -> bool:
-        """Return whether a place, in metres from home, is outside of the fence."""
+        """Return true if a place, in metres from home, is outside the fence."""
         kind = int(self.parameters[FENCE_TYPE])
         too_high = bool(kind & TOP) and place.up_m >= self.parameters.get(FENCE_TOP, math.inf)
         too_far = bool(kind & CIRCLE) and math.hypot(place.north_m, place.east_m) >= self.parameters[FENCE_RADIUS]

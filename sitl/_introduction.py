@@ -1,4 +1,4 @@
-"""Request the version and all parameters of a vehicle after its boot.
+"""Request the version and all parameters of a vehicle after it has booted.
 
 A vehicle that leaves out some of them can still fly. It must know the parameters that the user has set.
 """
@@ -25,7 +25,7 @@ _GIVEN = Step("the parameters that it was given")
 
 
 class Introduction:
-    """The `Procedure` of these requests. `given` are parameters that the vehicle was started with, or must set now."""
+    """The requests for version and parameters. `given` contains parameters that the vehicle has, or must get now."""
 
     purpose = "introduce itself"
 
@@ -60,7 +60,7 @@ class Introduction:
                 link.request_parameter(name)  # ArduPilot lists none of a group that is switched off
 
     def _ask_for_list(self) -> None:
-        """Request all parameters at first, and later those that are missing."""
+        """Request all parameters at first, and later those that are still missing."""
         link = self._link
         if link.parameter_count is None:
             link.request_parameters()

@@ -1,4 +1,4 @@
-"""The motion of vehicles as courses of segments, each a closed formula of the time since its beginning.
+"""Describe the motion of vehicles as sequences of segments. Each segment is a formula of the time since its beginning.
 
 There are no dynamics and no time steps, so a position does not depend on how often it is computed. A process that wakes
 once in twenty simulated seconds and a simulation in virtual time compute the same track. The motions of copters, planes
@@ -28,9 +28,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Motion:
-    """The position of a vehicle relative to home, and its movement, in metres, metres per second and radians, all
-    finite.
-    """
+    """The position and movement of a vehicle relative to home, in metres, metres per second and radians."""
 
     north_m: float = 0.0
     east_m: float = 0.0
@@ -48,16 +46,16 @@ class Motion:
 
     @property
     def halted(self) -> Motion:
-        """The same place and heading without movement."""
+        """Return the same position and heading without movement."""
         return Motion(self.north_m, self.east_m, self.up_m, yaw_rad=self.yaw_rad)
 
 
 class Segment(Protocol):
-    """A part of a course."""
+    """One segment of a motion."""
 
     @property
     def duration_s(self) -> float:
-        """The duration in seconds. math.inf for a segment without an end."""
+        """The duration of the segment in seconds, or math.inf if it has no end."""
 
     def at(self, since_s: float) -> Motion:
         """Return the motion at a time since the beginning, 0 to `duration_s`."""
@@ -75,8 +73,7 @@ class Rest:
 
 
 class Line:
-    """A straight line with a trapezoidal speed profile: from `from_ms` up to `speed_ms`, then down to `to_ms`, both at
-    `accel_ms2`.
+    """A straight line: the speed changes from `from_ms` to `speed_ms`, and at the end to `to_ms`, with `accel_ms2`.
 
     On a short line the profile is triangular. The line must be long enough for the change from `from_ms` to `to_ms`.
     The vehicle heads along the line. On a vertical line it keeps its heading.
@@ -143,7 +140,7 @@ class Arc:
 
 
 class Climbing:
-    """A level segment with a climb or descent at `rate_ms` to `up_m`, and level after that."""
+    """A level segment, with a climb or descent at `rate_ms` to the altitude `up_m`."""
 
     def __init__(self, level: Segment, up_m: float, rate_ms: float) -> None:
         self._level, self._up_m = level, up_m
@@ -184,27 +181,27 @@ class Fall:
 
 
 class Course:
-    """A sequence of segments from `begin_s` on. Times are seconds of any one clock."""
+    """A sequence of segments that begins at `begin_s`. Times are seconds of any one clock."""
 
     def __init__(self, begin_s: float, segments: Sequence[Segment]) -> None:
-        """Make a course of at least one segment. Only the last segment may be infinite."""
+        """Create a motion from at least one segment. Only the last segment may be infinite."""
         self._segments = segments
         *self._begin_s, self.end_s = itertools.accumulate((part.duration_s for part in segments), initial=begin_s)
 
     @property
     def rests_from_s(self) -> float:
-        """The time from which the place is constant. Infinite if there is none."""
+        """The time from which the position stays the same, or infinity if there is none."""
         return self._begin_s[-1] if isinstance(self._segments[-1], Rest) else self.end_s
 
     def at(self, now_s: float) -> Motion:
-        """Return the motion at `now_s`. Before the beginning and after the end, this is the motion there."""
+        """Return the motion at the time `now_s`, or at the nearer end of the sequence if that time is outside it."""
         index = max(0, bisect.bisect_right(self._begin_s, now_s) - 1)
         segment = self._segments[index]
         return segment.at(min(max(0.0, now_s - self._begin_s[index]), segment.duration_s))
 
 
 class Part:
-    """A part of a course, from `begin_s` to `end_s` on the clock of the course."""
+    """A part of a motion, from `begin_s` to `end_s` on its clock."""
 
     def __init__(self, course: Course, begin_s: float, end_s: float) -> None:
         self._course, self._begin_s = course, begin_s

@@ -1,4 +1,4 @@
-"""The course of a plan in GUIDED mode: each leg ends when the pilot notices its end (_by_guided.py)."""
+"""Compute the motion of a plan in GUIDED mode, in which each leg ends when the pilot notices its end."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def leg_by_leg(
 
 
 def _made_s(course: Course, since_s: float, waypoint: Waypoint, vehicle_type: VehicleType, limit_s: float) -> float:
-    """Return the time at which the course completes a waypoint. Infinite if it does not do so before `limit_s`."""
+    """Return the time at which the motion completes a waypoint, or infinity if it does not do so before `limit_s`."""
     now_s = since_s
     while now_s < limit_s:
         place = course.at(now_s).point

@@ -1,4 +1,4 @@
-"""Split a byte stream into MAVLink frames of any dialect, without decoding them, for speed."""
+"""Divide a byte stream into MAVLink frames without decoding them, which is fast."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _HEADER_BYTES = 3  # bytes that determine the length of a frame
 
 
 class FrameSplitter:
-    """A splitter for the bytes of one vehicle. Bytes that begin no frame are skipped."""
+    """Divides the bytes of one vehicle into frames. Other bytes are skipped."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -33,7 +33,7 @@ class FrameSplitter:
 
 
 def _length(stream: bytes, at: int) -> int | None:
-    """Return the length of the frame that begins here: header, payload, checksum, and 13 more bytes if it is signed."""
+    """Return the length of the frame that begins here, or None if none begins or its length is not known yet."""
     if stream[at] == _V2:
         return 12 + stream[at + 1] + 13 * (stream[at + 2] & _SIGNED)
     return 8 + stream[at + 1] if stream[at] == _V1 else None

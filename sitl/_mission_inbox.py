@@ -1,4 +1,4 @@
-"""The vehicle's side of the MAVLink mission protocol, for one client: receive a mission, and send the current one.
+"""Implement the vehicle's side of the MAVLink mission protocol: receive a mission, and send the current one.
 
 The vehicle requests a mission item by item. The mission replaces the old one when it is complete. There are no timers:
 a client without an answer sends MISSION_COUNT again, which restarts the transfer. Results equal those of ArduPilot
@@ -19,7 +19,7 @@ MAX_ITEMS = 1000
 
 
 class MissionInbox:
-    """The state of one client's transfers. `receive` takes a message of the protocol and returns the answers."""
+    """The state of mission transfers with one client. `receive` takes a message and returns the answers."""
 
     def __init__(self, vehicle: Autopilot) -> None:
         self._vehicle = vehicle
@@ -85,7 +85,7 @@ class MissionInbox:
 
 
 def _sender(message: Any) -> tuple[int, int]:
-    """Return system and component of the sender, to which the answer goes."""
+    """Return the system and component ID of the sender, to which the answer goes."""
     return message.get_srcSystem(), message.get_srcComponent()
 
 
@@ -101,7 +101,7 @@ def _with_integers(item: Any) -> Any:
 
 
 def _check(item: Any) -> int:
-    """Return the MAV_MISSION_RESULT of one item."""
+    """Return the result code (MAV_MISSION_RESULT) for one mission item."""
     if item.command not in ITEM_NAMES:
         return int(mavlink.MAV_MISSION_UNSUPPORTED)
     if item.frame not in FRAMES and item.command != mavlink.MAV_CMD_DO_CHANGE_SPEED:

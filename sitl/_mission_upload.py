@@ -1,4 +1,4 @@
-"""Convert a route to a MAVLink mission, and upload it: the pilot's side of the mission protocol.
+"""Convert a route to a MAVLink mission and upload it. This is the pilot's side of the mission protocol.
 
 https://mavlink.io/en/services/mission.html. Item 0 is home. ArduPilot replaces it by its own.
 """
@@ -47,7 +47,7 @@ def on_earth(place: Point, home: Home) -> tuple[int, int]:
 
 
 class Mission:
-    """The MISSION_ITEM_INTs of a route, and the item number of each waypoint.
+    """The mission items (MISSION_ITEM_INT) of a route, and the item number of each waypoint.
 
     If a plane's plan does not end with a landing, the mission ends with a circle around the last place. Without it,
     ArduPlane would fly home.

@@ -1,4 +1,4 @@
-"""The motion models by type of vehicle. A `MotionModel` converts a goal and the current motion into segments."""
+"""Select the motion model for each type of vehicle. It converts a goal and the current motion into segments."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class MotionModel(Protocol):
 
     @property
     def cruise_ms(self) -> float:
-        """The default speed."""
+        """The default speed in metres per second."""
 
     def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]: ...
 
     def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
-        """Go to a place. A plane first returns to the line from `before`, its previous place, to this place."""
+        """Go to a place. A plane first returns to the straight line from its previous place `before`."""
 
     def loiter(
         self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
@@ -39,7 +39,7 @@ class MotionModel(Protocol):
         """Land at `place`, and stop there. `before` is used as in `go_to`."""
 
     def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
-        """Take off without a mission, and continue with the default behaviour for an unlimited time."""
+        """Take off without a mission, and then continue with the default behaviour without end."""
 
 
 MODELS: dict[VehicleType, MotionModel] = {"copter": Copter(), "plane": Plane(), "rover": Rover()}

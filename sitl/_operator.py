@@ -1,4 +1,4 @@
-"""A bounded log of the commands that an operator sends from a ground station."""
+"""Record the commands that an operator sends from a ground station, up to a maximum number."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _ADDRESS = frozenset({"target_system", "target_component", "command", "mavpacket
 
 
 class CommandLog:
-    """The commands in order. Equal consecutive commands make one entry with their number and end time."""
+    """The recorded commands in order. Equal consecutive commands form one entry with a count and an end time."""
 
     def __init__(self) -> None:
         self.left_out = 0
@@ -85,7 +85,7 @@ def _command(message: Any) -> str | None:
 
 
 def _values(message: Any) -> dict[str, Any]:
-    """Return the fields of the message without its address, as JSON values. Empty for stick messages."""
+    """Return the fields of the message, without its address, as JSON values. For joystick messages they are empty."""
     if message.get_type() in _AT_THE_STICKS:
         return {}
     values = {name: getattr(message, name) for name in message.get_fieldnames() if name not in _ADDRESS}

@@ -1,4 +1,4 @@
-"""The connection of a pilot to its vehicle: it keeps the vehicle's state, writes the telemetry log, and sends messages.
+"""Connect a pilot to its vehicle: track the vehicle's state, write the telemetry log, and send messages.
 
 One process has a link for each vehicle of a run. Therefore a link has no thread, only an asyncio protocol and a timer.
 """
@@ -108,7 +108,7 @@ class Link(asyncio.Protocol):
         self._knows_its_height: bool | None = None  # above its home: whether it did when its estimate got good
 
     async def start(self) -> None:
-        """Start to read, to log and to send heartbeats."""
+        """Start to read and log messages, and to send heartbeats."""
         self._socket.setblocking(False)
         self.heard_at = time.monotonic()
         await asyncio.get_running_loop().create_connection(lambda: self, sock=self._socket)
@@ -124,7 +124,7 @@ class Link(asyncio.Protocol):
 
     @property
     def real_time_factor(self) -> float | None:
-        """Simulated seconds per second, divided by the speedup, since the first message.
+        """The simulated seconds per second since the first message, divided by the speedup, or None.
 
         1.0 means a fast enough machine.
         """
@@ -161,7 +161,7 @@ class Link(asyncio.Protocol):
 
     @property
     def has_left_its_mode(self) -> bool:
-        """True if the vehicle was in the mode that was requested last, and has left it."""
+        """True if the vehicle was in the requested mode and has left it."""
         return self._was_in_asked_mode and self.state.mode != self._asked_mode
 
     @property
@@ -272,7 +272,7 @@ class Link(asyncio.Protocol):
             self._tlog = None
 
     def _give_up_log(self, error: OSError) -> None:
-        """End the log after an error, such as a full disk. The flight continues."""
+        """Stop writing the telemetry log after an error, such as a full disk. The flight continues."""
         self.state.log_error = f"telemetry log {self.tlog_path}: {error.strerror}"
         if self._tlog is not None:
             self._tlog.abandon()

@@ -1,4 +1,4 @@
-"""The motion of a plane in arcs and straight lines, never slower than its minimum flying speed.
+"""Compute the motion of a plane in arcs and straight lines, never slower than its minimum flying speed.
 
 The figures are those of ArduPlane's SITL (plane.parm), or measurements with ArduPlane 4.7 where noted. Turns are the
 shortest ones, as in the paths of Dubins (1957). ArduPlane's L1 controller flies turns that differ by some tens of
@@ -48,7 +48,7 @@ ROLL_OUT_ACCEL_MS2 = LANDING_MS**2 / (2 * (ROLL_OUT_M + PAST_M))
 
 
 class Plane:
-    """The `MotionModel` of a plane: it passes the places of a plan, and circles where it must stay."""
+    """The motion of a plane: it passes the places of a plan, and circles where it must stay."""
 
     cruise_ms = CRUISE_MS
 
@@ -110,7 +110,7 @@ class Plane:
 
 
 def _until_heading_for(there: Point, centre: Point, here: Motion) -> float:
-    """Return the angle, in radians, to continue on a circle until the plane heads for a place within ArduPlane's
+    """Return the angle in radians to continue on a circle, until the plane flies towards a place within ArduPlane's
     tolerance.
 
     0 if the place is so near that the plane never heads for it.
@@ -133,7 +133,7 @@ def _duration_s(segments: Sequence[Segment]) -> float:
 
 
 class _Path:
-    """A path under construction, at one speed, with a climb or descent to one altitude at one rate."""
+    """A path under construction at one speed, with a climb or descent to one altitude."""
 
     def __init__(self, start: Motion, speed_ms: float, up_m: float, rate_ms: float) -> None:
         self.segments: list[Segment] = []
@@ -181,7 +181,7 @@ class _Path:
 
 
 def _lift_off(start: Motion, altitude_m: float, straight_to_m: float) -> tuple[Sequence[Segment], _Path]:
-    """Return the take-off run, and a path that climbs to `altitude_m`, straight up to `straight_to_m`."""
+    """Return the motion on the ground before take-off, and a path that climbs to `altitude_m`."""
     run = Line(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
     path = _Path(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
     path.straight(TAKE_OFF_MS * max(0.0, straight_to_m - start.up_m) / TAKE_OFF_CLIMB_MS)
@@ -191,7 +191,7 @@ def _lift_off(start: Motion, altitude_m: float, straight_to_m: float) -> tuple[S
 def _back_and_on(
     start: Motion, place: Point, before: Point | None, speed_ms: float, rate_ms: float, reached_m: float
 ) -> Sequence[Segment]:
-    """Return to the line from `before` to `place`, and follow it until the distance is `reached_m`."""
+    """Return to the line from `before` to `place`, and follow it until the distance to `place` is `reached_m`."""
     aim = None if before is None else _back_on_line(start.point, before, place)
     if before is None or aim is None:
         return _fly_by(start, place, speed_ms, rate_ms, reached_m)
@@ -210,7 +210,7 @@ def _fly_by(start: Motion, place: Point, speed_ms: float, rate_ms: float, reache
 
 
 class _Turn(NamedTuple):
-    """A turn to a heading on which a place is straight ahead: centre, clockwise angle, and remaining distance."""
+    """A turn after which a place is straight ahead: its centre, its clockwise angle, and the remaining distance."""
 
     centre: tuple[float, float]
     turn_rad: float
@@ -218,7 +218,7 @@ class _Turn(NamedTuple):
 
 
 def _turn_towards(start: Motion, place: Point, radius_m: float, rather_left_m: float) -> _Turn | None:
-    """Return the turn of the shorter path. None if the place is inside both circles."""
+    """Return the turn with the shorter path, or None if the place is inside both possible circles."""
     ways = []
     for side in (1, -1):  # to the right, to the left
         centre = _beside(start, side * radius_m)
@@ -242,7 +242,7 @@ def _turn_towards(start: Motion, place: Point, radius_m: float, rather_left_m: f
 
 
 def _back_on_line(here: Point, before: Point, place: Point) -> Point | None:
-    """Return the point to aim at on the line between two places. None if the place itself is as near."""
+    """Return the point to aim at on the line between two places, or None if the place itself is as near."""
     north, east = place.north_m - before.north_m, place.east_m - before.east_m
     length_m = math.hypot(north, east)
     if length_m < NEAR_M:
@@ -259,7 +259,7 @@ def _bearing_rad(here: Point, there: Point) -> float:
 
 
 def _on_circle(place: Point, radius_m: float, bearing_rad: float) -> Point:
-    """Return the point of the circle around a place in this direction from the place."""
+    """Return the point on the circle around a place that lies in this direction from its centre."""
     north_m, east_m = radius_m * math.cos(bearing_rad), radius_m * math.sin(bearing_rad)
     return Point(place.north_m + north_m, place.east_m + east_m, place.up_m)
 
@@ -281,5 +281,5 @@ def _ahead(start: Motion, length_m: float) -> Point:
 
 
 def _beside(start: Motion, right_m: float) -> tuple[float, float]:
-    """Return north and east of the point at this distance to the right."""
+    """Return north and east of the point at this distance to the right of the vehicle."""
     return start.north_m - right_m * math.sin(start.yaw_rad), start.east_m + right_m * math.cos(start.yaw_rad)

@@ -1,4 +1,4 @@
-"""One TCP port of the embedded vehicle: a listener with at most one client. It never blocks, and its memory is bounded.
+"""One TCP port of the embedded vehicle, for at most one client. It never blocks, and its memory is limited.
 
 A client that reads too slowly loses telemetry, and the vehicle does not wait for it. ArduPilot does wait at a speedup
 above 1. A second client can connect, but receives nothing until the first disconnects, as with ArduPilot.
@@ -18,7 +18,7 @@ MAX_UNSENT_BYTES = 65_536
 
 
 class Port:
-    """A listener on 127.0.0.1. Raises OSError if the port is not available."""
+    """A TCP server on 127.0.0.1. Raises OSError if the port is not available."""
 
     def __init__(self, number: int, autopilot: Autopilot, selector: selectors.BaseSelector) -> None:
         self._autopilot = autopilot
@@ -64,7 +64,7 @@ class Port:
             self._drop_client()
 
     def send(self) -> None:
-        """Send the pending messages of the channel, or discard them if the client is too slow.
+        """Send the waiting messages, or discard them if the client is too slow.
 
         Only complete batches are discarded, so the client never receives part of a message.
         """

@@ -1,4 +1,4 @@
-"""The route of a plan: each leg has a place, an altitude and a speed, and a plane has an approach.
+"""Convert a flight plan to a route with a place, an altitude and a speed for each leg, and an approach for a plane.
 
 The pilot, which flies a plan, and track.py, which computes its track, both use the route. Therefore they agree.
 """
@@ -31,7 +31,7 @@ Kind = Literal["take_off", "go_to", "loiter", "land"]
 
 @dataclass(frozen=True)
 class Waypoint:
-    """One action at `place`, at `speed_ms` on the way there, and for `seconds` if it is a loiter."""
+    """One action of a route at `place`. `speed_ms` is the speed on the way there, and `seconds` the time to stay."""
 
     leg: str  # of the plan, in words: "leg 2 of 5 (...)"
     kind: Kind
@@ -41,7 +41,7 @@ class Waypoint:
 
 
 def route(plan: Plan, vehicle_type: VehicleType, heading_deg: float) -> tuple[Waypoint, ...]:
-    """Return the waypoints of `plan` for a vehicle whose home has the heading `heading_deg`. Raises PlanError."""
+    """Return the waypoints of a plan for a vehicle whose home has this heading. Raises PlanError."""
     plan.check(vehicle_type)
     cruise_ms = MODELS[vehicle_type].cruise_ms
     place, speed_ms = Point(0.0, 0.0, 0.0), cruise_ms
@@ -75,18 +75,18 @@ def limit_s(waypoints: Sequence[Waypoint], index: int) -> float:
 
 
 def is_near(place: Point, waypoint: Waypoint, vehicle_type: VehicleType) -> bool:
-    """Return whether a vehicle in GUIDED mode has reached the waypoint."""
+    """Return true if a vehicle in GUIDED mode has reached the waypoint."""
     level = vehicle_type == "rover" or abs(place.up_m - waypoint.place.up_m) <= NEAR_UP_M
     return level and to_go_m(place, waypoint, vehicle_type) <= 0
 
 
 def to_go_m(place: Point, waypoint: Waypoint, vehicle_type: VehicleType) -> float:
-    """Return the remaining distance over the ground. Negative inside the tolerance."""
+    """Return the remaining distance over the ground in metres. It is negative inside the tolerance."""
     return math.dist(place[:2], waypoint.place[:2]) - NEAR_M[vehicle_type]
 
 
 def landing_begins(waypoints: Sequence[Waypoint], vehicle_type: VehicleType) -> int | None:
-    """Return the index of the waypoint at which a plane's landing begins. The landing is always a mission."""
+    """Return the index of the waypoint at which a plane's landing begins, or None. The landing is always a mission."""
     return len(waypoints) - 2 if vehicle_type == "plane" and waypoints[-1].kind == "land" else None
 
 

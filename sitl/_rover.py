@@ -1,4 +1,4 @@
-"""The motion of a rover. The figures are those of ArduRover's SITL (rover.parm) and its default parameters."""
+"""Compute the motion of a rover, with ArduRover's default parameters and those of its SITL (rover.parm)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CORNER_MS = 0.5  # it does not stop completely at a corner
 
 @dataclass(frozen=True)
 class Rover:
-    """The `MotionModel` of a rover: straight lines on level ground, with almost a stop at each place.
+    """The motion of a rover: straight lines on level ground, with almost a stop at each place.
 
     A standing rover waits `start_s` before it moves. At corners it turns at `corner_rads`, in radians per second. The
     default values were measured with ArduRover 4.7 in AUTO mode, in which it smooths corners.

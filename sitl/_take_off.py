@@ -1,4 +1,4 @@
-"""Procedures that take off, without a plan or before a plan in GUIDED mode, and that end a flight by force.
+"""Procedures that take off without a flight plan or before one, and that force the end of a flight.
 
 The commands are those of ArduPilot's developer documentation, "Copter Commands in Guided Mode". A plane cannot take off
 in GUIDED mode. It takes off in its mode TAKEOFF, to the altitude in its parameter TKOFF_ALT. A rover only arms.
@@ -25,7 +25,7 @@ TKOFF_ALT = "TKOFF_ALT"
 
 
 class TakeOff:
-    """Set the mode, arm, take off, and climb to `altitude_m` above home. A rover only arms in GUIDED mode."""
+    """A take-off: set the mode, arm, and climb to `altitude_m` above home. A rover only arms."""
 
     purpose = "take off"
 
@@ -68,7 +68,7 @@ class TakeOff:
 
 
 class Termination:
-    """Disarm in flight by force, and fall to the ground."""
+    """A forced end of a flight: disarm in the air, and fall to the ground."""
 
     purpose = "end its flight"
 

@@ -1,4 +1,4 @@
-"""Read text files that a user names: regular files of limited size only."""
+"""Read text files that a user names. They must be regular files of limited size."""
 
 from __future__ import annotations
 

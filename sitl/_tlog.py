@@ -1,4 +1,4 @@
-"""The telemetry log: each received MAVLink frame, after the time of its arrival.
+"""Write the telemetry log, which contains each received MAVLink frame after its time of arrival.
 
 The format is that of MAVProxy, Mission Planner and pymavlink (`.tlog`). The time is in microseconds since the Unix
 epoch as a big-endian u64, and its two lowest bits number the link.
@@ -15,7 +15,7 @@ _LINK_BITS = 3
 
 
 class TelemetryLog:
-    """A .tlog file that is appended to. A restarted vehicle continues its file. Methods raise OSError."""
+    """A .tlog file to which frames are appended. A restarted vehicle continues its file. Methods raise OSError."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("ab")

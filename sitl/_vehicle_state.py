@@ -1,4 +1,4 @@
-"""The last reported state of a vehicle, as its pilot keeps it."""
+"""Store the last reported state of a vehicle."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Position:
-    """The reported position: degrees, metres above sea level, and metres above home.
+    """A reported position in degrees, with its height in metres above sea level and above home.
 
     The movement is in metres per second north, east and up. The heading is in degrees clockwise from north, None if
     unknown.
@@ -26,7 +26,7 @@ class Position:
 
 @dataclass(frozen=True)
 class Battery:
-    """Voltage and remaining share, 0 to 1. None means unknown."""
+    """The voltage and the remaining share (0 to 1) of a battery. None means unknown."""
 
     voltage_v: float | None
     left: float | None
@@ -34,16 +34,14 @@ class Battery:
 
 @dataclass(frozen=True)
 class Version:
-    """The version in its usual form ("4.7.0-dev"), and the first digits of the git commit of the build, if reported."""
+    """A firmware version such as "4.7.0-dev", and the first digits of its git commit if reported."""
 
     number: str
     commit: str | None = None
 
     @classmethod
     def of(cls, number: int, custom: bytes) -> Version:
-        """Return the version in an AUTOPILOT_VERSION: three numbers and a FIRMWARE_VERSION_TYPE, one byte each, and
-        8 characters.
-        """
+        """Return the version in a MAVLink message AUTOPILOT_VERSION."""
         major, minor, patch, kind = number.to_bytes(4, "big")
         stages = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc"}
         stage = next((word for least, word in sorted(stages.items(), reverse=True) if kind >= least), "")
@@ -54,7 +52,7 @@ class Version:
 
 @dataclass
 class VehicleState:
-    """The state. None means that it was not reported yet."""
+    """The state of a vehicle. None means that a value was not reported yet."""
 
     mode: int | None = None  # ArduPilot's custom_mode
     mav_type: int | None = None  # MAV_TYPE

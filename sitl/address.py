@@ -1,4 +1,4 @@
-"""The address of a ground station, and a socket to it."""
+"""Parse the address of a ground station, and open a socket to it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Return the address in HOST:PORT, or [HOST]:PORT for IPv6. Raises VehicleError."""
+        """Parse HOST:PORT, or [HOST]:PORT for IPv6. Raises VehicleError."""
         host, _, port = text.rpartition(":")
         bracketed = host.startswith("[") and host.endswith("]")
         host = host[1:-1] if bracketed else host

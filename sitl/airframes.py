@@ -1,4 +1,4 @@
-"""ArduPilot's frames: the type of vehicle, the model name in its program, and the default parameters of each.
+"""List ArduPilot's frames: the type of vehicle, the model name, and the default parameters of each.
 
 The table has the frames of ArduPilot's sim_vehicle.py that its own simulation flies. The default parameters are files
 of ArduPilot's Tools/autotest, which are applied in order. Names must match exactly. ArduPilot's programs compare only
@@ -21,7 +21,9 @@ HELI = "arducopter-heli"
 
 @dataclass(frozen=True)
 class Airframe:
-    """A frame. `model` is the value of the option --model of `program`. `defaults` has the names of files in order."""
+    """A frame of ArduPilot. `model` is the value for the option --model of `program`. `defaults` lists parameter
+    files.
+    """
 
     vehicle_type: VehicleType
     model: str
@@ -30,7 +32,7 @@ class Airframe:
 
 
 def airframe(name: str | None, vehicle_type: VehicleType) -> Airframe:
-    """Return the frame with this name. None selects the default frame of the type.
+    """Return the frame with this name. For None, return the default frame of the vehicle type.
 
     Raises VehicleError if no frame has this name. The error names the nearest frame of the type.
     """

@@ -1,4 +1,4 @@
-"""ArduPilot SITL: find the binary, and start it without user interaction.
+"""Find a binary of ArduPilot SITL, and start it without user interaction.
 
 The command line is that of ArduPilot's SITL (`arducopter --help`, developer documentation "SITL Simulator"). Each
 vehicle is instance 0 in its own network namespace, and so has the same ports. Builds with CAN need a multicast route in
@@ -58,7 +58,7 @@ _ELF_NAMES = {number: name for machines in _ELF_MACHINES.values() for number, na
 
 @dataclass(frozen=True)
 class ArduPilot:
-    """The `VehicleKind` of ArduPilot SITL: an executable, its files of default parameters, and its setup.
+    """A kind of vehicle that runs ArduPilot SITL: an executable, its files of default parameters, and its settings.
 
     `defaults` are the files that lie beside the executable. `missing` are those that its frame needs and that do not.
     """
@@ -72,7 +72,7 @@ class ArduPilot:
 
     @property
     def sha256(self) -> str | None:
-        """The SHA-256 hash of the binary in hexadecimal. None if the binary cannot be read."""
+        """The SHA-256 hash of the binary in hexadecimal, or None if it cannot be read."""
         with contextlib.suppress(OSError):
             return sha256(self.binary)
         return None
@@ -88,12 +88,14 @@ class ArduPilot:
 
     @property
     def uses_udp(self) -> bool:
-        """True, because a build with CAN sends itself multicast datagrams."""
+        """True, because a binary with CAN support sends itself multicast datagrams."""
         return True
 
     @property
     def lack(self) -> str | None:
-        """A sentence on missing default parameters, without which a vehicle may refuse to arm. None if complete."""
+        """A sentence about missing default parameters, without which a vehicle may refuse to arm. None if all are
+        there.
+        """
         if not self.missing:
             return None
         files = " and ".join(self.missing)
@@ -107,7 +109,7 @@ class ArduPilot:
         vehicle_type: VehicleType = "copter",
         setup: Setup = USUAL_SETUP,
     ) -> ArduPilot:
-        """Return `binary`, or the first binary for the frame in ARDUPILOT_SITL, on PATH, or among the installed ones.
+        """Return `binary`, or the first suitable binary in ARDUPILOT_SITL, on PATH, or among the installed ones.
 
         Raises UnusableBinaryError if the binary cannot be used, and NoBinaryError if none is found.
         """
@@ -164,7 +166,7 @@ class ArduPilot:
         return cls(binary.absolute(), found, vehicle_type, setup, missing)
 
     def check(self) -> None:
-        """Raise VehicleError if the binary or this machine cannot provide the setup of the vehicle."""
+        """Raise VehicleError if the binary or this machine does not support the settings of the vehicle."""
         if self.setup.frame is not None:
             if self.missing:
                 files, many = " and ".join(self.missing), len(self.missing) > 1
@@ -178,7 +180,7 @@ class ArduPilot:
             raise NoProgramError(f"no {self.setup.debugger} is on PATH: install it, or leave out `debugger`")
 
     def _check_model(self, frame: str) -> None:
-        """Raise VehicleError if the binary offers neither the frame nor, as `plane` of `plane-vtail`, its first words.
+        """Raise VehicleError if the binary does not offer the frame.
 
         An older binary lacks some frames. It would take a frame for another one whose name has the same start.
         """
@@ -230,7 +232,7 @@ class ArduPilot:
                 return {"LOG_FILE_TIMEOUT": PATIENT_S}
 
     def _bounded(self) -> list[str]:
-        """The start of a command line that limits the size of files to that of the log.
+        """The beginning of a command line that limits the size of files to that of the log.
 
         ArduPilot treats the limit as a slow disk, and stops writing. It would start another log after LOG_FILE_TIMEOUT
         seconds. `ulimit -f` counts blocks of 512 bytes (POSIX).
@@ -252,7 +254,7 @@ _DEBUGGERS: dict[Debugger | None, tuple[str, ...]] = {
 
 
 def models(binary: Path) -> list[str]:
-    """Return the names of the frames that a binary lists when it is started without a frame. Empty if it lists none."""
+    """Return the names of the frames that a binary lists when it is started without a frame. The list may be empty."""
     try:
         said = subprocess.run(
             [binary], stdin=subprocess.DEVNULL, capture_output=True, timeout=ANSWER_LIMIT_S, check=False, cwd="/"
@@ -264,7 +266,7 @@ def models(binary: Path) -> list[str]:
 
 
 def build_of(binary: Path) -> Version | None:
-    """Return the version and the commit in a binary, as it prints them at its start. None if it has none."""
+    """Return the version and the commit in a binary, as it prints them at its start, or None."""
     try:
         with binary.open("rb") as file:
             found = _BUILD.search(file.read(MAX_BINARY_BYTES))
@@ -278,7 +280,7 @@ MAX_BINARY_BYTES = 200_000_000  # one with its debugging information has 80 MB
 
 
 def default_parameters(binary: Path, name: str) -> Path | None:
-    """Return a file of default parameters in ArduPilot's source tree or next to the binary. None if it is missing."""
+    """Return a file of default parameters in ArduPilot's source tree or next to the binary, or None."""
     for directory in autotest(binary.resolve().parent):
         for path in (directory / name, directory / "default_params" / name, directory / "models" / name):
             if path.is_file():
@@ -287,12 +289,12 @@ def default_parameters(binary: Path, name: str) -> Path | None:
 
 
 def _own_defaults(sysid: int) -> str:
-    """Return the system ID under both names, before and since ArduPilot 4.7. ArduPilot ignores an unknown parameter."""
+    """Return the system ID as parameters under its old and new name. ArduPilot ignores an unknown parameter."""
     return f"SYSID_THISMAV {sysid}\nMAV_SYSID {sysid}\n"
 
 
 def _not_a_program(head: bytes) -> str | None:
-    """Return the error of a binary whose file starts with these bytes, or None."""
+    """Return the error about a file that begins with these bytes but is not a usable binary, or None."""
     if not head:
         return "is empty"
     if head.startswith(b"#!"):  # a wrapper of the user's own

@@ -1,4 +1,4 @@
-"""Faults and weather of a simulated vehicle: parameters of ArduPilot's simulation (SIM_...).
+"""Simulate faults and weather of a vehicle, by parameters of ArduPilot's simulation (SIM_...).
 
 The names of these parameters differ between versions. A circumstance therefore has several alternatives, the current
 one first. The first alternative whose parameters all exist is used. ArduPilot does not answer a request for an unknown
@@ -34,12 +34,12 @@ _COMPASSES = tuple(f"SIM_MAG{number}_FAIL" for number in (1, 2, 3))
 
 
 class NotSimulatedError(VehicleError):
-    """The vehicle cannot simulate the circumstance, or did not confirm it."""
+    """An error: the vehicle cannot simulate an event, or did not confirm it."""
 
 
 @dataclass(frozen=True)
 class Circumstance:
-    """A circumstance. `what` completes "simulate ...". Each of `ways` has parameters with their values.
+    """An event to simulate, such as a GPS failure. `what` completes "simulate ...". Each of `ways` contains parameters.
 
     `station_is_heard` begins or ends the vehicle's contact with its ground station. None leaves it unchanged.
     """
@@ -71,17 +71,17 @@ FENCE_LIFTED = Circumstance("a flight without a fence", ({"FENCE_ENABLE": 0.0},)
 
 
 def battery(volts: float) -> Circumstance:
-    """Return the circumstance that the battery has this voltage from now on."""
+    """Return the event that the battery has this voltage from now on."""
     return Circumstance(f"a battery of {volts:g} V", ({"SIM_BATT_VOLTAGE": volts},))
 
 
 def wind(speed_ms: float, from_deg: float) -> Circumstance:
-    """Return the circumstance of wind at this speed, from a direction in degrees clockwise from north."""
+    """Return the event that wind blows at this speed, from a direction in degrees clockwise from north."""
     return Circumstance(f"wind of {speed_ms:g} m/s", ({"SIM_WIND_SPD": speed_ms, "SIM_WIND_DIR": from_deg},))
 
 
 async def bring_about(link: Link, circumstance: Circumstance) -> Mapping[str, float]:
-    """Make the vehicle simulate a circumstance. Return the set parameters. Raises NotSimulatedError."""
+    """Make the vehicle simulate an event. Return the parameters that were set. Raises NotSimulatedError."""
     ways, limit_s = circumstance.ways, ANSWER_S / min(1.0, link.speedup)
     for way in ways:
         for name in way:
@@ -126,7 +126,7 @@ async def _heard(
     ask: Callable[[], None],
     limit_s: float,
 ) -> Mapping[str, float] | None:
-    """Return the answer. The request is repeated until the time limit or the end of the connection."""
+    """Return the answer, or None. The request is repeated until a time limit or the end of the connection."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + limit_s
     while loop.time() < deadline and not link.closed.is_set():
@@ -140,5 +140,5 @@ async def _heard(
 
 
 def _same(said: float, meant: float) -> bool:
-    """Return whether both values are equal as 32-bit floats."""
+    """Return true if both values are equal as 32-bit floats."""
     return math.isclose(said, meant, rel_tol=1e-5, abs_tol=1e-5)

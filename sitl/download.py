@@ -32,20 +32,20 @@ Progress = Callable[[int, int], None]
 
 
 class DownloadError(VehicleError):
-    """The download of a file failed."""
+    """An error: the download of a file failed."""
 
 
 class NotThereError(DownloadError):
-    """The server has no such file (404 or 410)."""
+    """An error: the server does not have this file (404 or 410)."""
 
 
 class UnreachableError(DownloadError):
-    """The server cannot be reached."""
+    """An error: the server cannot be reached."""
 
 
 @dataclass(frozen=True)
 class _Origin:
-    """The size and validator that the server gave for a partly downloaded file."""
+    """The size and version mark that the server reported for a partly downloaded file."""
 
     size: int
     validator: str
@@ -103,7 +103,7 @@ def megabytes(number: int) -> str:
 
 
 class StayEncrypted(urllib.request.HTTPRedirectHandler):
-    """A handler that follows redirects, but never from https to an unencrypted address."""
+    """Follows redirects, but never from https to an unencrypted address."""
 
     def redirect_request(
         self, req: urllib.request.Request, fp: IO[bytes], code: int, msg: str, headers: Any, newurl: str
@@ -115,7 +115,7 @@ class StayEncrypted(urllib.request.HTTPRedirectHandler):
 
 @contextlib.contextmanager
 def _answer(url: str, headers: Mapping[str, str], stall_s: float) -> Iterator[Any]:
-    """Provide the server's answer, a success or 416 (Range Not Satisfiable). Raises DownloadError."""
+    """Yield the server's answer, which is a success or 416 (Range Not Satisfiable). Raises DownloadError."""
     host = urlsplit(url).netloc
     request = urllib.request.Request(url, headers={"User-Agent": "ucp-harness", **headers})  # noqa: S310 - http(s) only
     opener = urllib.request.build_opener(StayEncrypted)
@@ -135,7 +135,7 @@ def _answer(url: str, headers: Mapping[str, str], stall_s: float) -> Iterator[An
 
 
 def _chunks(url: str, answer: Any, stall_s: float) -> Iterator[bytes]:
-    """Yield the body in chunks. Raises DownloadError if it is missing or incomplete."""
+    """Yield the content in pieces. Raises DownloadError if it is missing or incomplete."""
     left: int | None = answer.length
     if left is None and not answer.chunked:
         raise _endless(url)
@@ -161,12 +161,12 @@ def _broken_off(url: str) -> DownloadError:
 
 
 def _endless(url: str) -> DownloadError:
-    """Return the error for an answer without a size, whose completeness cannot be checked."""
+    """Return the error for an answer without a size, because it cannot be checked for completeness."""
     return DownloadError(f"{urlsplit(url).netloc} does not say how large {url} is: use another --url")
 
 
 def _kept(part: Path, noted: Path) -> tuple[int, _Origin] | None:
-    """Return the size and origin of an earlier partial download. None if there is none."""
+    """Return the size and origin of an earlier partial download, or None."""
     try:
         have, origin = part.stat().st_size, _Origin(**json.loads(noted.read_text()))
         return (have, origin) if have else None
@@ -175,20 +175,20 @@ def _kept(part: Path, noted: Path) -> tuple[int, _Origin] | None:
 
 
 def _fits(answer: Any, have: int, origin: _Origin) -> bool:
-    """Return whether a partial answer is the rest of the file after its first `have` bytes."""
+    """Return true if a partial answer continues the file after its first `have` bytes."""
     match = re.fullmatch(r"bytes (\d+)-(\d+)/(\d+)", answer.headers.get("Content-Range", ""))
     wanted = (have, origin.size - 1, origin.size)
     return match is not None and tuple(map(int, match.groups())) == wanted and _validator(answer) == origin.validator
 
 
 def _validator(answer: Any) -> str | None:
-    """Return the validator of the file: a strong ETag, else Last-Modified, else None."""
+    """Return the version mark of the file: a strong ETag, or else Last-Modified, or else None."""
     etag: str = answer.headers.get("ETag", "")
     return etag if etag.startswith('"') else answer.headers.get("Last-Modified")
 
 
 def _size(url: str, answer: Any, limit: int) -> int:
-    """The size that the server announces. Raises DownloadError if it announces none, or more than `limit`."""
+    """Return the size that the server announces. Raises DownloadError if it announces none, or more than `limit`."""
     size: int | None = answer.length
     if size is None:
         raise _endless(url)

@@ -1,4 +1,4 @@
-"""The embedded vehicle, which flies without an ArduPilot binary.
+"""The embedded vehicle, a simple vehicle model that flies without an ArduPilot binary.
 
     python -m sitl.embedded --type plane --sysid 3 --home -35.363262,149.165237,584,270 --speedup 20
 
@@ -44,7 +44,7 @@ MAX_DELAY_S = 0.25  # a sleep that takes longer than it should by more was no sl
 
 @dataclass(frozen=True)
 class Embedded:
-    """The `VehicleKind` of the embedded vehicle, which needs no other program."""
+    """A kind of vehicle that runs the embedded model and needs no other program."""
 
     vehicle_type: VehicleType = "copter"
     setup: Setup = USUAL_SETUP
@@ -59,7 +59,7 @@ class Embedded:
         return self.setup.parameters
 
     def check(self) -> None:
-        """Raise VehicleError if the setup asks for a feature that only ArduPilot has."""
+        """Raise VehicleError if the settings need a feature that only ArduPilot has."""
         frame = self.setup.frame
         asked = {
             f"frame {frame}": frame is not None and frame != USUAL[self.vehicle_type],
@@ -86,7 +86,7 @@ class Embedded:
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """Print one sentence in place of the usage text."""
+        """Print one sentence instead of the usage text."""
         self.exit(2, f"{self.prog}: {message}\n")
 
 
@@ -114,7 +114,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Fly until SIGTERM. Exits with status 2 and one sentence for wrong arguments or unavailable ports."""
+    """Fly until SIGTERM. Exit with status 2 and one sentence for wrong arguments or unavailable ports."""
     arguments = _arguments(argv)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -140,7 +140,7 @@ def _complain(sysid: int, port: int, reason: str) -> int:
 
 
 class _Clock:
-    """Simulated seconds since boot. They stop while the process is stopped (SIGSTOP), as in ArduPilot."""
+    """The simulated seconds since boot. They do not advance while the process is suspended, as in ArduPilot."""
 
     def __init__(self, speedup: float) -> None:
         self._speedup = speedup
@@ -148,7 +148,7 @@ class _Clock:
         self.now_s = 0.0
 
     def read(self, slept_s: float) -> float:
-        """Return the time after a sleep of `slept_s`.
+        """Return the time on the clock after the process slept for `slept_s` seconds.
 
         A much longer sleep means that the process was stopped, and is not counted.
         """

@@ -1,4 +1,4 @@
-"""Install ArduPilot's SITL binaries for Linux into the cache (sitl/installed.py).
+"""Install ArduPilot's SITL binaries for Linux into the cache of the user.
 
 The firmware server has a statically linked binary at VEHICLE/RELEASE/BOARD/, and `git-version.txt` with its commit and
 version. RELEASE is stable, beta, latest, or for example stable-4.6.3. BOARD is SITL_x86_64_linux_gnu or
@@ -57,7 +57,7 @@ _NUMBER = re.compile(r"\d+\.\d+\.\d+")
 
 @dataclass(frozen=True)
 class _Board:
-    """The processor that a binary is built for: its directory on the server, and the beginning of its ELF header."""
+    """A kind of processor: its directory on the server, and the beginning of an ELF file for it."""
 
     directory: str
     processor: str
@@ -72,18 +72,18 @@ _FROM_SOURCE = "build ArduPilot SITL from source and set ARDUPILOT_SITL to its d
 
 
 class RequestError(VehicleError):
-    """The version or the address does not exist."""
+    """An error: the requested version or address does not exist."""
 
 
 class CacheError(VehicleError):
-    """The cache cannot be written."""
+    """An error: the cache cannot be written."""
 
 
 class Watcher(Protocol):
-    """An observer of an installation."""
+    """An object that is informed about the progress of an installation."""
 
     def waits(self) -> None:
-        """Report that another installation of this vehicle must end first."""
+        """Report that another installation of this vehicle must finish first."""
 
     def downloads(self, done: int, total: int) -> None:
         """Report the number of downloaded bytes of the binary, and its size."""
@@ -91,7 +91,7 @@ class Watcher(Protocol):
 
 @dataclass(frozen=True)
 class Outcome:
-    """The installed version, and whether it was installed before."""
+    """The installed version, and true if it was installed before."""
 
     installed: Installed
     already: bool
@@ -99,14 +99,16 @@ class Outcome:
 
 @dataclass(frozen=True)
 class _Build:
-    """The version and commit in `git-version.txt`."""
+    """The version and commit in the file `git-version.txt`."""
 
     version: str
     commit: str
 
     @property
     def name(self) -> str:
-        """The name of the directory. Development builds may share a version, so it contains the commit."""
+        """The name of the directory. It contains the commit, because development versions may share a version
+        number.
+        """
         return self.version if _NUMBER.fullmatch(self.version) else f"{self.version}-{self.commit[:8]}"
 
 
@@ -118,7 +120,7 @@ def install(
     base: str | None = None,
     stall_s: float = STALL_S,
 ) -> Outcome:
-    """Install the binary and the default parameters of a vehicle, unless they are in the cache, and make them current.
+    """Install the binary and default parameters of a vehicle, unless they are in the cache. Runs then use this version.
 
     `version` is `stable`, `beta`, `latest` or a number such as 4.6.3. A number that is installed needs no server. An
     interrupted installation is resumed. Parameter files of frames are included if the version has them.
@@ -156,7 +158,7 @@ def install(
 
 
 class _Server:
-    """One release of one vehicle on ArduPilot's server or a mirror. Raises RequestError for an invalid `base`."""
+    """One release of one vehicle type on ArduPilot's server or a mirror. Raises RequestError for an invalid `base`."""
 
     def __init__(self, vehicle: VehicleType, version: str, board: _Board, base: str | None, stall_s: float) -> None:
         self._vehicle, self._version, self._board, self._stall_s = vehicle, version, board, stall_s
@@ -178,7 +180,7 @@ class _Server:
         return _Build(version[1], commit[1])
 
     def fetch_binary(self, directory: Path, watcher: Watcher) -> File:
-        """Download the binary to `directory`, unless it is there, and make it executable."""
+        """Download the binary to `directory` unless it is there, and make it executable."""
         path = directory / BINARIES[self._vehicle]
         url = self._release + path.name
         if not path.exists():
@@ -200,9 +202,7 @@ class _Server:
         return File.of(path, url)
 
     def fetch_parameters(self, directory: Path, build: _Build) -> dict[str, File]:
-        """Download the default parameters of the vehicle at the commit of the binary, and the existing ones of its
-        frames.
-        """
+        """Download the default parameters of the vehicle and its frames at the commit of the binary."""
         own = DEFAULTS[self._vehicle]
         places = {own: _PARAMETERS[self._vehicle]}
         for name in stacked(self._vehicle):
@@ -217,7 +217,7 @@ class _Server:
         return f"{self._source}/ArduPilot/ardupilot/{build.commit}/{_AUTOTEST}"
 
     def _fetch_parameters(self, path: Path, build: _Build, places: tuple[str, ...]) -> File | None:
-        """Download a parameter file from the first place that has it. None if no place has it."""
+        """Download a parameter file from the first address that has it. Return None if there is none."""
         for place in places:
             url = f"{self._tree(build)}/{place}"
             try:
@@ -231,7 +231,7 @@ class _Server:
         return None
 
     def _no_such_version(self) -> RequestError:
-        """Return the error for a missing release, with the existing ones if the server lists them."""
+        """Return the error for a release that does not exist, with the existing ones if the server lists them."""
         try:
             listing = fetch_text(self._releases, TEXT_LIMIT, self._stall_s)
         except DownloadError:
@@ -245,7 +245,7 @@ class _Server:
 
 
 def _refuse_what_does_not_run(program: Path) -> None:
-    """Raise VehicleError if this aarch64 machine does not run 32-bit programs."""
+    """Raise VehicleError if this aarch64 machine cannot run 32-bit programs."""
     try:
         subprocess.run([program, "--help"], capture_output=True, timeout=HELP_S, stdin=subprocess.DEVNULL, check=False)
     except subprocess.TimeoutExpired:
@@ -276,7 +276,7 @@ def _intact(vehicle: VehicleType, directory: Path) -> bool:
 
 
 def _use(installed: Installed, already: bool) -> Outcome:
-    """Make this version the current one, and remove unfinished installations."""
+    """Make this version the one that runs use, and remove unfinished installations."""
     home = installed.directory.parent
     link = home / f".{CURRENT}"
     link.unlink(missing_ok=True)
@@ -289,7 +289,9 @@ def _use(installed: Installed, already: bool) -> Outcome:
 
 @contextlib.contextmanager
 def _locked(home: Path, watcher: Watcher) -> Iterator[None]:
-    """Allow one installation of a vehicle at a time. A process that ends releases the lock (flock(2))."""
+    """Allow one installation of a vehicle at a time, by a lock that the kernel releases when a process ends
+    (flock(2)).
+    """
     home.mkdir(parents=True, exist_ok=True)
     with (home / ".lock").open("w") as lock:
         try:
@@ -302,7 +304,7 @@ def _locked(home: Path, watcher: Watcher) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _ways_out(home: Path) -> Iterator[None]:
-    """Add the solution to network errors, and convert disk errors to CacheError."""
+    """Add a solution to network errors, and convert disk errors to CacheError."""
     try:
         yield
     except UnreachableError as error:

@@ -1,4 +1,4 @@
-"""Connect vehicles with one UDP port of a ground station: QGroundControl, Mission Planner, MAVProxy or another client.
+"""Connect vehicles with a ground station over UDP: QGroundControl, Mission Planner, MAVProxy or another program.
 
 Each vehicle has a port for ground stations (STATION_PORT), separate from the ports of its pilot and its agent. An
 operator therefore disturbs neither of them. A `GroundStation` forwards complete frames between these ports and one UDP
@@ -29,13 +29,13 @@ DATAGRAM_BYTES = 1400
 
 
 class GroundStation(asyncio.DatagramProtocol):
-    """A forwarder between vehicles and one ground station, which may come and go.
+    """Forwards messages between vehicles and one ground station, which may connect and disconnect at any time.
 
     It may be used in one event loop only.
     """
 
     def __init__(self, address: Address, now: Callable[[], float], taken_over: Callable[[list[int]], None]) -> None:
-        """Make a station. Use `open` instead. `now` returns the mission second, for the log of commands.
+        """Create the object. Callers use `open` instead. `now` returns the mission second, for the log of commands.
 
         `taken_over` receives the vehicles that the operator flies from now on.
         """
@@ -63,7 +63,7 @@ class GroundStation(asyncio.DatagramProtocol):
         return station
 
     async def attach(self, vehicle_id: int, sysid: int, sock: socket.socket) -> None:
-        """Take over `sock`, which is connected to the vehicle's port for ground stations.
+        """Take over the socket `sock`, which is connected to the vehicle's port for ground stations.
 
         It replaces an earlier connection.
         """
@@ -75,7 +75,7 @@ class GroundStation(asyncio.DatagramProtocol):
         self._vehicles[sysid] = vehicle
 
     def reach(self, sysid: int, *, reachable: bool) -> None:
-        """Begin or end the contact between a vehicle and the ground station. Frames are lost without contact."""
+        """Start or stop forwarding between a vehicle and the ground station. Without it, messages are lost."""
         if reachable:
             self._out_of_reach.discard(sysid)
         else:
@@ -154,7 +154,7 @@ class GroundStation(asyncio.DatagramProtocol):
         self._full = False
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore the error: no program listens at the address at the moment."""
+        """Ignore the error, which means that no program listens at the address at the moment."""
 
 
 class _Vehicle(asyncio.Protocol):

@@ -1,4 +1,4 @@
-"""The cache of ArduPilot SITL binaries, which `ucp-harness sitl install` fills, and the check of its integrity.
+"""Manage the cache of ArduPilot SITL binaries, which `ucp-harness sitl install` fills, and check its integrity.
 
     $XDG_CACHE_HOME/ucp-harness/sitl/copter/4.6.3/arducopter      (XDG Base Directory Specification; else ~/.cache)
                                                   copter.parm     ArduPilot's default parameters of that commit
@@ -43,7 +43,7 @@ class File:
 
 @dataclass(frozen=True)
 class Manifest:
-    """The downloaded files by name, with ArduPilot's version and git commit, and the time (ISO 8601, UTC)."""
+    """The list of downloaded files, with ArduPilot's version and git commit, and the time (ISO 8601, UTC)."""
 
     vehicle: str
     version: str
@@ -70,7 +70,7 @@ class Manifest:
 
 @dataclass(frozen=True)
 class Installed:
-    """One version of one vehicle in the cache."""
+    """One installed version for one vehicle type."""
 
     vehicle: VehicleType
     directory: Path
@@ -88,14 +88,14 @@ class Installed:
 
     @cached_property
     def manifest(self) -> Manifest | None:
-        """The manifest. None if it cannot be read."""
+        """The list of downloaded files, or None if it cannot be read."""
         with contextlib.suppress(OSError, ValueError, TypeError, LookupError, AttributeError):
             return Manifest.read(self.directory)
         return None
 
     @cached_property
     def damage(self) -> str | None:
-        """A description of the first file that differs from its download, or None. This reads all files."""
+        """A description of the first file that was changed after its download, or None. This reads all files."""
         if self.manifest is None:
             return f"{MANIFEST} is missing or cannot be read"
         for name in dict.fromkeys((self.binary.name, DEFAULTS[self.vehicle], *self.manifest.files)):
@@ -109,7 +109,7 @@ class Installed:
 
 
 def cache(environ: Mapping[str, str]) -> Path:
-    """Return the directory with one directory per vehicle. Raises VehicleError if the environment determines none."""
+    """Return the directory of the cache. Raises VehicleError if the environment does not determine it."""
     for base in (Path(environ.get("XDG_CACHE_HOME", "")), Path(environ.get("HOME", "")) / ".cache"):
         if base.is_absolute():
             return base / "ucp-harness" / "sitl"
@@ -117,7 +117,7 @@ def cache(environ: Mapping[str, str]) -> Path:
 
 
 def all_installed(vehicle: VehicleType, environ: Mapping[str, str]) -> list[Installed]:
-    """Return all versions in the cache, sorted by name."""
+    """Return all installed versions, sorted by name."""
     try:
         directories = sorted(path for path in (cache(environ) / vehicle).iterdir() if not path.name.startswith("."))
     except (OSError, VehicleError):

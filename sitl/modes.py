@@ -1,4 +1,4 @@
-"""Names and numbers (HEARTBEAT.custom_mode) of ArduPilot's flight modes, by type of vehicle.
+"""List the names and numbers (HEARTBEAT.custom_mode) of ArduPilot's flight modes by vehicle type.
 
 They equal the values of the parameter FLTMODE1 in ArduCopter and ArduPlane, and of MODE1 in ArduRover.
 """
@@ -19,7 +19,7 @@ BOOT_MODES: dict[VehicleType, str] = {"copter": "STABILIZE", "plane": "MANUAL", 
 
 
 def mode_name(vehicle_type: VehicleType, number: int | None) -> str:
-    """Return the name of a mode. For an unknown mode, return its number."""
+    """Return the name of a flight mode, or its number if it is unknown."""
     return next((name for name, known in MODES[vehicle_type].items() if known == number), str(number))
 
 

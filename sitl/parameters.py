@@ -1,4 +1,4 @@
-"""ArduPilot's parameter files: `NAME VALUE` or `NAME,VALUE` per line, or the columns of QGroundControl.
+"""Read ArduPilot's parameter files: `NAME VALUE` or `NAME,VALUE` per line, or the columns of QGroundControl.
 
 The reader limits size and values, because files come from any source. Ground stations can read the written files.
 """
@@ -28,11 +28,11 @@ _COMMENTS = re.compile(r"#.*|//.*")
 
 
 class ParameterError(VehicleError):
-    """An invalid parameter, or an invalid file of parameters."""
+    """An error: a parameter, or a file of parameters, is invalid."""
 
 
 def read(path: Path) -> dict[str, float]:
-    """Return the parameters in a file, without `OURS`.
+    """Return the parameters in a file, except those in `OURS`.
 
     Of a repeated parameter the last value is used. Raises VehicleError.
     """
@@ -54,7 +54,7 @@ def read(path: Path) -> dict[str, float]:
 
 
 def check(values: Mapping[str, float]) -> None:
-    """Raise ParameterError for an invalid name or value, and for those of `OURS`."""
+    """Raise ParameterError for an invalid name or value, and for parameters in `OURS`."""
     if len(values) > MAX_PARAMETERS:
         raise ParameterError(f"there are more than {MAX_PARAMETERS} parameters")
     for name, value in values.items():
@@ -67,9 +67,9 @@ def check(values: Mapping[str, float]) -> None:
 
 
 def unknown(asked: Iterable[str], known: Iterable[str]) -> str | None:
-    """Return a phrase with the requested parameters that a vehicle lacks, and similar known ones.
+    """Return a phrase about the requested parameters that a vehicle lacks, with similar known ones.
 
-    None if all are known.
+    Return None if all are known.
     """
     names = set(known)
     missing = sorted(set(asked) - names)
@@ -82,7 +82,7 @@ def unknown(asked: Iterable[str], known: Iterable[str]) -> str | None:
 
 
 def in_lines(values: Mapping[str, float]) -> str:
-    """Return the text of a parameter file, sorted by name. `read` restores each 32-bit float exactly."""
+    """Return the text of a parameter file, sorted by name. `read` restores each value exactly."""
     return "".join(f"{name} {shortest(values[name])}\n" for name in sorted(values))
 
 

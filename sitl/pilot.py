@@ -1,4 +1,4 @@
-"""The pilot: a client that flies ArduPilot or the embedded vehicle over MAVLink.
+"""Fly ArduPilot or the embedded vehicle over MAVLink.
 
 A pilot has a link (_pilot_link.py) and executes procedures (procedure.py): a take-off, a plan as a mission or in GUIDED
 mode, and the end of a flight. It executes the steps before arming of a take-off or plan separately. Each step has a
@@ -36,7 +36,7 @@ ASK_AGAIN_S = 2.0  # wall time without a position after which telemetry is reque
 
 
 class Pilot:
-    """The pilot of one vehicle, which commands it over MAVLink. Use it in one event loop only."""
+    """The pilot of one vehicle, which sends it MAVLink commands. Use it in one event loop only."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class Pilot:
         vehicle_type: VehicleType = "copter",
         vehicle_id: int | None = None,
     ) -> None:
-        """Use `sock`, which is connected to the pilot port of the vehicle. `close` closes it.
+        """Create the pilot. `sock` must be connected to the pilot port of the vehicle. `close` closes it.
 
         `sysid` is the MAVLink system ID. `tlog` is the file of the telemetry log. `speedup`, in simulated seconds per
         second, and `home` are those of the vehicle's launch. Errors contain `vehicle_id`, by default the system ID.
@@ -67,7 +67,7 @@ class Pilot:
 
     @property
     def real_time_factor(self) -> float | None:
-        """Simulated seconds per second, divided by the speedup. 1.0 means that the machine is fast enough."""
+        """The simulated seconds per second, divided by the speedup. 1.0 means that the machine is fast enough."""
         return self.link.real_time_factor
 
     async def start(self) -> None:
@@ -79,11 +79,11 @@ class Pilot:
         await self.link.close()
 
     def ascent(self, altitude_m: float) -> Procedure:
-        """Return the procedure of a take-off to `altitude_m` metres above home. A rover only arms, in GUIDED mode."""
+        """Return the procedure for a take-off to `altitude_m` metres above home. A rover only arms, in GUIDED mode."""
         return TakeOff(self.link, self.vehicle_type, altitude_m)
 
     def flight(self, plan: Plan, by: By) -> Procedure:
-        """Return the procedure of a flight plan. Raises PlanError if this type of vehicle cannot fly it."""
+        """Return the procedure for a flight plan. Raises PlanError if this type of vehicle cannot fly it."""
         waypoints = route(plan, self.vehicle_type, self.link.home.heading_deg)
         flight = MissionFlight if by == "mission" else GuidedFlight
         return flight(self.link, self.vehicle_type, waypoints)
@@ -98,7 +98,7 @@ class Pilot:
             raise ParameterError(f"vehicle {self.vehicle_id} knows {phrase}")
 
     async def get_ready(self, flight: Procedure) -> None:
-        """Execute the steps before arming. Return once all of them stay complete for READY_FOR_S seconds.
+        """Execute the steps before arming. Return when all of them have stayed complete for READY_FOR_S seconds.
 
         ArduPilot repeats its checks, and has further ones in other modes. It may therefore report ready and then not
         ready. Raises FlightError.
@@ -106,7 +106,7 @@ class Pilot:
         await self._pursue(GettingReady(flight, self.state))
 
     async def fly(self, flight: Procedure) -> None:
-        """Execute the procedure, and return after its last step. Raises FlightError."""
+        """Execute the procedure until its last step is complete. Raises FlightError."""
         await self._pursue(flight)
 
     async def terminate_flight(self) -> None:
@@ -118,7 +118,7 @@ class Pilot:
         await self._pursue(Termination(self.link))
 
     async def befall(self, circumstance: Circumstance) -> Mapping[str, float]:
-        """Make the vehicle simulate a circumstance. Return the parameters set for it, with their values.
+        """Make the vehicle simulate an event such as a GPS failure. Return the parameters that were set.
 
         The vehicle may now act on its own. If it then leaves its mode, disarms, or misses a time limit, the current
         procedure ends without an error. Raises NotSimulatedError if the vehicle cannot simulate the circumstance.
@@ -134,22 +134,22 @@ class Pilot:
         return values
 
     def shortfall(self, flight: Procedure) -> str | None:
-        """Return a sentence if the vehicle has not left its home. None if it has, or if it is to fly no longer."""
+        """Return a sentence if the vehicle should have left its home position and has not, otherwise None."""
         if self.state.has_moved or self._terminated or self._handed_over or self._befallen:
             return None
         awaited = self._awaited.name if self._awaited else "its end"
         return str(self._failed(flight, awaited, "it has not left its home when the mission ends"))
 
     def hand_over(self) -> None:
-        """Hand the vehicle over to another pilot. The current procedure ends without an error."""
+        """Let another pilot fly the vehicle. The current procedure ends without an error."""
         self._handed_over = True
 
     async def stay_in_touch(self) -> None:
-        """Raise FlightError when the vehicle is silent or disconnects. Return after `terminate_flight`."""
+        """Wait, and raise FlightError when the vehicle is silent or disconnects. Return after `terminate_flight`."""
         await self._pursue(_Listening())
 
     async def _pursue(self, procedure: Procedure) -> None:
-        """Request each step at every heartbeat until all steps are complete."""
+        """Request each step of the procedure at every heartbeat until all steps are complete."""
         clocks = _StepClocks(self.link)
         asked: tuple[Step, int] | None = None
         while (step := self._next_step(procedure)) is not None:
@@ -175,7 +175,9 @@ class Pilot:
                 continue
 
     def _is_over(self, procedure: Procedure) -> bool:
-        """Return true if the procedure is obsolete: the flight was terminated, or another pilot has the vehicle."""
+        """Return true if the procedure need not continue, because the flight was ended or another pilot flies the
+        vehicle.
+        """
         if isinstance(procedure, Termination):
             return False
         left = self.link.has_left_its_mode or self.link.has_disarmed
@@ -207,7 +209,7 @@ class Pilot:
 
 
 class _Listening:
-    """A `Procedure` without steps, which only listens."""
+    """A procedure without steps, which only receives messages."""
 
     purpose = "stay in touch"
     _step = Step("its next word", math.inf)
@@ -220,7 +222,7 @@ class _Listening:
 
 
 class _StepClocks:
-    """The waiting time of each step over all attempts, in simulated seconds and in seconds of wall time."""
+    """The time for which the pilot has waited for each step, in simulated seconds and in seconds of wall time."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -232,7 +234,7 @@ class _StepClocks:
         self.patience_s = 0.0  # of our time: then it is worth looking again, even if nothing is heard
 
     def lost(self) -> str | None:
-        """Return the reason if the vehicle is lost, otherwise None."""
+        """Return the reason if the connection to the vehicle is lost, otherwise None."""
         now = time.monotonic()
         if self._link.closed.is_set():
             return "it ended the connection"
@@ -244,7 +246,7 @@ class _StepClocks:
         return None
 
     def overdue(self, step: Step) -> str | None:
-        """Return the reason if a time limit of the step has expired, otherwise None."""
+        """Return the reason if a time limit of the step has passed, otherwise None."""
         link, now = self._link, time.monotonic()
         if self._step is not None:
             if self._time_s is not None and link.state.time_s is not None:
@@ -266,6 +268,6 @@ class _StepClocks:
         return SILENCE_S / min(1.0, self._link.speedup)
 
     def _streams(self) -> dict[str, float]:
-        """Return the times of the last message, and of the last heartbeat and position once there is one."""
+        """Return the times of the last message, and of the last heartbeat and position if there was one."""
         times = {"it has sent no heartbeat": self._link.heartbeat_at, "it has sent no position": self._link.position_at}
         return {"it has been silent": self._link.heard_at, **{what: at for what, at in times.items() if at is not None}}

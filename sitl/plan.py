@@ -1,4 +1,4 @@
-"""A flight plan: the legs of a flight, in metres from the home of the vehicle.
+"""Represent a flight plan: the legs of a flight, in metres from the home position of the vehicle.
 
 A plan is a value without MAVLink. `Plan.check` checks that a type of vehicle can fly it. Vehicles with the same plan
 keep the formation of their homes. sitl/_route.py adds missing values, such as altitudes, speeds and the approach of a
@@ -29,7 +29,7 @@ SPEED_LIMITS_MS: dict[VehicleType, tuple[float, float]] = {
 
 
 class PlanError(VehicleError):
-    """A plan that the vehicle cannot fly."""
+    """An error: the vehicle cannot fly the plan."""
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,12 @@ Leg = TakeOff | GoTo | Loiter | Land
 
 @dataclass(frozen=True)
 class Plan:
-    """A flight plan: 1 to MAX_LEGS legs in order."""
+    """A flight plan with 1 to MAX_LEGS legs, in order."""
 
     legs: tuple[Leg, ...]
 
     def check(self, vehicle_type: VehicleType) -> None:
-        """Raise PlanError, naming the leg (from 1), if this type of vehicle cannot fly the plan."""
+        """Raise PlanError if this type of vehicle cannot fly the plan. The message names the leg (from 1)."""
         if not 1 <= len(self.legs) <= MAX_LEGS:
             raise PlanError(f"a plan has 1 to {MAX_LEGS} legs, this one has {len(self.legs)}")
         flies = vehicle_type != "rover"
@@ -99,7 +99,7 @@ class Plan:
 
 
 def _problem(leg: Leg, first: bool, last: bool, vehicle_type: VehicleType) -> str | None:
-    """Return a sentence about the error in a leg of the flight plan. None without an error."""
+    """Return a sentence about the error in a leg of the flight plan, or None."""
     if vehicle_type == "rover" and isinstance(leg, TakeOff | Land):
         return "a rover neither takes off nor lands"
     match leg:

@@ -1,4 +1,4 @@
-"""Steps and procedures, which all flights share.
+"""Define steps and procedures, which all flights use.
 
 A flight is not a script. At each heartbeat the pilot determines the first step that is not complete, and requests it.
 ArduPilot may acknowledge a mode and undo it, or disarm by itself while the machine is busy. The pilot then simply
@@ -25,7 +25,7 @@ READY_LIMIT_S = 180.0  # ArduPilot calibrates, and waits for its estimates to ag
 
 @dataclass(frozen=True)
 class Step:
-    """A step, with its name in errors, and its time limit in simulated seconds over all attempts."""
+    """A step of a procedure, with its name for error messages and its time limit in simulated seconds."""
 
     name: str
     limit_s: float = STEP_LIMIT_S
@@ -38,23 +38,23 @@ STAY_READY = Step("ready to arm, and not only for a moment", READY_LIMIT_S)
 
 
 class HopelessError(Exception):
-    """The flight cannot continue. The message contains the reason."""
+    """An error: the flight cannot continue. The message contains the reason."""
 
 
 class Procedure(Protocol):
-    """A procedure that a pilot executes. `purpose` completes "did not ..."."""
+    """A procedure that a pilot executes. `purpose` completes the phrase "did not ..."."""
 
     purpose: str
 
     def next_step(self) -> Step | None:
-        """Return the first incomplete step. None if all are complete. Raises HopelessError."""
+        """Return the first incomplete step, or None if all are complete. Raises HopelessError."""
 
     def ask(self, step: Step) -> None:
-        """Request a step from the vehicle. Called once per heartbeat until the step is complete."""
+        """Request a step from the vehicle. The pilot calls this once per heartbeat until the step is complete."""
 
 
 class GettingReady:
-    """The steps of a flight before arming, until all of them have stayed complete for READY_FOR_S seconds."""
+    """The steps before arming, until all of them have stayed complete for READY_FOR_S seconds."""
 
     purpose = "get ready"
 
@@ -94,7 +94,7 @@ class Commander:
         self.link.ask_for_mode(MODES[self.vehicle_type][name])
 
     def arming(self) -> Step | None:
-        """Return the next step of arming. None if the vehicle is armed."""
+        """Return the next step of arming, or None if the vehicle is armed."""
         if self.state.armed:
             return None
         return ARM if self.state.ready_to_arm and self.state.position else READY
@@ -106,7 +106,7 @@ class Commander:
         return self.link.acks.get(command) == int(mavlink.MAV_RESULT_ACCEPTED)
 
     def refused(self, commands: Sequence[int]) -> bool:
-        """Return whether one of these commands was answered with MAV_RESULT_FAILED. Each answer counts once."""
+        """Return true if the vehicle answered one of these commands with MAV_RESULT_FAILED. Each answer counts once."""
         failed = [command for command in commands if self.link.acks.get(command) == int(mavlink.MAV_RESULT_FAILED)]
         for command in failed:
             del self.link.acks[command]

@@ -1,4 +1,4 @@
-"""The connection of one client to the embedded vehicle, like one serial port of an ArduPilot: MAVLink without a socket.
+"""Connect one client to the embedded vehicle, like one serial port of an ArduPilot: MAVLink without a socket.
 
 Each `Channel` has its own parser, sequence numbers, message intervals and incomplete mission.
 """
@@ -32,7 +32,7 @@ SYSTEM_ID = "SYSID_THISMAV"
 
 
 class Channel:
-    """One client of an autopilot, from connection to disconnection."""
+    """The connection of one client to an autopilot, from its beginning to its end."""
 
     def __init__(self, autopilot: Autopilot) -> None:
         self._autopilot = autopilot
@@ -48,7 +48,7 @@ class Channel:
         self._autopilot.listeners.remove(self)
 
     def receive(self, data: bytes) -> None:
-        """Process bytes from the client, in pieces of any size and with any content."""
+        """Process bytes from the client. They may have any content and arrive in any pieces."""
         for message in self._mav.parse_buffer(data) or ():
             kind = message.get_type()
             if kind == "HEARTBEAT":
@@ -85,7 +85,9 @@ class Channel:
         self._mav.seq = (self._mav.seq + 1) % 256
 
     def send_due(self) -> None:
-        """Send each message whose interval has passed, once. A late client receives the latest state, not a burst."""
+        """Send each message that is due once. A slow client receives the latest state, and not all messages that it
+        missed.
+        """
         now_s = self._autopilot.now_s
         for message_id, due_s in self._due_s.items():
             if due_s <= now_s:
@@ -112,7 +114,7 @@ class Channel:
         )
 
     def _command(self, message: Any) -> int:
-        """Execute a COMMAND_LONG or COMMAND_INT. Returns the MAV_RESULT."""
+        """Execute a COMMAND_LONG or COMMAND_INT, and return its result code (MAV_RESULT)."""
         vehicle = self._autopilot
         match message.command:
             case mavlink.MAV_CMD_COMPONENT_ARM_DISARM if message.param1 == 1:
@@ -150,7 +152,7 @@ class Channel:
         return int(mavlink.MAV_RESULT_UNSUPPORTED) if number is None else self._autopilot.set_mode(number)
 
     def _reposition(self, message: Any) -> int:
-        """Execute MAV_CMD_DO_REPOSITION. param1 is the speed, -1 or 0 for the current one. param2 may request GUIDED
+        """Execute MAV_CMD_DO_REPOSITION, and return its result code. param1 is the speed, and param2 may request GUIDED
         mode.
         """
         vehicle = self._autopilot
@@ -165,14 +167,14 @@ class Channel:
         return vehicle.go_to(vehicle.place(message.frame, message.x, message.y, message.z))
 
     def _position_target(self, message: Any) -> None:
-        """Accept complete positions without an answer. A plane ignores them, as ArduPlane does."""
+        """Process a complete target position without an answer. A plane ignores it, as ArduPlane does."""
         vehicle = self._autopilot
         whole = not message.type_mask & NO_POSITION and message.coordinate_frame in FRAMES
         if whole and vehicle.vehicle_type != "plane":
             vehicle.go_to(vehicle.place(message.coordinate_frame, message.lat_int, message.lon_int, message.alt))
 
     def _set_parameter(self, message: Any) -> None:
-        """Set a parameter. An unknown one gets no answer, as in ArduPilot."""
+        """Set a parameter. An unknown parameter gets no answer, as in ArduPilot."""
         vehicle, name, value = self._autopilot, message.param_id, message.param_value
         if name == TAKE_OFF_ALTITUDE and vehicle.vehicle_type == "plane":
             if 0 < value <= MAX_ALTITUDE_M:
@@ -184,7 +186,9 @@ class Channel:
         self.send(self._parameters()[name])
 
     def _parameters(self) -> dict[str, Any]:
-        """Return the PARAM_VALUE of each parameter. A ground station requests all of them before it shows a vehicle."""
+        """Return the message PARAM_VALUE for each parameter. A ground station requests them all before it shows a
+        vehicle.
+        """
         values: dict[str, float] = {SYSTEM_ID: self._autopilot.sysid}
         if self._autopilot.vehicle_type == "plane":
             values[TAKE_OFF_ALTITUDE] = self._autopilot.take_off_altitude_m
@@ -214,7 +218,7 @@ class Channel:
                 self._set_interval(message_id, 1e6 / rate if rate else -1)
 
     def _set_interval(self, message_id: float, interval_us: float) -> int:
-        """Execute MAV_CMD_SET_MESSAGE_INTERVAL in microseconds.
+        """Execute MAV_CMD_SET_MESSAGE_INTERVAL, and return its result code. The interval is in microseconds.
 
         0 is the default interval, and -1 turns the message off.
         """
@@ -255,5 +259,5 @@ class Channel:
 
 
 def _seventh(message: Any) -> float:
-    """Return parameter 7, the altitude. In a COMMAND_INT its name is z."""
+    """Return parameter 7 of a command, the altitude. In a COMMAND_INT it is called z."""
     return float(message.z if message.get_type() == "COMMAND_INT" else message.param7)

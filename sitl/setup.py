@@ -1,4 +1,4 @@
-"""Settings that may differ between vehicles of one type: frame, parameters, arguments, debugger and size of the log."""
+"""Settings that may differ between vehicles of one type: frame, parameters, arguments, debugger and log size."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DEBUGGERS: tuple[Debugger, ...] = get_args(Debugger)
 
 @dataclass(frozen=True)
 class Setup:
-    """The setup of one vehicle.
+    """The settings of one vehicle.
 
     `frame` None is the default frame of its type. `log_mib` None means no limit of the log.
     """

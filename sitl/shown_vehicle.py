@@ -1,4 +1,4 @@
-"""A vehicle on a computed track, for display in a ground station.
+"""Show a vehicle on a computed flight path in a ground station.
 
 It uses the same `Channel` as the embedded vehicle, and refuses each command of an operator with a text.
 """
@@ -21,7 +21,7 @@ LOW_M = 0.1
 
 
 class ShownVehicle(Autopilot):
-    """A vehicle on its track, armed from second 0 on. Its only parameter is its system ID."""
+    """A vehicle on its flight path, armed from second 0 on. Its only parameter is its system ID."""
 
     takes_missions = False
 

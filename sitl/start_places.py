@@ -1,4 +1,4 @@
-"""Start places in ArduPilot's file formats: named locations, and the offsets of a swarm.
+"""Read start positions from files in ArduPilot's formats: named locations, and the offsets of a swarm.
 
     locations.txt      CMAC=-35.363261,149.165230,584,353     latitude, longitude, metres above sea level, heading
     swarminit.txt      1=20,-20,0,90                          instance; metres east, north and up, optional heading
@@ -25,11 +25,11 @@ MAX_SHOWN = 60
 
 
 class PlaceError(VehicleError):
-    """A missing place, or an unreadable file of places."""
+    """An error: a location is missing, or a file of locations cannot be read."""
 
 
 class Offset(NamedTuple):
-    """An offset in metres from the first home. A heading of None means the heading of the first home."""
+    """An offset in metres from the first home position. A heading of None means the heading of the first one."""
 
     east_m: float
     north_m: float
@@ -37,7 +37,7 @@ class Offset(NamedTuple):
     heading_deg: float | None = None
 
     def of(self, home: Home) -> Home:
-        """Return the place at this offset from `home`. Raises VehicleError if there is no such place."""
+        """Return the place at this offset from `home`. Raises VehicleError if it is not on Earth."""
         if not all(math.isfinite(part) and abs(part) <= MAX_OFFSET_M for part in self[:3]):
             raise PlaceError(f"an offset in metres is at most {MAX_OFFSET_M:g} each way")
         there = home.offset(self.north_m, self.east_m)
@@ -63,7 +63,7 @@ def named(name: str, beside: Path | None, environ: Mapping[str, str]) -> Home:
 
 
 def swarm(path: Path) -> dict[int, Offset]:
-    """Return the offsets of a swarm by instance, from 0. Raises VehicleError."""
+    """Return the offsets of a swarm by number, from 0. Raises VehicleError."""
     offsets: dict[int, Offset] = {}
     for number, key, values in _lines(path):
         where = f"{path}, line {number}"
@@ -79,7 +79,7 @@ def swarm(path: Path) -> dict[int, Offset]:
 
 
 def _files(beside: Path | None, environ: Mapping[str, str]) -> Iterator[Path]:
-    """Yield the possible files: next to the scenario, the user's own as in sim_vehicle.py, and next to the binaries."""
+    """Yield the possible files: next to the scenario, in the user's own directory, and next to the binaries."""
     if beside is not None:
         yield beside / LOCATIONS
     home = Path(environ.get("HOME", "."))
@@ -90,7 +90,7 @@ def _files(beside: Path | None, environ: Mapping[str, str]) -> Iterator[Path]:
 
 
 def autotest(binaries: Path) -> Iterator[Path]:
-    """Yield the possible directories of ArduPilot's files: that of the binaries, and the source tree that built
+    """Yield the possible directories of ArduPilot's files: next to the binaries, and in the source tree that built
     them.
     """
     yield binaries
@@ -99,7 +99,7 @@ def autotest(binaries: Path) -> Iterator[Path]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str, str]]:
-    """Yield number, key and values of each line that has any. Raises VehicleError."""
+    """Yield the number, key and values of each line that is not empty. Raises VehicleError."""
     for number, line in enumerate(text_of(path, MAX_BYTES).splitlines(), start=1):
         content = line.partition("#")[0].strip()
         if not content:

@@ -1,4 +1,4 @@
-"""The messages that the embedded vehicle sends at intervals: one function per message of `STREAMS`."""
+"""Define the messages that the embedded vehicle sends at intervals, with a function for each message in `STREAMS`."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def home_position(vehicle: Autopilot) -> Any:
 
 
 def autopilot_version(vehicle: Autopilot) -> Any:
-    """Return the version of this package, without a commit. It is sent on request only."""
+    """Return the version of this package, without a commit. It is only sent on request."""
     parts = [min(part, 255) for part in release(_installed())]
     number = int.from_bytes([*parts, mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL], "big")
     capabilities = mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
@@ -149,7 +149,7 @@ def release(installed: str) -> tuple[int, int, int]:
 
 
 def _installed() -> str:
-    """Return the version of the package. An image of containers has its files only, without a version."""
+    """Return the version of the package. A container image contains only its files, and no version."""
     try:
         return version("ucp-harness")
     except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""MAVLink system IDs for the vehicles of a run."""
+"""Choose MAVLink system IDs for the vehicles of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The position of a vehicle at each mission second, computed without a flight, for radio ranges in virtual time.
+"""Compute the position of a vehicle at each mission second without flying, for radio ranges in virtual time.
 
 The motion models are those of the embedded vehicle. The computation is a pure function without MAVLink, clock or
 process.
@@ -20,7 +20,7 @@ from sitl.vehicle import VehicleType
 
 @dataclass(frozen=True)
 class Track:
-    """The course of one vehicle, in mission seconds and metres. A track never ends."""
+    """The computed path of one vehicle, in mission seconds and metres. It never ends."""
 
     course: Course
     home_offset: tuple[float, float, float]
@@ -31,7 +31,7 @@ class Track:
         return motion.north_m, motion.east_m, motion.up_m
 
     def in_field(self, t_s: float) -> tuple[float, float, float]:
-        """Return (north_m, east_m, up_m) relative to the centre of the field: `at` plus `home_offset`."""
+        """Return (north_m, east_m, up_m) relative to the centre of the field."""
         north_m, east_m, up_m = self.at(t_s)
         return north_m + self.home_offset[0], east_m + self.home_offset[1], up_m + self.home_offset[2]
 
@@ -46,7 +46,7 @@ def track(
     takeoff_altitude_m: float = 20.0,
     by: By = "mission",
 ) -> Track:
-    """Return the track of a vehicle that begins to fly `plan` at mission second `begin_s`, in the way `by`.
+    """Return the path of a vehicle that begins to fly `plan` at mission second `begin_s`.
 
     Before that it stands at home. After the plan it stays, or circles if it is a plane, unless it has landed.
     `home_offset` is the place of home in the field, in metres north, east and up from its centre. `heading_deg` is the
@@ -64,7 +64,7 @@ def track(
 
 
 def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion) -> Sequence[Segment]:
-    """Return the segments of the waypoints in AUTO mode, and of the unlimited stay after the last one."""
+    """Return the segments for the waypoints in AUTO mode, and for the unlimited stay after the last one."""
     model, last = MODELS[vehicle_type], waypoints[-1]
     segments: list[Segment] = [Rest(start, 0.0)]
     for before, waypoint, after in zip((None, *waypoints), waypoints, (*waypoints[1:], None), strict=False):
@@ -75,7 +75,7 @@ def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mo
 
 
 def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion) -> Sequence[Segment]:
-    """Return the segments in GUIDED mode. The landing of a plane is a mission."""
+    """Return the segments in GUIDED mode. The landing of a plane is always a mission."""
     begins = landing_begins(waypoints, vehicle_type)
     led, staying = leg_by_leg(waypoints[:begins], vehicle_type, start)
     if begins is None or len(led) < begins:
@@ -86,7 +86,7 @@ def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mot
 def _manoeuvre(
     model: MotionModel, waypoint: Waypoint, start: Motion, before: Waypoint | None, after: Waypoint | None
 ) -> Sequence[Segment]:
-    """Return the segments of one waypoint from the current motion, between its neighbours."""
+    """Return the segments for one waypoint from the current motion, with regard to its neighbours."""
     led = before.place if before is not None and before.kind in ("go_to", "loiter") else None
     match waypoint.kind:
         case "take_off":

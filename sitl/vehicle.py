@@ -1,4 +1,4 @@
-"""A vehicle: a program that speaks MAVLink on three TCP ports, and the command that starts it.
+"""Define a vehicle: a program that offers MAVLink on three TCP ports, and the command that starts it.
 
 Each vehicle runs in its own network namespace. Therefore all vehicles listen on the same ports, those of the first
 three serial ports of ArduPilot SITL. The pilot in the orchestrator uses the first, the agent the second, and a ground
@@ -30,28 +30,30 @@ MAX_SYSID = 255  # MAVLink: u8 system ID, 0 is a broadcast
 
 
 class VehicleError(Exception):
-    """The base of all errors of `sitl`: one sentence for the user on the cause and the way out."""
+    """The base class of all errors of this package. Each is one sentence for the user with the cause and a solution."""
 
 
 class NoBinaryError(VehicleError):
-    """No ArduPilot binary is named or found. A run may use the embedded vehicle instead."""
+    """An error: no ArduPilot binary is named or found. A run may use the embedded vehicle instead."""
 
 
 class UnusableBinaryError(VehicleError):
-    """An ArduPilot binary is named or found, but cannot be run."""
+    """An error: an ArduPilot binary is named or found, but cannot be run."""
 
 
 class NoProgramError(VehicleError):
-    """A program that runs the vehicle, such as a debugger, is not on this machine."""
+    """An error: a program that the vehicle needs, such as a debugger, is not on this machine."""
 
 
 class FlightError(VehicleError):
-    """A vehicle did not do what its pilot asked, or stopped answering."""
+    """An error: a vehicle did not do what its pilot requested, or stopped answering."""
 
 
 @dataclass(frozen=True)
 class Home:
-    """A place on the ground: degrees (WGS 84), metres above sea level, heading in degrees clockwise from north."""
+    """A place on the ground: degrees (WGS 84), metres above sea level, and a heading in degrees clockwise from
+    north.
+    """
 
     lat_deg: float
     lon_deg: float
@@ -74,7 +76,7 @@ class Home:
 
     @classmethod
     def parse(cls, text: str) -> Home:
-        """Return the place of a text LAT,LON,ALT,HDG. Raises VehicleError for any other text."""
+        """Parse a place in the form LAT,LON,ALT,HDG. Raises VehicleError for any other text."""
         try:
             lat, lon, alt, heading = (float(part) for part in text.split(","))
         except ValueError:
@@ -93,7 +95,9 @@ class Home:
         return Home(max(-90.0, min(90.0, lat)), (lon + 180.0) % 360.0 - 180.0, self.alt_m, self.heading_deg)
 
     def metres_to(self, lat_deg: float, lon_deg: float, alt_m: float) -> tuple[float, float, float]:
-        """Return the offset of a place from this one, in metres north, east and up. The inverse of `offset`."""
+        """Return the offset of another place from this one, in metres north, east and up. It is the inverse of
+        `offset`.
+        """
         north_m = (lat_deg - self.lat_deg) * METRES_PER_DEGREE
         degrees_east = (lon_deg - self.lon_deg + 180.0) % 360.0 - 180.0
         east_m = degrees_east * METRES_PER_DEGREE * max(math.cos(math.radians(self.lat_deg)), 1e-6)
@@ -122,26 +126,26 @@ class VehicleKind(Protocol):
 
     @property
     def frame(self) -> str | None:
-        """The name of the frame in the program. None if the program has only one."""
+        """The name of the frame in the program, or None if the program has only one."""
 
     @property
     def sha256(self) -> str | None:
-        """The SHA-256 hash of the program in hexadecimal. None if the program is no single file."""
+        """The SHA-256 hash of the program in hexadecimal, or None if the program is not a single file."""
 
     @property
     def parameters(self) -> Mapping[str, float]:
-        """Parameters from the user. The vehicle must know each of them."""
+        """The parameters that the user has set. The vehicle must know each of them."""
 
     @property
     def lack(self) -> str | None:
-        """A sentence on a missing requirement of flight, with a solution. None if nothing is missing."""
+        """A sentence about a missing requirement for flight, with a solution, or None."""
 
     @property
     def uses_udp(self) -> bool:
         """True if the program receives UDP datagrams in its network namespace."""
 
     def check(self) -> None:
-        """Raise VehicleError if this machine cannot run the vehicle with its setup."""
+        """Raise VehicleError if this machine cannot run the vehicle with its settings."""
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
         """Prepare the working directory of a vehicle, and return the command that starts it.
@@ -162,7 +166,7 @@ def check_launch(sysid: int, home: Home, speedup: float) -> None:
 
 
 def place_in_field(index: int, spacing_m: float = SPACING_M) -> tuple[float, float]:
-    """Return metres north and east of the centre of a field, for the vehicle with this index from 0.
+    """Return metres north and east of the field's centre for the vehicle with this index, from 0.
 
     The places form the pattern of the seeds of a sunflower. Two places are at least about `spacing_m` apart. Any number
     of vehicles fits, and a further vehicle moves no other.
@@ -173,5 +177,5 @@ def place_in_field(index: int, spacing_m: float = SPACING_M) -> tuple[float, flo
 
 
 def home_in_field(index: int, centre: Home, spacing_m: float = SPACING_M) -> Home:
-    """Return the home of the vehicle with this index from 0, at `place_in_field`."""
+    """Return the home position of the vehicle with this index, from 0."""
     return centre.offset(*place_in_field(index, spacing_m))

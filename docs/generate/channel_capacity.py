@@ -1,4 +1,4 @@
-"""`python -m docs.generate.channel_capacity`: measure how many vehicles a shared radio channel carries.
+"""Measure how many vehicles a shared radio channel can serve: `python -m docs.generate.channel_capacity`.
 
 Each cell of the measurement is a mission with a radio, a number of agents and a spread of answers. All cells have the
 same seeds. This program draws the picture of the page and writes its tables. The text around them is written by hand.
@@ -75,7 +75,7 @@ OUT_OF_REACH = ("range", "fade")
 
 
 class Cell(NamedTuple):
-    """A mission with a radio; None for a network without loss that is no channel."""
+    """A mission with a radio. None means a network without loss."""
 
     mission: Mission
     radio: str | None
@@ -88,7 +88,7 @@ class Cell(NamedTuple):
 
 
 class Run(NamedTuple):
-    """The figures of a run. None: the run has no such figure."""
+    """The figures of a run. None means that the run does not determine a figure."""
 
     finished: bool
     in_every_chain: float
@@ -110,7 +110,7 @@ Runs = Mapping[Cell, Sequence[Run]]
 
 
 def cells() -> list[Cell]:
-    """Return all cells of the page."""
+    """Return all missions of the page."""
     grid = [
         Cell(mission, radio, agents, spread_s)
         for mission, numbers in MISSIONS.items()
@@ -123,7 +123,7 @@ def cells() -> list[Cell]:
 
 
 def scenario(cell: Cell, seed: int) -> Scenario:
-    """Return the scenario of a run. The seed draws when blocks are completed, and by which agents."""
+    """Return the scenario of a run. The seed decides which agents complete blocks, and when."""
     draws = random.Random(f"{cell.mission}/{cell.agents}/{seed}")
     blocks = round(BUSY_BLOCKS_PER_AGENT * cell.agents) if cell.mission == "busy" else BLOCKS
     script = [
@@ -152,7 +152,7 @@ def scenario(cell: Cell, seed: int) -> Scenario:
 
 
 def play(task: tuple[Cell, int]) -> Run:
-    """Return the figures of the run of a cell with a seed."""
+    """Return the figures of the run of a mission with a seed."""
     cell, seed = task
     played = scenario(cell, seed)
     simulated = simulate(played, seed)
@@ -178,7 +178,7 @@ def play(task: tuple[Cell, int]) -> Run:
 
 
 def carried(runs: Runs, mission: Mission, radio: str | None, spread_s: float) -> int:
-    """Return the largest measured number of agents that the radio carries, with all smaller ones; 0 if it has none."""
+    """Return the largest measured number of agents that the radio can serve, or 0."""
     most = 0
     for agents in MISSIONS[mission]:
         those = runs[Cell(mission, radio, agents, spread_s)]
@@ -251,7 +251,7 @@ COLUMNS = (
 
 
 def size_row(cell: Cell, those: Sequence[Run]) -> list[str]:
-    """Return the row of a cell in the table over the number of agents."""
+    """Return the table row of a mission."""
     return [_radio(cell), str(cell.agents), *_figures(those)]
 
 
@@ -274,7 +274,7 @@ def _figures(those: Sequence[Run]) -> list[str]:
 
 
 def _mean(values: Iterable[float | None], *, percent: bool = False, unit: str = "") -> str:
-    """Format the mean and the margin of its 95 % interval."""
+    """Return the mean and the margin of its 95 % confidence interval as text."""
     estimate = estimate_mean([value for value in values if value is not None])
     if estimate.mean is None:
         return "\u2013"
@@ -284,7 +284,7 @@ def _mean(values: Iterable[float | None], *, percent: bool = False, unit: str = 
 
 
 def _number(value: float) -> str:
-    """Format three digits."""
+    """Return a number with three significant digits as text."""
     if value == 0:
         return "0"
     digits = max(0, 2 - math.floor(math.log10(abs(value))))
@@ -302,7 +302,7 @@ def _carries(runs: Runs) -> str:
 
 
 def _asking_table(runs: Runs) -> str:
-    """Compare runs with the same seed without and with `asks_after_commit`."""
+    """Return a table that compares runs with the same seed without and with the setting `asks_after_commit`."""
     body = []
     for off, on in zip(_asking(False), _asking(True), strict=True):
         fields = [off.mission, _radio(off), str(off.agents)]
@@ -367,7 +367,7 @@ SHOWN = {
 
 
 def draw(runs: Runs) -> str:
-    """Draw the mission `busy`: a row of panels for each radio, with a line for each spread."""
+    """Draw the mission `busy`: a row of charts for each radio, with a line for each answer delay."""
     areas = svg.grid(len(SHOWN) * len(RADIOS), len(SHOWN), HEAD, PANEL_HEIGHT)
     places = [(radio, shown) for radio in RADIOS for shown in SHOWN]
     return svg.document(
@@ -423,7 +423,7 @@ def _legend() -> Markup:
 
 
 def _description(runs: Runs) -> str:
-    """Describe the picture in words, with the default spread."""
+    """Return a text that describes the picture."""
     return " ".join(
         f"{radio}, {shown}: "
         + ", ".join(
@@ -436,7 +436,7 @@ def _description(runs: Runs) -> str:
 
 
 def put(page: str, name: str, table: str) -> str:
-    """Replace the table of this name in the page."""
+    """Replace the table with this name in the page."""
     begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->\n"
     before, rest = page.split(begin)
     _, after = rest.split(end)

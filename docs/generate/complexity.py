@@ -1,4 +1,4 @@
-"""`python -m docs.generate.complexity RUN_DIR`: write a matrix's growth into docs/appendix/growth.md.
+"""Write the growth figures of a matrix into docs/appendix/growth.md: `python -m docs.generate.complexity RUN_DIR`.
 
 The tables and the picture come from RUN_DIR. The text around them is written by hand.
 """
@@ -30,7 +30,7 @@ PICTURE = PAGE.with_name("growth.svg")
 
 
 def tables(record: MatrixRecord) -> str:
-    """Return Markdown: the means at the middle mission length, and the exponents over agents and blocks together."""
+    """Return Markdown tables: the means at the middle mission length, and the exponents of the laws of growth."""
     return f"{_sizes(record)}\n{_exponents(record)}"
 
 

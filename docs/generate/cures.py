@@ -1,4 +1,4 @@
-"""`python -m docs.generate.cures`: measure the cost and the effect of each cure over the loss matrix of the thesis.
+"""Measure the cost and the effect of each protocol correction at many loss rates: `python -m docs.generate.cures`.
 
 Each cure uses the same seeds as the default settings. This program writes the tables of the page. The text around them
 is written by hand.
@@ -49,7 +49,7 @@ CURES: dict[str, dict[str, Any]] = {
 
 
 class Task(NamedTuple):
-    """One run."""
+    """One run of a matrix."""
 
     cure: str
     point: Point
@@ -57,14 +57,14 @@ class Task(NamedTuple):
 
 
 def play(matrix: Matrix, task: Task) -> tuple[Figures, bool]:
-    """Return the figures of a run, and whether the swarm became idle."""
+    """Return the figures of a run, and true if the swarm became idle."""
     document = matrix.scenario_at(task.point).model_dump(exclude_unset=True) | CURES[task.cure]
     simulated = simulate(Scenario.model_validate(document), task.seed)
     return simulated.result.figures, simulated.played.settled
 
 
 def tables(jobs: int) -> str:
-    """Return Markdown: a table for each figure, with a row for each cure and a column for each loss."""
+    """Return Markdown: a table for each figure, with a row for each correction and a column for each loss rate."""
     matrix = load_matrix(MATRIX)
     tasks = [Task(cure, point, seed) for cure in CURES for point in matrix.points for seed in matrix.seed_list[:SEEDS]]
     figures: dict[tuple[str, float], list[Figures]] = defaultdict(list)

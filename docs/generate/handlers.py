@@ -1,4 +1,4 @@
-"""Draw the diagram of the event handlers from their declarations, and write ../../ucp/contract/HANDLERS.md.
+"""Draw a diagram of the event handlers from their declarations, and write ../../ucp/contract/HANDLERS.md.
 
 Run it with `python -m docs.generate.handlers`.
 
@@ -96,7 +96,7 @@ def _row(handler: EventHandler[Any]) -> str:
 
 
 def _causes(handler: EventHandler[Any]) -> Iterator[str]:
-    """Yield the causes of the handler in the tables of `ucp.agent`, with the handlers that trigger it."""
+    """Yield the causes of the handler, including the handlers that trigger it."""
     for message, receiver in ON_MESSAGE.items():
         if receiver is handler:
             yield f"{message.NAME} arrives"

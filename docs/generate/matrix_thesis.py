@@ -1,5 +1,4 @@
-"""`python -m docs.generate.matrix_thesis RUN_DIR`: compare a matrix with the observations of Section 4.3, in
-docs/appendix/loss-matrix.md.
+"""Compare a matrix with the observations in Section 4.3 of the thesis: `python -m docs.generate.matrix_thesis RUN_DIR`.
 
 The table and the picture come from RUN_DIR. The text around them is written by hand.
 """
@@ -32,7 +31,7 @@ OBSERVED = {
 
 
 def table(record: MatrixRecord) -> str:
-    """Return Markdown: for each loss, the observation of the thesis and the means with their intervals."""
+    """Return Markdown: for each loss rate, the observation of the thesis and the means with confidence intervals."""
     headers = ["loss", "Section 4.3", *(metric.label for metric in METRICS)]
     lines = [headers, ["--:", "---", *("--:" for _ in METRICS)], *map(_row, record.cells)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

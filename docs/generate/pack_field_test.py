@@ -1,4 +1,4 @@
-"""Play pack_field_test.yaml, damage the records as field data is damaged, and pack them.
+"""Play pack_field_test.yaml, damage its records as on real flights, and pack them into an archive.
 
     python docs/generate/pack_field_test.py docs/field_test_2020.tar.xz
 
@@ -45,7 +45,7 @@ def _flown(scenario: Scenario, directory: Path) -> dict[str, bytes]:
 
 
 def packed(files: dict[str, bytes]) -> bytes:
-    """An archive of them, in the directory `logs`."""
+    """Return an archive of these files, in the directory `logs`."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:xz", format=tarfile.USTAR_FORMAT) as archive:
         for name, content in sorted(files.items()):

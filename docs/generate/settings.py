@@ -1,6 +1,4 @@
-"""The table of settings in the agent contract, from their declarations: `python -m docs.generate.settings` writes it
-into ../../ucp/contract/CONTRACT.md.
-"""
+"""Write the table of settings in the agent contract from their declarations: `python -m docs.generate.settings`."""
 
 import json
 from pathlib import Path

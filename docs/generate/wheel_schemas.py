@@ -1,4 +1,4 @@
-"""Build hook of the wheel: generate the JSON Schemas and add them as files.
+"""Generate the JSON schemas when the Python package is built, and add them as files.
 
 An editable install has no schema files. The code generates a schema when it needs one.
 """
@@ -13,7 +13,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
 class WheelSchemas(BuildHookInterface):  # type: ignore[type-arg]
-    """Writes the schemas into a temporary folder, which lasts until the wheel is built."""
+    """Writes the JSON schemas to a temporary folder, which exists until the package is built."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         self._folder = TemporaryDirectory()

@@ -1,4 +1,5 @@
-"""`python -m docs.generate.wrong_agents_proof [QUIRK ...]`: print the table of wrong agents for the page of bounds.
+"""Print a table of the deliberate errors that a proof detects: `python -m docs.generate.wrong_agents_proof [QUIRK
+...]`.
 
 The page is docs/appendix/proof-bounds.md. Each quirk is examined twice. First, each step is compared with that of a
 correct agent, within small bounds. Second, the prover searches for a violation within bounds in which all properties
@@ -37,7 +38,7 @@ TRIED = (
 
 
 class WrongStep(NamedTuple):
-    """A wrong step: its handler, the bounds in which it occurs, and its distance from the start in instants.
+    """A wrong step: its handler, the bounds in which it occurs, and its distance from the initial state.
 
     In the network `any`, `instants` counts the inputs of one agent.
     """
@@ -48,7 +49,7 @@ class WrongStep(NamedTuple):
 
 
 def wrong_step(quirk: str, most_s: float = MOST_S) -> WrongStep | str:
-    """Return the nearest wrong step, or the reason why none is known."""
+    """Return the wrong step nearest to the initial state, or the reason why none is known."""
     undecided = []
     for bounds in TRIED:
         flaw, instants, ended = _first_flaw(_with(quirk, replace(bounds, steps=True)), most_s)
@@ -60,7 +61,7 @@ def wrong_step(quirk: str, most_s: float = MOST_S) -> WrongStep | str:
 
 
 def _first_flaw(bounds: Bounds, most_s: float) -> tuple[Flaw | None, int, Ended]:
-    """Return the nearest flaw and its distance in instants, or in inputs of one agent in the network `any`."""
+    """Return the violation nearest to the initial state, and its distance."""
     if bounds.network == "any":
         collected = collect(bounds, most_bytes=MOST_BYTES, most_s=most_s)
         return collected.flaw, len(collected.way), collected.ended
@@ -70,7 +71,7 @@ def _first_flaw(bounds: Bounds, most_s: float) -> tuple[Flaw | None, int, Ended]
 
 
 def violation(quirk: str, most_s: float = MOST_S) -> str:
-    """Name the first property that does not hold within the small bounds."""
+    """Return the first property that does not hold within small bounds."""
     graph = explore(Swarm(_with(quirk, SMALL)), most_bytes=MOST_BYTES, most_s=most_s)
     if graph.flaw is not None:
         return f"characteristic {graph.flaw.kind}" if graph.flaw.kind.isdecimal() else graph.flaw.kind

@@ -1,4 +1,4 @@
-"""Add pages of the source tree outside `docs/` to the site.
+"""Add pages from outside the folder `docs/` to the documentation site.
 
 The README is the start page of the site. Each file that a page links to becomes part of the site, under its path in the
 repository. A link to a folder leads to the README of the folder. If the folder has no README, the link becomes plain
@@ -29,7 +29,7 @@ _IMAGE = re.compile(r'(?P<before><img src=")(?P<target>[^":]+)')
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the files that pages link to, directly or through other added pages."""
+    """Add the files to which pages link, directly or through other added pages."""
     waiting = [ROOT / "README.md", *(Path(file.abs_src_path or "") for file in files.documentation_pages())]
     there = {*waiting}
     while waiting:
@@ -48,7 +48,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Return the page with links that are valid between pages of the site."""
+    """Return the page with links that work between pages of the site."""
     source = ROOT / "README.md" if page.file.src_uri == HOME else _source(page.file.src_uri)
     here = posixpath.dirname(page.file.src_uri) or "."
 
@@ -83,7 +83,7 @@ def _targets(page: Path) -> list[Path]:
 
 
 def _resolved(page: Path, target: str) -> Path | None:
-    """Return the target file of a link, or None for a folder without a README.
+    """Return the file to which a link points, or None for a folder without a README.
 
     Raises PluginError if the target does not exist.
     """

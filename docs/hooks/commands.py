@@ -1,4 +1,4 @@
-"""Generate the sections on commands of `docs/reference/commands.md` from the help of the commands.
+"""Generate the sections of `docs/reference/commands.md` from the help texts of the commands.
 
 The page shows the description, usage, arguments and options of each command, so it cannot differ from `--help`.
 """
@@ -42,7 +42,7 @@ def reference() -> str:
 
 
 def _section(name: str, summary: str) -> Iterator[str]:
-    """Yield the paragraphs on one command, or on a group of commands."""
+    """Yield the paragraphs about one command, or about a group of commands."""
     command = load_command(name)
     yield f"### {PROGRAM} {name}"
     if not hasattr(command, "commands"):
@@ -83,7 +83,7 @@ def _names(option: Any, context: Any) -> str:
 
 
 def _described(option: Any, context: Any) -> str:
-    """Return the help with default and range. If the name of its panel starts with "With", this name comes first."""
+    """Return the help text of an option with its default and range."""
     _, text = option.get_help_record(context)
     panel = option.rich_help_panel
     return f"{panel}: {text}" if panel and panel.startswith("With") else str(text)

@@ -1,4 +1,4 @@
-"""Generate the tables of `docs/reference/scenario-keys.md`.
+"""Generate the tables in `docs/reference/scenario-keys.md`.
 
 The JSON Schema of a scenario has the types and defaults. The docstrings of the models have the descriptions.
 """
@@ -46,7 +46,7 @@ def reference() -> str:
 
 
 def _quirks() -> str:
-    """Return a table of all quirks, in the order of their Algorithms."""
+    """Return a table of all deliberate errors of agents, in the order of their Algorithms."""
     rows = ["| quirk | value | mistake |", "|---|---|---|"]
     for name, quirk in QUIRKS.items():
         rows.append(f"| `{name}` | {'probability 0 to 1' if quirk.chance else 'true'} | {quirk.sentence} |")
@@ -79,7 +79,7 @@ def _table(name: str, schema: dict[str, Any], models: dict[str, type[BaseModel]]
 
 
 def _type(schema: dict[str, Any]) -> str:
-    """Return the allowed values in words."""
+    """Return a text about the allowed values."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
         return f"[{name}](#{name.lower()})"
@@ -128,7 +128,7 @@ def _models(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
 
 
 def _docstrings(model: type[BaseModel]) -> dict[str, str]:
-    """Return the docstring of each attribute, from the source of the model and of its base classes."""
+    """Return the docstring of each attribute of a model and its base classes, from the source."""
     documented: dict[str, str] = {}
     for base in reversed(model.__mro__):
         if base.__module__.startswith("harness."):

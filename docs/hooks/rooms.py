@@ -1,4 +1,4 @@
-"""Draw a picture of the imports between the rooms of the harness for `docs/explanation/architecture.md`."""
+"""Draw a picture of the imports between the packages of the harness for `docs/explanation/architecture.md`."""
 
 import ast
 import re
@@ -25,7 +25,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def uses(rooms: list[str]) -> Counter[tuple[str, str]]:
-    """Return (room, imported room) -> number of files of the room with such an import."""
+    """Return, for each pair of packages, the number of files in the first that import the second."""
     counted: Counter[tuple[str, str]] = Counter()
     for room in rooms:
         for path in (ROOT / "harness" / room).rglob("*.py"):
@@ -34,14 +34,14 @@ def uses(rooms: list[str]) -> Counter[tuple[str, str]]:
 
 
 def _imported(path: Path) -> Iterator[str]:
-    """Yield the rooms that a file imports from."""
+    """Yield the packages that a file imports."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("harness."):
             yield node.module.split(".")[1]
 
 
 def picture(rooms: list[str], counted: Counter[tuple[str, str]]) -> str:
-    """Return an SVG with a row for each room. The more files import a room, the darker is its mark."""
+    """Return an SVG table with a row for each package. Darker marks mean that more files import the package."""
     size = len(rooms) * CELL
     most = max(counted.values())
     parts = []

@@ -1,4 +1,4 @@
-"""Rank search results: guides first, then explanations, then generated lists and measurements."""
+"""Rank the search results of the documentation site: guides first, then explanations, then generated lists."""
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import Files

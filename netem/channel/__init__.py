@@ -1,4 +1,4 @@
-"""A radio channel that all vehicles share. `_channel.py` has the model."""
+"""Simulate a radio channel that all vehicles share. The module `_channel.py` describes the model."""
 
 from netem.channel._channel import Channel
 from netem.channel._frame import Fate, Transmission, numbers

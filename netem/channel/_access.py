@@ -1,4 +1,4 @@
-"""The rule by which a station chooses when to send: in turns, or as its duty cycle allows.
+"""Define the rules by which a radio decides when to send: in its own time slot, or as its duty cycle allows.
 
 `netem.channel._contention` has the rule of IEEE 802.11.
 """
@@ -17,29 +17,29 @@ NEVER = 1 << 62
 
 
 class Access(Protocol):
-    """A rule. Stations are numbered from 0, and times are nanoseconds."""
+    """A rule for access to the channel. Stations are numbered from 0, and times are nanoseconds."""
 
     next_due: int
     """When the next station sends, if nothing changes; NEVER without frames."""
 
     def take_due(self) -> list[int]:
-        """Remove the stations that send at `next_due`, and return them."""
+        """Remove the stations that send at the time `next_due`, and return them."""
 
     def wait(self, frame: Frame, now: int, active: Collection[Frame]) -> None:
-        """Choose when the sender of `frame` sends it. `active` are the frames on the air."""
+        """Choose the time at which the sender of `frame` sends it. `active` contains the frames that are being sent."""
 
     def begun(self, frames: list[Frame], now: int) -> None:
-        """React to the beginning of these frames, which `take_due` has named."""
+        """Process the beginning of these frames, which `take_due` has returned."""
 
     def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Collection[Frame]) -> None:
-        """React to the end of `frame`. `waiting` is the next frame of its sender."""
+        """Process the end of `frame`. `waiting` is the next frame of its sender."""
 
     def too_long(self, airtime_ns: int) -> bool:
         """Return true if a frame with this airtime can never be sent."""
 
 
 class DutyCycle:
-    """Send at once, unless the station has used up its share of the time.
+    """The rule to send at once, unless the station has used up its share of the time.
 
     After a frame of T seconds a station is silent until T / duty after the beginning of this frame (ETSI EN 300 220, as
     LoRaWAN devices apply it).
@@ -78,7 +78,7 @@ class DutyCycle:
 
 
 class TimeSlots(DutyCycle):
-    """Send in the own time slot only. A frame that does not fit into the rest of the slot waits for the next one."""
+    """The rule to send only in the station's own time slot. A frame that no longer fits waits for the next slot."""
 
     def __init__(self, count: int, radio: Turns) -> None:
         super().__init__(count, radio)

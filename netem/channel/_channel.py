@@ -1,4 +1,5 @@
-"""A radio channel that all vehicles share: airtime, carrier sense, collisions, hidden terminals, capture.
+"""Simulate a radio channel that all vehicles share: sending times, carrier sense, collisions, hidden stations and
+capture.
 
 The model does no I/O and reads no clock. It plays events, which are the beginnings and the ends of frames, up to the
 time that the caller gives it. The same calls with the same seed give the same result on every machine: times are
@@ -37,7 +38,7 @@ from netem.radio import Place
 
 
 class Channel:
-    """The channel between `vehicles`, which are numbered from 0 in this order.
+    """The radio channel between `vehicles`, which are numbered from 0 in this order.
 
     Times are seconds, and no call may go back in time. All vehicles are at one place until the first call of `move`.
     """
@@ -63,7 +64,7 @@ class Channel:
         self._capture_window = nanoseconds(radio.capture_window_s)
 
     def send(self, sender: int, now: float, data_bytes: int) -> int | Fate:
-        """Queue a message of this length, and return the number of its frame.
+        """Queue a message of this length. Return the number of its frame, or the reason why it is never sent.
 
         Return Fate.QUEUE or Fate.TOO_LONG if the radio drops the message.
         """
@@ -85,24 +86,26 @@ class Channel:
         return frame.number
 
     def next_event(self) -> float | None:
-        """Return when the next frame begins or ends, in seconds; None if all queues are empty."""
+        """Return the time in seconds at which the next frame begins or ends, or None if all queues are empty."""
         ends, due = self._next_end, self._access.next_due
         next_ns = ends if ends < due else due
         return None if next_ns == NEVER else next_ns / NANOSECONDS
 
     def advance(self, now: float) -> list[Transmission]:
-        """Play all events up to `now`, and return the transmissions that have ended since the last call, in order."""
+        """Play all events up to the time `now`, and return the transmissions that have ended since the last call, in
+        order.
+        """
         self._play(nanoseconds(now))
         finished, self._finished = self._finished, []
         return finished
 
     def move(self, places: Sequence[Place], now: float) -> None:
-        """Put the vehicles at these places. Frames on the air keep the power with which they began."""
+        """Set the positions of the vehicles. Frames that are being sent keep the power with which they began."""
         self._play(nanoseconds(now))
         self._links.move(places)
 
     def tune(self, groups: Sequence[int], now: float) -> None:
-        """Give each vehicle the number of a channel. Vehicles on different channels neither hear nor disturb another.
+        """Assign a channel number to each vehicle. Vehicles on different channels do not affect each other.
 
         Frames on the air are still received on the old channel.
         """
@@ -144,7 +147,7 @@ class Channel:
         self._access.begun(sensed, now)
 
     def _overlap(self, frames: list[Frame], now: int) -> list[Frame]:
-        """Decide which receivers begin to receive these frames, and which frames on the air are disturbed.
+        """Decide which receivers begin to receive these frames, and which other frames are disturbed.
 
         Return the frames that further stations sense from now on.
 
@@ -172,7 +175,7 @@ class Channel:
         return self._sum_energy(air, totals)
 
     def _sum_energy(self, air: list[Frame], totals: Sequence[float]) -> list[Frame]:
-        """Let stations sense the sum of the powers of all frames, until it falls below the level of energy detection.
+        """Let stations sense the total power of all frames, until it falls below their detection level.
 
         Return the frames that further stations sense from now on.
         """
@@ -205,7 +208,7 @@ class Channel:
 
 
 def _sufficient(frame: Frame, totals: Sequence[float], ratio: float) -> int:
-    """Return the receivers, as bits, at which the power of the frame times `ratio` is at least the total power."""
+    """Return the receivers (as bits) at which the power of the frame times `ratio` is at least the total power."""
     receivers = 0
     for number in [number for number, power in enumerate(frame.reach.powers) if power * ratio >= totals[number]]:
         receivers |= 1 << number

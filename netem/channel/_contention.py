@@ -1,4 +1,4 @@
-"""Carrier sense and random backoff of IEEE 802.11 broadcasts: the DCF of IEEE 802.11-2020, 10.3.4.
+"""Simulate carrier sense and the random waiting time (backoff) of IEEE 802.11 broadcasts (IEEE 802.11-2020, 10.3.4).
 
 A station with a frame sends at once if the channel has been idle for DIFS. If the channel is busy, the station draws a
 number of slots from 0 to the contention window. It counts a slot down whenever the channel was idle for its duration,
@@ -23,7 +23,7 @@ _WORD_BITS = 32
 
 
 class CarrierSense:
-    """The backoff of all stations. `draws` has a random stream per station."""
+    """The waiting times of all stations. `draws` contains a random number stream for each station."""
 
     def __init__(self, radio: Contention, draws: Sequence[Random]) -> None:
         self.next_due = NEVER
@@ -64,7 +64,7 @@ class CarrierSense:
         self.next_due = min(self.next_due, due)
 
     def begun(self, frames: list[Frame], now: int) -> None:
-        """Let the stations that sense these frames wait. Those that are due before they sense them send all the same.
+        """Let the stations that sense these frames wait. Stations that are due earlier send nevertheless.
 
         This runs for each frame and each waiting station, so it counts the slots itself.
         """
@@ -126,7 +126,7 @@ class CarrierSense:
         return False
 
     def _wait_for_longer(self, stations: int, now: int) -> None:
-        """Let these stations wait for EIFS from now on in place of DIFS."""
+        """Let these stations wait for the longer interval EIFS instead of DIFS from now on."""
         early, late = now + self._difs, now + self._eifs
         for station in (*self._due, *self._resting):
             if stations >> station & 1 and self._from[station] == early:
@@ -139,7 +139,7 @@ class CarrierSense:
         self.next_due = min(self._due.values(), default=NEVER)
 
     def _counted(self, station: int, now: int) -> int:
-        """Count down the slots that have passed, and return the number of slots left."""
+        """Count down the slots that have passed, and return the number of remaining slots."""
         left = self._left[station]
         if left and now > self._from[station]:
             passed = (now - self._from[station]) // self._slot
@@ -151,7 +151,7 @@ class CarrierSense:
         return self._draws[station].getrandbits(_WORD_BITS) * self._choices >> _WORD_BITS
 
     def _busy_until(self, station: int, now: int, active: Iterable[Frame]) -> int:
-        """Return when the frames end that the station senses now; 0 if there are none."""
+        """Return the time at which the frames end that the station senses now, or 0 if there are none."""
         began_by = now - self._sense
         return max(
             (frame.ends_ns for frame in active if frame.sensed >> station & 1 and frame.begins_ns <= began_by),
@@ -159,7 +159,9 @@ class CarrierSense:
         )
 
     def _idle_from(self, station: int, now: int) -> int:
-        """Return when the channel has been idle for long enough, after the last frame that the station sensed."""
+        """Return the time at which the channel has been idle long enough after the last frame that the station
+        sensed.
+        """
         for frame in reversed(self._over):
             if frame.sensed >> station & 1:
                 failed = frame.receiving & frame.disturbed

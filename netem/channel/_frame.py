@@ -1,4 +1,4 @@
-"""A frame, from its way into the queue to its end on the air."""
+"""Represent a frame, from the queue of its sender to the end of its transmission."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from netem.channel._parameters import NANOSECONDS
 
 
 class Fate(StrEnum):
-    """The fate of a frame at one receiver. A frame with one of the last two was never sent."""
+    """The result of a frame at one receiver. A frame with one of the last two results was never sent."""
 
     RECEIVED = "received"
     COLLISION = "collision"
@@ -54,7 +54,7 @@ class Frame:
 
     @property
     def sensed(self) -> int:
-        """Stations for which this frame makes the channel busy."""
+        """The stations for which this frame makes the channel busy."""
         return self.receiving | self.disturbed | self.reach.energetic | self.summed
 
     @property
@@ -67,7 +67,7 @@ class Frame:
 
 
 class Transmission:
-    """A frame whose transmission has ended, with its fate at each receiver."""
+    """A frame whose transmission has ended, with its result at each receiver."""
 
     __slots__ = ("_frame",)
 
@@ -76,7 +76,7 @@ class Transmission:
 
     @property
     def number(self) -> int:
-        """The number that `Channel.send` returned."""
+        """The number that `Channel.send` returned for the message."""
         return self._frame.number
 
     @property
@@ -89,7 +89,7 @@ class Transmission:
 
     @property
     def queued_at(self) -> float:
-        """When `Channel.send` was called, in seconds."""
+        """The time in seconds at which `Channel.send` was called."""
         return self._frame.queued_ns / NANOSECONDS
 
     @property
@@ -102,11 +102,11 @@ class Transmission:
 
     @property
     def received(self) -> int:
-        """The receivers that got the frame, as bits: receiver 0 is the lowest bit."""
+        """The receivers that received the frame, as bits. Receiver 0 is the lowest bit."""
         return self._frame.received
 
     def lost(self) -> dict[Fate, int]:
-        """Return the receivers that lost the frame, as bits, by fate."""
+        """Return the receivers that lost the frame, as bits, by the reason."""
         frame, reach = self._frame, self._frame.reach
         lost = {
             Fate.COLLISION: frame.collided,
@@ -118,7 +118,7 @@ class Transmission:
         return {fate: receivers for fate, receivers in lost.items() if receivers}
 
     def fate(self, receiver: int) -> Fate:
-        """Return the fate of the frame at this receiver, which is not the sender."""
+        """Return the result of the frame at this receiver, which must not be the sender."""
         bit = 1 << receiver
         return next((fate for fate, receivers in self.lost().items() if receivers & bit), Fate.RECEIVED)
 

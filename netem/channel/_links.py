@@ -1,4 +1,4 @@
-"""The power with which each vehicle hears each other one: path loss over the distance, and shadowing.
+"""Compute the power with which each vehicle receives each other one, from path loss over distance and from shadowing.
 
 Shadowing is a normal deviation in decibels, equal in both directions of a link. It is correlated: after a vehicle has
 moved, or after some time, a part of the old deviation remains (Gudmundson, Correlation Model for Shadow Fading in
@@ -40,7 +40,7 @@ _LIGHT_M_PER_S = 299_792_458.0
 
 @cache
 def linear(centibels: int) -> float:
-    """Return the power of this level in 0.01 dB, relative to 10^-6 of level 0."""
+    """Convert a level in 0.01 dB to a power, relative to 10^-6 of level 0."""
     if centibels < _SILENT // 2:
         return 0.0
     tens, step = divmod(centibels, 1000)
@@ -49,13 +49,15 @@ def linear(centibels: int) -> float:
 
 @cache
 def _deviations(shadowing_db: float) -> list[int]:
-    """Return equally probable normal deviations in 0.01 dB."""
+    """Return equally probable values of a normal distribution in 0.01 dB."""
     return [round(100 * shadowing_db * quantile / SCALE) for quantile in table("normal", _TABLE_SIZE)]
 
 
 @dataclass(slots=True)
 class Reach:
-    """How a frame of one sender arrives at each receiver. Sets of receivers are bits: receiver 0 is the lowest bit."""
+    """The reception of one sender's frames at each receiver. Sets of receivers are bits. Receiver 0 is the lowest
+    bit.
+    """
 
     levels: list[int]
     """Powers in 0.01 dB."""
@@ -73,7 +75,7 @@ class Reach:
 
     @property
     def powers(self) -> list[float]:
-        """The power at each receiver. Only frames that overlap need it."""
+        """The power at each receiver. It is computed only if frames overlap."""
         if self._powers is None:
             self._powers = [linear(level) for level in self.levels]
         return self._powers
@@ -81,7 +83,7 @@ class Reach:
 
 @dataclass(slots=True)
 class _Mean:
-    """How frames of one sender arrive without shadowing."""
+    """The reception of one sender's frames without shadowing."""
 
     levels: list[int]
     near: int
@@ -93,7 +95,7 @@ class _Mean:
 
 
 class Links:
-    """The links between `count` vehicles, which are at one place until the first call of `move`."""
+    """The links between `count` vehicles. All vehicles are at the same place until `move` is called."""
 
     def __init__(self, count: int, radio: Radio, energy_dbm: float, draws: Random) -> None:
         self._count = count
@@ -122,7 +124,7 @@ class Links:
             self._shift(None)
 
     def move(self, places: Sequence[Place]) -> None:
-        """Put the vehicles at these places."""
+        """Set the positions of the vehicles."""
         moved = [number for number, place in enumerate(places) if place != self._places[number]]
         if not moved:
             return
@@ -134,7 +136,7 @@ class Links:
         self._forget()
 
     def tune(self, groups: Sequence[int]) -> None:
-        """Let only vehicles with the same number in `groups` hear and disturb each other."""
+        """Let only vehicles with the same number in `groups` affect each other."""
         self._group = list(groups)
         self._forget()
 
@@ -143,7 +145,7 @@ class Links:
         self._reaches = [None] * self._count
 
     def reach(self, sender: int, now_ns: int) -> Reach:
-        """Return how a frame arrives that `sender` begins to send now."""
+        """Return the reception of a frame that `sender` begins to send now."""
         if self._each_frame:
             return self._computed(sender, self._drawn(self._count))
         if self._correlated and now_ns >= self._ages_at:
@@ -184,7 +186,8 @@ class Links:
         return _Mean(levels, near, far, cut)
 
     def _path_loss(self, one: Place, other: Place) -> int:
-        """Return the path loss: log-distance, or over a flat ground whichever of the two is greater.
+        """Return the path loss between two places: that of the log-distance model or of a flat ground, whichever is
+        greater.
 
         Two rays: Rappaport, Wireless Communications, 2nd ed., eq. 4.52, far from the antennas.
         """
@@ -199,14 +202,14 @@ class Links:
         return _centibels(loss_db)
 
     def _age(self, now_ns: int) -> None:
-        """Change the shadowing by the time and the movement since its last change."""
+        """Change the shadowing according to the time and the movement since its last change."""
         elapsed_s = (now_ns - self._shadowed_at) / NANOSECONDS
         self._shadowed_at = now_ns
         self._ages_at = now_ns + nanoseconds(STEP * self._radio.shadowing_s)
         self._shift(elapsed_s / self._radio.shadowing_s)
 
     def _shift(self, exponent: float | None) -> None:
-        """Draw the shadowing again. Without an exponent, nothing of the old shadowing remains."""
+        """Draw random numbers for the shadowing again. Without an exponent, nothing of the old shadowing remains."""
         shadow, moved_m = self._shadow, self._moved_m
         known = -1.0
         kept = rest = 0.0
@@ -224,7 +227,7 @@ class Links:
         self._reaches = [None] * self._count
 
     def _drawn(self, count: int) -> list[int]:
-        """Draw normal deviations in 0.01 dB."""
+        """Draw values of a normal distribution in 0.01 dB."""
         words = array("H", self._draws.randbytes(2 * count))
         if sys.byteorder == "big":
             words.byteswap()

@@ -1,4 +1,4 @@
-"""The figures of a radio: power and reception, the form of its frames, and the rule by which it accesses the channel.
+"""Define the properties of radios: power, reception, the form of frames, and the rule for access to the channel.
 
 Each kind of radio is a class. Its fields are the keys of `network.channel` in a scenario, with the unit in the name.
 Times are seconds here. The model counts nanoseconds, because equal times must compare as equal: two stations collide
@@ -23,7 +23,7 @@ MAX_BYTES = 65_507
 
 @dataclass(frozen=True, kw_only=True)
 class Radio:
-    """The figures that all kinds have in common."""
+    """The properties that all kinds of radio have."""
 
     power_dbm: float
     sensitivity_dbm: float
@@ -47,13 +47,15 @@ class Radio:
             _check(field.name, getattr(self, field.name))
 
     def airtime_ns(self, data_bytes: int) -> int:
-        """Return the time that a message with this number of data bytes occupies the channel, in nanoseconds."""
+        """Return the time in nanoseconds for which a message with this number of data bytes occupies the channel."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
 class Contention(Radio):
-    """An IEEE 802.11 radio that broadcasts: carrier sense and a random backoff, no acknowledgement and no retry."""
+    """An IEEE 802.11 radio for broadcasts, with carrier sense and random waiting times, without acknowledgements or
+    retries.
+    """
 
     rate_bps: float
     preamble_s: float
@@ -82,7 +84,7 @@ class Contention(Radio):
 
 @dataclass(frozen=True, kw_only=True)
 class Turns(Radio):
-    """A telemetry radio with time slots. The vehicles transmit one after the other, each in its own slot."""
+    """A telemetry radio with time slots. The vehicles send one after another, each in its own slot."""
 
     rate_bps: float
     preamble_s: float
@@ -104,7 +106,7 @@ class Turns(Radio):
 
 @dataclass(frozen=True, kw_only=True)
 class Chirps(Radio):
-    """A LoRa radio. It transmits at once, without carrier sense, as often as its duty cycle allows."""
+    """A LoRa radio. It sends at once, without carrier sense, as often as its duty cycle allows."""
 
     spreading_factor: int
     bandwidth_hz: float
@@ -113,7 +115,8 @@ class Chirps(Radio):
     duty: float
 
     def airtime_ns(self, data_bytes: int) -> int:
-        """Return the airtime with explicit header and CRC (Semtech, SX1276 data sheet, rev. 7, 4.1.1.6 and 4.1.1.7).
+        """Return the sending time in nanoseconds with explicit header and CRC (Semtech, SX1276 data sheet, rev. 7,
+        4.1.1.6 and 4.1.1.7).
 
         The low data rate optimisation is on if a symbol is longer than 16 ms, as the data sheet demands.
         """

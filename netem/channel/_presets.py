@@ -1,4 +1,4 @@
-"""Radios with the figures of standards and data sheets."""
+"""Define radios with properties from standards and data sheets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table of attacks on a secured mission. Each row is played in virtual time.
+"""Generate the table of attacks on a secured mission. Each attack is played in virtual time.
 
 `python -m docs.generate.threats` plays all rows, and writes the table into docs/explanation/security.md.
 """

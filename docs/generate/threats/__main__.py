@@ -1,4 +1,4 @@
-"""`python -m docs.generate.threats`: play all attacks, and write the table into docs/explanation/security.md."""
+"""Play all attacks, and write the table in docs/explanation/security.md: `python -m docs.generate.threats`."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The rows of the table: attacker, attack, and the scenario in which the attack is played."""
+"""List the rows of the table: the attacker, the attack, and the scenario that plays it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ LOST_S, REVOKED_S, ATTACK_S = 100, 200, 300
 
 @dataclass(frozen=True)
 class Row:
-    """One attack. `attack` has entries of the timeline without their times.
+    """One attack. `attack` contains timeline entries without their times.
 
     With `captured` the attacker has the keys of vehicle 3. With `revoked` these keys are revoked before the attack.
     `quirks` are wrong handlers of vehicle 3. `own` replaces keys of the scenario.
@@ -28,7 +28,7 @@ class Row:
 
     @property
     def scenario(self) -> Scenario:
-        """Five agents with keys, for ten minutes, and a final reconcile."""
+        """Return the scenario: five agents with keys, ten minutes, and a final reconcile."""
         timeline: list[dict[str, Any]] = []
         if self.captured:
             timeline.append({"at_s": LOST_S, "kill": [CAPTURED]})

@@ -1,4 +1,4 @@
-"""Play an attack, and report the violated characteristics and the reasons of dropped datagrams."""
+"""Play an attack, and report the violated characteristics and the reasons for dropped datagrams."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -21,14 +21,14 @@ SWARM = 0
 
 @dataclass(frozen=True)
 class Outcome:
-    """The mark of each characteristic, and the reasons of dropped datagrams, most frequent first."""
+    """The verdict on each characteristic, and the reasons for dropped datagrams. The most frequent is first."""
 
     marks: dict[str, str]
     dropped: list[str]
 
 
 def outcome(row: Row) -> Outcome:
-    """Return the combined outcome of all seeds."""
+    """Return the combined result of all seeds."""
     guilty: dict[str, set[int]] = {key: set() for key in CHARACTERISTICS}
     dropped = Counter[str]()
     for seed in SEEDS:

@@ -1,4 +1,5 @@
-"""Wrong agents at play: what finds each quirk, how often, how soon, and whether it names the handler that is wrong.
+"""Measure which check detects which deliberate error of agents, how often and how soon, and whether it names the wrong
+handler.
 
 wrong_trial.py          one run of a wrong swarm: which judgements are bad, since when, which handler is named
 trials_page.py    ../../appendix/wrong-agents.md: a row for each quirk, from many runs

@@ -1,4 +1,5 @@
-"""`python -m docs.generate.wrong_agents.at_the_desk [QUIRK ...]`: find wrong agents in traces with `replay`.
+"""Find agents with deliberate errors by `replay` of their traces: `python -m docs.generate.wrong_agents.at_the_desk
+[QUIRK ...]`.
 
 The agents run as processes. The rows of these quirks, or of all, are written into docs/appendix/wrong-agents-field.md.
 The text of the page is written by hand.
@@ -38,7 +39,7 @@ HEADER = "| quirk | Algorithm | named first | correct | minutes | runs | differe
 
 @dataclass(frozen=True)
 class Named:
-    """The first difference of a record. `handler` is None if the difference belongs to no handler."""
+    """The first difference in a record. `handler` is None if the difference belongs to no handler."""
 
     t: float
     handler: str | None
@@ -47,7 +48,7 @@ class Named:
 
 @dataclass(frozen=True)
 class AtTheDesk:
-    """The first difference of each record of the last run. Records without a difference have none."""
+    """The first difference in each record of the last run. Records without a difference are not included."""
 
     runs: int
     records: int
@@ -55,7 +56,7 @@ class AtTheDesk:
 
 
 def at_the_desk(quirk: str) -> AtTheDesk:
-    """Run until a record differs, at most `MOST_RUNS` times."""
+    """Play runs until a record differs, at most `MOST_RUNS` times."""
     value = PROBABILITY if QUIRKS[quirk].chance else True
     scenario = load_scenario(MISSION).model_copy(update={"quirks": {quirk: value}})
     records, named = 0, list[Named]()
@@ -105,7 +106,7 @@ def _is_of(handler: str | None, quirk: str) -> bool:
 
 
 def main(names: Sequence[str]) -> None:
-    """Run these quirks, or all if none is named. The rows of other quirks stay the same."""
+    """Test these deliberate errors, or all if none is named. Other table rows stay the same."""
     with sweep(list(names or QUIRKS), at_the_desk, JOBS, what="quirks", in_order=False) as outcomes:
         for quirk, brought in outcomes:
             if isinstance(brought, FailedTask):

@@ -1,4 +1,5 @@
-"""`python -m docs.generate.wrong_agents.conformance_page [QUIRK ...]`: test wrong agents with the conformance cases.
+"""Test agents with deliberate errors with the conformance test: `python -m docs.generate.wrong_agents.conformance_page
+[QUIRK ...]`.
 
 The vectors are played in virtual time. This compares the same outputs as UDP, and the expiry of the next timer. An
 agent that passes them also plays the handwritten cases over UDP. The rows of these quirks, or of all, are written into
@@ -34,7 +35,7 @@ ALIKE = {
 
 
 def test(quirk: str) -> Results:
-    """Raises HarnessError."""
+    """Run the conformance test for an agent with this error, and return the results. Raises HarnessError."""
     command = (sys.executable, "-P", "-m", quirky.__name__, quirk)
     with TemporaryDirectory(prefix="ucp-conformance-") as place:
         results = conform(ConformanceRequest(command, None, None, virtual=True), Path(place), _no_progress, _vectors())
@@ -51,12 +52,12 @@ def _no_progress(count: int, total: int) -> None:
 
 @cache
 def _vectors() -> list[VectorSet]:
-    """Return the vectors of the default settings."""
+    """Return the generated tests for the default settings."""
     return generate()[:1]
 
 
 def row(quirk: str, results: Results) -> str:
-    """Return a line of the table, with the named Algorithms and their number of failures."""
+    """Return a line of the table: the accused Algorithms with their number of failures."""
     about = QUIRKS[quirk]
     named = Counter(case.algorithm for case in results.failures)
     words = ", ".join(f"{algorithm or 'program'} ({count})" for algorithm, count in named.most_common())
@@ -74,7 +75,7 @@ def row(quirk: str, results: Results) -> str:
 
 
 def main(names: Sequence[str]) -> None:
-    """Test these quirks, or all if none is named. The rows of other quirks stay the same."""
+    """Test these deliberate errors, or all if none is named. Other table rows stay the same."""
     for quirk in names or QUIRKS:
         began = time.monotonic()
         try:

@@ -1,4 +1,5 @@
-"""A wrong agent as a program: `python -m docs.generate.wrong_agents.quirky QUIRK MISSION_FILE`, or `QUIRK --virtual`.
+"""Run an agent with a deliberate error: `python -m docs.generate.wrong_agents.quirky QUIRK MISSION_FILE`, or `QUIRK
+--virtual`.
 
 It is `python -m ucp.node`, and adds this quirk to every mission.
 """
@@ -17,14 +18,14 @@ PROBABILITY = 0.2
 
 
 def wrong(mission: dict[str, Any], quirk: str) -> dict[str, Any]:
-    """Return the mission with this quirk."""
+    """Return the mission file with this deliberate error."""
     quirks = {**mission.get("quirks", {}), quirk: PROBABILITY if QUIRKS[quirk].chance else True}
     features = list(dict.fromkeys([*mission.get("features", []), "quirks"]))
     return {**mission, "quirks": quirks, "features": features}
 
 
 class _Lines:
-    """Standard input of an agent in virtual time. Adds the quirk to each mission."""
+    """Standard input of an agent in virtual time, with the deliberate error added to each mission."""
 
     def __init__(self, quirk: str) -> None:
         self._quirk = quirk

@@ -1,5 +1,5 @@
-"""`python -m docs.generate.wrong_agents.trials_page [QUIRK ...]`: play all wrong agents, or some, and write the
-table of docs/appendix/wrong-agents.md.
+"""Play agents with deliberate errors, and write the table in docs/appendix/wrong-agents.md: `python -m
+docs.generate.wrong_agents.trials_page [QUIRK ...]`.
 
 The table comes from many runs of each quirk. A finding counts only if the correct agent does not have it in the same
 mission. The text around the table is written by hand.
@@ -30,16 +30,16 @@ HEADER = (
 )
 
 Trials = dict[int, Trial]
-"""By seed."""
+"""The right trial of each seed."""
 
 
 def findings_of(wrong: Trial, right: Trial) -> dict[str, float | None]:
-    """Return the findings of the wrong swarm that the correct one does not have in the same mission."""
+    """Return the findings for the wrong swarm that the correct swarm in the same mission does not have."""
     return {key: first_s for key, first_s in wrong.bad.items() if key not in right.bad}
 
 
 def row(quirk: str, wrong: Trials, right: Trials) -> str:
-    """Return a line of the table: the checks that find the quirk, how often, and when."""
+    """Return a line of the table: the checks that detect the error, how often, and when."""
     about = QUIRKS[quirk]
     findings = {seed: findings_of(trial, right[seed]) for seed, trial in wrong.items()}
     counts = Counter(key for finding in findings.values() for key in finding)
@@ -64,7 +64,7 @@ def row(quirk: str, wrong: Trials, right: Trials) -> str:
 
 
 def first_found(seed: int, finding: dict[str, float | None]) -> str:
-    """Return the first seed that finds the quirk, and its checks, such as "seed 2: steps, 2"."""
+    """Return the first seed that shows the error, and its checks, such as "seed 2: steps, 2"."""
     return f"seed {seed}: {', '.join(sorted(finding, reverse=True))}"
 
 
@@ -73,14 +73,14 @@ def _most_first(counted: tuple[str, int]) -> tuple[int, str]:
 
 
 def rows_of(page: str) -> dict[str, str]:
-    """Return the rows of the page's table, by quirk."""
+    """Return the rows of the page's table by the name of the error."""
     table = page.split(BEGIN)[1].split(END)[0]
     lines = [line for line in table.splitlines(keepends=True) if line.startswith("| `")]
     return {line.split("`")[1]: line for line in lines}
 
 
 def main(names: Sequence[str]) -> None:
-    """Play these quirks, or all if none is named. The rows of other quirks stay the same."""
+    """Play these deliberate errors, or all if none is named. Other table rows stay the same."""
     played: dict[str | None, Trials] = {}
     tasks = list(product([None, *(names or QUIRKS)], SEEDS))
     with sweep(tasks, lambda task: play(*task), cores(), what="runs") as outcomes:

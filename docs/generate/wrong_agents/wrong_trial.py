@@ -1,4 +1,4 @@
-"""Run a swarm in virtual time, all of whose agents have one quirk, and judge it like any run."""
+"""Simulate and judge a swarm whose agents all have the same deliberate error."""
 
 import re
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _MOMENT = re.compile(r"\bt=(\d+(?:\.\d+)?) s")
 
 @dataclass(frozen=True)
 class Trial:
-    """The violated judgements in `bad`, each with the mission second of its earliest evidence.
+    """The bad verdicts of a run, each with the mission second of its earliest evidence.
 
     The second is None if the evidence has no time. `named` is the handler that the step check names first.
     """
@@ -41,7 +41,7 @@ def mission(seed: int) -> Scenario:
 
 
 def play(quirk: str | None, seed: int) -> Trial:
-    """Play a run with this quirk, or with the correct agent if None."""
+    """Play and judge a run with this deliberate error, or with correct agents if it is None."""
     value = {quirk: PROBABILITY if QUIRKS[quirk].chance else True} if quirk else {}
     return judged(simulate(mission(seed).model_copy(update={"quirks": value}), seed, tracing=True).result)
 
