@@ -51,7 +51,9 @@ def _dataclass(
         else:
             content |= {name: options["default"] for name, options in fields.items() if "default" in options}
         content |= _methods(fields, frozen=frozen, eq=eq, then="__post_init__" in content)
-        if eq and not (frozen or unsafe_hash):
+        if vars(plain).get("__hash__") is not None:
+            content["__hash__"] = vars(plain)["__hash__"]
+        elif eq and not (frozen or unsafe_hash):
             content["__hash__"] = None
         content["__match_args__"] = tuple(name for name, options in fields.items() if options.get("init", True))
         content["__dataclass_fields__"] = _Described(kinds, fields)

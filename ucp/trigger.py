@@ -129,7 +129,7 @@ class UnknownTrigger(Trigger):
         return dict(self.fields)
 
     def __hash__(self) -> int:
-        return hash(tuple(self.fields.items()))
+        return hash(frozenset(self.fields.items()))
 
 
 _OF_ONE_VALUE: dict[str, tuple[type, Callable[[Any], Trigger]]] = {

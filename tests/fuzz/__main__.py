@@ -1,13 +1,15 @@
-"""`python -m tests.fuzz [TARGET ...] [--seconds 60] [--random]`: give hostile input to all readers.
+"""`python -m tests.fuzz [TARGET ...] [--seconds 60] [--random] [--inputs N]`: give hostile input to all readers.
 
 `--seconds` is the time for each target. If `atheris` is installed (`pip install -e '.[test,fuzz]'`), coverage guides
 the mutations. Without it, or with `--random`, the stored inputs are mutated at random. New inputs that cover more code
-are stored in .fuzz for the next call. Failing inputs are stored in .fuzz/failures, and the exit status is then 1.
+are stored in .fuzz for the next call. `--inputs` sets the number of random inputs for each target in place of a time.
+Failing inputs are stored in .fuzz/failures, and the exit status is then 1.
 """
 
 import argparse
 import hashlib
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -35,13 +37,16 @@ def main() -> int:
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"of {', '.join(NAMES)}; all if none is named")
     parser.add_argument("--seconds", type=int, default=60, help="for each target")
     parser.add_argument("--random", action="store_true", help="no coverage guidance")
+    parser.add_argument("--inputs", type=int, help="random inputs for each target, in place of a time")
     asked = parser.parse_args()
     if unknown := [name for name in asked.targets if name not in NAMES]:
         parser.error(f"there is no target {unknown[0]}: there are {', '.join(NAMES)}")
     FAILURES.mkdir(parents=True, exist_ok=True)
-    is_guided = not asked.random and find_spec("atheris") is not None
+    is_guided = not asked.random and asked.inputs is None and find_spec("atheris") is not None
     failed = [
-        name for name in asked.targets or NAMES if not (_guided if is_guided else _at_random)(name, asked.seconds)
+        name
+        for name in asked.targets or NAMES
+        if not (_guided(name, asked.seconds) if is_guided else _at_random(name, asked.seconds, asked.inputs))
     ]
     if failed:
         sys.stdout.write(f"failed: {', '.join(failed)}; the inputs are in {FAILURES}\n")
@@ -87,12 +92,12 @@ def _where_it_hangs(running: "subprocess.Popen[bytes]") -> None:
     running.wait()
 
 
-def _at_random(name: str, seconds: int) -> bool:
-    """Fuzz a target with random mutations. Return whether no input fails."""
+def _at_random(name: str, seconds: int, limit: int | None) -> bool:
+    """Fuzz a target with random mutations for some seconds, or with `limit` inputs. Return whether no input fails."""
     target, kept = named(name), [path.read_bytes() for path in files_of(name)]
     began, inputs, problem = time.monotonic(), 0, ""
     for data in mutated(kept, seed=time.time_ns()):
-        if problem or time.monotonic() > began + seconds:
+        if problem or (time.monotonic() > began + seconds if limit is None else inputs == limit):
             break
         inputs += 1
         try:
@@ -101,7 +106,8 @@ def _at_random(name: str, seconds: int) -> bool:
             failed = FAILURES / f"{name}-crash-{hashlib.sha1(data, usedforsecurity=False).hexdigest()}"
             failed.write_bytes(data)
             problem = f"{failed}: {traceback.format_exc()}"
-    _tell(name, inputs, time.monotonic() - began, "at random", problem)
+    largest_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+    _tell(name, inputs, time.monotonic() - began, f"at random, at most {largest_mib} MiB", problem)
     return not problem
 
 

@@ -57,6 +57,7 @@ def test_triggers_of_different_kinds_differ() -> None:
 def test_invalid_trigger_is_kept_as_unknown_trigger(fields: dict[str, Any]) -> None:
     trigger = parse(fields)
     assert isinstance(trigger, UnknownTrigger)
+    assert hash(trigger) == hash(UnknownTrigger(dict(reversed(trigger.fields.items()))))
     assert trigger.to_json() == fields
 
 
