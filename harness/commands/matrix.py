@@ -8,7 +8,7 @@ import typer
 from harness.archive.directory import default_path
 from harness.backend_names import BackendName
 from harness.commands._shared_options import complete_scenario
-from harness.commands.terminal import complain, end_sweep, print_json, print_lines
+from harness.commands.terminal import StatusLine, complain, end_sweep, print_json, print_lines
 from harness.errors import INTERRUPTED
 from harness.play.variant import Variant, load_variant
 from harness.run.parallel import cores
@@ -16,7 +16,7 @@ from harness.run.variant_in_force import in_force
 from harness.sweep import matrix
 from harness.sweep.matrix import matrix_outputs, matrix_summary, matrix_table
 from harness.sweep.matrix import nights as nights_of_matrix
-from harness.sweep.matrix.matrix_run import Spread, compare_with, on_cluster, on_cores
+from harness.sweep.matrix.matrix_run import Spread, compare_with, name_changes, name_culprits, on_cluster, on_cores
 from harness.sweep.matrix.nights import load_baseline
 from harness.sweep.matrix.variant_comparison import compare_runs
 from ucp.agent_files import write_atomically, write_json_atomically
@@ -54,6 +54,10 @@ def matrix_command(
         Path | None,
         typer.Option(metavar="DIR", help="Keep this night in DIR, and draw the trend of all nights in it."),
     ] = None,
+    bisect: Annotated[
+        float | None,
+        typer.Option(min=0, metavar="MINUTES", help="Find the commits of worse figures, for at most this time."),
+    ] = None,
 ) -> None:
     """Play a scenario over loss rates, swarm sizes and many seeds.
 
@@ -71,6 +75,8 @@ def matrix_command(
     directory = (out or default_path(request.name)).absolute()
     if variant is not None and (against, nights, scheduler, coverage) != (None, None, None, False):
         raise typer.BadParameter("--variant excludes --against, --nights, --scheduler and --coverage: leave them out")
+    if bisect is not None and against is None:
+        raise typer.BadParameter("--bisect needs --against: it searches the commits since the baseline")
     if scheduler is None:
         spread = on_cores(request, jobs or cores(), shown=True)
     else:
@@ -79,7 +85,10 @@ def matrix_command(
         _compare_with_variant(request, load_variant(variant), directory, spread, as_json)
     finished = matrix.run_matrix(request, directory, spread, covers=coverage)
     if baseline is not None:
-        finished = compare_with(finished, baseline)
+        finished = name_changes(compare_with(finished, baseline), baseline, jobs or cores())
+        if bisect is not None:
+            with StatusLine() as status:
+                finished = name_culprits(finished, baseline, 60 * bisect, status.show)
     earlier = None
     if nights_directory is not None:
         nights_of_matrix.keep(finished.record, nights_directory)

@@ -37,6 +37,8 @@ class Run(AtPoint):
     seed: int
     figures: dict[str, float | int | None] = {}
     verdicts: dict[str, Verdict] = {}
+    steps: str = ""
+    """The fingerprint of its handler runs, in virtual time with traces. See `_run_steps`."""
     failed: str | None = None
     unsupported: str | None = None
     reached: Annotated[Any, Field(exclude=True)] = None

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from harness.archive.archive import RunArchive
 from harness.checker import Result, gather
@@ -19,8 +20,18 @@ from harness.scenario import Scenario
 from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._growth_metrics import growth_figures
 from harness.sweep.matrix._matrix_file import Matrix, Point, Task
+from harness.sweep.matrix._run_steps import fingerprint
 
-Judge = Callable[[Scenario, int], tuple[RunOutcome, Result]]
+
+class Judged(NamedTuple):
+    """A judged run. `steps` is its fingerprint, empty without traces."""
+
+    played: RunOutcome
+    result: Result
+    steps: str = ""
+
+
+Judge = Callable[[Scenario, int], Judged]
 """Plays a scenario with a seed and judges the run."""
 
 
@@ -31,21 +42,21 @@ class RunFailedError(HarnessError):
 
 
 @gc_paused()
-def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> tuple[RunOutcome, Result]:
+def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> Judged:
     """Simulate a run in virtual time, and judge it. Every step is judged if `tracing` is true."""
     from harness.run.simulate import simulate
 
     run = simulate(scenario, seed, tracing=tracing)
-    return run.played, run.result
+    return Judged(run.played, run.result, fingerprint(run.evidence.traces))
 
 
 @gc_paused()
-def play_with_coverage(scenario: Scenario, seed: int, reached: Reached) -> tuple[RunOutcome, Result]:
+def play_with_coverage(scenario: Scenario, seed: int, reached: Reached) -> Judged:
     """Simulate a run with traces, and add its coverage to `reached`."""
     watcher = Watcher()
     run = simulate_watched(scenario, seed, watcher.step)
     reached.add(watcher.reached)
-    return run.played, run.result
+    return Judged(run.played, run.result, fingerprint(run.evidence.traces))
 
 
 def _same_twice(scenario: Scenario, seed: int) -> None:
@@ -74,18 +85,25 @@ class Player:
                 _same_twice(scenario, task.seed)
             reached = Reached() if self.covers else None
             if not in_memory:
-                played, result = self._play_with_processes(scenario, task, reached)
+                judged = self._play_with_processes(scenario, task, reached)
             elif reached is not None:
-                played, result = play_with_coverage(scenario, task.seed, reached)
+                judged = play_with_coverage(scenario, task.seed, reached)
             else:
-                played, result = self.judge(scenario, task.seed)
+                judged = self.judge(scenario, task.seed)
         except UnsupportedError as error:
             return Run(**task.point._asdict(), seed=task.seed, unsupported=str(error))
-        verdicts = {key: judgement.verdict for key, judgement in result.judgements.items()}
-        figures = dict(result.figures)
+        verdicts = {key: judgement.verdict for key, judgement in judged.result.judgements.items()}
+        figures = dict(judged.result.figures)
         if self.matrix.grows:
-            figures |= growth_figures(scenario, played.mission_s, figures)
-        return Run(**task.point._asdict(), seed=task.seed, figures=figures, verdicts=verdicts, reached=reached)
+            figures |= growth_figures(scenario, judged.played.mission_s, figures)
+        return Run(
+            **task.point._asdict(),
+            seed=task.seed,
+            figures=figures,
+            verdicts=verdicts,
+            steps=judged.steps,
+            reached=reached,
+        )
 
     def refuse(self, points: Iterable[Point]) -> None:
         """Check before the first run that all combinations of values can be played.
@@ -95,9 +113,7 @@ class Player:
         for point in points:
             BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))
 
-    def _play_with_processes(
-        self, scenario: Scenario, task: Task, reached: Reached | None
-    ) -> tuple[RunOutcome, Result]:
+    def _play_with_processes(self, scenario: Scenario, task: Task, reached: Reached | None) -> Judged:
         """Play a run with real programs. Raises UnsupportedError, or RunFailedError that names the run directory."""
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # remains of an interrupted run
@@ -115,7 +131,7 @@ class Player:
             reached.add(reached_in(gather(RunArchive(directory))))
         if not finished.result.bad and self.matrix.keep == "violated":
             shutil.rmtree(directory)
-        return finished.played, finished.result
+        return Judged(finished.played, finished.result)
 
 
 def directory_name(task: Task) -> str:

@@ -13,12 +13,13 @@ The metric states which direction is worse.
 
 from collections.abc import Iterator, Sequence
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from harness.play.backends import BACKENDS
 from harness.sweep.matrix._cell import AtPoint, Cell, Run
 from harness.sweep.matrix._estimate import BY_NAME, CONFIDENCE, Estimate, Metric, estimate_mean
 from harness.sweep.matrix._matrix_file import Point
+from harness.sweep.matrix._run_steps import FirstChange
 
 
 class Change(AtPoint):
@@ -36,10 +37,37 @@ class Change(AtPoint):
 
 
 class ChangedRuns(AtPoint):
-    """The seeds of the simulated runs that differ from the earlier night, among `pairs` compared runs."""
+    """The seeds of the simulated runs that differ from the earlier night, among `pairs` compared runs.
+
+    `first` has the first changed handler run of the first `MAX_NAMED` of them.
+    """
 
     pairs: int
     seeds: list[int]
+    first: list[FirstChange] = Field(default_factory=list)
+
+
+class CulpritCommit(BaseModel):
+    """A commit, and the figure of the run before and after it."""
+
+    hash: str
+    date: str
+    author: str
+    subject: str
+    before: float | None
+    after: float | None
+
+
+class Culprit(AtPoint):
+    """The commits that changed a worse figure of the run with this seed, oldest first.
+
+    `problem` is the reason why the search did not find all of them, or null.
+    """
+
+    metric: str
+    seed: int
+    commits: list[CulpritCommit] = Field(default_factory=list)
+    problem: str | None = None
 
 
 class Comparison(BaseModel):
@@ -51,9 +79,13 @@ class Comparison(BaseModel):
 
     baseline: str
     started_at: str | None = None
+    baseline_commit: str | None = None
+    """The commit of the code of that night, or null if it is unknown."""
     cells: int = 0
     changes: list[Change]
     changed_runs: list[ChangedRuns] = []
+    culprits: list[Culprit] = []
+    """The commits of worse figures, if a search was requested."""
     not_compared: list[str] = []
     """A sentence for each difference of the two matrices because of which cells are not compared."""
 
@@ -106,11 +138,17 @@ def compare_pairs(
         ChangedRuns(
             **point._asdict(),
             pairs=len(its_pairs),
-            seeds=[run.seed for was, run in its_pairs if (was.figures, was.verdicts) != (run.figures, run.verdicts)],
+            seeds=[run.seed for was, run in its_pairs if _differ(was, run)],
         )
         for point, its_pairs in pairs.items()
     ]
     return changes, [each for each in changed if each.seeds]
+
+
+def _differ(was: Run, run: Run) -> bool:
+    """Return true if the runs differ. Without two fingerprints, only figures and verdicts are compared."""
+    steps_differ = bool(was.steps and run.steps) and was.steps != run.steps
+    return steps_differ or (was.figures, was.verdicts) != (run.figures, run.verdicts)
 
 
 def is_paired(point: Point) -> bool:

@@ -3,7 +3,7 @@
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,16 +17,22 @@ from harness.sweep.matrix._cell import Run, sum_up
 from harness.sweep.matrix._cell_play import Judge, Player, simulated
 from harness.sweep.matrix._cluster import cluster
 from harness.sweep.matrix._comparison import Comparison, compare, compare_pairs, is_paired
+from harness.sweep.matrix._culprits import find_culprits
 from harness.sweep.matrix._growth import growths
 from harness.sweep.matrix._matrix_coverage import CoverageTally
 from harness.sweep.matrix._matrix_file import Matrix, Point, Task
 from harness.sweep.matrix._results_file import Results, opened
+from harness.sweep.matrix._run_steps import FirstChange, first_changed, name_change
 from harness.sweep.matrix.matrix_record import MatrixRecord, RunWithoutResult
 from harness.sweep.matrix.nights import Baseline
 
 Outcomes = Iterator[tuple[Task, Run | FailedTask]]
 Spread = Callable[[Sequence[Task], Callable[[Task], Run]], AbstractContextManager[Outcomes]]
 """Distributes tasks, and yields their outcomes in order of completion."""
+
+
+MAX_NAMED = 50
+"""Number of changed runs in a cell whose first changed handler run is named."""
 
 
 @dataclass(frozen=True)
@@ -136,12 +142,54 @@ def compare_with(finished: Finished, baseline: Baseline) -> Finished:
     comparison = Comparison(
         baseline=str(baseline.path),
         started_at=baseline.record.started_at,
+        baseline_commit=baseline.record.versions.get("commit"),
         cells=len(baseline.points),
         changes=[*changes_in_pairs, *changes],
         changed_runs=changed_runs,
         not_compared=baseline.not_compared,
     )
     return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
+
+
+def name_changes(finished: Finished, baseline: Baseline, jobs: int) -> Finished:
+    """Return the results together with the first changed handler run of each changed run, at most MAX_NAMED per cell.
+
+    The runs are played again. Ctrl-C ends this search; the remaining changes then have no name.
+    """
+    comparison, earlier = finished.record.against, baseline.record
+    if comparison is None or earlier is None:
+        return finished
+    before, now = ({run.task: run.steps for run in record.results} for record in (earlier, finished.record))
+    tasks = [Task(each.point, seed) for each in comparison.changed_runs for seed in each.seeds[:MAX_NAMED]]
+    tasks = [task for task in tasks if before.get(task) and now.get(task)]
+
+    def name(task: Task) -> FirstChange | None:
+        position = first_changed(before[task], now[task])
+        return (
+            None
+            if position is None
+            else name_change(finished.record.matrix.scenario_at(task.point), task.seed, position)
+        )
+
+    named: dict[Point, list[FirstChange]] = defaultdict(list)
+    with suppress(KeyboardInterrupt), sweep(tasks, name, jobs, what="changed runs") as outcomes:
+        for task, change in outcomes:
+            if isinstance(change, FirstChange):
+                named[task.point].append(change)
+    changed = [each.model_copy(update={"first": named[each.point]}) for each in comparison.changed_runs]
+    against = comparison.model_copy(update={"changed_runs": changed})
+    return Finished(finished.record.model_copy(update={"against": against}), finished.runs)
+
+
+def name_culprits(
+    finished: Finished, baseline: Baseline, budget_s: float, report_progress: Callable[[str], None]
+) -> Finished:
+    """Return the results together with the commits that made figures worse."""
+    if finished.record.against is None or baseline.record is None:
+        return finished
+    culprits = find_culprits(finished.record, baseline.record, budget_s, report_progress)
+    against = finished.record.against.model_copy(update={"culprits": culprits})
+    return Finished(finished.record.model_copy(update={"against": against}), finished.runs)
 
 
 def _effort(scenario: Scenario) -> float:

@@ -1,5 +1,6 @@
 """Print the results of a matrix on the terminal: means with 95 % confidence intervals, laws of growth, and failures."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 
 from rich.console import Group, RenderableType
@@ -10,7 +11,7 @@ from harness.present import text as words
 from harness.scenario.verdict_names import BAD_IN_WORDS, CHARACTERISTICS
 from harness.sweep.matrix import _growth_table
 from harness.sweep.matrix._cell import Cell
-from harness.sweep.matrix._comparison import Change
+from harness.sweep.matrix._comparison import Change, ChangedRuns, Culprit
 from harness.sweep.matrix._estimate import BY_NAME, METRICS, Estimate, Metric
 from harness.sweep.matrix._matrix_file import Matrix, Point
 from harness.sweep.matrix.matrix_record import MatrixRecord
@@ -152,6 +153,9 @@ def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
     for change in record.against.regressions if record.against else ():
         if change.point == cell.point:
             yield _say_change(change)
+    for culprit in record.against.culprits if record.against else ():
+        if culprit.point == cell.point:
+            yield from _say_culprit(culprit)
 
 
 def unsupported(record: MatrixRecord, cell: Cell) -> Iterable[str]:
@@ -188,9 +192,31 @@ def changed_runs(record: MatrixRecord) -> Iterable[str]:
         plural = "s" if len(changed.seeds) > 1 else ""
         yield (
             f"{name_of(record.matrix, changed.point)}: {len(changed.seeds)} of {changed.pairs} runs differ from the "
-            f"baseline, seed{plural} {seeds}"
+            f"baseline, seed{plural} {seeds}{_first_changes(changed)}"
         )
     yield from record.against.not_compared
+
+
+def _say_culprit(culprit: Culprit) -> Iterable[str]:
+    metric = BY_NAME[culprit.metric]
+    for commit in culprit.commits:
+        after, before = ("unknown" if each is None else f"{each:.4g}" for each in (commit.after, commit.before))
+        became = f"{metric.label} of seed {culprit.seed} becomes {after}, was {before}"
+        yield f"{became}, at {commit.hash[:12]}, {commit.date}, {commit.author}: {commit.subject}"
+    if culprit.problem:
+        yield f"no further commit was found for {metric.label} of seed {culprit.seed}: {culprit.problem}"
+
+
+def _first_changes(changed: ChangedRuns) -> str:
+    """Return the handlers of the first changed handler runs, and the earliest of them."""
+    known = [each for each in changed.first if each.handler is not None]
+    if not known:
+        return ""
+    counts = Counter(each.handler for each in known).most_common()
+    handlers = ", ".join(f"{handler} ({count})" for handler, count in counts[:NAMED])
+    first = min(known, key=lambda each: each.at_s or 0.0)
+    where = f"of seed {first.seed} at {first.at_s:.1f} s, agent {first.agent_id}"
+    return f"; they differ first in {handlers}, the earliest {where}"
 
 
 def _say_change(change: Change) -> str:

@@ -1,5 +1,6 @@
 """Write the page about a matrix. The template escapes all text from scenarios, runs and earlier nights."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from markupsafe import Markup
@@ -10,6 +11,8 @@ from harness.report import html
 from harness.report.agent_programs import asked_for
 from harness.scenario.verdict_names import ALL_CHECKS
 from harness.sweep.matrix import _growth_table
+from harness.sweep.matrix._cell_scenarios import scenario_file
+from harness.sweep.matrix._comparison import ChangedRuns
 from harness.sweep.matrix._growth_picture import draw_growth
 from harness.sweep.matrix._matrix_picture import draw, series_of
 from harness.sweep.matrix.matrix_record import MatrixRecord
@@ -25,7 +28,7 @@ from harness.sweep.matrix.matrix_table import (
     unjudged,
 )
 from harness.sweep.matrix.nights import Nights
-from harness.sweep.matrix.report import _heatmap, _trend
+from harness.sweep.matrix.report import _heatmap, _night_table, _trend
 from harness.sweep.matrix.report._drilldown import drilldown
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
@@ -69,6 +72,9 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
         not_taken=record.tried.all_cells["branches"]["not_taken"] if record.tried else [],
         nights=nights,
         drawn=drawn,
+        night_columns=_night_table.columns(drawn),
+        night_rows=_night_table.rows(drawn, record),
+        changed=list(_changed(record)),
         trends=[(figure, _trend.trend(drawn, record, figure)) for figure in shown] if len(drawn) > 1 else [],
         series=series_of(record),
         picture=Markup(draw(record)),  # noqa: S704 - it escapes text from outside
@@ -76,6 +82,16 @@ def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -
         growth_table=_growth_table,
         growth_picture=Markup(draw_growth(record)) if record.matrix.grows else None,  # noqa: S704 - as above
     )
+
+
+def _changed(record: MatrixRecord) -> Iterator[tuple[str, ChangedRuns, str]]:
+    """Yield each cell with changed runs: its name, the runs, and a command that compares one of them in detail."""
+    against = record.against
+    for changed in against.changed_runs if against else ():
+        before = against.baseline_commit if against else None
+        seed = min(changed.first, key=lambda each: each.at_s or 0.0).seed if changed.first else changed.seeds[0]
+        command = f"ucp-harness bisect {scenario_file(changed.point)} --seed {seed} --good {before or 'COMMIT'}"
+        yield name_of(record.matrix, changed.point), changed, command
 
 
 def _choosing(shown: list[_heatmap.Figure]) -> str:

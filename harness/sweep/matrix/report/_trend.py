@@ -34,6 +34,7 @@ def trend(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figure: Figure)
     """Return a drawing for each number of agents and backend, with a name if there are several."""
     of_night = [{cell.point: figure.of(cell) for cell in night.cells} for night in nights]
     begun = [text.started(night.started_at)[:16] for night in nights]
+    commits = [f"commit {night.versions.get('commit', 'unknown')}" for night in nights]
     drawings = []
     for cells in series(tonight):
         cells = sorted(cells, key=lambda cell: cell.loss)
@@ -42,7 +43,7 @@ def trend(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figure: Figure)
         for cell, area in zip(cells, areas, strict=True):
             known = [(at, by_point[cell.point]) for at, by_point in enumerate(of_night) if cell.point in by_point]
             dots = [
-                Dot(at, estimate, f"{begun[at]}: {say(figure.metric, estimate)}")
+                Dot(at, estimate, f"{begun[at]}, {commits[at]}: {say(figure.metric, estimate)}")
                 for at, estimate in known
                 if _is_sane(estimate)
             ]

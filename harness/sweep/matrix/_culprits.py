@@ -1,0 +1,132 @@
+"""Find the commits that made a figure worse, by playing one run at commits between the baseline and tonight.
+
+A run in virtual time is the same each time, so one run is enough: the one whose figure changed most. A search by halves
+finds the first commit with another figure. If that figure is not yet the one of tonight, the search goes on after this
+commit. A commit that changes the run without making the figure worse is therefore named too, with the figure that it
+leaves.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from harness.archive.archive import RunArchive
+from harness.errors import HarnessError
+from harness.field.bisection import Subject, UntestableError, Workshop
+from harness.run.code_state import History, SuspectCommits
+from harness.run.provenance import MODIFIED, ROOT
+from harness.sweep.matrix._comparison import Change, Culprit, CulpritCommit
+from harness.sweep.matrix._estimate import BY_NAME, Metric
+from harness.sweep.matrix.matrix_record import MatrixRecord
+
+LIMIT_S = 600.0
+"""Maximum time for one run at one commit."""
+
+
+class _TimeIsUpError(Exception):
+    """The budget is used up."""
+
+
+def find_culprits(
+    tonight: MatrixRecord, baseline: MatrixRecord, budget_s: float, report_progress: Callable[[str], None]
+) -> list[Culprit]:
+    """Search the commits for each cell with a worse figure in virtual time, until the budget is used up.
+
+    The repository is the clone from which the harness runs. Ctrl-C ends the search.
+    """
+    regressions = {change.point: change for change in reversed(_paired_regressions(tonight))}
+    deadline, culprits = time.monotonic() + budget_s, []
+    for change in regressions.values():
+        culprit = Culprit(**change.point._asdict(), metric=change.metric, seed=_worst_seed(tonight, baseline, change))
+        try:
+            with TemporaryDirectory(prefix="ucp-harness-culprits-") as directory:
+                search = _Search(tonight, baseline, culprit, Path(directory), deadline, report_progress)
+                search.run()
+        except _TimeIsUpError:
+            culprit = culprit.model_copy(update={"problem": "the time for the search was used up"})
+        except KeyboardInterrupt:
+            culprit = culprit.model_copy(update={"problem": "the search was interrupted"})
+            deadline = time.monotonic()
+        except HarnessError as error:
+            culprit = culprit.model_copy(update={"problem": str(error)})
+        culprits.append(culprit)
+    return culprits
+
+
+def _paired_regressions(record: MatrixRecord) -> list[Change]:
+    return [change for change in record.against.regressions if change.difference is not None] if record.against else []
+
+
+def _worst_seed(tonight: MatrixRecord, baseline: MatrixRecord, change: Change) -> int:
+    """Return the seed whose figure became worse by most."""
+    metric = BY_NAME[change.metric]
+    sign = 1 if metric.worse == "higher" else -1
+    before = {run.seed: metric.of(run.figures) for run in baseline.results if run.point == change.point}
+    by_seed = {run.seed: metric.of(run.figures) for run in tonight.results if run.point == change.point}
+    return max(by_seed, key=lambda seed: sign * ((by_seed[seed] or 0.0) - (before.get(seed) or 0.0)))
+
+
+class _Search:
+    """The search for one run. Appends to the commits of `culprit`."""
+
+    def __init__(
+        self,
+        tonight: MatrixRecord,
+        baseline: MatrixRecord,
+        culprit: Culprit,
+        directory: Path,
+        deadline: float,
+        report_progress: Callable[[str], None],
+    ) -> None:
+        self._ends = [record.versions.get("commit", "") for record in (baseline, tonight)]
+        if not all(self._ends) or any(commit.endswith(MODIFIED) for commit in self._ends):
+            raise HarnessError("the baseline or tonight's code is not a commit of a repository, so no commit is named")
+        self._culprit, self._deadline, self._report_progress = culprit, deadline, report_progress
+        self._metric: Metric = BY_NAME[culprit.metric]
+        self._history = History.clone(ROOT, directory / "code")
+        plays = directory / "plays"
+        plays.mkdir()
+        subject = Subject(plays, tonight.matrix.scenario_at(culprit.point), culprit.seed)
+        self._workshop = Workshop(subject, plays, limit_s=LIMIT_S)
+        self._figures: dict[str, float | None] = {}
+
+    def run(self) -> None:
+        good, bad = map(self._history.resolve, self._ends)
+        while (at_good := self._figure(good)) != (at_bad := self._figure(bad)):
+            found = self._first_after(good, bad, at_good)
+            commit, after = self._history.commit(found), self._figure(found)
+            fields = {"hash": commit.hash, "date": commit.date, "author": commit.author, "subject": commit.subject}
+            self._culprit.commits.append(CulpritCommit(**fields, before=at_good, after=after))
+            if after == at_bad:
+                return
+            good = found
+        if not self._culprit.commits:
+            raise HarnessError("the run has the same figure at both commits, so no commit is named")
+
+    def _first_after(self, good: str, bad: str, figure: float | None) -> str:
+        """Return the first commit after `good` whose figure differs."""
+        step = self._history.begin(good, bad)
+        while not isinstance(step, SuspectCommits):
+            try:
+                same = self._figure(step) == figure
+            except UntestableError:
+                step = self._history.mark("skip")
+            else:
+                step = self._history.mark("good" if same else "bad")
+        if len(step.first) > 1:
+            raise HarnessError(f"it is one of {len(step.first)} commits, most of which cannot be played")
+        return step.first[0]
+
+    def _figure(self, commit: str) -> float | None:
+        """Return the figure of the run at this commit."""
+        if commit not in self._figures:
+            if time.monotonic() > self._deadline:
+                raise _TimeIsUpError
+            self._history.check_out(commit)
+            outcome, directory = self._workshop.play(self._history.tree)
+            if outcome.crashed is not None:
+                raise UntestableError(f"{commit[:12]} crashes: {outcome.crashed}")
+            self._figures[commit] = self._metric.of(RunArchive(directory).record.figures)
+            self._report_progress(f"{commit[:12]}: {self._metric.label} {self._figures[commit]}")
+        return self._figures[commit]

@@ -1,0 +1,87 @@
+"""Fingerprints of the steps of a run, which find the first handler run at which a run differs from an earlier night.
+
+A night keeps two bytes for each handler run, in the order of mission time. The first two bytes that differ give the
+position of the first changed handler run. To name it, the run is played again with the code of tonight. The code of the
+earlier night is therefore not needed.
+
+Handler runs that only received a message are left out. With an edited core, the simulation delivers more messages
+without effect, and they would hide the first real change.
+"""
+
+import base64
+import zlib
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from pydantic import BaseModel
+
+from harness.archive.traces import Trace, only_receives
+from harness.scenario import Scenario
+from ucp.trace import HandlerRun
+
+MAX_STEPS = 4000
+"""Maximum number of handler runs in a fingerprint."""
+_BYTES = 2
+
+
+class Step(NamedTuple):
+    """A handler run and its agent."""
+
+    t: float
+    agent_id: int
+    run: HandlerRun
+
+
+class FirstChange(BaseModel):
+    """The first handler run of tonight's run with this seed that the earlier night did not have.
+
+    `handler` is null if it is not among the handler runs of the fingerprint, or if tonight's run ended before.
+    """
+
+    seed: int
+    at_s: float | None = None
+    agent_id: int | None = None
+    handler: str | None = None
+    branch: str | None = None
+
+
+def fingerprint(traces: Mapping[int, Trace]) -> str:
+    """Return the fingerprint of a run in base64. Empty without traces."""
+    digests = [_digest(step).to_bytes(_BYTES) for step in _steps(traces)[:MAX_STEPS]]
+    return base64.b64encode(b"".join(digests)).decode("ascii")
+
+
+def first_changed(before: str, now: str) -> int | None:
+    """Return the position of the first step that differs, or None if the fingerprints are equal."""
+    if before == now:
+        return None
+    was, is_now = base64.b64decode(before), base64.b64decode(now)
+    shared = min(len(was), len(is_now))
+    byte = next((place for place in range(shared) if was[place] != is_now[place]), shared)
+    return byte // _BYTES
+
+
+def name_change(scenario: Scenario, seed: int, position: int) -> FirstChange:
+    """Play the run again, and return the handler run at this position."""
+    from harness.run.simulate import simulate
+
+    steps = _steps(simulate(scenario, seed, tracing=True).evidence.traces)
+    if position >= len(steps):
+        return FirstChange(seed=seed)
+    step = steps[position]
+    return FirstChange(
+        seed=seed, at_s=round(step.t, 3), agent_id=step.agent_id, handler=step.run.handler, branch=step.run.branch
+    )
+
+
+def _steps(traces: Mapping[int, Trace]) -> list[Step]:
+    """Return the handler runs with an effect of all agents, in the order of mission time."""
+    steps = (Step(run.t, agent_id, run) for agent_id, trace in sorted(traces.items()) for run in trace.runs)
+    return sorted((step for step in steps if step.run.sent or not only_receives(step.run)), key=lambda step: step.t)
+
+
+def _digest(step: Step) -> int:
+    run = step.run
+    sent = [(message.message, message.seq, message.block) for message in run.sent]
+    facts = (round(step.t, 6), step.agent_id, run.handler, run.branch, [*map(tuple, run.changes)], sent)
+    return zlib.crc32(repr(facts).encode()) % (1 << 8 * _BYTES)
